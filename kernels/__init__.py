@@ -1,0 +1,1 @@
+"""Warp code: imports warp, numpy and itself, never the host package. Installed as warpcloth.kernels."""
