@@ -1,0 +1,161 @@
+"""Factories of the kernels that turn a term into sums over vertices and copies: energy, gradient, Hessian blocks.
+
+With ``project`` the only kernels that know stencils; none of them knows a material. Each kernel is compiled only when a
+solver asks for it. Signatures: elements, state in, parameters, out.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .term import Term
+
+
+@cache
+def types(dtype):
+    """The vector and 3×3 matrix types of a scalar type: (vec3, mat33)."""
+    return wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
+
+
+@cache
+def local_coordinate(term: Term, dtype):
+    """The device function (stencil, element, rest, x) → y = Σᵢ wᵢ ⊗ xᵢ of a term, in its own precision."""
+    vec3, _ = types(dtype)
+    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    weight = term.weight
+
+    @wp.func
+    def y_of(stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3)):
+        y = y_type()
+        for i in range(K):
+            w = weight(rest, i)
+            for m in range(M):
+                y[m] = y[m] + w[m] * x[stencil[e, i]]
+        return y
+
+    return y_of
+
+
+@cache
+def energy(term: Term, dtype):
+    """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in double precision for the sum that follows."""
+    vec3, _ = types(dtype)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, u, measure = local_coordinate(term, dtype), term.energy, term.measure
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def energy_of_elements(
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        x: wp.array(dtype=vec3),
+        out: wp.array(dtype=wp.float64),
+    ):
+        e = wp.tid()
+        r = rest[e]
+        out[e] = wp.float64(stiffness[e] * measure(r) * u(y_of(stencil, e, r, x), r))
+
+    return energy_of_elements
+
+
+@cache
+def scatter_gradient(term: Term, dtype):
+    """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i]. Serial on the CPU, so deterministic there."""
+    vec3, _ = types(dtype)
+    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, weight, gradient, measure = local_coordinate(term, dtype), term.weight, term.gradient, term.measure
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter(
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        x: wp.array(dtype=vec3),
+        out: wp.array(dtype=vec3),
+    ):
+        e = wp.tid()
+        r = rest[e]
+        g = (stiffness[e] * measure(r)) * gradient(y_of(stencil, e, r, x), r)
+        for i in range(K):
+            w = weight(r, i)
+            force = vec3()
+            for m in range(M):
+                force += w[m] * g[m]
+            wp.atomic_add(out, stencil[e, i], force)
+
+    return scatter
+
+
+@cache
+def gather_gradient(term: Term, dtype):
+    """Kernel over vertices, the same sum as :func:`scatter_gradient` in a fixed order: deterministic on a GPU.
+
+    incidences[offsets[v] : offsets[v+1]] lists K·element + corner of the stencils that vertex v belongs to.
+    """
+    vec3, _ = types(dtype)
+    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, weight, gradient, measure = local_coordinate(term, dtype), term.weight, term.gradient, term.measure
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather(
+        offsets: wp.array(dtype=wp.int32),
+        incidences: wp.array(dtype=wp.int32),
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        x: wp.array(dtype=vec3),
+        out: wp.array(dtype=vec3),
+    ):
+        v = wp.tid()
+        total = vec3()
+        for n in range(offsets[v], offsets[v + 1]):
+            e = incidences[n] // K
+            r = rest[e]
+            g = (stiffness[e] * measure(r)) * gradient(y_of(stencil, e, r, x), r)
+            w = weight(r, incidences[n] - e * K)
+            for m in range(M):
+                total += w[m] * g[m]
+        out[v] = out[v] + total
+
+    return gather
+
+
+@cache
+def hessian_blocks(term: Term, dtype):
+    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], under the policy of the element's copy."""
+    vec3, mat33 = types(dtype)
+    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, weight, hessian, measure = local_coordinate(term, dtype), term.weight, term.hessian, term.measure
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def blocks_of_elements(
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        x: wp.array(dtype=vec3),
+        elements_per_copy: int,
+        policy: wp.array(dtype=wp.int32),
+        out: wp.array2d(dtype=mat33),
+    ):
+        e = wp.tid()
+        r = rest[e]
+        corners = out.shape[1] // K  # K, but unknown to the compiler: unrolling all of this takes it seconds
+        h = (stiffness[e] * measure(r)) * hessian(y_of(stencil, e, r, x), r, policy[e // elements_per_copy])
+        for i in range(corners):
+            wi = weight(r, i)
+            for j in range(corners):
+                wj = weight(r, j)
+                block = mat33()
+                for m in range(M):
+                    for n in range(M):
+                        w = wi[m] * wj[n]
+                        for row in range(3):
+                            for column in range(3):
+                                block[row, column] = block[row, column] + w * h[3 * m + row, 3 * n + column]
+                out[e, K * i + j] = block
+
+    return blocks_of_elements

@@ -1,0 +1,59 @@
+"""The record of an energy: what a file in ``kernels/terms`` fills in, and all that a factory or a solver may know of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+
+class HessianPolicy(IntEnum):
+    """What ``hessian`` makes of the negative curvature of an energy.
+
+    ``RAW`` returns ∂²u/∂y² as it is. ``CLAMP`` drops the negative part, ``ABSOLUTE`` turns its sign; both are
+    semi-definite, and equal to ``RAW`` where that is. Closed forms, no numerical eigenvalues.
+    """
+
+    RAW = 0
+    CLAMP = 1
+    ABSOLUTE = 2
+
+
+@dataclass(frozen=True)
+class Term:
+    """An energy U = Σₑ kₑ Aₑ u(yₑ) over stencils of ``vertices`` = K vertices.
+
+    The local coordinate y = Σᵢ wᵢ ⊗ xᵢ, a matrix of ``rows`` = M rows of 3, is linear in the vertices. The functions are
+    ``@wp.func``, generic over float32 and float64; ``rest`` below is one element's vector of ``parameters`` = P numbers.
+    None of them knows the stiffness kₑ [the term's unit]: the factories multiply by kₑ Aₑ.
+
+    Attributes:
+        name: The name of the energy in reports and kernels.
+        vertices: K.
+        rows: M.
+        parameters: P.
+        rest_state: NumPy function (points (n, 3) [m], stencil (E, K)) → (E, P), the rest state of every element.
+        weight: (rest, i) → (M,), the weights of vertex i in y; also ∂y/∂xᵢ.
+        measure: (rest) → Aₑ.
+        energy: (y, rest) → u.
+        gradient: (y, rest) → ∂u/∂y (M, 3).
+        hessian: (y, rest, policy) → ∂²u/∂y² (3M, 3M), y row by row, see :class:`HessianPolicy`.
+        project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or None.
+        constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next two.
+        constraint_gradient: (y, rest) → ∂C/∂y (M, 3).
+        constraint_hessian: (y, rest) → ∂²C/∂y² (3M, 3M).
+    """
+
+    name: str
+    vertices: int
+    rows: int
+    parameters: int
+    rest_state: Callable
+    weight: Any
+    measure: Any
+    energy: Any
+    gradient: Any
+    hessian: Any
+    project: Any = None
+    constraint: Any = None
+    constraint_gradient: Any = None
+    constraint_hessian: Any = None

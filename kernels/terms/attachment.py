@@ -1,0 +1,65 @@
+"""Attachment: U = Σ ½k‖x − target‖², k in N/m: a spring of no length to a fixed place.
+
+Stencil (x₀), y = x₀, rest state the target (3,) [m], measure 1. Not invariant to translation: it holds on to the world.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from ..term import Term
+
+
+def rest_state(points, stencil):
+    """Targets [m] (E, 3): the places of the vertices ``stencil`` (E, 1) in ``points``."""
+    return points[stencil[:, 0]].copy()
+
+
+@wp.func
+def weight(rest: Any, i: int):
+    w = wp.vector(length=1, dtype=rest.dtype)
+    w[0] = rest.dtype(1.0)
+    return w
+
+
+@wp.func
+def measure(rest: Any):
+    return rest.dtype(1.0)
+
+
+@wp.func
+def project(y: Any, rest: Any):
+    p = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    p[0] = rest
+    return p
+
+
+@wp.func
+def gradient(y: Any, rest: Any):
+    return y - project(y, rest)
+
+
+@wp.func
+def energy(y: Any, rest: Any):
+    offset = y[0] - rest
+    return y.dtype(0.5) * wp.dot(offset, offset)
+
+
+@wp.func
+def hessian(y: Any, rest: Any, policy: int):
+    return wp.identity(n=3, dtype=y.dtype)
+
+
+ATTACHMENT = Term(
+    name="Attachment",
+    vertices=1,
+    rows=1,
+    parameters=3,
+    rest_state=rest_state,
+    weight=weight,
+    measure=measure,
+    energy=energy,
+    gradient=gradient,
+    hessian=hessian,
+    project=project,
+)

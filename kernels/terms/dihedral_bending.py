@@ -1,0 +1,205 @@
+"""Dihedral bending: U = Σ ½D|e|²/(A₁ + A₂)(θ − θ̄)², D the plate's bending stiffness in N·m (Grinspun et al. 2003,
+*Discrete shells*; Bridson et al. 2003).
+
+Stencil: a hinge (x₀, x₁ the edge, x₂ and x₃ the opposite vertices). y = (e, a, b) = (x₁, x₂, x₃) − x₀. θ is the signed angle
+about e from the normal e×a to the normal b×e, 0 when flat; θ̄, the edge |e| and the areas Aᵢ come from the rest shape.
+The textbook has a factor 3 where this has 1: with 1 an equilateral sheet that is rolled up has the energy ½Dκ² per area.
+
+Derivatives in closed form (Tamstorf and Grinspun 2013, *Discrete bending forces and their Jacobians*), here arranged so that
+each part of ∂²θ is a product of two orthogonal covectors and so splits into its positive and negative half by itself.
+For the triangle with apex distance vector a = s e + h m (m ⟂ e the way to the apex, n its normal, t = e/|e|), a change
+(δe, δa) moves the apex against its foot by d = δa − s δe and turns the edge by ε = δe/|e|:
+
+    δθ = −Σ n·d/h,        ½δ²θ = Σ (n·d/h)(m·d/h) + (n·ε)(t·d/h + ½m·ε)        over both triangles,
+
+found by rotating both normals with the edge (parallel transport), where only their difference counts.
+∂²u = ∂θ∂θᵀ + (θ − θ̄)∂²θ is semi-definite only for θ = θ̄.
+
+An apex closer to the line of the edge than 1e-6 of its distance from x₀ has no normal: C = 0 and no force there.
+θ − θ̄ is wrapped into (−π, π]; it jumps when a hinge passes through folded flat.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..term import HessianPolicy, Term
+
+RAW = wp.constant(int(HessianPolicy.RAW))
+CLAMP = wp.constant(int(HessianPolicy.CLAMP))
+
+
+def rest_state(points, stencil):
+    """Rest angles θ̄ [rad] and the measure |e|²/(A₁ + A₂) [1] of the hinges ``stencil`` (E, 4), as an array (E, 2)."""
+    x0, x1, x2, x3 = (points[stencil[:, i]] for i in range(4))
+    e = x1 - x0
+    n1, n2 = np.cross(e, x2 - x0), np.cross(x3 - x0, e)
+    length = np.linalg.norm(e, axis=1)
+    sine = np.einsum("ij,ij->i", np.cross(n1, n2), e) / length
+    angle = np.arctan2(sine, np.einsum("ij,ij->i", n1, n2))
+    areas = 0.5 * (np.linalg.norm(n1, axis=1) + np.linalg.norm(n2, axis=1))
+    return np.stack([angle, length**2 / areas], axis=1)
+
+
+@wp.func
+def weight(rest: Any, i: int):
+    w = wp.vector(length=3, dtype=rest.dtype)
+    if i == 0:
+        w = -wp.vector(rest.dtype(1.0), rest.dtype(1.0), rest.dtype(1.0))
+    else:
+        w[i - 1] = rest.dtype(1.0)
+    return w
+
+
+@wp.func
+def measure(rest: Any):
+    return rest[1]
+
+
+@wp.func
+def has_no_normal(e: Any, a: Any, normal: Any):
+    return wp.dot(normal, normal) <= e.dtype(1.0e-12) * wp.dot(e, e) * wp.dot(a, a)
+
+
+@wp.func
+def undefined(y: Any):
+    return has_no_normal(y[0], y[1], wp.cross(y[0], y[1])) or has_no_normal(y[0], y[2], wp.cross(y[0], y[2]))
+
+
+@wp.func
+def constraint(y: Any, rest: Any):
+    c = rest[0] * rest.dtype(0.0)
+    if not undefined(y):
+        n1 = wp.normalize(wp.cross(y[0], y[1]))
+        n2 = wp.normalize(wp.cross(y[2], y[0]))
+        c = wp.atan2(wp.dot(wp.cross(n1, n2), wp.normalize(y[0])), wp.dot(n1, n2)) - rest[0]
+        if c > rest.dtype(wp.pi):
+            c -= rest.dtype(2.0 * wp.pi)
+        if c <= -rest.dtype(wp.pi):
+            c += rest.dtype(2.0 * wp.pi)
+    return c
+
+
+@wp.func
+def apex_covector(direction: Any, foot: Any, corner: int):
+    """direction·d with d = δy[corner] − foot·δe, as a matrix of the shape of y."""
+    g = wp.matrix(shape=(3, 3), dtype=direction.dtype)
+    g[0] = -foot * direction
+    g[corner] = direction
+    return g
+
+
+@wp.func
+def edge_covector(direction: Any):
+    """direction·δe, as a matrix of the shape of y."""
+    g = wp.matrix(shape=(3, 3), dtype=direction.dtype)
+    g[0] = direction
+    return g
+
+
+@wp.func
+def constraint_gradient(y: Any, rest: Any):
+    g = y * y.dtype(0.0)
+    if not undefined(y):
+        e = y[0]
+        for corner in range(1, 3):
+            normal = wp.cross(e, y[corner])
+            if corner == 2:
+                normal = -normal
+            g -= apex_covector(
+                normal * (wp.length(e) / wp.dot(normal, normal)), wp.dot(y[corner], e) / wp.dot(e, e), corner
+            )
+    return g
+
+
+@wp.func
+def flatten(g: Any):
+    v = wp.vector(length=9, dtype=g.dtype)
+    for i in range(3):
+        for j in range(3):
+            v[3 * i + j] = g[i, j]
+    return v
+
+
+@wp.func
+def product(g: Any, h: Any, ratio: Any, scale: Any, policy: int):
+    """scale·(g hᵀ + h gᵀ), or its positive half or absolute value; ratio is |h|/|g|, and g ⟂ h."""
+    u = flatten(g) * wp.sqrt(ratio)
+    v = flatten(h) / wp.sqrt(ratio)
+    if policy == RAW:
+        return scale * (wp.outer(u, v) + wp.outer(v, u))
+    if policy == CLAMP:
+        w = u + wp.sign(scale) * v
+        return wp.abs(scale) * scale.dtype(0.5) * wp.outer(w, w)
+    return wp.abs(scale) * (wp.outer(u, u) + wp.outer(v, v))
+
+
+@wp.func
+def curvature(y: Any, scale: Any, policy: int):
+    """scale·∂²θ, or of each of its four products the part that ``policy`` asks for."""
+    h = wp.matrix(shape=(9, 9), dtype=y.dtype)
+    if undefined(y):
+        return h
+    e = y[0]
+    length = wp.length(e)
+    t = e / length
+    one = y.dtype(1.0)
+    half = y.dtype(0.5)
+    for corner in range(1, 3):
+        normal = wp.cross(e, y[corner])
+        if corner == 2:
+            normal = -normal
+        height = wp.length(normal) / length
+        foot = wp.dot(y[corner], e) / (length * length)
+        n = wp.normalize(normal)
+        m = (y[corner] - foot * e) / height
+        # Lengths of the covectors over the four vertices, so that the split does not depend on which is x₀.
+        apex = wp.sqrt(one + foot * foot + (one - foot) * (one - foot)) / height
+        edge = wp.sqrt(y.dtype(2.0)) / length
+        h += product(
+            apex_covector(n / height, foot, corner), apex_covector(m / height, foot, corner), one, scale, policy
+        )
+        sigma = apex_covector(t / height, foot, corner) + edge_covector(m * (half / length))
+        ratio = wp.sqrt(apex * apex + y.dtype(0.25) * edge * edge) / edge
+        h += product(edge_covector(n / length), sigma, ratio, scale, policy)
+    return h
+
+
+@wp.func
+def constraint_hessian(y: Any, rest: Any):
+    return curvature(y, y.dtype(1.0), RAW)
+
+
+@wp.func
+def energy(y: Any, rest: Any):
+    c = constraint(y, rest)
+    return y.dtype(0.5) * c * c
+
+
+@wp.func
+def gradient(y: Any, rest: Any):
+    return constraint(y, rest) * constraint_gradient(y, rest)
+
+
+@wp.func
+def hessian(y: Any, rest: Any, policy: int):
+    g = flatten(constraint_gradient(y, rest))
+    return wp.outer(g, g) + curvature(y, constraint(y, rest), policy)
+
+
+DIHEDRAL_BENDING = Term(
+    name="DihedralBending",
+    vertices=4,
+    rows=3,
+    parameters=2,
+    rest_state=rest_state,
+    weight=weight,
+    measure=measure,
+    energy=energy,
+    gradient=gradient,
+    hessian=hessian,
+    constraint=constraint,
+    constraint_gradient=constraint_gradient,
+    constraint_hessian=constraint_hessian,
+)

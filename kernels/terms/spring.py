@@ -1,0 +1,123 @@
+"""Spring: U = Σ ½k(‖x₁ − x₀‖ − L)², k in N/m (Provot 1995, *Deformation constraints in a mass-spring model*).
+
+Stencil (x₀, x₁), y = x₁ − x₀, rest state L [m], measure 1. The Hessian k[ŷŷᵀ + (1 − L/l)(I − ŷŷᵀ)] has the eigenvalue
+k(1 − L/l) < 0 in compression (Choi and Ko 2002, *Stable but responsive cloth*); clamping that is dropping it.
+
+A collapsed spring, l ≤ 1e-12 L, has no direction: its gradient is 0, its Hessian I, and projection leaves it.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..term import HessianPolicy, Term
+
+CLAMP = wp.constant(int(HessianPolicy.CLAMP))
+ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
+
+
+def rest_state(points, stencil):
+    """Rest lengths [m] of the pairs ``stencil`` (E, 2) as an array (E, 1)."""
+    return np.linalg.norm(points[stencil[:, 1]] - points[stencil[:, 0]], axis=1)[:, None]
+
+
+@wp.func
+def weight(rest: Any, i: int):
+    w = wp.vector(length=1, dtype=rest.dtype)
+    w[0] = rest.dtype(2 * i - 1)
+    return w
+
+
+@wp.func
+def measure(rest: Any):
+    return rest.dtype(1.0)
+
+
+@wp.func
+def collapsed(length: Any, rest_length: Any):
+    return length <= rest_length * type(rest_length)(1.0e-12)
+
+
+@wp.func
+def energy(y: Any, rest: Any):
+    c = wp.length(y[0]) - rest[0]
+    return y.dtype(0.5) * c * c
+
+
+@wp.func
+def gradient(y: Any, rest: Any):
+    length = wp.length(y[0])
+    g = y * y.dtype(0.0)
+    if not collapsed(length, rest[0]):
+        g[0] = (y.dtype(1.0) - rest[0] / length) * y[0]
+    return g
+
+
+@wp.func
+def hessian(y: Any, rest: Any, policy: int):
+    length = wp.length(y[0])
+    eye = wp.identity(n=3, dtype=y.dtype)
+    if collapsed(length, rest[0]):
+        return eye
+    direction = y[0] / length
+    transverse = y.dtype(1.0) - rest[0] / length
+    if transverse < y.dtype(0.0):
+        if policy == CLAMP:
+            transverse = y.dtype(0.0)
+        if policy == ABSOLUTE:
+            transverse = -transverse
+    along = wp.outer(direction, direction)
+    return along + transverse * (eye - along)
+
+
+@wp.func
+def project(y: Any, rest: Any):
+    length = wp.length(y[0])
+    p = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    p[0] = y[0]
+    if not collapsed(length, rest[0]):
+        p[0] = y[0] * (rest[0] / length)
+    return p
+
+
+@wp.func
+def constraint(y: Any, rest: Any):
+    return wp.length(y[0]) - rest[0]
+
+
+@wp.func
+def constraint_gradient(y: Any, rest: Any):
+    length = wp.length(y[0])
+    g = y * y.dtype(0.0)
+    if not collapsed(length, rest[0]):
+        g[0] = y[0] / length
+    return g
+
+
+@wp.func
+def constraint_hessian(y: Any, rest: Any):
+    length = wp.length(y[0])
+    h = wp.matrix(shape=(3, 3), dtype=y.dtype)
+    if not collapsed(length, rest[0]):
+        direction = y[0] / length
+        h = (wp.identity(n=3, dtype=y.dtype) - wp.outer(direction, direction)) / length
+    return h
+
+
+SPRING = Term(
+    name="Spring",
+    vertices=2,
+    rows=1,
+    parameters=1,
+    rest_state=rest_state,
+    weight=weight,
+    measure=measure,
+    energy=energy,
+    gradient=gradient,
+    hessian=hessian,
+    project=project,
+    constraint=constraint,
+    constraint_gradient=constraint_gradient,
+    constraint_hessian=constraint_hessian,
+)
