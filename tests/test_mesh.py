@@ -1,5 +1,6 @@
 """The mesh: topology against slow references, springs, selections, files, and everything that it refuses."""
 
+import re
 import subprocess
 import sys
 
@@ -428,6 +429,143 @@ def test_arrays_are_copies_and_read_only():
         assert getattr(mesh, name) is array, name  # computed once
     with pytest.raises(AttributeError):
         mesh.points = points
+
+
+# --- files
+
+
+def exported(mesh, path):
+    import trimesh
+
+    visual = trimesh.visual.TextureVisuals(uv=mesh.texture_coordinates)
+    trimesh.Trimesh(mesh.points, mesh.triangles, visual=visual, process=False).export(path)
+    return path
+
+
+@pytest.mark.parametrize("ending", ["obj", "ply", "off", "glb", "gltf", "stl", "OBJ"])
+@pytest.mark.parametrize("seed", range(3))
+def test_files_keep_the_order(tmp_path, ending, seed):
+    random = np.random.default_rng(seed)
+    grid = Mesh.grid(5, 4, pattern=PATTERNS[seed])
+    order = random.permutation(20)
+    points = (grid.points + random.normal(scale=0.01, size=(20, 3)))[np.argsort(order)].astype(np.float32)
+    mesh = Mesh(points, order[random.permutation(grid.triangles)], texture_coordinates=grid.texture_coordinates)
+    loaded = Mesh.load(exported(mesh, tmp_path / f"cloth.{ending}"))
+    if ending == "stl":  # has no indices: vertices come in the order in which triangles use them first
+        used = mesh.triangles.ravel()
+        _, first = np.unique(used, return_index=True)
+        order = used[np.sort(first)]
+        np.testing.assert_array_equal(loaded.points, mesh.points[order])
+        np.testing.assert_array_equal(order[loaded.triangles], mesh.triangles)
+    else:
+        # Text formats have at least 8 decimals; the points are about 1 m.
+        np.testing.assert_allclose(loaded.points, mesh.points, atol=1e-8 if ending in ("obj", "OBJ", "off") else 0)
+        np.testing.assert_array_equal(loaded.triangles, mesh.triangles)
+    if ending in ("ply", "glb", "gltf"):
+        np.testing.assert_allclose(loaded.texture_coordinates, mesh.texture_coordinates, atol=1e-7)
+
+
+CLOTH = "".join(f"v {x} {y} {z}\n" for x, y, z in SQUARE)
+BODY = "".join(f"v {x} {y + 2} {z}\n" for x, y, z in SQUARE)
+TEXTURE = "".join(f"vt {k / 8} {k / 8}\n" for k in range(6))
+
+READ = [  # text of an OBJ file, name, number of points, triangles
+    ("quad", CLOTH + "f 1 3 4 2\n", None, 4, [[0, 2, 3], [3, 1, 0]]),
+    ("pentagon", CLOTH + "v 2 0 .5\nf 1 3 4 5 2\n", None, 5, [[0, 2, 3], [0, 3, 4], [0, 4, 1]]),
+    ("materials", CLOTH + "usemtl red\nf 1 3 4\nusemtl blue\nf 1 4 2\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
+    ("seam", CLOTH + TEXTURE + "f 1/1 3/2 4/3\nf 1/4 4/5 2/6\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
+    ("normals", CLOTH + "vn 0 1 0\nvn 0 -1 0\nf 1//1 3//1 4//1\nf 1//2 4//2 2//2\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
+    ("unused vertex", "v 9 9 9\n" + CLOTH + "f 2 4 5\n", None, 5, [[1, 3, 4]]),
+    ("groups", CLOTH + "g a\nf 1 3 4\ng b\nf 1 4 2\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
+    ("second object", "o cloth\n" + CLOTH + "f 1 3 4\no body\n" + BODY + "f 6 7 8\n", "body", 3, [[0, 1, 2]]),
+    ("first object", "o cloth\n" + CLOTH + "f 1 3 4\no body\n" + BODY + "f 5 6 7\n", "cloth", 3, [[0, 1, 2]]),
+]
+
+
+@pytest.mark.parametrize("text, name, points, triangles", [row[1:] for row in READ], ids=[row[0] for row in READ])
+def test_obj(tmp_path, text, name, points, triangles):
+    path = tmp_path / "cloth.obj"
+    path.write_text(text)
+    mesh = Mesh.load(path, name)
+    assert len(mesh.points) == points
+    assert mesh.triangles.tolist() == triangles
+    assert mesh.texture_coordinates is None
+
+
+def test_ply_stays_whole_at_seams(tmp_path):
+    elements = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    elements += "element face 2\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
+    points = "".join(f"{x} {y} {z}\n" for x, y, z in SQUARE)
+    faces = "3 0 2 3 6 0 0 0 1 1 1\n3 0 3 1 6 .5 .5 0 .5 1 .5\n"
+    (tmp_path / "cloth.ply").write_text(f"ply\nformat ascii 1.0\n{elements}end_header\n{points}{faces}")
+    mesh = Mesh.load(tmp_path / "cloth.ply")
+    assert mesh.points.tolist() == [list(point) for point in SQUARE] and mesh.triangles.tolist() == [
+        [0, 2, 3],
+        [0, 3, 1],
+    ]
+
+
+def test_gltf_transforms_and_names(tmp_path):
+    import trimesh
+
+    mesh = Mesh.grid(3, 3)
+    scene = trimesh.Scene()
+    mirror = np.array([(0, 1.0, 0, 1), (2, 0, 0, 2), (0, 0, 1, 3), (0, 0, 0, 1)])  # (x, y, z) to (y + 1, 2x + 2, z + 3)
+    for name, transform in (("cloth", mirror), ("body", np.eye(4))):
+        copy = trimesh.Trimesh(mesh.points, mesh.triangles, process=False)
+        scene.add_geometry(copy, node_name=name, geom_name=name, transform=transform)
+    scene.export(tmp_path / "two.glb")
+    with pytest.raises(ValueError, match=r"two.glb: has several geometries, name one of them: 'body', 'cloth'"):
+        Mesh.load(tmp_path / "two.glb")
+    with pytest.raises(ValueError, match=r"two.glb: has no geometry 'hat', it has 'body', 'cloth'"):
+        Mesh.load(tmp_path / "two.glb", "hat")
+    loaded = Mesh.load(tmp_path / "two.glb", "cloth")
+    np.testing.assert_array_equal(loaded.points, mesh.points[:, [1, 0, 2]] * (1, 2, 1) + (1, 2, 3))
+    assert (normal(loaded.points, *loaded.triangles.T)[:, 0] > 0).all()  # still the front
+
+
+def test_gltf_is_welded_at_seams(tmp_path):
+    import trimesh
+
+    mesh = Mesh.grid(3, 3)
+    loose = mesh.points[mesh.triangles].reshape(-1, 3)
+    st = np.arange(48).reshape(24, 2) / 48
+    for uv, expected in ((st, None), (loose[:, [0, 2]], mesh.texture_coordinates)):
+        visual = trimesh.visual.TextureVisuals(uv=uv)
+        cut = trimesh.Trimesh(loose, np.arange(24).reshape(-1, 3), visual=visual, process=False)
+        cut.export(tmp_path / "seams.glb")
+        loaded = Mesh.load(tmp_path / "seams.glb")
+        assert (len(loaded.points), len(loaded.hinges)) == (9, len(mesh.hinges))
+        if expected is None:
+            assert loaded.texture_coordinates is None
+        else:
+            np.testing.assert_allclose(loaded.texture_coordinates, loaded.points[:, [0, 2]], atol=1e-7)
+
+
+BAD_FILES = [
+    ("missing.obj", None, FileNotFoundError, "no such file"),
+    ("cloth.step", "x", ValueError, "the ending must be one of .obj .ply .stl"),
+    ("cloth", "x", ValueError, "the ending must be one of"),
+    ("empty.ply", "", ValueError, "the file is empty"),
+    ("empty.stl", "", ValueError, "the file is empty"),
+    ("noise.ply", "no header\n", ValueError, "cannot be read as .ply"),
+    ("noise.glb", "no header, but long enough for one", ValueError, "cannot be read as .glb"),
+    ("noise.obj", "no vertices\n", ValueError, "has no triangles"),
+    ("cloud.obj", CLOTH, ValueError, "has no triangles"),
+    ("range.obj", CLOTH + "f 1 3 9\n", ValueError, "cannot be read as .obj"),
+    ("relative.obj", CLOTH + "f 1/1 2/1 -1/1\n", ValueError, "its faces have relative"),
+    ("flat.obj", CLOTH + "f 1 1 3\n", ValueError, r"triangles\[0\] = \[0, 0, 2\]: must be 3 different"),
+    ("nan.obj", CLOTH.replace("1", "nan") + "f 1 3 4\n", ValueError, r"points\[1\] = .*must be finite"),
+    ("range.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", ValueError, "cannot be read as .off"),
+]
+
+
+@pytest.mark.parametrize("name, text, kind, message", BAD_FILES, ids=[row[0] for row in BAD_FILES])
+def test_bad_files(tmp_path, name, text, kind, message):
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(kind, match=f"^{re.escape(str(tmp_path / name))}: .*{message}"):
+        Mesh.load(tmp_path / name)
 
 
 def test_import_is_light():

@@ -149,6 +149,25 @@ class Mesh:
         points = np.linspace(0, length, n)[:, None] * (along / np.linalg.norm(along))
         return cls(points, edges=np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
 
+    @classmethod
+    def load(cls, path, prim=None):
+        """The mesh in a file: see `loading.read_file`, and for USD stages `usd.read_mesh`, which give what is raised.
+
+        Args:
+            path: An .obj, .ply, .stl, .off, .glb or .gltf file, or a .usd, .usda, .usdc or .usdz stage.
+            prim: Name of the geometry, or path of the prim, where the file has several.
+
+        Returns:
+            Mesh: Vertices in the order of the file.
+        """
+        if str(path).lower().endswith((".usd", ".usda", ".usdc", ".usdz")):
+            from .usd import read_mesh
+
+            return read_mesh(path, prim)
+        from .loading import read_file
+
+        return read_file(path, prim)
+
     def select(self, text):
         """Vertices described by a text such as "z == 0 and not corners": see `selection.select`.
 
