@@ -1,0 +1,118 @@
+"""Meshes from files, by trimesh."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from .mesh import Mesh
+
+# trimesh would split vertices at texture seams and make a mesh of every material; an OBJ's objects stay apart.
+_OPTIONS = {
+    ".obj": {"split_objects": True, "group_material": False, "skip_materials": True},
+    ".ply": {"fix_texture": False, "skip_materials": True},
+    ".stl": {},
+    ".off": {},
+    ".glb": {},
+    ".gltf": {},
+}
+# STL has no shared vertices at all; glTF stores a vertex once for every normal and texture coordinate that it has.
+_WELDED = (".stl", ".glb", ".gltf")
+
+
+def read_file(path, name=None):
+    """The triangle mesh in a file.
+
+    Vertices keep the order of the file. STL and glTF repeat a vertex wherever triangles differ in normal or texture,
+    which would cut the cloth: there, vertices with exactly equal points are welded into the first of them. glTF node
+    transforms are applied; lengths are taken for metres. Polygons are cut into fans of triangles (x₀, xₖ, xₖ₊₁), which
+    come after the file's own triangles.
+
+    Texture coordinates are read where there is one pair for each vertex: from PLY (where faces have their own, the last
+    counts), and from glTF unless welding joins vertices with different ones. OBJ has them for each corner of each face,
+    so they are not read.
+
+    Args:
+        path: An .obj, .ply, .stl, .off, .glb or .gltf file.
+        name: Of the geometry (OBJ: object; glTF: node; STL: solid), if the file has several. Vertices of the others are
+            left out.
+
+    Returns:
+        Mesh: float64 points, as exact as the file's numbers.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The ending is none of those above; the file is empty, cannot be read, has no triangles or (OBJ) has
+            relative indices; it has several geometries and `name` is none of them; or Mesh refuses it. The message
+            begins with the path.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    ending = path.suffix.lower()
+    if ending not in _OPTIONS:
+        raise ValueError(f"{path}: the ending must be one of {' '.join(_OPTIONS)} .usd .usda .usdc .usdz")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path}: the file is empty")
+    # trimesh counts relative indices from the end of the file instead of from their line: other triangles, silently.
+    if ending == ".obj" and re.search(rb"^f\s[^\n#]*-\d", path.read_bytes(), re.MULTILINE):
+        raise ValueError(f"{path}: its faces have relative (negative) indices, which are not supported")
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(path, process=False, maintain_order=True, **_OPTIONS[ending])
+    except Exception as error:  # the readers raise whatever a broken file makes them stumble over
+        raise ValueError(f"{path}: cannot be read as {ending}, {type(error).__name__}: {error}") from error
+    found = {node: scene.graph[node] for node in scene.graph.nodes_geometry}
+    found = {node: at for node, at in found.items() if len(getattr(scene.geometry[at[1]], "faces", ()))}
+    if not found:
+        raise ValueError(f"{path}: has no triangles")
+    names = ", ".join(repr(node) for node in sorted(found, key=str))
+    if name is None and len(found) > 1:
+        raise ValueError(f"{path}: has several geometries, name one of them: {names}")
+    if name is not None and name not in found:
+        raise ValueError(f"{path}: has no geometry {name!r}, it has {names}")
+    transform, geometry = found[next(iter(found)) if name is None else name]
+    return _mesh(path, scene.geometry[geometry], transform, len(found) > 1)
+
+
+def _mesh(path, geometry, transform, drop_unused):
+    """The Mesh of a trimesh.Trimesh, as read_file describes it."""
+    ending = path.suffix.lower()
+    points = np.asarray(geometry.vertices, dtype=np.float64)
+    triangles = np.asarray(geometry.faces, dtype=np.int64)
+    if not np.array_equal(transform, np.eye(4)):
+        points = points @ transform[:3, :3].T + transform[:3, 3]
+        if np.linalg.det(transform[:3, :3]) < 0:  # a mirror turns the front of a triangle to the back
+            triangles = triangles[:, ::-1]
+    # Of an OBJ trimesh takes the mean of the *indices* that a vertex has at a seam: unrelated coordinates.
+    st = None if ending == ".obj" else getattr(geometry.visual, "uv", None)
+    st = None if st is None or len(st) != len(points) else np.asarray(st, dtype=np.float64)
+    if triangles.min() < 0 or triangles.max() >= len(points):
+        span = f"{triangles.min()} to {triangles.max()}"
+        raise ValueError(f"{path}: triangles refer to vertices {span}, must be 0 to {len(points) - 1}")
+    kept = np.arange(len(points))
+    if drop_unused:
+        kept = np.unique(triangles)
+        triangles = np.searchsorted(kept, triangles)
+    if ending in _WELDED:
+        first, place = _first_of_equals(points[kept])
+        if st is not None and not np.array_equal(st[kept], st[kept][first][place]):
+            st = None
+        kept, triangles = kept[first], place[triangles]
+    try:
+        return Mesh(points[kept], triangles, texture_coordinates=None if st is None else st[kept])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _first_of_equals(points):
+    """The first row of each set of equal rows, in order, and for every row the place of its set in that order."""
+    order = np.lexsort(points.T)  # stable: equal rows stay in order
+    new = np.concatenate([[True], (points[order][1:] != points[order][:-1]).any(axis=1)])
+    first = order[new]
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    place = np.empty(len(points), dtype=np.int64)
+    place[order] = rank[np.cumsum(new) - 1]
+    return np.sort(first), place
