@@ -18,31 +18,41 @@ def types(dtype):
 
 
 @cache
-def local_coordinate(term: Term, dtype):
-    """The device function (stencil, element, rest, x) → y = Σᵢ wᵢ ⊗ xᵢ of a term, in its own precision."""
+def local_coordinate(term: Term, dtype, corrected: bool):
+    """The device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ + Σᵢ wᵢ ⊗ dᵢ of a term; without d if not ``corrected``.
+
+    In float32 the sum x + d would lose the digits of d to the size of x; the difference of neighbouring x is nearly exact.
+    """
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     weight = term.weight
 
     @wp.func
-    def y_of(stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3)):
+    def y_of(
+        stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)
+    ):
         y = y_type()
         for i in range(K):
             w = weight(rest, i)
             for m in range(M):
                 y[m] = y[m] + w[m] * x[stencil[e, i]]
+        if wp.static(corrected):
+            for i in range(K):
+                w = weight(rest, i)
+                for m in range(M):
+                    y[m] = y[m] + w[m] * d[stencil[e, i]]
         return y
 
     return y_of
 
 
 @cache
-def energy(term: Term, dtype):
+def energy(term: Term, dtype, corrected: bool = False):
     """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in double precision for the sum that follows."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
-    y_of, u, measure = local_coordinate(term, dtype), term.energy, term.measure
+    y_of, u, measure = local_coordinate(term, dtype, corrected), term.energy, term.measure
 
     @wp.kernel(module="unique", enable_backward=False)
     def energy_of_elements(
@@ -50,22 +60,23 @@ def energy(term: Term, dtype):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
         out: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
         r = rest[e]
-        out[e] = wp.float64(stiffness[e] * measure(r) * u(y_of(stencil, e, r, x), r))
+        out[e] = wp.float64(stiffness[e] * measure(r) * u(y_of(stencil, e, r, x, d), r))
 
     return energy_of_elements
 
 
 @cache
-def scatter_gradient(term: Term, dtype):
+def scatter_gradient(term: Term, dtype, corrected: bool = False):
     """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i]. Serial on the CPU, so deterministic there."""
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
-    y_of, weight, gradient, measure = local_coordinate(term, dtype), term.weight, term.gradient, term.measure
+    y_of, weight, gradient, measure = local_coordinate(term, dtype, corrected), term.weight, term.gradient, term.measure
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter(
@@ -73,11 +84,12 @@ def scatter_gradient(term: Term, dtype):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
         out: wp.array(dtype=vec3),
     ):
         e = wp.tid()
         r = rest[e]
-        g = (stiffness[e] * measure(r)) * gradient(y_of(stencil, e, r, x), r)
+        g = (stiffness[e] * measure(r)) * gradient(y_of(stencil, e, r, x, d), r)
         for i in range(K):
             w = weight(r, i)
             force = vec3()
@@ -89,7 +101,7 @@ def scatter_gradient(term: Term, dtype):
 
 
 @cache
-def gather_gradient(term: Term, dtype):
+def gather_gradient(term: Term, dtype, corrected: bool = False):
     """Kernel over vertices, the same sum as :func:`scatter_gradient` in a fixed order: deterministic on a GPU.
 
     incidences[offsets[v] : offsets[v+1]] lists K·element + corner of the stencils that vertex v belongs to.
@@ -97,7 +109,7 @@ def gather_gradient(term: Term, dtype):
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
-    y_of, weight, gradient, measure = local_coordinate(term, dtype), term.weight, term.gradient, term.measure
+    y_of, weight, gradient, measure = local_coordinate(term, dtype, corrected), term.weight, term.gradient, term.measure
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather(
@@ -107,6 +119,7 @@ def gather_gradient(term: Term, dtype):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
         out: wp.array(dtype=vec3),
     ):
         v = wp.tid()
@@ -114,7 +127,7 @@ def gather_gradient(term: Term, dtype):
         for n in range(offsets[v], offsets[v + 1]):
             e = incidences[n] // K
             r = rest[e]
-            g = (stiffness[e] * measure(r)) * gradient(y_of(stencil, e, r, x), r)
+            g = (stiffness[e] * measure(r)) * gradient(y_of(stencil, e, r, x, d), r)
             w = weight(r, incidences[n] - e * K)
             for m in range(M):
                 total += w[m] * g[m]
@@ -124,12 +137,12 @@ def gather_gradient(term: Term, dtype):
 
 
 @cache
-def hessian_blocks(term: Term, dtype):
+def hessian_blocks(term: Term, dtype, corrected: bool = False):
     """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], under the policy of the element's copy."""
     vec3, mat33 = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
-    y_of, weight, hessian, measure = local_coordinate(term, dtype), term.weight, term.hessian, term.measure
+    y_of, weight, hessian, measure = local_coordinate(term, dtype, corrected), term.weight, term.hessian, term.measure
 
     @wp.kernel(module="unique", enable_backward=False)
     def blocks_of_elements(
@@ -137,6 +150,7 @@ def hessian_blocks(term: Term, dtype):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
         elements_per_copy: int,
         policy: wp.array(dtype=wp.int32),
         out: wp.array2d(dtype=mat33),
@@ -144,7 +158,7 @@ def hessian_blocks(term: Term, dtype):
         e = wp.tid()
         r = rest[e]
         corners = out.shape[1] // K  # K, but unknown to the compiler: unrolling all of this takes it seconds
-        h = (stiffness[e] * measure(r)) * hessian(y_of(stencil, e, r, x), r, policy[e // elements_per_copy])
+        h = (stiffness[e] * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, policy[e // elements_per_copy])
         for i in range(corners):
             wi = weight(r, i)
             for j in range(corners):

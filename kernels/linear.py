@@ -1,0 +1,254 @@
+"""Factories of the kernels of a sparse system of 3×3 blocks: filling it, multiplying, conjugate gradients per copy.
+
+The matrix is in block compressed rows (offsets, columns, values); every copy is a diagonal block of it, so that nothing here
+but the sums knows of copies. ``active[copy]`` is 1 while that copy still iterates.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .assemble import types
+
+
+@cache
+def set_inertia(dtype):
+    """Kernel over vertices: values[diagonal] = scale·m I, and I for a pinned vertex, which thereby stays."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def set_diagonal(
+        diagonal: wp.array(dtype=wp.int32),
+        mass: wp.array(dtype=dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        scale: dtype,
+        values: wp.array(dtype=mat33),
+    ):
+        i = wp.tid()
+        entry = dtype(1.0)
+        if inverse_mass[i] > dtype(0.0):
+            entry = scale * mass[i]
+        values[diagonal[i]] = entry * wp.identity(n=3, dtype=dtype)
+
+    return set_diagonal
+
+
+@cache
+def add_blocks(dtype):
+    """Kernel over the blocks of the matrix: values[s] += Σ blocks[sources[offsets[s] : offsets[s+1]]], in a fixed order."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather_blocks(
+        offsets: wp.array(dtype=wp.int32),
+        sources: wp.array(dtype=wp.int32),
+        blocks: wp.array(dtype=mat33),
+        values: wp.array(dtype=mat33),
+    ):
+        s = wp.tid()
+        total = values[s]
+        for n in range(offsets[s], offsets[s + 1]):
+            total += blocks[sources[n]]
+        values[s] = total
+
+    return gather_blocks
+
+
+@cache
+def multiply(dtype):
+    """Kernel over block rows: q = A p."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def multiply_rows(
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=mat33),
+        p: wp.array(dtype=vec3),
+        q: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        total = vec3()
+        for s in range(offsets[i], offsets[i + 1]):
+            total += values[s] * p[columns[s]]
+        q[i] = total
+
+    return multiply_rows
+
+
+@cache
+def invert_diagonal(dtype):
+    """Kernel over block rows: inverse[i] = A[i, i]⁻¹, the block Jacobi preconditioner."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def invert_blocks(
+        diagonal: wp.array(dtype=wp.int32), values: wp.array(dtype=mat33), inverse: wp.array(dtype=mat33)
+    ):
+        i = wp.tid()
+        inverse[i] = wp.inverse(values[diagonal[i]])
+
+    return invert_blocks
+
+
+@cache
+def start_iteration(dtype):
+    """Kernel over vertices: x = 0, r = b, z = P r, p = z."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def start(
+        preconditioner: wp.array(dtype=mat33),
+        b: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        r: wp.array(dtype=vec3),
+        z: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        x[i] = vec3()
+        r[i] = b[i]
+        z[i] = preconditioner[i] * b[i]
+        p[i] = z[i]
+
+    return start
+
+
+@cache
+def start_copies():
+    """Kernel over copies: every copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def start(
+        rz: wp.array(dtype=wp.float64),
+        first: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        iteration: wp.array(dtype=wp.int32),
+        proceed: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        first[copy] = rz[copy]
+        active[copy] = wp.where(rz[copy] > wp.float64(0.0), 1, 0)
+        iteration[0] = 0
+        proceed[0] = 1
+
+    return start
+
+
+@cache
+def advance(dtype):
+    """Kernel over vertices: x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy.
+
+    In a direction without positive curvature the first step of a copy is x = p, later ones leave x: a descent direction
+    either way (Steihaug 1983).
+    """
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance_vertices(
+        preconditioner: wp.array(dtype=mat33),
+        p: wp.array(dtype=vec3),
+        q: wp.array(dtype=vec3),
+        rz: wp.array(dtype=wp.float64),
+        pq: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        iteration: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # in and out
+        x: wp.array(dtype=vec3),
+        r: wp.array(dtype=vec3),
+        # out
+        z: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        if active[copy] == 1:
+            if pq[copy] <= wp.float64(0.0):
+                if iteration[0] == 0:
+                    x[i] = p[i]
+            else:
+                a = dtype(rz[copy] / pq[copy])
+                x[i] = x[i] + a * p[i]
+                r[i] = r[i] - a * q[i]
+                z[i] = preconditioner[i] * r[i]
+
+    return advance_vertices
+
+
+@cache
+def check_copies():
+    """Kernel over copies: stops those that are done; ratio = new rᵀz / old rᵀz; proceed = 1 while one is left."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def check(
+        new_rz: wp.array(dtype=wp.float64),
+        pq: wp.array(dtype=wp.float64),
+        first: wp.array(dtype=wp.float64),
+        tolerance: wp.array(dtype=wp.float64),
+        # in and out
+        rz: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        negative: wp.array(dtype=wp.int32),
+        # out
+        ratio: wp.array(dtype=wp.float64),
+        proceed: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        if active[copy] == 1:
+            ratio[copy] = new_rz[copy] / rz[copy]
+            rz[copy] = new_rz[copy]
+            if pq[copy] <= wp.float64(0.0):
+                negative[copy] = 1
+                active[copy] = 0
+            # Written so that NaN ends the iteration too; the caller sees it in the result.
+            if not (new_rz[copy] > tolerance[copy] * tolerance[copy] * first[copy]):
+                active[copy] = 0
+            if active[copy] == 1:
+                proceed[0] = 1
+
+    return check
+
+
+@cache
+def begin_check():
+    """Kernel of one thread, before :func:`check_copies`: counts the iteration; proceed = 0."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def begin(iteration: wp.array(dtype=wp.int32), proceed: wp.array(dtype=wp.int32)):
+        iteration[0] = iteration[0] + 1
+        proceed[0] = 0
+
+    return begin
+
+
+@cache
+def limit_iterations():
+    """Kernel of one thread, after :func:`check_copies`: proceed = 0 once the iterations are used up."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def limit(iteration: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
+        if iteration[0] >= most:
+            proceed[0] = 0
+
+    return limit
+
+
+@cache
+def new_direction(dtype):
+    """Kernel over vertices: p = z + ratio p."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def turn(
+        z: wp.array(dtype=vec3),
+        ratio: wp.array(dtype=wp.float64),
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        if active[copy] == 1:
+            p[i] = z[i] + dtype(ratio[copy]) * p[i]
+
+    return turn

@@ -1,0 +1,162 @@
+"""Factories of the kernels that minimise φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d over the free vertices, per copy.
+
+With base = x̃, s = 1/h² and load = 0 this is the objective of implicit Euler; with base the start, s = 0 and load = 1 it is
+the potential energy under gravity.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .assemble import types
+
+
+@cache
+def set_trial(dtype):
+    """Kernel over vertices: trial = d + step·p with the step length of the copy; clears the gradient."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def place(
+        correction: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        step: wp.array(dtype=wp.float64),
+        per_copy: int,
+        # out
+        trial: wp.array(dtype=vec3),
+        gradient: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        trial[i] = correction[i] + dtype(step[i // per_copy]) * direction[i]
+        gradient[i] = vec3()
+
+    return place
+
+
+@cache
+def add_inertia(dtype):
+    """Kernel over vertices: gradient += s m d − load m g, and 0 for pins; work[i] = s/2 m d·d − load m g·d [J]."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        mass: wp.array(dtype=dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        gravity: wp.array(dtype=vec3),
+        per_copy: int,
+        s: dtype,
+        load: dtype,
+        correction: wp.array(dtype=vec3),
+        # in and out
+        gradient: wp.array(dtype=vec3),
+        # out
+        work: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] > dtype(0.0):
+            d = correction[i]
+            pull = load * gravity[i // per_copy]
+            gradient[i] = gradient[i] + mass[i] * (s * d - pull)
+            work[i] = wp.float64(mass[i]) * wp.float64(wp.dot(dtype(0.5) * s * d - pull, d))
+        else:
+            gradient[i] = vec3()
+            work[i] = wp.float64(0.0)
+
+    return add
+
+
+@cache
+def negate(dtype):
+    """Kernel over vertices: out = −a."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def negate_vertices(a: wp.array(dtype=vec3), out: wp.array(dtype=vec3)):
+        i = wp.tid()
+        out[i] = -a[i]
+
+    return negate_vertices
+
+
+@cache
+def begin_search():
+    """Kernel over copies: step 1 for those that still iterate and 0 for the rest."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def begin(
+        active: wp.array(dtype=wp.int32),
+        step: wp.array(dtype=wp.float64),
+        searching: wp.array(dtype=wp.int32),
+        trials: wp.array(dtype=wp.int32),
+        proceed: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        step[copy] = wp.float64(active[copy])
+        searching[copy] = active[copy]
+        trials[0] = 0
+        proceed[0] = 1
+
+    return begin
+
+
+@cache
+def check_trial():
+    """Kernel over copies: accepts a trial step, or halves it, and to 0 when ``most`` trials are used up.
+
+    Accepted is φ(α) ≤ φ(0) + 1e-4 α φ'(0) (Armijo), and, where φ no longer resolves the decrease, φ'(α) ≤ −(1 − 2e-4)·φ'(0)
+    with φ(α) ≤ φ(0) + noise (the approximate Wolfe condition of Hager and Zhang 2005). NaN is never accepted.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def check(
+        start: wp.array(dtype=wp.float64),
+        trial: wp.array(dtype=wp.float64),
+        slope: wp.array(dtype=wp.float64),
+        trial_slope: wp.array(dtype=wp.float64),
+        noise: wp.float64,
+        trials: wp.array(dtype=wp.int32),
+        most: int,
+        # in and out
+        step: wp.array(dtype=wp.float64),
+        searching: wp.array(dtype=wp.int32),
+        # out
+        proceed: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        if searching[copy] == 1:
+            decrease = trial[copy] <= start[copy] + wp.float64(1.0e-4) * step[copy] * slope[copy]
+            level = trial[copy] <= start[copy] + noise * wp.abs(start[copy])
+            flat = trial_slope[copy] <= -wp.float64(1.0 - 2.0e-4) * slope[copy]
+            if decrease or (level and flat):
+                searching[copy] = 0
+            else:
+                step[copy] = wp.float64(0.5) * step[copy]
+                proceed[0] = 1
+                if trials[0] >= most:
+                    step[copy] = wp.float64(0.0)
+
+    return check
+
+
+@cache
+def begin_trial():
+    """Kernel of one thread, before :func:`check_trial`: counts the trial; proceed = 0."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def begin(trials: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
+        trials[0] = trials[0] + 1
+        proceed[0] = 0
+
+    return begin
+
+
+@cache
+def end_trial():
+    """Kernel of one thread, after :func:`check_trial`: one more evaluation after the last halving, then the end."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def end(trials: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
+        if trials[0] > most:
+            proceed[0] = 0
+
+    return end

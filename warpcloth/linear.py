@@ -1,0 +1,106 @@
+"""The only thing that solves a sparse system: conjugate gradients on the device, or a factorisation on the host."""
+
+import numpy as np
+import warp as wp
+
+from .capture import on_host
+from .kernels import linear
+
+
+class ConjugateGradients:
+    """Solves A x = b for each copy by conjugate gradients with the inverse diagonal blocks as preconditioner.
+
+    Runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) fell to its tolerance times the first, or at
+    a direction without positive curvature: then x is a descent direction of ½xᵀAx − bᵀx all the same and ``negative`` is 1
+    (Steihaug 1983).
+
+    Args:
+        hessian: The :class:`warpcloth.operators.Hessian`.
+        sums: :class:`warpcloth.operators.Sums`.
+        iterations: The most iterations of one solve.
+    """
+
+    capturable = True
+
+    def __init__(self, hessian, sums, iterations):
+        model = self.model = hessian.model
+        self.hessian, self.sums, self.iterations = hessian, sums, iterations
+        self.r, self.z, self.p, self.q = (model.vectors() for _ in range(4))
+        self.preconditioner = wp.zeros(model.count, dtype=model.mat33, device=model.device)
+
+        def per_copy(dtype):
+            return wp.zeros(model.copies, dtype=dtype, device=model.device)
+
+        self.rz, self.new_rz, self.pq, self.first, self.ratio, self.tolerance = (per_copy(wp.float64) for _ in range(6))
+        self.active, self.negative = per_copy(wp.int32), per_copy(wp.int32)
+        self.proceed, self.iteration = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        names = ("multiply", "invert_diagonal", "start_iteration", "advance", "new_direction")
+        self.kernels = {name: model.kernel(getattr(linear, name), model.dtype) for name in names}
+        names = ("start_copies", "begin_check", "check_copies", "limit_iterations")
+        self.kernels |= {name: model.kernel(getattr(linear, name)) for name in names}
+
+    def solve(self, b, x):
+        """x = A⁻¹ b to the relative ``tolerance`` (B,) of each copy."""
+        model, hessian = self.model, self.hessian
+        N, B = model.count, model.copies
+        self._launch("invert_diagonal", N, [hessian.diagonal, hessian.values], [self.preconditioner])
+        self._launch("start_iteration", N, [self.preconditioner, b], [x, self.r, self.z, self.p])
+        self.sums.dot(self.r, self.z, self.rz)
+        self.negative.zero_()
+        self._launch("start_copies", B, [self.rz], [self.first, self.active, self.iteration, self.proceed])
+        wp.capture_while(self.proceed, self._iterate, x=x)
+
+    def _iterate(self, x):
+        model, hessian = self.model, self.hessian
+        N, B, n = model.count, model.copies, model.per_copy
+        self._launch("multiply", N, [hessian.offsets, hessian.columns, hessian.values, self.p], [self.q])
+        self.sums.dot(self.p, self.q, self.pq)
+        state = [self.preconditioner, self.p, self.q, self.rz, self.pq, self.active, self.iteration, n]
+        self._launch("advance", N, state, [x, self.r, self.z])
+        self.sums.dot(self.r, self.z, self.new_rz)
+        self._launch("begin_check", 1, [], [self.iteration, self.proceed])
+        given = [self.new_rz, self.pq, self.first, self.tolerance]
+        self._launch("check_copies", B, given, [self.rz, self.active, self.negative, self.ratio, self.proceed])
+        self._launch("limit_iterations", 1, [self.iteration, self.iterations], [self.proceed])
+        self._launch("new_direction", N, [self.z, self.ratio, self.active, n], [self.p])
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.model.launch(self.kernels[name], dim, inputs, outputs)
+
+
+class Factorised:
+    """Solves A x = b by a sparse factorisation on the host (scipy's SuperLU in symmetric mode), exact and for any stiffness.
+
+    Pivots are taken from the diagonal, so that their signs are those of the eigenvalues (Sylvester): ``negative`` is 1 for a
+    copy with a negative one. Of two pivots of about 0 in an indefinite matrix no promise is made.
+
+    Args:
+        hessian: The :class:`warpcloth.operators.Hessian`.
+    """
+
+    capturable = False
+
+    def __init__(self, hessian):
+        self.model, self.hessian = hessian.model, hessian
+        self.negative = wp.zeros(self.model.copies, dtype=wp.int32, device=self.model.device)
+
+    def solve(self, b, x):
+        """x = A⁻¹ b, in double precision; where A is singular, NaN."""
+        from scipy.sparse.linalg import splu
+
+        model = self.model
+        on_host(model.device, "a factorisation")
+        matrix = self.hessian.matrix().tocsc().astype(np.float64)
+        right = b.numpy().astype(np.float64).ravel()
+        try:
+            factor = splu(
+                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
+            )
+        except RuntimeError:  # exactly singular: nothing to step along, and the caller is told
+            x.fill_(np.nan)
+            return
+        solution = factor.solve(right)
+        pivots = np.empty(len(right), dtype=bool)
+        pivots[factor.perm_c] = factor.U.diagonal() < 0.0
+        self.negative.assign(pivots.reshape(model.copies, -1).any(axis=1).astype(np.int32))
+        x.assign(solution.reshape(-1, 3).astype(model.numpy_dtype))

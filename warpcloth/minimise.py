@@ -1,0 +1,184 @@
+"""Newton's method with a line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d, shared by motion and equilibrium."""
+
+import numpy as np
+import warp as wp
+
+from .capture import Segment, on_host
+from .kernels import minimise as kernels
+from .kernels.term import HessianPolicy
+from .linear import ConjugateGradients, Factorised
+from .operators import Energy, Gradient, Hessian, Sums
+
+# Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
+HALVINGS = 30
+
+POLICIES = {
+    "adaptive": HessianPolicy.RAW,
+    "raw": HessianPolicy.RAW,
+    "clamp": HessianPolicy.CLAMP,
+    "absolute": HessianPolicy.ABSOLUTE,
+}
+
+
+class Minimiser:
+    """Finds the d that minimises φ for each copy, from d = 0 (for the equation see the module).
+
+    Args:
+        model: The :class:`warpcloth.model.Model`.
+        base: Where d = 0 is, (N,) vectors [m]; the caller's array, read only.
+        hessian: ``"adaptive"`` (raw; clamped in an iteration whose matrix shows a negative curvature), ``"raw"``,
+            ``"clamp"`` or ``"absolute"``.
+        linear: ``"factorised"``, ``"cg"`` or ``"automatic"``: factorised on the CPU, cg on CUDA.
+        s: Weight of the inertia, 1/h² [1/s²].
+        load: Part of gravity that acts as a force.
+        linear_iterations: The most iterations of a conjugate gradient solve.
+
+    Attributes:
+        correction: d (N,) [m].
+        residual: ‖∇φ‖ of each copy over its scale, (B,) on the host, after :meth:`minimise`.
+        iterations: Newton iterations of the last :meth:`minimise`.
+    """
+
+    def __init__(self, model, base, hessian, linear, s, load=0.0, linear_iterations=10_000):
+        self.model, self.base, self.s, self.load = model, base, s, load
+        self.adaptive = hessian == "adaptive"
+        self.sums = Sums(model)
+        self.gradient_of, self.energy_of = Gradient(model, corrected=True), Energy(model, self.sums, corrected=True)
+        self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
+        if linear == "automatic":
+            linear = "cg" if model.device.is_cuda else "factorised"
+        iterative = linear == "cg"
+        self.linear = (
+            ConjugateGradients(self.hessian, self.sums, linear_iterations) if iterative else Factorised(self.hessian)
+        )
+        self.correction, self.trial, self.gradient, self.direction, self.right = (model.vectors() for _ in range(5))
+        self.work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+
+        def per_copy(dtype):
+            return wp.zeros(model.copies, dtype=dtype, device=model.device)
+
+        scalars = (per_copy(wp.float64) for _ in range(6))
+        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square = scalars
+        self.active, self.searching = per_copy(wp.int32), per_copy(wp.int32)
+        self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        # Rounding of φ: below this part of it two values do not differ.
+        self.noise = 64.0 * float(np.finfo(model.numpy_dtype).eps)
+        self._find_kernels()
+        self._record()
+        self.weight_of_gravity = self._weight_of_gravity()
+        self.residual, self.iterations = np.zeros(model.copies), 0
+
+    def _find_kernels(self):
+        model = self.model
+        self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("set_trial", "add_inertia", "negate")}
+        names = ("begin_search", "check_trial", "begin_trial", "end_trial")
+        self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in names}
+
+    def _record(self):
+        device = self.model.device
+        self._start = Segment(device, self._launch_start)
+        self._assemble = Segment(device, self._launch_assemble)
+        self._solve = Segment(device, self._launch_solve) if self.linear.capturable else self._launch_solve
+        self._search = Segment(device, self._launch_search)
+
+    def set_objective(self, s, load):
+        """Another s and load; what was recorded holds the old ones and is recorded again."""
+        self.s, self.load = s, load
+        self._record()
+
+    def _weight_of_gravity(self):
+        """‖m g‖ over the free vertices of each copy [N], the scale of a force where none else acts."""
+        model = self.model
+        free = np.where(model.inverse_mass.numpy() > 0.0, model.mass.numpy(), 0.0).reshape(model.copies, -1)
+        return np.linalg.norm(free, axis=1) * np.linalg.norm(model.gravity.numpy(), axis=1)
+
+    def minimise(self, tolerance, iterations):
+        """Iterates until ‖∇φ‖ ≤ ``tolerance``·scale in every copy, or a step is lost in rounding.
+
+        The scale of a copy is ‖m g‖ + ‖∇φ(0)‖.
+
+        Returns:
+            (B,) bool, which copies converged.
+        """
+        on_host(self.model.device, "the test of convergence")
+        self._start()
+        norm = np.sqrt(self.square.numpy())
+        scale = self.weight_of_gravity + norm
+        scale[scale == 0.0] = 1.0
+        converged = np.zeros(self.model.copies, dtype=bool)
+        stuck = np.zeros(self.model.copies, dtype=bool)
+        self.iterations = 0
+        while True:
+            previous, self.residual = self.residual, norm / scale
+            converged = self.residual <= tolerance
+            active = ~converged & ~stuck & np.isfinite(self.residual)
+            if not active.any() or self.iterations == iterations:
+                return converged
+            self.active.assign(active.astype(np.int32))
+            if self.linear.capturable:
+                self.linear.tolerance.assign(np.clip(self.residual, 1e-12, 0.1))
+            self._find_direction()
+            self._search()
+            norm = np.sqrt(self.square.numpy())
+            stuck |= active & (self.step.numpy() == 0.0)
+            self.iterations += 1
+
+    def _find_direction(self):
+        if self.adaptive:
+            self.hessian.policy.fill_(int(HessianPolicy.RAW))
+        self._assemble()
+        self._solve()
+        if self.adaptive and self.linear.negative.numpy().any():
+            self.hessian.policy.assign(self.linear.negative.numpy() * int(HessianPolicy.CLAMP))
+            self._assemble()
+            self._solve()
+
+    # What the segments record.
+
+    def _launch_start(self):
+        self.correction.zero_()
+        self.direction.zero_()
+        self.step.zero_()
+        self._launch_trial()
+        self.sums.dot(self.gradient, self.gradient, self.square)
+        wp.copy(self.energy, self.trial_energy)
+
+    def _launch_trial(self):
+        """trial = d + step·p with its φ, ∇φ and slope φ'."""
+        model = self.model
+        N, n = model.count, model.per_copy
+        self._launch("set_trial", N, [self.correction, self.direction, self.step, n], [self.trial, self.gradient])
+        self.gradient_of.add(self.base, self.gradient, self.trial)
+        given = [model.mass, model.inverse_mass, model.gravity, n, self.s, self.load, self.trial]
+        self._launch("add_inertia", N, given, [self.gradient, self.work])
+        model.launch(self.energy_of._sum, self.sums.partial.shape, [self.work, n], [self.sums.partial])
+        self.sums.finish(1.0, 0.0, self.trial_energy)
+        self.energy_of.add(self.base, self.trial_energy, self.trial)
+        self.sums.dot(self.gradient, self.direction, self.trial_slope)
+
+    def _launch_assemble(self):
+        self.hessian.assemble(self.base, self.s, self.correction)
+        self._launch("negate", self.model.count, [self.gradient], [self.right])
+
+    def _launch_solve(self):
+        self.linear.solve(self.right, self.direction)
+
+    def _launch_search(self):
+        self.sums.dot(self.gradient, self.direction, self.slope)
+        self._launch(
+            "begin_search", self.model.copies, [self.active], [self.step, self.searching, self.trials, self.proceed]
+        )
+        wp.capture_while(self.proceed, self._try_step)
+        wp.copy(self.correction, self.trial)
+        wp.copy(self.energy, self.trial_energy)
+        self.sums.dot(self.gradient, self.gradient, self.square)
+
+    def _try_step(self):
+        self._launch_trial()
+        self._launch("begin_trial", 1, [], [self.trials, HALVINGS, self.proceed])
+        given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
+        self._launch("check_trial", self.model.copies, given, [self.step, self.searching, self.proceed])
+        self._launch("end_trial", 1, [self.trials, HALVINGS], [self.proceed])
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.model.launch(self.kernels[name], dim, inputs, outputs)

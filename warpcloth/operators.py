@@ -1,0 +1,138 @@
+"""Sums over the terms of a model: energy, gradient, Hessian. Each allocates its scratch once and then only launches."""
+
+import numpy as np
+import warp as wp
+
+from .kernels import assemble, linear, reduce
+
+# Chunks of a sum per copy: one on the CPU, which runs them in turn; on a GPU enough for it to be busy.
+CHUNKS = 256
+
+
+class Sums:
+    """Sums per copy in double precision and a fixed order."""
+
+    def __init__(self, model):
+        self.model = model
+        chunks = CHUNKS if model.device.is_cuda else 1
+        self.partial = wp.zeros((model.copies, chunks), dtype=wp.float64, device=model.device)
+        self._finish = model.kernel(reduce.finish_sum)
+        self._dot = model.kernel(reduce.partial_dot, model.dtype)
+
+    def dot(self, a, b, out):
+        """out (B,) = Σ a·b over the vertices of each copy."""
+        self.model.launch(self._dot, self.partial.shape, [a, b, self.model.per_copy], [self.partial])
+        self.finish(1.0, 0.0, out)
+
+    def finish(self, scale, start, out):
+        """out (B,) = start·out + scale·Σ partial."""
+        self.model.launch(self._finish, self.model.copies, [self.partial, scale, start], [out])
+
+
+class Gradient:
+    """∂U/∂x of all terms [N]."""
+
+    def __init__(self, model, corrected=False):
+        self.model = model
+        cuda = model.device.is_cuda
+        factory = assemble.gather_gradient if cuda else assemble.scatter_gradient
+        self.kernels = [model.kernel(factory, elements.term, model.dtype, corrected) for elements in model.terms]
+        # Gathering needs to know which stencils a vertex belongs to; scattering does not, and then nothing is built.
+        self.incidences = [elements.incidences if cuda else () for elements in model.terms]
+
+    def add(self, x, out, correction=None):
+        """out += ∂U/∂x at x, or at x + correction of operators built ``corrected``."""
+        for elements, kernel, incidences in zip(self.model.terms, self.kernels, self.incidences, strict=True):
+            dim = len(incidences[0]) - 1 if incidences else elements.count
+            self.model.launch(kernel, dim, [*incidences, *elements.arguments, x, correction], [out])
+
+
+class Energy:
+    """U of all terms [J], per copy."""
+
+    def __init__(self, model, sums, corrected=False):
+        self.model, self.sums = model, sums
+        self.kernels = [model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in model.terms]
+        self.of_elements = [
+            wp.zeros(elements.count, dtype=wp.float64, device=model.device) for elements in model.terms
+        ]
+        self._sum = model.kernel(reduce.partial_sum)
+
+    def add(self, x, out, correction=None):
+        """out (B,) += U(x), or U(x + correction)."""
+        for elements, kernel, values in zip(self.model.terms, self.kernels, self.of_elements, strict=True):
+            self.model.launch(kernel, elements.count, [*elements.arguments, x, correction], [values])
+            self.model.launch(self._sum, self.sums.partial.shape, [values, elements.per_copy], [self.sums.partial])
+            self.sums.finish(1.0, 1.0, out)
+
+
+class Hessian:
+    """∂²U/∂x² + scale·M in block compressed rows, pinned vertices replaced by the identity.
+
+    Attributes:
+        offsets, columns: Block rows (N+1,) and the column of each block.
+        diagonal: Place of each diagonal block (N,).
+        values: The blocks [N/m].
+        policy: (B,) int32, a :class:`HessianPolicy` for each copy.
+    """
+
+    def __init__(self, model, policy=0, corrected=False):
+        self.model = model
+        device = model.device
+        self.kernels = [model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected) for elements in model.terms]
+        self.blocks = [
+            wp.zeros((elements.count, elements.term.vertices**2), dtype=model.mat33, device=device)
+            for elements in model.terms
+        ]
+        self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=device)
+        self._set_inertia = model.kernel(linear.set_inertia, model.dtype)
+        self._add_blocks = model.kernel(linear.add_blocks, model.dtype)
+        self._find_pattern()
+
+    def _find_pattern(self):
+        """The blocks of the matrix and, for each, the element blocks that it is the sum of."""
+        model, n = self.model, self.model.count
+        fixed = model.inverse_mass.numpy() == 0.0
+        keys, sources = [np.arange(n, dtype=np.int64) * (n + 1)], []
+        for elements in model.terms:
+            stencil = elements.stencil.numpy().astype(np.int64)
+            K = stencil.shape[1]
+            rows, columns = np.repeat(stencil, K, axis=1).ravel(), np.tile(stencil, K).ravel()
+            source = np.flatnonzero(~(fixed[rows] | fixed[columns]))
+            keys.append(rows[source] * n + columns[source])
+            sources.append(source)
+        unique, place = np.unique(np.concatenate(keys), return_inverse=True)
+
+        def put(values):
+            return wp.array(values.astype(np.int32), dtype=wp.int32, device=model.device)
+
+        self.offsets = put(np.searchsorted(unique, np.arange(n + 1) * n))
+        self.columns = put(unique % n)
+        self.diagonal = put(place[:n])
+        self.values = wp.zeros(len(unique), dtype=model.mat33, device=model.device)
+        self.gathers, start = [], n
+        for source in sources:
+            target = place[start : start + len(source)]
+            order = np.argsort(target, kind="stable")
+            offsets = np.searchsorted(target[order], np.arange(len(unique) + 1))
+            self.gathers.append((put(offsets), put(source[order])))
+            start += len(source)
+
+    def assemble(self, x, scale, correction=None):
+        """Fills ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal."""
+        model = self.model
+        self.values.zero_()
+        model.launch(
+            self._set_inertia, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values]
+        )
+        for elements, kernel, blocks, gather in zip(model.terms, self.kernels, self.blocks, self.gathers, strict=True):
+            arguments = [*elements.arguments, x, correction, elements.per_copy, self.policy]
+            model.launch(kernel, elements.count, arguments, [blocks])
+            model.launch(self._add_blocks, len(self.values), [*gather, blocks.flatten()], [self.values])
+
+    def matrix(self):
+        """``values`` on the host as a scipy matrix in block compressed rows (3N, 3N)."""
+        from scipy.sparse import bsr_matrix
+
+        n = 3 * self.model.count
+        return bsr_matrix((self.values.numpy(), self.columns.numpy(), self.offsets.numpy()), shape=(n, n))

@@ -1,0 +1,158 @@
+"""What is declared: a scene is data, and holds no solver. Any solver that supports its terms runs it unchanged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from .mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Pins:
+    """Vertices that do not obey forces.
+
+    Attributes:
+        vertices: Indices (p,), or a selection of the mesh such as ``"x<0.01"``.
+        keyframes: Places (F, p, 3) [m] at the scene's frames 0 … F−1, linear between them, at rest after the last; in the
+            order of ``vertices``. Without them the pins stay where they start.
+    """
+
+    vertices: str | Sequence[int] | np.ndarray
+    keyframes: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A cloth, what acts on it, and for how long. SI units, y up.
+
+    Attributes:
+        mesh: The :class:`Mesh`; its points are the rest shape.
+        density: Mass per area [kg/m²], lumped: a third of each adjacent triangle; of a mesh of edges alone per length
+            [kg/m], half of each adjacent edge.
+        masses: Mass of each vertex, (n,) [kg], in place of ``density``.
+        positions: Where the vertices start, (n, 3) [m]; the rest shape if not given.
+        velocities: How they start, (n, 3) [m/s]; at rest if not given.
+        terms: The energies, see :mod:`warpcloth.terms`.
+        pins: :class:`Pins`, or vertices or a selection of fixed ones.
+        gravity: Acceleration (3,) [m/s²].
+        duration: [s], a whole number of frames.
+        fps: Frames per second.
+        name: For reports and files.
+
+    Raises:
+        ValueError: If a value breaks a rule; the sentence names it.
+    """
+
+    mesh: Mesh
+    density: float | None = None
+    masses: np.ndarray | None = None
+    positions: np.ndarray | None = None
+    velocities: np.ndarray | None = None
+    terms: Sequence = ()
+    pins: Pins | str | Sequence[int] | np.ndarray | None = None
+    gravity: Sequence[float] = (0.0, -9.81, 0.0)
+    duration: float = 1.0
+    fps: float = 60.0
+    name: str = "scene"
+
+    def __post_init__(self):
+        n = len(self.mesh.points)
+
+        def keep(field, value):
+            object.__setattr__(self, field, value)
+
+        if not (np.isfinite(self.fps) and self.fps > 0.0):
+            raise ValueError(f"fps is {self.fps}; it must be a number above 0")
+        frames = self.duration * self.fps
+        if not (np.isfinite(frames) and frames > 0.0 and abs(frames - round(frames)) < 1e-6 * frames):
+            raise ValueError(f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames, 1 or more")
+        keep("terms", tuple(self.terms))
+        keep("gravity", _array("gravity", self.gravity, (3,)))
+        keep("positions", self.mesh.points if self.positions is None else _array("positions", self.positions, (n, 3)))
+        keep("velocities", np.zeros((n, 3)) if self.velocities is None else _array("velocities", self.velocities, (n, 3)))
+        keep("pins", self._checked_pins(n))
+        keep("masses", self._checked_masses(n))
+
+    def _checked_pins(self, n):
+        pins = self.pins if isinstance(self.pins, Pins) else Pins([] if self.pins is None else self.pins)
+        vertices = self.mesh.select(pins.vertices) if isinstance(pins.vertices, str) else np.asarray(pins.vertices)
+        vertices = vertices.astype(np.int32) if len(vertices) == 0 else vertices
+        if vertices.ndim != 1 or vertices.dtype.kind not in "iu":
+            raise ValueError(f"pins.vertices has type {vertices.dtype}; it must be a list of whole numbers")
+        wrong = np.flatnonzero((vertices < 0) | (vertices >= n))
+        if len(wrong):
+            raise ValueError(f"pins.vertices[{wrong[0]}] is {vertices[wrong[0]]}; it must lie in 0 … {n - 1}")
+        if len(np.unique(vertices)) < len(vertices):
+            raise ValueError("pins.vertices names a vertex twice; each may stand once")
+        keyframes = pins.keyframes
+        if keyframes is not None:
+            count = len(keyframes) if np.ndim(keyframes) == 3 else 1
+            keyframes = _array("pins.keyframes", keyframes, (count, len(vertices), 3))
+            gap = np.abs(keyframes[0] - self.positions[vertices]).max(initial=0.0)
+            if gap > 1e-6 * np.ptp(self.positions, axis=0).max():
+                raise ValueError(f"pins.keyframes[0] is {gap:.3g} m from where the pinned vertices start; it must be there")
+        return Pins(vertices.astype(np.int32), keyframes)
+
+    def _checked_masses(self, n):
+        if (self.density is None) == (self.masses is None):
+            raise ValueError("exactly one of density and masses must be given")
+        if self.masses is None:
+            if not (np.isfinite(self.density) and self.density > 0.0):
+                raise ValueError(f"density is {self.density}; it must be a number above 0")
+            measures = self.mesh.vertex_areas if len(self.mesh.triangles) else self.mesh.vertex_lengths
+            masses = self.density * measures
+        else:
+            masses = _array("masses", self.masses, (n,))
+        free = np.ones(n, dtype=bool)
+        free[self.pins.vertices] = False
+        bad = np.flatnonzero(free & ~(masses > 0.0))
+        if len(bad):
+            raise ValueError(f"vertex {bad[0]} has mass {masses[bad[0]]} kg; a vertex that is not pinned must have one above 0")
+        return masses
+
+    @property
+    def frames(self):
+        """Number of frames after the first."""
+        return round(self.duration * self.fps)
+
+    def build(self, device="cpu", dtype="float32", copies=1, vary=None):
+        """The scene on a device, see :class:`warpcloth.model.Model`."""
+        from .model import Model
+
+        return Model(self, device=device, dtype=dtype, copies=copies, vary=vary)
+
+    def __str__(self):
+        mesh, pins = self.mesh, self.pins
+        lines = [
+            f"{self.name}: {len(mesh.points)} vertices, {len(mesh.triangles)} triangles, {len(mesh.edges)} edges",
+            f"  mass {self.masses.sum():.4g} kg, gravity {self.gravity.tolist()} m/s²",
+            f"  {self.duration:g} s in {self.frames} frames of 1/{self.fps:g} s",
+            f"  pins: {len(pins.vertices)}" + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
+        ]
+        return "\n".join(lines + [f"  {_described(term)}" for term in self.terms])
+
+
+def _array(name, value, shape):
+    """``value`` as a finite float64 array of ``shape``, or a ValueError that names it."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is not numeric; it must have shape {shape}") from None
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}; it must be {shape}")
+    wrong = np.argwhere(~np.isfinite(array))
+    if len(wrong):
+        raise ValueError(f"{name}{wrong[0].tolist()} is {array[tuple(wrong[0])]}; it must be finite")
+    array.setflags(write=False)
+    return array
+
+
+def _described(term):
+    """A term in one line: Spring(pairs='structural', stiffness=1000.0)."""
+    parts = []
+    for field in fields(term):
+        value = getattr(term, field.name)
+        if value is not None:
+            parts.append(f"{field.name}={f'array{np.shape(value)}' if np.ndim(value) and np.size(value) > 4 else value!r}")
+    return f"{type(term).__name__}({', '.join(parts)})"

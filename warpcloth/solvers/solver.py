@@ -1,0 +1,161 @@
+"""What all solvers share: the options of the step, the state of a bound solver, and what a run reports."""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from ..kernels import step as kernels
+
+
+class Result(Enum):
+    """How a run or a step ended; the value is what is shown."""
+
+    COMPLETED = "completed"
+    CONVERGED = "converged"
+    ITERATIONS_USED_UP = "iterations used up"
+    DIVERGED = "diverged"
+
+
+class Status(NamedTuple):
+    """How a run ended.
+
+    Attributes:
+        result: See :class:`Result`.
+        frame: The last frame that is good.
+        residual: Largest residual of any step so far, relative; 0 of methods that have none.
+        message: One sentence.
+    """
+
+    result: Result
+    frame: int = 0
+    residual: float = 0.0
+    message: str = ""
+
+    @property
+    def ok(self):
+        """False if the run diverged."""
+        return self.result is not Result.DIVERGED
+
+
+class State(NamedTuple):
+    """x (N,) [m] and v (N,) [m/s] of all copies, on the device."""
+
+    x: wp.array
+    v: wp.array
+
+
+@dataclass(frozen=True)
+class Step:
+    """The step of a solver: exactly one of ``dt`` and ``substeps``.
+
+    Attributes:
+        dt: Step [s]; 1/(fps·dt) must be a whole number.
+        substeps: Steps a frame.
+
+    Raises:
+        ValueError: If both or neither are given, or they are not above 0.
+    """
+
+    dt: float | None = None
+    substeps: int | None = None
+
+    def __post_init__(self):
+        if (self.dt is None) == (self.substeps is None):
+            raise ValueError("exactly one of dt and substeps must be given")
+        if self.dt is not None:
+            number("dt", self.dt, above=0.0)
+        else:
+            whole("substeps", self.substeps, 1)
+
+    def per_frame(self, fps):
+        """Steps a frame at ``fps``."""
+        if self.substeps is not None:
+            return self.substeps
+        steps = 1.0 / (fps * self.dt)
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be a whole number of steps, not {steps:g}")
+        return round(steps)
+
+
+class Stepper:
+    """A solver bound to a model: all it needs is allocated, and ``step`` moves the state on by one step.
+
+    Attributes:
+        state: :class:`State`.
+        h: Step [s].
+        steps_per_frame: Steps a frame.
+        result, residual: Of the steps so far, see :class:`Status`.
+    """
+
+    def __init__(self, options, model):
+        fps = model.scene.fps
+        self.options, self.model = options, model
+        self.steps_per_frame = options.per_frame(fps)
+        self.h = 1.0 / (fps * self.steps_per_frame)
+        self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
+        self.result, self.residual = Result.COMPLETED, 0.0
+        self.count = wp.zeros(1, dtype=wp.int32, device=model.device) if model.pins is not None else None
+
+    def launch_pins(self):
+        """Moves the pins that have keyframes to the end of the step."""
+        model = self.model
+        if model.pins is None:
+            return
+        dim = (model.copies, len(model.pins))
+        move, count = model.kernel(kernels.move_pins, model.dtype), model.kernel(kernels.count_step)
+        given = [model.pins, model.keyframes, self.count, self.steps_per_frame, model.per_copy, self.h]
+        model.launch(move, dim, given, [self.state.x, self.state.v])
+        model.launch(count, 1, [], [self.count])
+
+    def launch_prediction(self):
+        """x = x̃ = x + h v + h² g, pins at the end of the step."""
+        model = self.model
+        kernel = model.kernel(kernels.predict, model.dtype)
+        given = [model.inverse_mass, self.state.v, model.gravity, model.per_copy, self.h]
+        model.launch(kernel, model.count, given, [self.state.x])
+        self.launch_pins()
+
+    def launch_finish(self, correction):
+        """x = x̃ + d, v = (x − x before)/h."""
+        model = self.model
+        kernel = model.kernel(kernels.finish, model.dtype)
+        given = [model.inverse_mass, model.gravity, correction, model.per_copy, self.h]
+        model.launch(kernel, model.count, given, [self.state.x, self.state.v])
+
+    def step(self):
+        """One step of h."""
+        raise NotImplementedError  # every solver has its own
+
+
+def refuse_hard(model, solver, instead):
+    """Refuses infinite stiffness for a solver that needs forces.
+
+    Raises:
+        ValueError: Naming the term, the solver and what would work.
+    """
+    for elements in model.terms:
+        if elements.hard:
+            raise ValueError(f"{solver} cannot take {elements.label} with infinite stiffness; {instead}")
+
+
+def number(name, value, above=None, least=None):
+    """Checks that an option is a finite number."""
+    rule = f"above {above:g}" if above is not None else f"of {least:g} or more"
+    good = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and np.isfinite(value)
+    if not good or (above is not None and not value > above) or (least is not None and not value >= least):
+        raise ValueError(f"{name} is {value!r}; it must be a number {rule}")
+
+
+def whole(name, value, least):
+    """Checks that an option is a whole number."""
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{name} is {value!r}; it must be a whole number of {least} or more")
+
+
+def choice(name, value, allowed):
+    """Checks that an option is one of some words."""
+    if value not in allowed:
+        raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(map(repr, allowed))}")
