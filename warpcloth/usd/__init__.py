@@ -2,5 +2,6 @@
 
 from .frames import FrameSequence
 from .stage import StageMesh, read_mesh, read_stage_mesh
+from .writer import AnimationWriter
 
-__all__ = ["FrameSequence", "StageMesh", "read_mesh", "read_stage_mesh"]
+__all__ = ["AnimationWriter", "FrameSequence", "StageMesh", "read_mesh", "read_stage_mesh"]
