@@ -695,6 +695,38 @@ def test_memory_stays_flat(tmp_path, ending):
         assert grown < 40 * frame_bytes, (writing, closing, reading)
 
 
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+@pytest.mark.parametrize("step", range(10))
+def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step, single_file):
+    """A disk that is full at any of the steps leaves the earlier result, or the new one as far as it got."""
+    mesh, output = Mesh.grid(5, 4), tmp_path / "out.usdc"
+    write(output, mesh, frames=30, sign=-1.0)
+    steps = iter(range(100))
+    replace = os.replace
+
+    def replace_until_full(*paths):
+        if next(steps) == step:
+            raise OSError("no space left on device")
+        replace(*paths)
+
+    monkeypatch.setattr("warpcloth.usd.writer.os.replace", replace_until_full)
+    writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
+    appended = 0
+    try:
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame))
+            appended += 1
+        writer.close(single_file=single_file)
+    except OSError:
+        assert appended < FRAMES or step >= 6
+    else:
+        assert step >= 8 and not single_file, "eight renames, and two more for one file"
+    now = FrameSequence(output)
+    assert len(now) == (30 if step <= 3 else min(FRAMES, (step - 2) // 2 * CHUNK))
+    for frame, points in enumerate(now):
+        np.testing.assert_allclose(points, motion(mesh, frame, -1.0 if step <= 3 else 1.0)[0], atol=4 * EPS)
+
+
 VICTIM = """
 import itertools, os, sys
 sys.path[:0] = {path!r}
