@@ -1,0 +1,813 @@
+"""USD files: what is read, what is written, and what is left when the writer is killed."""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import warp.examples
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from usd_validation import validate
+
+from warpcloth.mesh import Mesh
+from warpcloth.usd import AnimationWriter, FrameSequence, read_mesh, read_stage_mesh
+
+EPS = np.finfo(np.float32).eps
+FRAMES = 8
+CHUNK = 3
+SQUARE_CLOTH = os.path.join(warp.examples.get_asset_directory(), "square_cloth.usd")
+SAMPLED = {"points", "velocities", "normals", "extent"}
+
+
+def motion(mesh, frame, sign=1.0):
+    """Points [m] and velocities [m/s] that tell the frame, the vertex and the run that they belong to."""
+    vertex = np.arange(len(mesh.points))[:, None]
+    points = mesh.points + sign * frame * np.array([0.01, -0.02, 0.03]) + 1e-3 * np.sin(vertex + frame)
+    return points, sign * np.stack(
+        [np.full(len(vertex), frame), vertex[:, 0] / len(vertex), -0.5 + vertex[:, 0] % 3], 1
+    )
+
+
+def write(output, mesh, frames=FRAMES, fps=24, single_file=False, sign=1.0, **options):
+    """Writes some frames, and returns the path of the result."""
+    with AnimationWriter(output, mesh, fps, **{"chunk": CHUNK, **options}) as writer:
+        for frame in range(frames):
+            writer.append(*motion(mesh, frame, sign))
+        writer.close(single_file=single_file)
+    return writer.path
+
+
+def sphere():
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    return Mesh(ball.vertices, ball.faces)
+
+
+def artist_stage(path, mesh=None, orientation="rightHanded", scale=(1, 1, 1), animated=False):
+    """A stage in cm, z up, 24 fps from time code 101: the cloth turned and moved, one animated prim beside it."""
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    stage.SetTimeCodesPerSecond(24)
+    stage.SetFramesPerSecond(24)
+    stage.SetStartTimeCode(101)
+    stage.SetEndTimeCode(500)
+    world = UsdGeom.Xform.Define(stage, "/Set")
+    stage.SetDefaultPrim(world.GetPrim())
+    group = UsdGeom.Xform.Define(stage, "/Set/Group")
+    group.AddTranslateOp().Set(Gf.Vec3d(30, -20, 150))
+    group.AddRotateXYZOp().Set(Gf.Vec3f(20, 40, 70))
+    group.AddScaleOp().Set(Gf.Vec3f(*scale))
+    mesh = mesh or Mesh.grid(5, 4)
+    points = Vt.Vec3fArray.FromNumpy(np.float32(100 * mesh.points))
+    cloth = UsdGeom.Mesh.Define(stage, "/Set/Group/Sheet")
+    cloth.CreatePointsAttr(points)
+    cloth.CreateFaceVertexCountsAttr([3] * len(mesh.triangles))
+    cloth.CreateFaceVertexIndicesAttr(np.array(mesh.triangles).reshape(-1))
+    cloth.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    cloth.CreateOrientationAttr(orientation)
+    # What an artist's mesh may carry, and must not be seen on the animated one.
+    corners = UsdGeom.PrimvarsAPI(cloth).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, "faceVarying")
+    corners.Set([Gf.Vec3f(0, 1, 0)] * mesh.triangles.size)
+    if animated:
+        for code in (101, 110):
+            cloth.GetPointsAttr().Set(Vt.Vec3fArray([Gf.Vec3f(code)] * len(points)), code)
+    UsdGeom.Subset.CreateGeomSubset(cloth, "hem", "point", [0, 1, 2], "pins", "unrestricted")
+    ball = UsdGeom.Sphere.Define(stage, "/Set/Ball")
+    ball.CreateExtentAttr([(-1, -1, -1), (1, 1, 1)])
+    ball.AddTranslateOp().Set(Gf.Vec3d(0), 101)
+    ball.GetPrim().GetAttribute("xformOp:translate").Set(Gf.Vec3d(48, 0, 0), 149)
+    stage.Save()
+    return str(path)
+
+
+def plain(folder):
+    mesh = Mesh.grid(5, 4, size=(1.0, 0.7))
+    return mesh, {"pins": {"corners": mesh.corners(), "row": [0, 1, 2]}, "metadata": {"solver": "none", "dt": 0.01}}
+
+
+def chain(folder):
+    return Mesh.chain(7, length=1.3), {"pins": {"top": [0]}}
+
+
+def net(folder):
+    grid = Mesh.grid(4, 3)
+    return Mesh(np.concatenate([grid.points, [[3, 0, 0]]]), edges=grid.edges), {"pins": {"some": [1, 5, 11]}}
+
+
+def over(folder, **options):
+    source = artist_stage(folder / "artist.usda", **options)
+    return read_mesh(source), {"source": source}
+
+
+def over_animated(folder):
+    return over(folder, animated=True)
+
+
+def over_mirrored(folder):
+    return over(folder, mesh=sphere(), orientation="leftHanded", scale=(-1, 2, 1))
+
+
+def over_package(folder):
+    mesh = Mesh.grid(5, 4)
+    return mesh, {"source": write(folder / "package.usdz", mesh)}
+
+
+def over_result(folder):
+    mesh = Mesh.grid(5, 4)
+    return mesh, {"source": write(folder / "first.usda", mesh, frames=2 * FRAMES, sign=-1.0)}
+
+
+def over_net(folder):
+    mesh, options = net(folder)
+    return mesh, {"source": write(folder / "net.usda", mesh, single_file=True, **options)}
+
+
+def over_square_cloth(folder):
+    return read_mesh(SQUARE_CLOTH), {"source": SQUARE_CLOTH}
+
+
+CASES = [
+    (plain, "usda", False),
+    (plain, "usdc", False),
+    (plain, "usd", False),
+    (plain, "usda", True),
+    (plain, "usdc", True),
+    (plain, "usd", True),
+    (plain, "usdz", True),
+    (chain, "usdc", False),
+    (chain, "usdz", True),
+    (net, "usda", False),
+    (net, "usdc", True),
+    (over, "usda", False),
+    (over, "usdc", True),
+    (over, "usdz", True),
+    (over_animated, "usdc", False),
+    (over_animated, "usdc", True),
+    (over_mirrored, "usdc", False),
+    (over_package, "usda", False),
+    (over_package, "usdc", True),
+    (over_result, "usdc", False),
+    (over_result, "usdc", True),
+    (over_net, "usda", False),
+    (over_square_cloth, "usda", False),
+    (over_square_cloth, "usdc", True),
+]
+
+
+@pytest.fixture(
+    scope="module", params=CASES, ids=lambda case: f"{case[0].__name__}-{case[1]}-{'one' if case[2] else 'chunks'}"
+)
+def result(request, tmp_path_factory):
+    """A written animation: (path, mesh, options, the file alone)."""
+    make, ending, single_file = request.param
+    folder = tmp_path_factory.mktemp("usd")
+    mesh, options = make(folder)
+    path = write(folder / f"result.{ending}", mesh, single_file=single_file, **options)
+    return path, mesh, options, single_file
+
+
+def animated_prim(path):
+    """The stage, which has to be kept, and the prim in it."""
+    stage = Usd.Stage.Open(str(path))
+    return stage, stage.GetPrimAtPath(stage.GetRootLayer().customLayerData["warpcloth"]["prim"])
+
+
+def test_frames_come_back_in_metres_and_world_space(result):
+    path, mesh, _, _ = result
+    transform = read_stage_mesh(path).transform
+    linear = transform[:3, :3]
+    for attribute, part in (("points", 0), ("velocities", 1)):
+        sequence = FrameSequence(path, attribute=attribute)
+        assert sequence.shape == (FRAMES, len(mesh.points), 3) and sequence.dtype == np.float32
+        for frame, values in enumerate(sequence):
+            expected = motion(mesh, frame)[part]
+            local = (expected - (transform[3, :3] if part == 0 else 0)) @ np.linalg.inv(linear)
+            # Rounded once in the prim's own units, which the transform scales, and once in metres.
+            tolerance = EPS * (np.abs(local).max() * np.linalg.norm(linear, 2) + np.abs(expected).max())
+            np.testing.assert_allclose(values, expected, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(sequence.times, np.arange(FRAMES) / 24, atol=1e-12)
+
+
+def test_rest_shape_is_the_default(result):
+    path, mesh, options, _ = result
+    again = read_stage_mesh(path)
+    span = max(np.abs(mesh.points).max(), np.linalg.norm(again.transform[3]))
+    np.testing.assert_allclose(again.mesh.points, mesh.points, rtol=0, atol=4 * EPS * span)
+    np.testing.assert_array_equal(again.mesh.triangles, mesh.triangles)
+    np.testing.assert_array_equal(again.mesh.edges, mesh.edges)
+    for name, vertices in options.get("pins", {}).items():
+        np.testing.assert_array_equal(again.pins[name], np.unique(vertices))
+
+
+def test_passes_the_validators(result):
+    path, _, options, _ = result
+    assert validate(path, options.get("source")) == []
+
+
+def test_time_codes_and_samples(result):
+    path, _, options, _ = result
+    stage, prim = animated_prim(path)
+    start = 0.0
+    if "source" in options:
+        source = Sdf.Layer.FindOrOpen(options["source"])
+        start = source.startTimeCode if source.HasStartTimeCode() else 0.0
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (start, start + FRAMES - 1)
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == 24
+    for name in SAMPLED - ({"normals"} if prim.IsA(UsdGeom.BasisCurves) else set()):
+        assert prim.GetAttribute(name).GetTimeSamples() == [start + frame for frame in range(FRAMES)], name
+    # Frames between two samples, those at the seams of chunks too, and the last frame held after the end.
+    points = prim.GetAttribute("points")
+    for frame in range(FRAMES - 1):
+        both = [np.array(points.Get(start + f)) for f in (frame, frame + 1)]
+        size = np.abs(both).max()
+        np.testing.assert_allclose(points.Get(start + frame + 0.5), sum(both) / 2, rtol=0, atol=2 * EPS * size)
+    np.testing.assert_array_equal(points.Get(start + FRAMES + 5), points.Get(start + FRAMES - 1))
+    np.testing.assert_array_equal(points.Get(start - 5), points.Get(start))
+
+
+def test_extent_bounds_the_points(result):
+    path, _, _, _ = result
+    _stage, prim = animated_prim(path)
+    widths = UsdGeom.Curves(prim).GetWidthsAttr().Get() if prim.IsA(UsdGeom.Curves) else [0.0]
+    for code in [Usd.TimeCode.Default(), *prim.GetAttribute("points").GetTimeSamples()]:
+        points = np.array(prim.GetAttribute("points").Get(code))
+        extent = np.array(prim.GetAttribute("extent").Get(code))
+        tolerance = 2 * EPS * np.abs(points).max()
+        np.testing.assert_allclose(extent[0], points.min(0) - max(widths) / 2, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(extent[1], points.max(0) + max(widths) / 2, rtol=0, atol=tolerance)
+
+
+def test_normals_are_unit_at_vertices(result):
+    path, mesh, _, _ = result
+    _stage, prim = animated_prim(path)
+    if prim.IsA(UsdGeom.BasisCurves):
+        assert not prim.GetAttribute("normals").HasAuthoredValue()
+        return
+    assert UsdGeom.PointBased(prim).GetNormalsInterpolation() == "vertex"
+    assert UsdGeom.Mesh(prim).GetSubdivisionSchemeAttr().Get() == "none"
+    assert not UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals").HasValue(), "would be used instead of normals"
+    for code in [Usd.TimeCode.Default(), *prim.GetAttribute("normals").GetTimeSamples()]:
+        normals = np.array(prim.GetAttribute("normals").Get(code))
+        assert len(normals) == len(mesh.points)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=4 * EPS)
+
+
+@pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
+@pytest.mark.parametrize("scale", [(1, 1, 1), (-1, 2, 1)])
+def test_normals_point_to_the_front(tmp_path, orientation, scale):
+    """The faces say which side is the front: a left-handed sphere of the same faces is inside out."""
+    ball = sphere()
+    source = artist_stage(tmp_path / "artist.usda", ball, orientation, scale)
+    path = write(tmp_path / "out.usdc", read_mesh(source), source=source)
+    _stage, prim = animated_prim(path)
+    front = 1 if orientation == "rightHanded" else -1
+    for code in (Usd.TimeCode.Default(), 104):
+        points, normals = (np.array(prim.GetAttribute(name).Get(code)) for name in ("points", "normals"))
+        across = np.cross(
+            points[ball.triangles[:, 1]] - points[ball.triangles[:, 0]],
+            points[ball.triangles[:, 2]] - points[ball.triangles[:, 0]],
+        )
+        assert (front * np.einsum("tki,ti->tk", normals[ball.triangles], across) > 0).all()
+    # Read back, triangle normals are the front in world space, mirrored or not.
+    mesh = read_mesh(path)
+    corners = mesh.points[mesh.triangles] - mesh.points.mean(axis=0)
+    assert np.sign(np.linalg.det(corners)).tolist() == [front] * len(mesh.triangles)
+
+
+def test_scene_has_what_viewers_need(tmp_path):
+    mesh, options = plain(tmp_path)
+    stage, prim = animated_prim(write(tmp_path / "a.usda", mesh, **options))
+    assert stage.GetDefaultPrim().GetPath() == "/World" and prim.GetPath() == "/World/Cloth"
+    assert stage.GetPrimAtPath("/World/Looks").GetTypeName() == "Scope"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert stage.HasAuthoredMetadata("kilogramsPerUnit")
+    cloth = UsdGeom.Mesh(prim)
+    assert cloth.GetDoubleSidedAttr().Get() and cloth.GetOrientationAttr().Get() == "rightHanded"
+    assert cloth.GetDisplayColorAttr().Get() and not cloth.GetFaceVertexIndicesAttr().GetNumTimeSamples()
+    np.testing.assert_allclose(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get(), mesh.texture_coordinates, atol=EPS)
+    assert UsdGeom.Subset(prim.GetChild("row")).GetFamilyNameAttr().Get() == "pins"
+    assert stage.GetRootLayer().customLayerData["warpcloth"] == {"prim": "/World/Cloth", "solver": "none", "dt": 0.01}
+
+
+def test_chain_is_one_curve_in_order(tmp_path):
+    mesh, options = chain(tmp_path)
+    _stage, prim = animated_prim(write(tmp_path / "a.usda", mesh, **options))
+    assert list(UsdGeom.BasisCurves(prim).GetCurveVertexCountsAttr().Get()) == [len(mesh.points)]
+    np.testing.assert_allclose(prim.GetAttribute("points").Get(), mesh.points, atol=EPS * 1.3)
+
+
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+def test_layer_leaves_the_source_alone(tmp_path, single_file):
+    source = artist_stage(tmp_path / "artist.usda", animated=True)
+    before = Path(source).read_bytes()
+    output = tmp_path / "shots" / "shot.usda"
+    output.parent.mkdir()
+    write(output, read_mesh(source), source=source, single_file=single_file)
+    assert Path(source).read_bytes() == before
+    stage = Usd.Stage.Open(str(output))
+    assert stage.GetPrimAtPath("/Set/Ball").GetAttribute("xformOp:translate").Get(149) == Gf.Vec3d(48, 0, 0)
+    assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (0.01, "Z")
+    assert stage.GetDefaultPrim().GetPath() == "/Set"
+    assert str(tmp_path) not in stage.GetRootLayer().ExportToString(), "paths of other files must be relative"
+    if single_file:
+        assert not list(output.parent.glob("*_frames")) and not stage.GetRootLayer().subLayerPaths
+        return
+    own = set()
+    for layer in stage.GetLayerStack(includeSessionLayers=False):
+        if layer.realPath != source:
+            paths = []
+            layer.Traverse("/", paths.append)
+            own |= {str(path) for path in paths if path.IsPropertyPath()}
+    allowed = {*SAMPLED, "subdivisionScheme", "primvars:normals"}
+    assert own <= {f"/Set/Group/Sheet.{name}" for name in allowed}
+    # The whole may be moved, as long as it stays together.
+    shutil.copytree(tmp_path, tmp_path.parent / f"{tmp_path.name}-moved")
+    Path(source).rename(tmp_path / "elsewhere.usda")
+    shutil.rmtree(output.parent)
+    moved = FrameSequence(tmp_path.parent / f"{tmp_path.name}-moved" / "shots" / "shot.usda")
+    assert moved.shape[0] == FRAMES and np.isfinite(moved[-1]).all()
+
+
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+def test_other_rates_stay_in_step_with_the_source(tmp_path, single_file):
+    source = artist_stage(tmp_path / "artist.usda")
+    path = write(tmp_path / "out.usdc", read_mesh(source), fps=48, source=source, single_file=single_file)
+    stage, _ = animated_prim(path)
+    # Time code 101 of 24 a second is the same moment as 202 of 48; the ball is half-way at 125, so at 250.
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (202, 202 + FRAMES - 1)
+    assert stage.GetPrimAtPath("/Set/Ball").GetAttribute("xformOp:translate").Get(250) == Gf.Vec3d(24, 0, 0)
+
+
+def test_nothing_of_an_earlier_run_is_left(tmp_path):
+    mesh = Mesh.grid(5, 4)
+    output = tmp_path / "out.usdc"
+    write(output, mesh, frames=30, sign=-1.0)
+    kept = FrameSequence(output)  # keeps the earlier result's layers in pxr's memory
+    write(tmp_path / "out.usda", mesh, frames=4)  # another output whose folder has the same name
+    with AnimationWriter(output, mesh, 24, chunk=CHUNK) as writer:
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame))
+            earlier = frame < CHUNK - 1
+            now = FrameSequence(output)
+            assert len(now) == (30 if earlier else (frame + 1) // CHUNK * CHUNK)
+            expected = motion(mesh, 2, sign=-1.0 if earlier else 1.0)[0]
+            np.testing.assert_allclose(now[2], expected, atol=4 * EPS)
+    assert len(FrameSequence(output)) == FRAMES and len(kept) == 30
+    assert len(list((tmp_path / "out_frames").glob("usdc-*"))) == 1
+    assert len(FrameSequence(tmp_path / "out.usda")) == 4
+
+
+@pytest.mark.parametrize("ending", ["usda", "usdz"])
+def test_an_error_keeps_the_frames_before_it(tmp_path, ending):
+    mesh = Mesh.grid(5, 4)
+    with pytest.raises(RuntimeError), AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, chunk=CHUNK) as writer:
+        for frame in range(5):
+            writer.append(*motion(mesh, frame))
+        raise RuntimeError("diverged")
+    assert len(FrameSequence(writer.path)) == 5
+    assert validate(writer.path) == []
+
+
+def test_no_frames_write_nothing(tmp_path):
+    write(tmp_path / "out.usdz", Mesh.grid(3, 3), frames=0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sequence_behaves_as_an_array(tmp_path):
+    mesh = Mesh.grid(5, 4)
+    sequence = FrameSequence(write(tmp_path / "out.usdc", mesh))
+    whole = np.asarray(sequence)
+    assert whole.shape == sequence.shape and whole.dtype == np.float32 and sequence.ndim == 3
+    for key in (
+        (),
+        0,
+        -1,
+        slice(2, 7, 2),
+        slice(None, None, -1),
+        [1, 3],
+        (2, 5),
+        (slice(1, 3), 4, 0),
+        (..., 1),
+        np.int64(3),
+    ):
+        np.testing.assert_array_equal(sequence[key], whole[key])
+    with pytest.raises(IndexError):
+        sequence[FRAMES]
+    assert np.array(sequence, dtype=np.float64).dtype == np.float64
+
+
+# ---------------------------------------------------------------------------------------------------------- reading
+
+
+def define_mesh(path, points, counts, indices, **attributes):
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    mesh = UsdGeom.Mesh.Define(stage, "/Sheet")
+    mesh.CreatePointsAttr(points)
+    mesh.CreateFaceVertexCountsAttr(counts)
+    mesh.CreateFaceVertexIndicesAttr(indices)
+    for name, value in attributes.items():
+        mesh.GetPrim().GetAttribute(name).Set(value)
+    return stage, mesh
+
+
+PENTAGON = [(0, 0, 0), (2, 0, 0), (3, 1, 0), (1, 3, 0), (-1, 1, 0), (5, 0, 0)]
+PENTAGON_AND_TRIANGLE = ([5, 3], [0, 1, 2, 3, 4, 1, 5, 2])
+
+
+@pytest.mark.parametrize(
+    ("attributes", "expected"),
+    [
+        ({}, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [1, 5, 2]]),
+        ({"orientation": "leftHanded"}, [[2, 1, 0], [3, 2, 0], [4, 3, 0], [2, 5, 1]]),
+    ],
+)
+def test_polygons_become_fans(tmp_path, attributes, expected):
+    stage, _ = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE, **attributes)
+    stage.Save()
+    mesh = read_mesh(tmp_path / "a.usda")
+    np.testing.assert_array_equal(mesh.triangles, expected)
+    np.testing.assert_array_equal(mesh.points, PENTAGON)
+
+
+def test_stage_is_read_with_its_surroundings(tmp_path):
+    source = artist_stage(tmp_path / "artist.usda")
+    read = read_stage_mesh(source, "Sheet")
+    assert (read.prim, read.meters_per_unit, read.up_axis) == ("/Set/Group/Sheet", 0.01, "Z")
+    assert (read.fps, read.time_codes_per_second, read.start) == (24, 24, 101)
+    assert read.pins["hem"].tolist() == [0, 1, 2]
+    stage = Usd.Stage.Open(source)
+    world = UsdGeom.Imageable(stage.GetPrimAtPath(read.prim)).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+    for point, rest in zip(read.mesh.points, Mesh.grid(5, 4).points, strict=True):
+        expected = 0.01 * np.array(world.Transform(Gf.Vec3d(*map(float, np.float32(100 * rest)))))
+        np.testing.assert_allclose(point, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("seam", [False, True])
+def test_corner_texture_coordinates_are_read_where_each_vertex_has_one(tmp_path, seam):
+    stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    st = np.array(PENTAGON)[PENTAGON_AND_TRIANGLE[1], :2] / 10
+    if seam:
+        st[5] += 0.5
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "faceVarying")
+    primvar.Set([Gf.Vec2f(*map(float, pair)) for pair in st])
+    stage.Save()
+    read = read_mesh(tmp_path / "a.usda").texture_coordinates
+    if seam:
+        assert read is None
+    else:
+        np.testing.assert_allclose(read, np.array(PENTAGON)[:, :2] / 10, atol=EPS)
+
+
+def test_samples_alone_are_read_with_a_warning(tmp_path):
+    stage, mesh = define_mesh(tmp_path / "a.usda", None, *PENTAGON_AND_TRIANGLE)
+    mesh.GetPointsAttr().Set(PENTAGON, 7)
+    stage.Save()
+    with pytest.warns(UserWarning, match="no default value; the sample at time code 7"):
+        mesh = read_mesh(tmp_path / "a.usda")
+    np.testing.assert_array_equal(mesh.points, PENTAGON)
+    with pytest.warns(UserWarning, match="no default value"):
+        path = write(tmp_path / "out.usda", mesh, source=tmp_path / "a.usda")
+    np.testing.assert_array_equal(read_mesh(path).points, PENTAGON)
+
+
+def test_periodic_curves_are_closed(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    curves = UsdGeom.BasisCurves.Define(stage, "/Rope")
+    curves.CreateTypeAttr("linear")
+    curves.CreateWrapAttr("periodic")
+    curves.CreatePointsAttr(PENTAGON)
+    curves.CreateCurveVertexCountsAttr([3, 3])
+    stage.Save()
+    mesh = read_mesh(tmp_path / "a.usda")
+    assert mesh.edges.tolist() == [[0, 1], [0, 2], [1, 2], [3, 4], [3, 5], [4, 5]] and len(mesh.triangles) == 0
+
+
+def test_missing_textures_are_left_out_of_a_package(tmp_path):
+    with pytest.warns(UserWarning, match="the package is made without it"):
+        path = write(tmp_path / "a.usdz", read_mesh(SQUARE_CLOTH), source=SQUARE_CLOTH)
+    assert validate(path, SQUARE_CLOTH) == []
+    assert len(FrameSequence(path)) == FRAMES
+
+
+# ----------------------------------------------------------------------------------------------------------- errors
+
+
+def no_mesh(path):
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.Sphere.Define(stage, "/Set/Ball")
+    stage.Save()
+
+
+def two_meshes(path):
+    stage, _ = define_mesh(path, PENTAGON, *PENTAGON_AND_TRIANGLE)
+    UsdGeom.Mesh.Define(stage, "/Other")
+    stage.Save()
+
+
+def moving(path):
+    stage, mesh = define_mesh(path, PENTAGON, *PENTAGON_AND_TRIANGLE)
+    for code in (0, 1):
+        (mesh.GetTranslateOp() or mesh.AddTranslateOp()).Set(Gf.Vec3d(code), code)
+    stage.Save()
+
+
+def flattened(path):
+    stage, mesh = define_mesh(path, PENTAGON, *PENTAGON_AND_TRIANGLE)
+    mesh.AddScaleOp().Set(Gf.Vec3f(1, 0, 1))
+    stage.Save()
+
+
+def topology(points, counts, indices):
+    return lambda path: define_mesh(path, points, counts, indices)[0].Save()
+
+
+@pytest.mark.parametrize(
+    ("make", "prim", "error", "message"),
+    [
+        (lambda path: None, None, FileNotFoundError, "there is no such file"),
+        (lambda path: path.write_text("solid stl"), None, ValueError, "is no USD stage"),
+        (no_mesh, None, ValueError, r"has no Mesh prim, only /Set.*, /Set/Ball \(Sphere\)"),
+        (no_mesh, "/Set/Ball", ValueError, "prim /Set/Ball: is Sphere, must be a Mesh prim"),
+        (two_meshes, None, ValueError, "several meshes, name one of them as prim: /Sheet, /Other"),
+        (two_meshes, "/Third", ValueError, "prim /Third: there is no such prim, only /Sheet, /Other"),
+        (two_meshes, "/Other", ValueError, "prim /Other: has no points"),
+        (moving, None, ValueError, "prim /Sheet: the transform of /Sheet is animated"),
+        (flattened, None, ValueError, "must be invertible"),
+        (topology(PENTAGON, [2, 3], [0, 1, 2, 3, 4]), None, ValueError, "prim /Sheet: face 0 has 2 corners"),
+        (
+            topology(PENTAGON, [3, 3], [0, 1, 2, 3, 4]),
+            None,
+            ValueError,
+            "add up to 6, must be the number of indices, 5",
+        ),
+        (topology(PENTAGON, [3], [0, 1, 6]), None, ValueError, r"faceVertexIndices\[2\] = 6, must be a vertex, 0 to 5"),
+        (topology(PENTAGON, [3], [0, 1, 1]), None, ValueError, "prim /Sheet: triangles"),
+        (topology(PENTAGON, [], []), None, ValueError, "prim /Sheet: has no faces"),
+    ],
+)
+def test_bad_stages_are_refused(tmp_path, make, prim, error, message):
+    path = tmp_path / "a.usda"
+    make(path)
+    with pytest.raises(error, match=message) as caught:
+        read_mesh(path, prim)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"output": "nowhere/a.usda"}, FileNotFoundError, "nowhere does not exist"),
+        ({"output": "a.abc"}, ValueError, "must end with one of .usd, .usda, .usdc, .usdz"),
+        ({"output": "artist.usda", "source": "artist.usda"}, ValueError, "is a file of the source's stage"),
+        ({"output": "artist.usda", "source": "shot.usda"}, ValueError, "is a file of the source's stage"),
+        ({"source": "missing.usda"}, FileNotFoundError, "missing.usda: there is no such file"),
+        ({"source": "artist.usda", "pins": {"a": [0]}}, ValueError, "pins: a source has its own"),
+        ({"source": "instanced.usda"}, ValueError, "is part of an instance"),
+        ({"source": "artist.usda", "mesh": Mesh.grid(3, 3)}, ValueError, "has 20 vertices, must have as many.* 9"),
+        ({"pins": {"left side": [0]}}, ValueError, "pins: 'left side' must be a name"),
+        ({"pins": {"left": [0, 20]}}, ValueError, "0 to 20, must be whole numbers, 0 to 19"),
+        ({"fps": 0}, ValueError, "fps = 0: must be positive"),
+        ({"chunk": 0}, ValueError, "chunk = 0: must be a whole number, at least 1"),
+        ({"up_axis": "X"}, ValueError, "up_axis = 'X'"),
+        ({"prim": "/World/Cloth"}, ValueError, "prim = '/World/Cloth': must be a name"),
+        ({"output": "taken.usda"}, ValueError, "taken_frames: is a file"),
+    ],
+)
+def test_bad_options_are_refused(tmp_path, monkeypatch, options, error, message):
+    monkeypatch.chdir(tmp_path)
+    artist_stage("artist.usda")
+    Path("shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@./artist.usda@]\n)\n")
+    Path("instanced.usda").write_text(
+        '#usda 1.0\ndef Xform "Copy" (\n    instanceable = true\n    references = @./artist.usda@\n)\n{\n}\n'
+    )
+    Path("taken_frames").write_text("")
+    before = sorted(os.listdir())
+    with pytest.raises(error, match=message):
+        AnimationWriter(**{"output": "out.usda", "mesh": Mesh.grid(5, 4), "fps": 24, **options})
+    assert sorted(os.listdir()) == before
+
+
+def with_value(value, vertex):
+    points = Mesh.grid(5, 4).points.copy()
+    points[vertex, 1] = value
+    return points
+
+
+GOOD = Mesh.grid(5, 4).points
+
+
+@pytest.mark.parametrize(
+    ("points", "velocities", "message"),
+    [
+        (GOOD[:-1], GOOD, r"points: shape \(19, 3\) at frame 1, must be \(20, 3\)"),
+        (GOOD, GOOD[:, :2], r"velocities: shape \(20, 2\) at frame 1"),
+        (with_value(np.nan, 7), GOOD, "points: .*nan.* at frame 1, vertex 7, must be finite"),
+        (GOOD, with_value(-np.inf, 3), "velocities: .*-inf.* at frame 1, vertex 3, must be finite"),
+        (with_value(1e39, 0), GOOD, "points: .* at frame 1, vertex 0, must be finite in float32"),
+    ],
+)
+def test_bad_frames_are_refused(tmp_path, points, velocities, message):
+    writer = AnimationWriter(tmp_path / "a.usda", Mesh.grid(5, 4), 24)
+    writer.append(GOOD, GOOD)
+    with pytest.raises(ValueError, match=message):
+        writer.append(points, velocities)
+    writer.close()
+    assert len(FrameSequence(writer.path)) == 1
+    with pytest.raises(ValueError, match="is closed"):
+        writer.append(GOOD, GOOD)
+
+
+def test_unanimated_prims_have_no_frames(tmp_path):
+    with pytest.raises(ValueError, match="points have no time samples"):
+        FrameSequence(artist_stage(tmp_path / "a.usda"))
+
+
+def break_default(stage, prim):
+    prim.GetAttribute("points").ClearDefault()
+
+
+def break_extent(stage, prim):
+    prim.GetAttribute("extent").Set([(0, 0, 0), (0.1, 0.1, 0.1)])
+    prim.GetAttribute("extent").Set([(0, 0, 0), (0.1, 0.1, 0.1)], 3)
+
+
+def break_topology(stage, prim):
+    prim.GetAttribute("faceVertexIndices").Set([99] * len(prim.GetAttribute("faceVertexIndices").Get()))
+
+
+def break_units(stage, prim):
+    stage.GetRootLayer().pseudoRoot.ClearInfo("metersPerUnit")
+
+
+def break_material(stage, prim):
+    stage.GetPrimAtPath("/World/Looks/Cloth/Colour").GetAttribute("inputs:varname").Set("")
+    stage.RemovePrim("/World/Looks/Cloth")
+
+
+@pytest.mark.parametrize("damage", [break_default, break_extent, break_topology, break_units, break_material])
+def test_the_validators_can_fail(tmp_path, damage):
+    pytest.importorskip("usd_validation_nvidia", reason="part of the test extra")
+    path = write(tmp_path / "a.usdc", Mesh.grid(5, 4), single_file=True)
+    assert validate(path) == []
+    stage, prim = animated_prim(path)
+    damage(stage, prim)
+    stage.Save()
+    assert validate(path) != []
+
+
+# -------------------------------------------------------------------------------------------------- memory and kills
+
+
+def anonymous_memory():
+    """Bytes of this process that are no file's pages; those the system can drop at any time."""
+    with open("/proc/self/status") as status:
+        return next(1024 * int(line.split()[1]) for line in status if line.startswith("RssAnon:"))
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="counts memory as Linux does")
+@pytest.mark.parametrize("ending", ["usdc", "usdz"])
+def test_memory_stays_flat(tmp_path, ending):
+    mesh = Mesh.grid(100, 100)
+    points, velocities = (values.astype(np.float32) for values in motion(mesh, 0))
+    frame_bytes = 3 * points.nbytes
+    writer = AnimationWriter(tmp_path / f"a.{ending}", mesh, 24)
+    for frame in range(500):
+        if frame == 50:
+            before = anonymous_memory()
+        writer.append(points + np.float32(1e-3 * frame), velocities)
+    writing = anonymous_memory() - before
+    writer.close(single_file=True)
+    closing = anonymous_memory() - before
+    for values in FrameSequence(writer.path):
+        assert values[0, 0] >= 0
+    reading = anonymous_memory() - before
+    # Kept frames would be 450 · 360 kB = 154 MiB. A chunk of 10, its copy and what malloc keeps stay below 40 frames.
+    for grown in (writing, closing, reading):
+        assert grown < 40 * frame_bytes, (writing, closing, reading)
+
+
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+@pytest.mark.parametrize("step", range(10))
+def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step, single_file):
+    """A disk that is full at any of the steps leaves the earlier result, or the new one as far as it got."""
+    mesh, output = Mesh.grid(5, 4), tmp_path / "out.usdc"
+    write(output, mesh, frames=30, sign=-1.0)
+    steps = iter(range(100))
+    replace = os.replace
+
+    def replace_until_full(*paths):
+        if next(steps) == step:
+            raise OSError("no space left on device")
+        replace(*paths)
+
+    monkeypatch.setattr("warpcloth.usd.writer.os.replace", replace_until_full)
+    writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
+    appended = 0
+    try:
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame))
+            appended += 1
+        writer.close(single_file=single_file)
+    except OSError:
+        assert appended < FRAMES or step >= 6
+    else:
+        assert step >= 8 and not single_file, "eight renames, and two more for one file"
+    now = FrameSequence(output)
+    assert len(now) == (30 if step <= 3 else min(FRAMES, (step - 2) // 2 * CHUNK))
+    for frame, points in enumerate(now):
+        np.testing.assert_allclose(points, motion(mesh, frame, -1.0 if step <= 3 else 1.0)[0], atol=4 * EPS)
+
+
+VICTIM = """
+import itertools, os, sys
+sys.path[:0] = {path!r}
+from test_usd import CHUNK, FRAMES, Mesh, motion, read_mesh
+from warpcloth.usd import AnimationWriter
+output, source, single_file, log = sys.argv[1:]
+mesh = read_mesh(source) if source else Mesh.grid(40, 40)
+log = os.open(log, os.O_WRONLY | os.O_CREAT)
+print("ready", flush=True)
+for run in itertools.count():
+    with AnimationWriter(output, mesh, 24, source=source or None, chunk=CHUNK) as writer:
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame, (-1) ** run))
+            os.write(log, b".")
+        writer.close(single_file=bool(single_file))
+        os.write(log, b"|")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ending", "with_source", "single_file"),
+    [("usdc", False, False), ("usda", True, False), ("usdc", True, True), ("usdz", False, True)],
+    ids=["chunks", "layer", "one-file", "package"],
+)
+def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, ending, with_source, single_file):
+    """Five kills of each kind. The victim writes one result over the other for ever, so each kill meets it at work."""
+    mesh = Mesh.grid(40, 40)
+    source = artist_stage(tmp_path / "artist.usda", mesh) if with_source else ""
+    mesh = read_mesh(source) if source else mesh
+    script = VICTIM.format(path=[str(Path(__file__).parent), *sys.path])
+    moments = random.Random(f"{ending} {with_source} {single_file}")
+    for trial in range(5):
+        output, log = tmp_path / f"{trial}.{ending}", tmp_path / f"{trial}.log"
+        arguments = [str(output), source, "yes" if single_file else "", str(log)]
+        victim = subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE, text=True)
+        assert victim.stdout.readline() == "ready\n"
+        time.sleep(moments.uniform(0, 0.1 * trial + 0.02))
+        victim.send_signal(signal.SIGKILL)
+        assert victim.wait() == -signal.SIGKILL
+        check_survivor(output, mesh, log.read_text(), source)
+        # The next run is not disturbed by what is left, and clears it away.
+        write(output, mesh, source=source or None)
+        assert len(FrameSequence(output)) == FRAMES
+        left = list((tmp_path / f"{trial}_frames").glob("*"))
+        assert len(left) == (0 if ending == "usdz" else 1)
+
+
+def check_survivor(output, mesh, log, source):
+    """The result of the run before is left, or frames of the last run, without its last chunk at most.
+
+    Args:
+        output: The output.
+        mesh: Its mesh.
+        log: A point for each append that had returned, a bar for each close.
+        source: The artist's stage, or "".
+    """
+    runs = log.split("|")
+    appended = len(runs[-1])
+    last = (-1) ** (len(runs) - 1)
+    # A package is made at the end; until then its frames can be opened in the folder.
+    partial = [path for path in (output.parent / f"{output.stem}_frames").glob("usdz-*/animation.usdc")]
+    found = [path for path in [output, *partial] if path.exists()]
+    newest = 0
+    for path in found:
+        points, velocities = FrameSequence(path), FrameSequence(path, attribute="velocities")
+        sign = 1 if abs(velocities[1][0, 0] - 1.0) < 0.5 else -1
+        if sign == last:
+            newest = max(newest, len(points))
+        else:
+            assert len(runs) > 1 and len(points) == FRAMES
+        transform = read_stage_mesh(path).transform
+        for frame in range(len(points)):
+            expected = motion(mesh, frame, sign)
+            # As in the round trip, with the transform's condition number 1 and its offset below 2 m.
+            tolerance = 2 * EPS * (np.abs(expected[0]).max() + np.abs(transform[3]).max() + np.abs(expected[1]).max())
+            np.testing.assert_allclose(points[frame], expected[0], rtol=0, atol=tolerance)
+            np.testing.assert_allclose(velocities[frame], expected[1], rtol=0, atol=tolerance)
+        stage, _ = animated_prim(path)
+        assert stage.GetEndTimeCode() - stage.GetStartTimeCode() == len(points) - 1
+        assert validate(path, source or None) == []
+    assert appended // CHUNK * CHUNK <= newest <= FRAMES
+    assert found or appended < CHUNK
+    assert len(runs) == 1 or output.exists()

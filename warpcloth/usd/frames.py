@@ -1,0 +1,98 @@
+"""The frames of an animation, read from its file one at a time."""
+
+import numpy as np
+from pxr import UsdGeom
+
+from .stage import curve_vertices, find_prim, first_points, local_to_metres, open_stage
+
+
+class FrameSequence:
+    """Sampled points or velocities of a prim, as an array that reads from the file what is asked for.
+
+    A frame is read when it is indexed, and nothing is kept, so memory stays flat however many frames there are.
+    `np.asarray(sequence)` reads all of them.
+
+    Attributes:
+        shape: (frames, n, 3).
+        dtype: float32.
+        time_codes: Time code of each frame (frames,).
+        times: Seconds since the first frame (frames,).
+    """
+
+    dtype = np.dtype(np.float32)
+
+    def __init__(self, path, prim=None, attribute="points"):
+        """Opens the file.
+
+        Args:
+            path: A .usd, .usda, .usdc or .usdz file.
+            prim: Path or name of the prim; see `read_stage_mesh`.
+            attribute: "points", in world space [m], or "velocities" [m/s].
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It is no stage, the prim cannot be told, or the attribute is not animated.
+        """
+        if attribute not in ("points", "velocities"):
+            raise ValueError(f'attribute = {attribute!r}: must be "points" or "velocities"')
+        self._stage = open_stage(path)
+        found = find_prim(self._stage, path, prim)
+        where = f"{path}, prim {found.GetPath()}"
+        self._attribute = found.GetAttribute(attribute)
+        self.time_codes = np.array(self._attribute.GetTimeSamples())
+        if not len(self.time_codes):
+            raise ValueError(f"{where}: {attribute} have no time samples, the prim is not animated")
+        self.times = (self.time_codes - self.time_codes[0]) / self._stage.GetTimeCodesPerSecond()
+        transform = local_to_metres(found, where)
+        self._linear = None if np.array_equal(transform[:3, :3], np.eye(3)) else transform[:3, :3]
+        self._offset = transform[3, :3] if attribute == "points" and transform[3, :3].any() else None
+        count = len(self._attribute.Get(self.time_codes[0]))
+        # Curves show a vertex several times where they meet; the first is read.
+        self._points = None
+        if not found.IsA(UsdGeom.Mesh):
+            self._points = first_points(curve_vertices(found, count))
+            count = len(self._points)
+        self.shape = (len(self.time_codes), count, 3)
+
+    @property
+    def ndim(self):
+        """Three."""
+        return 3
+
+    def __len__(self):
+        return self.shape[0]
+
+    def __repr__(self):
+        return f"FrameSequence(shape={self.shape}, {self._attribute.GetPath()})"
+
+    def __iter__(self):
+        return (self._read(frame) for frame in range(len(self)))
+
+    def __getitem__(self, key):
+        """Frames as NumPy has them: an integer gives (n, 3), a slice or list (k, n, 3), more indices a part of that."""
+        frames, rest = (key[0], key[1:]) if isinstance(key, tuple) and key else (key, ())
+        if frames is Ellipsis or isinstance(frames, tuple):
+            return np.asarray(self)[key]
+        numbers = np.arange(len(self))[frames]
+        if np.ndim(numbers) == 0:
+            return self._read(int(numbers))[rest]
+        result = np.empty((len(numbers), *self.shape[1:]), np.float32)
+        for row, frame in enumerate(numbers):
+            result[row] = self._read(int(frame))
+        return result[(slice(None), *rest)]
+
+    def __array__(self, dtype=None, copy=None):
+        if copy is False:
+            raise ValueError("copy = False: the frames are in a file, so an array of them is always a copy")
+        result = self[:]
+        return result if dtype is None else result.astype(dtype, copy=False)
+
+    def _read(self, frame):
+        value = np.array(self._attribute.Get(self.time_codes[frame]), dtype=np.float32)
+        if self._points is not None:
+            value = value[self._points]
+        if self._linear is not None:
+            value = value.astype(np.float64) @ self._linear
+        if self._offset is not None:
+            value = value + self._offset
+        return value.astype(np.float32, copy=False)

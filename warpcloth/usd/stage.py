@@ -1,0 +1,332 @@
+"""A cloth prim of a USD stage: found, read in metres and world space, and described well enough to be written back."""
+
+import os
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Sdf, Tf, Usd, UsdGeom
+
+from ..mesh import Mesh
+
+# Where an animation keeps, in the root layer's customLayerData, the prim that it animates.
+METADATA_KEY = "warpcloth"
+# Primvar of curves: the mesh vertex of each curve point, for curves repeat the vertices where several of them meet.
+VERTEX_PRIMVAR = "warpcloth:vertex"
+
+
+@dataclass(frozen=True, eq=False)
+class StageMesh:
+    """The mesh of one prim, with what its stage says about space and time.
+
+    Attributes:
+        mesh: Rest shape in the stage's world space [m]; vertex i is point i of a Mesh prim.
+        path: The file.
+        prim: Path of the prim.
+        transform: (4, 4) float64; row vectors: x = [p, 1]·transform, from the prim's own space and units to world space
+            [m].
+        meters_per_unit: Metres in one unit of the stage; USD says 0.01 where the stage does not.
+        up_axis: "Y" or "Z".
+        fps: Frames per second, None where the stage does not say.
+        time_codes_per_second: Time codes in a second; USD says 24 where the stage does not.
+        start: First time code, None where the stage does not say.
+        pins: Sorted vertex indices (p,) int32 by name, of every GeomSubset of points.
+        point_vertices: Curves: the vertex of each point of the prim (P,); None for a Mesh prim, where they are the
+            same.
+    """
+
+    mesh: Mesh
+    path: str
+    prim: str
+    transform: np.ndarray
+    meters_per_unit: float
+    up_axis: str
+    fps: float | None
+    time_codes_per_second: float
+    start: float | None
+    pins: dict
+    point_vertices: np.ndarray | None = None
+
+
+def read_mesh(path, prim=None):
+    """The rest shape of a cloth: see `read_stage_mesh`, which also tells what the stage says about it.
+
+    Args:
+        path: A .usd, .usda, .usdc or .usdz file.
+        prim: Path or name of the prim; may be left out where there is only one mesh.
+
+    Returns:
+        Mesh: In metres and the stage's world space.
+    """
+    return read_stage_mesh(path, prim).mesh
+
+
+def read_stage_mesh(path, prim=None):
+    """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
+
+    The points at the default time are the rest shape. A stage with time samples alone is read at its first sample, with
+    a
+    warning: support for that is deprecated, for nothing says that a first frame is at rest. Polygons are cut into fans
+        of
+    triangles from their first corner, and turned where the prim is left-handed or mirrored by its transform, so that
+    triangle normals point out of the front. The up axis is reported, not changed.
+
+    Args:
+        path: A .usd, .usda, .usdc or .usdz file.
+        prim: Path or name of the prim; may be left out where the stage has one mesh (or no mesh and one curves prim),
+            and for a result of `AnimationWriter`, which names its own.
+
+    Returns:
+        StageMesh: The mesh and its surroundings.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no USD stage, has no mesh or several, the prim is missing or no mesh, its transform is
+            animated or cannot be inverted, or its points and topology make no valid `Mesh`.
+    """
+    stage = open_stage(path)
+    found = find_prim(stage, path, prim)
+    where = f"{path}, prim {found.GetPath()}"
+    transform = local_to_metres(found, where)
+    points = _rest_points(found, where) @ transform[:3, :3] + transform[3, :3]
+    point_vertices = None
+    try:
+        if found.IsA(UsdGeom.Mesh):
+            triangles = _triangles(found, len(points))
+            if np.linalg.det(transform[:3, :3]) < 0:
+                triangles = triangles[:, ::-1]
+            mesh = Mesh(points, triangles, texture_coordinates=_texture_coordinates(found, len(points)))
+        else:
+            point_vertices = curve_vertices(found, len(points))
+            edges = point_vertices[_curve_edges(found)]
+            edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
+            mesh = Mesh(points[first_points(point_vertices)], edges=edges)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    layer = stage.GetRootLayer()
+    rate = layer.framesPerSecond if layer.HasFramesPerSecond() else layer.timeCodesPerSecond
+    return StageMesh(
+        mesh=mesh,
+        path=os.fspath(path),
+        prim=str(found.GetPath()),
+        transform=transform,
+        meters_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
+        up_axis=str(UsdGeom.GetStageUpAxis(stage)),
+        fps=rate if layer.HasFramesPerSecond() or layer.HasTimeCodesPerSecond() else None,
+        time_codes_per_second=stage.GetTimeCodesPerSecond(),
+        start=stage.GetStartTimeCode() if layer.HasStartTimeCode() else None,
+        pins=_pins(found, point_vertices),
+        point_vertices=point_vertices,
+    )
+
+
+def open_stage(path):
+    """Opens a stage as it is on disk now.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Usd.Stage: Keep it: prims of a stage that is gone are invalid.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no USD stage.
+    """
+    path = os.fspath(path)
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"{path}: there is no such file")
+    # pxr keeps a layer while anyone uses it, and would show an earlier result that has been replaced since.
+    known = Sdf.Layer.Find(os.path.abspath(path))
+    if known and not known.dirty:
+        known.Reload()
+    try:
+        return Usd.Stage.Open(os.path.abspath(path))
+    except Tf.ErrorException as error:
+        reason = error.args[0].commentary if error.args and hasattr(error.args[0], "commentary") else str(error)
+        raise ValueError(f"{path}: is no USD stage ({reason.strip()})") from None
+
+
+def find_prim(stage, path, prim=None):
+    """The prim that holds the cloth.
+
+    Args:
+        stage: The stage to search.
+        path: Its file, for messages.
+        prim: Path or name of the prim, or None for the only one or the one that an earlier run animated.
+
+    Returns:
+        Usd.Prim: A Mesh, or linear BasisCurves.
+
+    Raises:
+        ValueError: Missing, of another type, or several and none of them named.
+    """
+    prims = list(stage.Traverse(Usd.TraverseInstanceProxies()))
+    meshes = [p for p in prims if p.IsA(UsdGeom.Mesh)]
+    curves = [p for p in prims if p.IsA(UsdGeom.BasisCurves) and UsdGeom.BasisCurves(p).GetTypeAttr().Get() == "linear"]
+    if prim is None:
+        prim = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY, {}).get("prim")
+    if prim is None:
+        candidates = meshes or curves
+    else:
+        candidates = [p for p in meshes + curves if str(prim) in (str(p.GetPath()), p.GetName())]
+    if len(candidates) == 1:
+        return candidates[0]
+    if candidates:
+        raise ValueError(f"{path}: has several meshes, name one of them as prim: {_listed(candidates)}")
+    if prim is None:
+        raise ValueError(f"{path}: has no Mesh prim, only {_listed(prims, types=True) or 'an empty stage'}")
+    other = next((p for p in prims if str(prim) in (str(p.GetPath()), p.GetName())), None)
+    if other:
+        raise ValueError(f"{path}, prim {other.GetPath()}: is {other.GetTypeName() or 'untyped'}, must be a Mesh prim")
+    raise ValueError(
+        f"{path}, prim {prim}: there is no such prim, only {_listed(meshes + curves) or 'others, no Mesh'}"
+    )
+
+
+def _listed(prims, types=False, most=12):
+    """Paths of prims as text, cut short."""
+    names = [f"{p.GetPath()} ({p.GetTypeName() or 'untyped'})" if types else str(p.GetPath()) for p in prims]
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def local_to_metres(prim, where):
+    """The transform (4, 4) float64 from a prim's own space and units to the stage's world space [m], for row vectors.
+
+    Args:
+        prim: The prim.
+        where: File and prim, for messages.
+
+    Returns:
+        np.ndarray: The matrix; its last column is [0, 0, 0, 1].
+
+    Raises:
+        ValueError: The transform is animated, projects, or cannot be inverted.
+    """
+    ancestor = prim
+    while ancestor and not ancestor.IsPseudoRoot():
+        xformable = UsdGeom.Xformable(ancestor)
+        # Points in a moving space would need velocities of that space too; nobody has asked for it yet.
+        if xformable and xformable.TransformMightBeTimeVarying():
+            raise ValueError(f"{where}: the transform of {ancestor.GetPath()} is animated, must be fixed for a cloth")
+        if xformable and xformable.GetResetXformStack():
+            break
+        ancestor = ancestor.GetParent()
+    matrix = np.array(UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
+    if not np.isfinite(matrix).all() or (matrix[:, 3] != [0, 0, 0, 1]).any():
+        raise ValueError(f"{where}: the transform to world space is {matrix.tolist()}, must be affine and finite")
+    if not np.linalg.matrix_rank(matrix[:3, :3]) == 3:
+        raise ValueError(f"{where}: the transform to world space is {matrix.tolist()}, must be invertible")
+    matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(prim.GetStage())
+    return matrix
+
+
+def curve_vertices(prim, count):
+    """The mesh vertex of each point of a curves prim.
+
+    Args:
+        prim: BasisCurves.
+        count: Number P of its points.
+
+    Returns:
+        np.ndarray: (P,) int32; the points' own order where nothing else is said.
+    """
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(VERTEX_PRIMVAR)
+    if not (primvar and primvar.HasValue()):
+        return np.arange(count, dtype=np.int32)
+    vertices = np.array(primvar.Get(), dtype=np.int32)
+    named = np.unique(vertices)
+    if len(vertices) != count or not np.array_equal(named, np.arange(len(named))):
+        raise ValueError(f"primvars:{VERTEX_PRIMVAR} must name each vertex from 0 on, once for each of {count} points")
+    return vertices
+
+
+def first_points(point_vertices):
+    """For each vertex (n,) the first point that shows it."""
+    return np.unique(point_vertices, return_index=True)[1]
+
+
+def _rest_points(prim, where):
+    """Points (P, 3) float64 in the prim's own space at the default time, or else at the first sample."""
+    attribute = UsdGeom.PointBased(prim).GetPointsAttr()
+    value = attribute.Get()
+    if value is None and attribute.GetNumTimeSamples():
+        first = attribute.GetTimeSamples()[0]
+        warnings.warn(
+            f"{where}: points have no default value; the sample at time code {first:g} is taken as the rest shape. "
+            "This is deprecated: author the rest shape as the default",
+            stacklevel=4,
+        )
+        value = attribute.Get(first)
+    if value is None or len(value) == 0:
+        raise ValueError(f"{where}: has no points")
+    return np.array(value, dtype=np.float64)
+
+
+def _topology(attribute):
+    """An integer array attribute at the default time, or at its first sample; empty where it has no value."""
+    value = attribute.Get()
+    if value is None:
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    return np.array(value if value is not None else [], dtype=np.int32)
+
+
+def _triangles(prim, count):
+    """Triangles (T, 3) int32 of a Mesh prim, counter-clockwise seen from the front in the prim's own space."""
+    mesh = UsdGeom.Mesh(prim)
+    counts, corners = _topology(mesh.GetFaceVertexCountsAttr()), _topology(mesh.GetFaceVertexIndicesAttr())
+    if len(counts) == 0:
+        raise ValueError("has no faces")
+    if (counts < 3).any():
+        face = int(np.argmax(counts < 3))
+        raise ValueError(f"face {face} has {counts[face]} corners, must have at least 3")
+    if counts.sum() != len(corners):
+        raise ValueError(f"faceVertexCounts add up to {counts.sum()}, must be the number of indices, {len(corners)}")
+    if (corners < 0).any() or (corners >= count).any():
+        corner = int(np.argmax((corners < 0) | (corners >= count)))
+        raise ValueError(f"faceVertexIndices[{corner}] = {corners[corner]}, must be a vertex, 0 to {count - 1}")
+    start = np.repeat(np.cumsum(counts) - counts, counts - 2)
+    # Position of each triangle within its polygon's fan.
+    step = np.arange(len(start)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    triangles = corners[np.stack([start, start + step + 1, start + step + 2], axis=1)]
+    return triangles[:, ::-1] if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded else triangles
+
+
+def _curve_edges(prim):
+    """Pairs of points (E, 2) that the segments of linear curves join."""
+    curves = UsdGeom.BasisCurves(prim)
+    counts = _topology(curves.GetCurveVertexCountsAttr())
+    end = np.cumsum(counts)
+    inner = np.setdiff1d(np.arange(counts.sum()), end - 1)
+    edges = np.stack([inner, inner + 1], axis=1)
+    if curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic:
+        edges = np.concatenate([edges, np.stack([end - 1, end - counts], axis=1)])
+    return edges
+
+
+def _texture_coordinates(prim, count):
+    """`primvars:st` as (n, 2), or None where there are none or a vertex has several (a seam)."""
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
+    if not (primvar and primvar.HasValue()):
+        return None
+    st = np.array(primvar.ComputeFlattened(), dtype=np.float64)
+    interpolation = primvar.GetInterpolation()
+    if interpolation in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and st.shape == (count, 2):
+        return st
+    corners = _topology(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr())
+    if interpolation != UsdGeom.Tokens.faceVarying or st.shape != (len(corners), 2):
+        return None
+    at_vertices = np.zeros((count, 2))
+    at_vertices[corners] = st
+    return at_vertices if np.array_equal(at_vertices[corners], st) else None
+
+
+def _pins(prim, point_vertices):
+    """Sorted vertices (p,) int32 of every GeomSubset of points, by name."""
+    pins = {}
+    for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
+        if subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.point:
+            points = _topology(subset.GetIndicesAttr())
+            vertices = points if point_vertices is None else point_vertices[points]
+            pins[subset.GetPrim().GetName()] = np.unique(vertices)
+    return pins

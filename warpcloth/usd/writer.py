@@ -1,0 +1,295 @@
+"""Writing an animation so that it can be opened at any moment, whatever happens to the process that writes it."""
+
+import os
+import re
+import secrets
+import shutil
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Usd, UsdUtils
+
+from .layers import SAMPLED, Target, flatten, over_layer, relative_path, scene_layer
+from .stage import METADATA_KEY
+
+_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+_CLIP_SET = "warpcloth"
+
+
+class AnimationWriter:
+    """Writes frames of a cloth as USD, in chunks that are each written once.
+
+    While it runs, the result is a small root layer, `path`, and a folder beside it, `<stem>_frames/<run>/`, with
+
+    - `rest.usdc`: all that is not animated. Without a source a complete stage, /World/Cloth and its material; with one,
+      what has to be said once about the artist's prim. It is weaker than the frames and stronger than the source.
+    - `frames_000000.usdc` and so on: value clips of `chunk` frames. USD interpolates between the last frame of one and
+      the first frame of the next too.
+    - `manifest.usda`: the names of the animated attributes, so that no chunk need be opened to find them.
+
+    Every file is written under another name, complete, and then renamed; the root is replaced after each chunk. So a
+    process killed at any moment leaves a result that opens, with at most one chunk of frames missing, and the result of
+    an earlier run stays whole until the first chunk of this one stands. Files are not forced to the disk (fsync): a
+    killed process loses nothing by that, a power failure may lose the newest chunks. Memory holds one chunk. The folder
+    belongs to the file: move them together, or make one file of them with `close(single_file=True)`. One writer at a
+    time for an output.
+
+    With a source the result is a layer over the artist's stage, which it sublayers by a relative path and never
+    changes: it has opinions on points, velocities, normals, extent and subdivisionScheme of one prim, in that prim's
+    own space and units, and blocks accelerations and `primvars:normals`, which would be used instead. Time codes start
+    at the source's own first one (at the same second, where fps differs from its time codes per second), or else at 0.
+
+    Edge meshes become linear BasisCurves along paths of edges (a chain: one curve, its vertices in order); where curves
+    meet each has a point for the vertex, and `primvars:warpcloth:vertex` says which vertex a point is.
+
+    Attributes:
+        path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
+        frames: Number of frames appended.
+    """
+
+    def __init__(self, output, mesh, fps, source=None, prim=None, pins=None, up_axis="Y", chunk=10, metadata=None):
+        """Checks everything that can be checked before the first frame; writes nothing yet.
+
+        Args:
+            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file.
+            mesh: The `Mesh`; its points are the rest shape. With a source: as read from it.
+            fps: Frames per second; also time codes per second.
+            source: A stage to write a layer over, or None.
+            prim: Of a source: path or name of the prim. Without: name of the prim under /World, "Cloth" if None.
+            pins: Vertex indices by name, written as GeomSubsets in the family "pins". A source has its own.
+            up_axis: "Y" or "Z"; a source has its own.
+            chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
+            metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers or texts.
+
+        Raises:
+            FileNotFoundError: The output's folder or the source does not exist.
+            ValueError: A parameter is not as above, or the output is a file of the source's stage.
+        """
+        self._output = Path(os.path.abspath(output))
+        _check_output(self._output)
+        _check_options(fps, up_axis, chunk)
+        self._source = None if source is None else Path(os.path.abspath(source))
+        start = 0.0
+        if source is None:
+            name = prim or "Cloth"
+            if not Sdf.Path.IsValidIdentifier(name):
+                raise ValueError(f"prim = {name!r}: must be a name of letters, digits and _ where there is no source")
+            self._rest, self._target, self._root_metadata = scene_layer(mesh, pins, up_axis, name)
+        else:
+            if pins:
+                raise ValueError("pins: a source has its own, and a layer over it writes none; leave them out")
+            self._rest, self._target, self._root_metadata, stage, files = over_layer(source, prim, mesh)
+            if os.path.realpath(self._output) in files:
+                raise ValueError(f"output = {output}: is a file of the source's stage, which must not be changed")
+            if stage.start is not None:
+                start = stage.start * fps / stage.time_codes_per_second
+        self._root_metadata["customLayerData"] = {METADATA_KEY: {**(metadata or {}), "prim": self._target.prim}}
+        self._start, self._fps, self._chunk = start, float(fps), int(chunk)
+        self._count = len(mesh.points)
+        self._folder = self._output.parent / f"{self._output.stem}_frames"
+        if self._folder.exists() and not self._folder.is_dir():
+            raise ValueError(f"{self._folder}: is a file, must be free for the folder of frames")
+        # A name never used before: pxr may still hold layers of an earlier run in this process, and would show those.
+        self._run = self._folder / f"{self._output.suffix[1:]}-{secrets.token_hex(4)}"
+        self.path = str(self._run / "animation.usdc" if self._output.suffix == ".usdz" else self._output)
+        self.frames = 0
+        self._pending = []
+        self._chunks = []  # (first time code, file) of each chunk that stands
+        self._closed = False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        if kind is None:
+            self.close()
+        elif not self._closed:
+            # What there is may be worth a look; it stays in chunks, for nobody waits for one file.
+            self._write_chunk()
+            self._closed = True
+
+    def append(self, points, velocities):
+        """Adds a frame; every `chunk` frames they are written.
+
+        Args:
+            points: (n, 3) [m], world space.
+            velocities: (n, 3) [m/s].
+
+        Raises:
+            ValueError: A wrong shape, or a value that is not finite as float32, with the frame and the vertex; the
+                writer is closed.
+        """
+        if self._closed:
+            raise ValueError(f"{self._output}: is closed, no frame can be appended")
+        points = self._checked("points", points)
+        velocities = self._checked("velocities", velocities)
+        samples = self._target.samples(points, velocities)
+        self._pending.append((self._start + self.frames, samples))
+        self.frames += 1
+        if len(self._pending) >= self._chunk:
+            self._write_chunk()
+
+    def close(self, single_file=False):
+        """Writes what is pending. Without a single frame nothing is written.
+
+        Args:
+            single_file: Make one self-contained file, with all of the source in it, and remove the folder. Frames are
+                copied chunk by chunk, so that memory stays flat; .usda alone is written from a binary file. A .usdz
+                always is one.
+
+        Raises:
+            OSError: A file could not be written; the chunks that stand stay.
+        """
+        if self._closed:
+            return
+        self._write_chunk()
+        self._closed = True
+        if self._chunks and (single_file or self._output.suffix == ".usdz"):
+            self._write_single_file()
+
+    def _checked(self, name, values):
+        values = np.asarray(values)
+        if values.shape != (self._count, 3):
+            raise ValueError(f"{name}: shape {values.shape} at frame {self.frames}, must be {(self._count, 3)}")
+        with np.errstate(over="ignore"):
+            finite = np.isfinite(values.astype(np.float32, copy=False))
+        if not finite.all():
+            vertex = int(np.argmin(finite)) // 3
+            raise ValueError(
+                f"{name}: {values[vertex].tolist()} at frame {self.frames}, vertex {vertex}, must be finite in float32"
+            )
+        return values
+
+    def _write_chunk(self):
+        """Writes the pending frames as a clip, and a root that has it."""
+        if not self._pending:
+            return
+        if not self._chunks:
+            self._start_run()
+        layer = Sdf.Layer.CreateAnonymous(".usdc")
+        _declare(layer, self._target)
+        for time, values in self._pending:
+            for name, value in values.items():
+                layer.SetTimeSample(f"{self._target.prim}.{name}", time, value)
+        layer.timeCodesPerSecond = layer.framesPerSecond = self._fps
+        layer.startTimeCode, layer.endTimeCode = self._pending[0][0], self._pending[-1][0]
+        path = self._run / f"frames_{len(self._chunks):06d}.usdc"
+        _export(layer, path)
+        self._chunks.append((self._pending[0][0], path))
+        self._pending = []
+        self._write_root()
+        if len(self._chunks) == 1:
+            self._remove_other_runs()
+
+    def _start_run(self):
+        self._run.mkdir(parents=True, exist_ok=True)
+        _export(self._rest, self._run / "rest.usdc")
+        manifest = Sdf.Layer.CreateAnonymous(".usda")
+        _declare(manifest, self._target)
+        _export(manifest, self._run / "manifest.usda")
+
+    def _write_root(self):
+        folder = Path(self.path).parent
+        end = self._start + self.frames - 1
+        layer = Sdf.Layer.CreateAnonymous(".usda")
+        stage = Usd.Stage.Open(layer)
+        clips = Usd.ClipsAPI(stage.OverridePrim(self._target.prim))
+        asset_paths = [Sdf.AssetPath(relative_path(path, folder)) for _, path in self._chunks]
+        clips.SetClipAssetPaths(asset_paths, _CLIP_SET)
+        clips.SetClipManifestAssetPath(Sdf.AssetPath(relative_path(self._run / "manifest.usda", folder)), _CLIP_SET)
+        clips.SetClipPrimPath(self._target.prim, _CLIP_SET)
+        clips.SetClipActive([(time, index) for index, (time, _) in enumerate(self._chunks)], _CLIP_SET)
+        # Clip time is stage time. One frame has one time: listed twice, USD 25.5 reports the frame twice.
+        clips.SetClipTimes([(time, time) for time in sorted({self._start, end})], _CLIP_SET)
+        del clips, stage
+        self._describe(layer)
+        # Last, for an anonymous layer cannot tell what they are relative to.
+        layer.subLayerPaths = [relative_path(path, folder) for path in self._base_paths()]
+        _export(layer, self.path, self._run)
+
+    def _describe(self, layer):
+        """Writes on a root layer what is read from root layers only."""
+        for name, value in self._root_metadata.items():
+            layer.pseudoRoot.SetInfo(name, value)
+        layer.timeCodesPerSecond = layer.framesPerSecond = self._fps
+        layer.startTimeCode, layer.endTimeCode = self._start, self._start + self.frames - 1
+
+    def _base_paths(self):
+        return [self._run / "rest.usdc"] + ([self._source] if self._source else [])
+
+    def _remove_other_runs(self):
+        """Removes what earlier runs to the same output left, now that the output no longer refers to it."""
+        own_kind = re.compile(re.escape(self._output.suffix[1:]) + "-[0-9a-f]{8}")
+        for folder in self._folder.iterdir():
+            if folder != self._run and own_kind.fullmatch(folder.name):
+                shutil.rmtree(folder)
+
+    def _write_single_file(self):
+        packed = self._output.suffix == ".usdz"
+        flat = flatten(self._base_paths(), self._describe, None if packed else self._output.parent)
+        _declare(flat, self._target)
+        for name in self._target.attributes:
+            flat.GetAttributeAtPath(f"{self._target.prim}.{name}").ClearInfo("timeSamples")
+        single = self._run / f"{self._output.stem}.usdc"
+        flat.Export(str(single))
+        self._copy_frames(single)
+        finished = self._run / f"finished{self._output.suffix}"
+        if packed:
+            if not UsdUtils.CreateNewUsdzPackage(str(single), str(finished)):
+                raise OSError(f"{finished}: could not be written")
+        elif self._output.suffix == ".usda":
+            _export(Sdf.Layer.FindOrOpen(str(single)), finished)
+        else:
+            os.replace(single, finished)
+        os.replace(finished, self._output)
+        self.path = str(self._output)
+        shutil.rmtree(self._run)
+        if not any(self._folder.iterdir()):
+            self._folder.rmdir()
+
+    def _copy_frames(self, single):
+        """Copies all chunks to a binary layer, saved in place: nobody needs that file if the process dies."""
+        layer = Sdf.Layer.FindOrOpen(str(single))
+        for _, path in self._chunks:
+            chunk = Sdf.Layer.FindOrOpen(str(path))
+            for name in self._target.attributes:
+                attribute = f"{self._target.prim}.{name}"
+                for time in chunk.ListTimeSamplesForPath(attribute):
+                    layer.SetTimeSample(attribute, time, chunk.QueryTimeSample(attribute, time))
+            if not layer.Save():
+                raise OSError(f"{single}: could not be written")
+
+
+def _check_output(output):
+    if output.suffix not in _ENDINGS:
+        raise ValueError(f"output = {output}: must end with one of {', '.join(_ENDINGS)}")
+    if not output.parent.is_dir():
+        raise FileNotFoundError(f"output = {output}: the folder {output.parent} does not exist")
+    if output.is_dir():
+        raise ValueError(f"output = {output}: is a folder, must be a file")
+
+
+def _check_options(fps, up_axis, chunk):
+    if not (np.isscalar(fps) and np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps = {fps}: must be positive and finite")
+    if up_axis not in ("Y", "Z"):
+        raise ValueError(f'up_axis = {up_axis!r}: must be "Y" or "Z"')
+    if int(chunk) != chunk or chunk < 1:
+        raise ValueError(f"chunk = {chunk}: must be a whole number, at least 1")
+
+
+def _declare(layer, target: Target):
+    """Makes sure that a layer has the sampled attributes, without giving them values."""
+    prim = layer.GetPrimAtPath(target.prim) or Sdf.CreatePrimInLayer(layer, target.prim)
+    for name in target.attributes:
+        if name not in prim.attributes:
+            Sdf.AttributeSpec(prim, name, SAMPLED[name])
+
+
+def _export(layer, path, unfinished_in=None):
+    """Writes a layer under another name first, so that the path has either what was there or the whole layer."""
+    path = Path(path)
+    unfinished = Path(unfinished_in or path.parent) / f"unfinished{path.suffix}"
+    if not layer.Export(str(unfinished)):
+        raise OSError(f"{path}: could not be written")
+    os.replace(unfinished, path)
