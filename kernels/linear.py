@@ -77,6 +77,29 @@ def multiply(dtype):
 
 
 @cache
+def rounding(dtype):
+    """Kernel over block rows: out[i] = (ε Σⱼ ‖A[i, j]‖‖xⱼ − xᵢ‖)², what rounding a length by ε does to the force [N²]."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def rounding_of_rows(
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=mat33),
+        x: wp.array(dtype=vec3),
+        epsilon: dtype,
+        out: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        total = dtype(0.0)
+        for s in range(offsets[i], offsets[i + 1]):
+            total += wp.sqrt(wp.ddot(values[s], values[s])) * wp.length(x[columns[s]] - x[i])
+        out[i] = wp.float64(epsilon * total) * wp.float64(epsilon * total)
+
+    return rounding_of_rows
+
+
+@cache
 def invert_diagonal(dtype):
     """Kernel over block rows: inverse[i] = A[i, i]⁻¹, the block Jacobi preconditioner."""
     vec3, mat33 = types(dtype)

@@ -5,6 +5,7 @@ import warp as wp
 
 from .capture import Segment, on_host
 from .kernels import minimise as kernels
+from .kernels.linear import rounding
 from .kernels.term import HessianPolicy
 from .linear import ConjugateGradients, Factorised
 from .operators import Energy, Gradient, Hessian, Sums
@@ -19,6 +20,8 @@ POLICIES = {
     "absolute": HessianPolicy.ABSOLUTE,
 }
 
+LINEAR = ("cg", "factorised")
+
 
 class Minimiser:
     """Finds the d that minimises φ for each copy, from d = 0 (for the equation see the module).
@@ -28,7 +31,7 @@ class Minimiser:
         base: Where d = 0 is, (N,) vectors [m]; the caller's array, read only.
         hessian: ``"adaptive"`` (raw; clamped in an iteration whose matrix shows a negative curvature), ``"raw"``,
             ``"clamp"`` or ``"absolute"``.
-        linear: ``"factorised"``, ``"cg"`` or ``"automatic"``: factorised on the CPU, cg on CUDA.
+        linear: ``"cg"`` or ``"factorised"``.
         s: Weight of the inertia, 1/h² [1/s²].
         load: Part of gravity that acts as a force.
         linear_iterations: The most iterations of a conjugate gradient solve.
@@ -45,20 +48,18 @@ class Minimiser:
         self.sums = Sums(model)
         self.gradient_of, self.energy_of = Gradient(model, corrected=True), Energy(model, self.sums, corrected=True)
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
-        if linear == "automatic":
-            linear = "cg" if model.device.is_cuda else "factorised"
-        iterative = linear == "cg"
-        self.linear = (
-            ConjugateGradients(self.hessian, self.sums, linear_iterations) if iterative else Factorised(self.hessian)
-        )
+        if linear == "cg":
+            self.linear = ConjugateGradients(self.hessian, self.sums, linear_iterations)
+        else:
+            self.linear = Factorised(self.hessian)
         self.correction, self.trial, self.gradient, self.direction, self.right = (model.vectors() for _ in range(5))
         self.work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
 
         def per_copy(dtype):
             return wp.zeros(model.copies, dtype=dtype, device=model.device)
 
-        scalars = (per_copy(wp.float64) for _ in range(6))
-        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square = scalars
+        scalars = (per_copy(wp.float64) for _ in range(7))
+        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square, self.rounding = scalars
         self.active, self.searching = per_copy(wp.int32), per_copy(wp.int32)
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         # Rounding of φ: below this part of it two values do not differ.
@@ -71,6 +72,7 @@ class Minimiser:
     def _find_kernels(self):
         model = self.model
         self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("set_trial", "add_inertia", "negate")}
+        self.kernels["rounding"] = model.kernel(rounding, model.dtype)
         names = ("begin_search", "check_trial", "begin_trial", "end_trial")
         self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in names}
 
@@ -93,9 +95,9 @@ class Minimiser:
         return np.linalg.norm(free, axis=1) * np.linalg.norm(model.gravity.numpy(), axis=1)
 
     def minimise(self, tolerance, iterations):
-        """Iterates until ‖∇φ‖ ≤ ``tolerance``·scale in every copy, or a step is lost in rounding.
+        """Iterates until ‖∇φ‖ ≤ ``tolerance``·scale in every copy, or no more than rounding makes of it.
 
-        The scale of a copy is ‖m g‖ + ‖∇φ(0)‖.
+        The scale of a copy is ‖m g‖ + ‖∇φ(0)‖; rounding counts with ε Σⱼ‖Hᵢⱼ‖‖xⱼ − xᵢ‖ a vertex.
 
         Returns:
             (B,) bool, which copies converged.
@@ -109,8 +111,8 @@ class Minimiser:
         stuck = np.zeros(self.model.copies, dtype=bool)
         self.iterations = 0
         while True:
-            previous, self.residual = self.residual, norm / scale
-            converged = self.residual <= tolerance
+            self.residual = norm / scale
+            converged = norm <= tolerance * scale + (0.0 if self.iterations == 0 else np.sqrt(self.rounding.numpy()))
             active = ~converged & ~stuck & np.isfinite(self.residual)
             if not active.any() or self.iterations == iterations:
                 return converged
@@ -159,6 +161,11 @@ class Minimiser:
     def _launch_assemble(self):
         self.hessian.assemble(self.base, self.s, self.correction)
         self._launch("negate", self.model.count, [self.gradient], [self.right])
+        hessian, model = self.hessian, self.model
+        given = [hessian.offsets, hessian.columns, hessian.values, self.base, np.finfo(model.numpy_dtype).eps]
+        self._launch("rounding", model.count, given, [self.work])
+        model.launch(self.energy_of._sum, self.sums.partial.shape, [self.work, model.per_copy], [self.sums.partial])
+        self.sums.finish(1.0, 0.0, self.rounding)
 
     def _launch_solve(self):
         self.linear.solve(self.right, self.direction)

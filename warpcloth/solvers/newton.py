@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ..capture import Segment
-from ..minimise import POLICIES, Minimiser
+from ..minimise import LINEAR, POLICIES, Minimiser
 from .solver import Result, Step, Stepper, choice, number, refuse_hard, whole
 
 
@@ -15,12 +15,13 @@ class Newton(Step):
 
     Attributes:
         dt, substeps: See :class:`Step`.
-        tolerance: Of the residual ‖∇‖/(‖m g‖ + ‖∇ at x̃‖); float32 ends earlier, where a step is lost in rounding.
+        tolerance: Of the residual ‖∇‖/(‖m g‖ + ‖∇ at x̃‖); a residual no larger than rounding makes it counts as converged,
+            which float32 reaches first.
         iterations: The most Newton iterations a step.
         hessian: What is done where the Hessian is indefinite (Choi and Ko 2002 for springs): ``"adaptive"`` clamps only in
             an iteration whose matrix shows it, ``"clamp"`` and ``"absolute"`` always change each element, ``"raw"`` nothing.
-        linear: ``"factorised"``, ``"cg"`` or ``"automatic"``: factorised on the CPU (2 to 4 times faster there, at 32² to
-            128² vertices), cg on CUDA.
+        linear: ``"cg"``, conjugate gradients no further than the Newton iteration needs, or ``"factorised"`` on the host
+            (4 to 6 times slower at 32² and 64² vertices of the hanging cloth, but for any stiffness).
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -29,14 +30,14 @@ class Newton(Step):
     tolerance: float = 1e-4
     iterations: int = 20
     hessian: str = "adaptive"
-    linear: str = "automatic"
+    linear: str = "cg"
 
     def __post_init__(self):
         super().__post_init__()
         number("tolerance", self.tolerance, above=0.0)
         whole("iterations", self.iterations, 1)
         choice("hessian", self.hessian, tuple(POLICIES))
-        choice("linear", self.linear, ("automatic", "factorised", "cg"))
+        choice("linear", self.linear, LINEAR)
 
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
