@@ -31,9 +31,7 @@ def partial_dot(dtype):
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def dot_chunks(
-        a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), per_copy: int, out: wp.array2d(dtype=wp.float64)
-    ):
+    def dot_chunks(a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), per_copy: int, out: wp.array2d(dtype=wp.float64)):
         copy, chunk = wp.tid()
         total = wp.float64(0.0)
         for i in range(chunk, per_copy, out.shape[1]):

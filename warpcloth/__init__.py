@@ -1,1 +1,22 @@
-"""Cloth simulation: every classic method on the same scene, from energies written once."""
+"""Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
+
+from .mesh import Mesh
+from .scene import Pins, Scene
+from .simulate import Animation, simulate
+from .solvers import PBD, Explicit, Newton
+from .terms import Attachment, DihedralBending, QuadraticBending, Spring
+
+__all__ = [
+    "PBD",
+    "Animation",
+    "Attachment",
+    "DihedralBending",
+    "Explicit",
+    "Mesh",
+    "Newton",
+    "Pins",
+    "QuadraticBending",
+    "Scene",
+    "Spring",
+    "simulate",
+]

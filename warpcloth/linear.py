@@ -94,7 +94,10 @@ class Factorised:
         right = b.numpy().astype(np.float64).ravel()
         try:
             factor = splu(
-                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
+                matrix,
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True, "Equil": False},
             )
         except RuntimeError:  # exactly singular: nothing to step along, and the caller is told
             x.fill_(np.nan)

@@ -71,7 +71,9 @@ class Minimiser:
 
     def _find_kernels(self):
         model = self.model
-        self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("set_trial", "add_inertia", "negate")}
+        self.kernels = {
+            name: model.kernel(getattr(kernels, name), model.dtype) for name in ("set_trial", "add_inertia", "negate")
+        }
         self.kernels["rounding"] = model.kernel(rounding, model.dtype)
         names = ("begin_search", "check_trial", "begin_trial", "end_trial")
         self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in names}

@@ -52,10 +52,10 @@ class Energy:
 
     def __init__(self, model, sums, corrected=False):
         self.model, self.sums = model, sums
-        self.kernels = [model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in model.terms]
-        self.of_elements = [
-            wp.zeros(elements.count, dtype=wp.float64, device=model.device) for elements in model.terms
+        self.kernels = [
+            model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in model.terms
         ]
+        self.of_elements = [wp.zeros(elements.count, dtype=wp.float64, device=model.device) for elements in model.terms]
         self._sum = model.kernel(reduce.partial_sum)
 
     def add(self, x, out, correction=None):
@@ -79,7 +79,9 @@ class Hessian:
     def __init__(self, model, policy=0, corrected=False):
         self.model = model
         device = model.device
-        self.kernels = [model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected) for elements in model.terms]
+        self.kernels = [
+            model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected) for elements in model.terms
+        ]
         self.blocks = [
             wp.zeros((elements.count, elements.term.vertices**2), dtype=model.mat33, device=device)
             for elements in model.terms

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
 
 from ..capture import Segment
 from ..kernels import project as kernels
