@@ -19,7 +19,7 @@ def types(dtype):
 
 @cache
 def local_coordinate(term: Term, dtype, corrected: bool):
-    """The device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ + Σᵢ wᵢ ⊗ dᵢ of a term; without d if not ``corrected``.
+    """The device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ of a term, or with ``corrected`` Σᵢ wᵢ ⊗ (xᵢ + dᵢ).
 
     In float32 the sum x + d would lose the digits of d to the size of x; the difference of neighbouring x is nearly exact.
     """
@@ -29,9 +29,7 @@ def local_coordinate(term: Term, dtype, corrected: bool):
     weight = term.weight
 
     @wp.func
-    def y_of(
-        stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)
-    ):
+    def y_of(stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
         y = y_type()
         for i in range(K):
             w = weight(rest, i)

@@ -14,7 +14,7 @@ from .assemble import types
 @cache
 def set_inertia(dtype):
     """Kernel over vertices: values[diagonal] = scale·m I, and I for a pinned vertex, which thereby stays."""
-    vec3, mat33 = types(dtype)
+    _, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_diagonal(
@@ -36,7 +36,7 @@ def set_inertia(dtype):
 @cache
 def add_blocks(dtype):
     """Kernel over the blocks of the matrix: values[s] += Σ blocks[sources[offsets[s] : offsets[s+1]]], in a fixed order."""
-    vec3, mat33 = types(dtype)
+    _, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_blocks(
@@ -102,12 +102,10 @@ def rounding(dtype):
 @cache
 def invert_diagonal(dtype):
     """Kernel over block rows: inverse[i] = A[i, i]⁻¹, the block Jacobi preconditioner."""
-    vec3, mat33 = types(dtype)
+    _, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def invert_blocks(
-        diagonal: wp.array(dtype=wp.int32), values: wp.array(dtype=mat33), inverse: wp.array(dtype=mat33)
-    ):
+    def invert_blocks(diagonal: wp.array(dtype=wp.int32), values: wp.array(dtype=mat33), inverse: wp.array(dtype=mat33)):
         i = wp.tid()
         inverse[i] = wp.inverse(values[diagonal[i]])
 

@@ -125,9 +125,7 @@ def test_the_random_meshes_cover_all_cases():
     meshes = [random_mesh(seed) for seed in range(30)]
     assert sum(len(mesh.isolated) > 0 for mesh in meshes) > 3
     runs = [set(map(tuple, mesh.triangles[:, [0, 1]])) for mesh in meshes]
-    assert any(
-        (x0, x1) in run for mesh, run in zip(meshes, runs, strict=True) for x0, x1 in mesh.hinges[:, :2].tolist()
-    )
+    assert any((x0, x1) in run for mesh, run in zip(meshes, runs, strict=True) for x0, x1 in mesh.hinges[:, :2].tolist())
 
 
 def test_hinge_orientation():
@@ -569,8 +567,6 @@ def test_bad_files(tmp_path, name, text, kind, message):
 
 
 def test_import_is_light():
-    code = (
-        "import sys, warpcloth.mesh; print({name.split('.')[0] for name in sys.modules} & {'trimesh', 'pxr', 'scipy'})"
-    )
+    code = "import sys, warpcloth.mesh; print({name.split('.')[0] for name in sys.modules} & {'trimesh', 'pxr', 'scipy'})"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "set()"

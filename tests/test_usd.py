@@ -30,9 +30,7 @@ def motion(mesh, frame, sign=1.0):
     """Points [m] and velocities [m/s] that tell the frame, the vertex and the run that they belong to."""
     vertex = np.arange(len(mesh.points))[:, None]
     points = mesh.points + sign * frame * np.array([0.01, -0.02, 0.03]) + 1e-3 * np.sin(vertex + frame)
-    return points, sign * np.stack(
-        [np.full(len(vertex), frame), vertex[:, 0] / len(vertex), -0.5 + vertex[:, 0] % 3], 1
-    )
+    return points, sign * np.stack([np.full(len(vertex), frame), vertex[:, 0] / len(vertex), -0.5 + vertex[:, 0] % 3], 1)
 
 
 def write(output, mesh, frames=FRAMES, fps=24, single_file=False, sign=1.0, **options):
@@ -161,9 +159,7 @@ CASES = [
 ]
 
 
-@pytest.fixture(
-    scope="module", params=CASES, ids=lambda case: f"{case[0].__name__}-{case[1]}-{'one' if case[2] else 'chunks'}"
-)
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case[0].__name__}-{case[1]}-{'one' if case[2] else 'chunks'}")
 def result(request, tmp_path_factory):
     """A written animation: (path, mesh, options, the file alone)."""
     make, ending, single_file = request.param

@@ -41,9 +41,7 @@ class Mesh:
         points = _coordinates("points", self.points, 3)
         n = len(points)
         if (self.triangles is None) == (self.edges is None):
-            raise ValueError(
-                "triangles, edges: give exactly one of the two, for the edges of triangles follow from them"
-            )
+            raise ValueError("triangles, edges: give exactly one of the two, for the edges of triangles follow from them")
         keep = object.__setattr__
         keep(self, "points", _read_only(points))
         if self.triangles is not None:
@@ -102,9 +100,7 @@ class Mesh:
             raise ValueError(f'pattern = {pattern!r}: must be "diagonal", "alternating" or "equilateral"')
         equilateral = pattern == "equilateral"
         if np.shape(size) != () and (equilateral or np.shape(size) != (2,)):
-            raise ValueError(
-                f"size = {size}: must be one length{'' if equilateral else ' or two'} for pattern = {pattern!r}"
-            )
+            raise ValueError(f"size = {size}: must be one length{'' if equilateral else ' or two'} for pattern = {pattern!r}")
         width, depth = (_length("size", length) for length in np.broadcast_to(size, 2).tolist())
 
         column, row = np.meshgrid(np.arange(nx), np.arange(ny))
@@ -120,9 +116,7 @@ class Mesh:
 
         a = (column + nx * row)[:-1, :-1]
         b, c, d = a + 1, a + nx, a + nx + 1
-        mirrored = {"diagonal": column < 0, "alternating": (column + row) % 2 == 1, "equilateral": row % 2 == 0}[
-            pattern
-        ]
+        mirrored = {"diagonal": column < 0, "alternating": (column + row) % 2 == 1, "equilateral": row % 2 == 0}[pattern]
         straight = np.stack([a, c, d, a, d, b], axis=-1)
         triangles = np.where(mirrored[:-1, :-1, None], np.stack([a, c, b, b, c, d], axis=-1), straight).reshape(-1, 3)
         return cls(points, triangles, texture_coordinates=st, grid_shape=None if equilateral else (nx, ny))

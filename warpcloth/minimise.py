@@ -174,9 +174,7 @@ class Minimiser:
 
     def _launch_search(self):
         self.sums.dot(self.gradient, self.direction, self.slope)
-        self._launch(
-            "begin_search", self.model.copies, [self.active], [self.step, self.searching, self.trials, self.proceed]
-        )
+        self._launch("begin_search", self.model.copies, [self.active], [self.step, self.searching, self.trials, self.proceed])
         wp.capture_while(self.proceed, self._try_step)
         wp.copy(self.correction, self.trial)
         wp.copy(self.energy, self.trial_energy)

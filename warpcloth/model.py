@@ -134,9 +134,7 @@ class Model:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _on_device(self, term, positions, vary):
-        copies = [
-            term.elements(self.scene.mesh, start) for start in (positions if vary.has("positions") else positions[:1])
-        ]
+        copies = [term.elements(self.scene.mesh, start) for start in (positions if vary.has("positions") else positions[:1])]
         one = copies[0]
         E = len(one.stencil)
         stencil = one.stencil[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
@@ -149,9 +147,7 @@ class Model:
             kind=one.kind,
             term=one.term,
             per_copy=E,
-            stencil=wp.array(
-                stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), dtype=wp.int32, device=self.device
-            ),
+            stencil=wp.array(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), dtype=wp.int32, device=self.device),
             stiffness=self._broadcast(stiffness, E),
             rest=self.array(rest, wp.types.vector(one.term.parameters, self.dtype)),
             hard=bool(np.isinf(stiffness).any()),

@@ -52,9 +52,7 @@ class Energy:
 
     def __init__(self, model, sums, corrected=False):
         self.model, self.sums = model, sums
-        self.kernels = [
-            model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in model.terms
-        ]
+        self.kernels = [model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in model.terms]
         self.of_elements = [wp.zeros(elements.count, dtype=wp.float64, device=model.device) for elements in model.terms]
         self._sum = model.kernel(reduce.partial_sum)
 
@@ -83,8 +81,7 @@ class Hessian:
             model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected) for elements in model.terms
         ]
         self.blocks = [
-            wp.zeros((elements.count, elements.term.vertices**2), dtype=model.mat33, device=device)
-            for elements in model.terms
+            wp.zeros((elements.count, elements.term.vertices**2), dtype=model.mat33, device=device) for elements in model.terms
         ]
         self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=device)
         self._set_inertia = model.kernel(linear.set_inertia, model.dtype)
@@ -124,9 +121,7 @@ class Hessian:
         """Fills ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal."""
         model = self.model
         self.values.zero_()
-        model.launch(
-            self._set_inertia, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values]
-        )
+        model.launch(self._set_inertia, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values])
         for elements, kernel, blocks, gather in zip(model.terms, self.kernels, self.blocks, self.gathers, strict=True):
             arguments = [*elements.arguments, x, correction, elements.per_copy, self.policy]
             model.launch(kernel, elements.count, arguments, [blocks])

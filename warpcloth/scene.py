@@ -69,15 +69,11 @@ class Scene:
             raise ValueError(f"fps is {self.fps}; it must be a number above 0")
         frames = self.duration * self.fps
         if not (np.isfinite(frames) and frames > 0.0 and abs(frames - round(frames)) < 1e-6 * frames):
-            raise ValueError(
-                f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames, 1 or more"
-            )
+            raise ValueError(f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames, 1 or more")
         keep("terms", tuple(self.terms))
         keep("gravity", _array("gravity", self.gravity, (3,)))
         keep("positions", self.mesh.points if self.positions is None else _array("positions", self.positions, (n, 3)))
-        keep(
-            "velocities", np.zeros((n, 3)) if self.velocities is None else _array("velocities", self.velocities, (n, 3))
-        )
+        keep("velocities", np.zeros((n, 3)) if self.velocities is None else _array("velocities", self.velocities, (n, 3)))
         keep("pins", self._checked_pins(n))
         keep("masses", self._checked_masses(n))
 
@@ -98,9 +94,7 @@ class Scene:
             keyframes = _array("pins.keyframes", keyframes, (count, len(vertices), 3))
             gap = np.abs(keyframes[0] - self.positions[vertices]).max(initial=0.0)
             if gap > 1e-6 * np.ptp(self.positions, axis=0).max():
-                raise ValueError(
-                    f"pins.keyframes[0] is {gap:.3g} m from where the pinned vertices start; it must be there"
-                )
+                raise ValueError(f"pins.keyframes[0] is {gap:.3g} m from where the pinned vertices start; it must be there")
         return Pins(vertices.astype(np.int32), keyframes)
 
     def _checked_masses(self, n):
@@ -117,9 +111,7 @@ class Scene:
         free[self.pins.vertices] = False
         bad = np.flatnonzero(free & ~(masses > 0.0))
         if len(bad):
-            raise ValueError(
-                f"vertex {bad[0]} has mass {masses[bad[0]]} kg; a vertex that is not pinned must have one above 0"
-            )
+            raise ValueError(f"vertex {bad[0]} has mass {masses[bad[0]]} kg; a vertex that is not pinned must have one above 0")
         return masses
 
     @property
@@ -139,8 +131,7 @@ class Scene:
             f"{self.name}: {len(mesh.points)} vertices, {len(mesh.triangles)} triangles, {len(mesh.edges)} edges",
             f"  mass {self.masses.sum():.4g} kg, gravity {self.gravity.tolist()} m/s²",
             f"  {self.duration:g} s in {self.frames} frames of 1/{self.fps:g} s",
-            f"  pins: {len(pins.vertices)}"
-            + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
+            f"  pins: {len(pins.vertices)}" + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
         ]
         return "\n".join(lines + [f"  {_described(term)}" for term in self.terms])
 
@@ -166,7 +157,5 @@ def _described(term):
     for field in fields(term):
         value = getattr(term, field.name)
         if value is not None:
-            parts.append(
-                f"{field.name}={f'array{np.shape(value)}' if np.ndim(value) and np.size(value) > 4 else value!r}"
-            )
+            parts.append(f"{field.name}={f'array{np.shape(value)}' if np.ndim(value) and np.size(value) > 4 else value!r}")
     return f"{type(term).__name__}({', '.join(parts)})"

@@ -54,9 +54,7 @@ class _Reader:
         while column < len(text):
             match = _TOKEN.match(text, column)
             if not match:
-                self.fail(
-                    column, f"unexpected {text[column]!r}, expected a number, a name, a comparison or one of ( ) , :"
-                )
+                self.fail(column, f"unexpected {text[column]!r}, expected a number, a name, a comparison or one of ( ) , :")
             if match.lastgroup != "space":
                 self.tokens.append((match.lastgroup, match.group(), column))
             column = match.end()
@@ -146,9 +144,7 @@ class _Reader:
         above = self.mesh.points[:, axis] - self.number()
         tolerance = _EQUAL * np.linalg.norm(np.ptp(self.mesh.points, axis=0))
         less, greater = above < -tolerance, above > tolerance
-        return {"<": less, "<=": ~greater, "==": ~(less | greater), "!=": less | greater, ">=": ~less, ">": greater}[
-            sign
-        ]
+        return {"<": less, "<=": ~greater, "==": ~(less | greater), "!=": less | greater, ">=": ~less, ">": greater}[sign]
 
     def nearest(self):
         self.require("(")

@@ -171,7 +171,9 @@ class Watch:
             return f"diverged in frame {frame}: vertex {wrong[0] % n} of copy {wrong[0] // n} is not finite"
         speed, limit = self._speed(velocities), 10.0 * (self.start + self.gravity * frame / self.model.scene.fps)
         if speed > limit:
-            return f"diverged in frame {frame}: a mean speed of {speed:.3g} m/s, above the {limit:.3g} m/s that its energy allows"
+            return (
+                f"diverged in frame {frame}: a mean speed of {speed:.3g} m/s, above the {limit:.3g} m/s that its energy allows"
+            )
         ends = points.astype(np.float64).reshape(self.model.copies, n, 3)[:, self.edges]
         lengths = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
         self.worst_strain = max(self.worst_strain, float(np.abs(lengths / self.rest - 1.0).max()))

@@ -202,7 +202,5 @@ def own_stencil(label, parameter, indices, vertices, count):
         wrong |= stencil[:, 0] == stencil[:, 1]
     if wrong.any():
         e = int(np.flatnonzero(wrong)[0])
-        raise ValueError(
-            f"{label}.{parameter}[{e}] is {stencil[e].tolist()}; indices must differ and lie in 0 … {count - 1}"
-        )
+        raise ValueError(f"{label}.{parameter}[{e}] is {stencil[e].tolist()}; indices must differ and lie in 0 … {count - 1}")
     return stencil.astype(np.int32)

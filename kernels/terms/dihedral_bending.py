@@ -107,9 +107,7 @@ def constraint_gradient(y: Any, rest: Any):
             normal = wp.cross(e, y[corner])
             if corner == 2:
                 normal = -normal
-            g -= apex_covector(
-                normal * (wp.length(e) / wp.dot(normal, normal)), wp.dot(y[corner], e) / wp.dot(e, e), corner
-            )
+            g -= apex_covector(normal * (wp.length(e) / wp.dot(normal, normal)), wp.dot(y[corner], e) / wp.dot(e, e), corner)
     return g
 
 
@@ -157,9 +155,7 @@ def curvature(y: Any, scale: Any, policy: int):
         # Lengths of the covectors over the four vertices, so that the split does not depend on which is x₀.
         apex = wp.sqrt(one + foot * foot + (one - foot) * (one - foot)) / height
         edge = wp.sqrt(y.dtype(2.0)) / length
-        h += product(
-            apex_covector(n / height, foot, corner), apex_covector(m / height, foot, corner), one, scale, policy
-        )
+        h += product(apex_covector(n / height, foot, corner), apex_covector(m / height, foot, corner), one, scale, policy)
         sigma = apex_covector(t / height, foot, corner) + edge_covector(m * (half / length))
         ratio = wp.sqrt(apex * apex + y.dtype(0.25) * edge * edge) / edge
         h += product(edge_covector(n / length), sigma, ratio, scale, policy)

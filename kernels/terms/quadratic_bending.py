@@ -27,9 +27,7 @@ def rest_state(points, stencil):
 
     at0 = cotangent(x0, x1, x2), cotangent(x0, x1, x3)
     at1 = cotangent(x1, x0, x2), cotangent(x1, x0, x3)
-    areas = 0.5 * (
-        np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) + np.linalg.norm(np.cross(x1 - x0, x3 - x0), axis=1)
-    )
+    areas = 0.5 * (np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) + np.linalg.norm(np.cross(x1 - x0, x3 - x0), axis=1))
     return np.stack(
         [at1[0] + at1[1], at0[0] + at0[1], -at0[0] - at1[0], -at0[1] - at1[1], 1.0 / areas],
         axis=1,

@@ -76,9 +76,7 @@ class Step:
             return self.substeps
         steps = 1.0 / (fps * self.dt)
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
-            raise ValueError(
-                f"dt is {self.dt:g} s; at fps {fps:g} a frame must be a whole number of steps, not {steps:g}"
-            )
+            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be a whole number of steps, not {steps:g}")
         return round(steps)
 
 

@@ -219,9 +219,7 @@ def _add_pins(geometry, target, pins, count):
             raise ValueError(f"pins: {name!r} must be a name of letters, digits and _, not starting with a digit")
         vertices = np.unique(np.asarray(vertices))
         if len(vertices) and (vertices.dtype.kind not in "iu" or vertices[0] < 0 or vertices[-1] >= count):
-            raise ValueError(
-                f"pins[{name!r}]: {vertices[0]} to {vertices[-1]}, must be whole numbers, 0 to {count - 1}"
-            )
+            raise ValueError(f"pins[{name!r}]: {vertices[0]} to {vertices[-1]}, must be whole numbers, 0 to {count - 1}")
         if target.point_vertices is not None:
             vertices = np.flatnonzero(np.isin(target.point_vertices, vertices))
         UsdGeom.Subset.CreateGeomSubset(

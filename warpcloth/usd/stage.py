@@ -179,9 +179,7 @@ def find_prim(stage, path, prim=None):
     other = next((p for p in prims if str(prim) in (str(p.GetPath()), p.GetName())), None)
     if other:
         raise ValueError(f"{path}, prim {other.GetPath()}: is {other.GetTypeName() or 'untyped'}, must be a Mesh prim")
-    raise ValueError(
-        f"{path}, prim {prim}: there is no such prim, only {_listed(meshes + curves) or 'others, no Mesh'}"
-    )
+    raise ValueError(f"{path}, prim {prim}: there is no such prim, only {_listed(meshes + curves) or 'others, no Mesh'}")
 
 
 def _listed(prims, types=False, most=12):
