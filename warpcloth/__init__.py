@@ -1,5 +1,6 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
+from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
@@ -11,6 +12,7 @@ __all__ = [
     "Animation",
     "Attachment",
     "DihedralBending",
+    "Equilibrium",
     "Explicit",
     "Mesh",
     "Newton",
@@ -18,5 +20,6 @@ __all__ = [
     "QuadraticBending",
     "Scene",
     "Spring",
+    "equilibrium",
     "simulate",
 ]

@@ -85,7 +85,7 @@ class Factorised:
         self.negative = wp.zeros(self.model.copies, dtype=wp.int32, device=self.model.device)
 
     def solve(self, b, x):
-        """x = A⁻¹ b, in double precision; where A is singular, NaN."""
+        """x = A⁻¹ b, in double precision; 0 where A is singular."""
         from scipy.sparse.linalg import splu
 
         model = self.model
@@ -99,10 +99,11 @@ class Factorised:
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True, "Equil": False},
             )
-        except RuntimeError:  # exactly singular: nothing to step along, and the caller is told
-            x.fill_(np.nan)
+        except RuntimeError:  # exactly singular: no direction to step along
+            x.zero_()
             return
-        solution = factor.solve(right)
+        solution = factor.solve(right).reshape(model.copies, -1)
+        solution[~np.isfinite(solution).all(axis=1)] = 0.0
         pivots = np.empty(len(right), dtype=bool)
         pivots[factor.perm_c] = factor.U.diagonal() < 0.0
         self.negative.assign(pivots.reshape(model.copies, -1).any(axis=1).astype(np.int32))

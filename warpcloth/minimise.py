@@ -124,7 +124,8 @@ class Minimiser:
             self._find_direction()
             self._search()
             norm = np.sqrt(self.square.numpy())
-            stuck |= active & (self.step.numpy() == 0.0)
+            # No step was found, or there was none to look for; a gradient that is not finite stays so and is seen above.
+            stuck |= active & ((self.step.numpy() == 0.0) | ~(self.slope.numpy() < 0.0))
             self.iterations += 1
 
     def _find_direction(self):

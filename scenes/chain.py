@@ -1,0 +1,17 @@
+"""A vertical chain of N springs and N equal masses, hung by its upper end: at rest its tip is mg/k·N(N+1)/2 lower."""
+
+import numpy as np
+
+import warpcloth as wc
+
+
+def scene(links: int = 20, length: float = 1.0, mass: float = 0.01, stiffness: float = 1e3, duration: float = 1.0):
+    """Number of springs, length of them all [m], each mass [kg], stiffness of each spring [N/m], duration [s]."""
+    return wc.Scene(
+        wc.Mesh.chain(links + 1, length=length, direction=(0.0, -1.0, 0.0)),
+        masses=np.full(links + 1, mass),
+        terms=[wc.Spring(pairs="edges", stiffness=stiffness)],
+        pins=[0],
+        duration=duration,
+        name="chain",
+    )
