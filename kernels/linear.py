@@ -101,13 +101,21 @@ def rounding(dtype):
 
 @cache
 def invert_diagonal(dtype):
-    """Kernel over block rows: inverse[i] = A[i, i]⁻¹, the block Jacobi preconditioner."""
+    """Kernel over block rows: inverse[i] = A[i, i]⁻¹, the block Jacobi preconditioner; I/‖A[i, i]‖ where that is indefinite.
+
+    Conjugate gradients need a definite preconditioner even where the matrix is not (leading minors, Sylvester).
+    """
     _, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def invert_blocks(diagonal: wp.array(dtype=wp.int32), values: wp.array(dtype=mat33), inverse: wp.array(dtype=mat33)):
         i = wp.tid()
-        inverse[i] = wp.inverse(values[diagonal[i]])
+        block = values[diagonal[i]]
+        minor = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
+        if block[0, 0] <= dtype(0.0) or minor <= dtype(0.0) or wp.determinant(block) <= dtype(0.0):
+            inverse[i] = wp.identity(n=3, dtype=dtype) / wp.sqrt(wp.ddot(block, block))
+        else:
+            inverse[i] = wp.inverse(block)
 
     return invert_blocks
 

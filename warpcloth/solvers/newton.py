@@ -28,7 +28,7 @@ class Newton(Step):
     """
 
     tolerance: float = 1e-4
-    iterations: int = 20
+    iterations: int = 50
     hessian: str = "adaptive"
     linear: str = "cg"
 
