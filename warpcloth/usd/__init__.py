@@ -1,7 +1,8 @@
-"""USD stages: a cloth read from one, an animation written as one. Nothing else in the package imports pxr."""
+"""USD stages: a cloth or a whole scene read from one, an animation written as one. Nothing else here imports pxr."""
 
 from .frames import FrameSequence
+from .scene import read_scene, write_scene
 from .stage import StageMesh, read_mesh, read_stage_mesh
 from .writer import AnimationWriter
 
-__all__ = ["AnimationWriter", "FrameSequence", "StageMesh", "read_mesh", "read_stage_mesh"]
+__all__ = ["AnimationWriter", "FrameSequence", "StageMesh", "read_mesh", "read_scene", "read_stage_mesh", "write_scene"]

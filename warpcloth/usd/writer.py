@@ -174,7 +174,7 @@ class AnimationWriter:
         layer.timeCodesPerSecond = layer.framesPerSecond = self._fps
         layer.startTimeCode, layer.endTimeCode = self._pending[0][0], self._pending[-1][0]
         path = self._run / f"frames_{len(self._chunks):06d}.usdc"
-        _export(layer, path)
+        export(layer, path)
         self._chunks.append((self._pending[0][0], path))
         self._pending = []
         self._write_root()
@@ -183,10 +183,10 @@ class AnimationWriter:
 
     def _start_run(self):
         self._run.mkdir(parents=True, exist_ok=True)
-        _export(self._rest, self._run / "rest.usdc")
+        export(self._rest, self._run / "rest.usdc")
         manifest = Sdf.Layer.CreateAnonymous(".usda")
         _declare(manifest, self._target)
-        _export(manifest, self._run / "manifest.usda")
+        export(manifest, self._run / "manifest.usda")
 
     def _write_root(self):
         folder = Path(self.path).parent
@@ -205,7 +205,7 @@ class AnimationWriter:
         self._describe(layer)
         # Last, for an anonymous layer cannot tell what they are relative to.
         layer.subLayerPaths = [relative_path(path, folder) for path in self._base_paths()]
-        _export(layer, self.path, self._run)
+        export(layer, self.path, self._run)
 
     def _describe(self, layer):
         """Writes on a root layer what is read from root layers only."""
@@ -238,7 +238,7 @@ class AnimationWriter:
             if not UsdUtils.CreateNewUsdzPackage(str(single), str(finished)):
                 raise OSError(f"{finished}: could not be written")
         elif self._output.suffix == ".usda":
-            _export(Sdf.Layer.FindOrOpen(str(single)), finished)
+            export(Sdf.Layer.FindOrOpen(str(single)), finished)
         else:
             os.replace(single, finished)
         os.replace(finished, self._output)
@@ -286,7 +286,7 @@ def _declare(layer, target: Target):
             Sdf.AttributeSpec(prim, name, SAMPLED[name])
 
 
-def _export(layer, path, unfinished_in=None):
+def export(layer, path, unfinished_in=None):
     """Writes a layer under another name first, so that the path has either what was there or the whole layer."""
     path = Path(path)
     unfinished = Path(unfinished_in or path.parent) / f"unfinished{path.suffix}"

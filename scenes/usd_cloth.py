@@ -1,0 +1,30 @@
+"""A real mesh from a stage: the square cloth among Warp's example assets, hung by the two corners of a long side.
+
+The file says 150 m by 100 m, z up: an awning over a street, level at first. The animation is a layer over the file.
+"""
+
+import os
+
+import warp.examples
+
+import warpcloth as wc
+from warpcloth.usd import read_stage_mesh
+
+
+def scene(density: float = 0.5, stiffness: float = 1e6, bending: float = 1.0, duration: float = 1.0):
+    """Density [kg/m²], stiffness of a spring on each edge [N/m], plate bending stiffness [N·m], duration [s]."""
+    stage = read_stage_mesh(os.path.join(warp.examples.get_asset_directory(), "square_cloth.usd"))
+    return wc.Scene(
+        stage.mesh,
+        density=density,
+        terms=[
+            wc.Spring(pairs="edges", stiffness=stiffness),
+            wc.QuadraticBending(stiffness=bending),
+        ],
+        pins=stage.mesh.corners()[:2],
+        gravity=(0.0, 0.0, -9.81),
+        duration=duration,
+        fps=stage.time_codes_per_second,
+        name="usd_cloth",
+        stage=stage,
+    )

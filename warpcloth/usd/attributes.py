@@ -1,0 +1,180 @@
+"""Whole scenes as USD stages: which attribute of a stage is which field of a scene, read and written by one table.
+
+A cloth is a Mesh prim (or linear BasisCurves) with attributes. For a linen cloth, by hand:
+
+    double warpcloth:density = 0.15
+    token warpcloth:terms:threads:type = "Spring"
+    token warpcloth:terms:threads:pairs = "edges"
+    double warpcloth:terms:threads:stiffness = 1000
+    token warpcloth:terms:bending:type = "QuadraticBending"
+    double warpcloth:terms:bending:stiffness = 1e-5
+
+Our own names stand on the cloth's prim. They are in SI whatever the units of the stage, in world space, and as precise as
+the scene. Standard names are read where they stand, in the units of the stage; where both are authored ours are taken.
+Attributes that cloth tools keep to themselves (their tension, shear and bending) have no names in USD, and are not guessed;
+neither is a spring stiffness from `physics:youngsModulus`, nor per-point `physics:masses`.
+
+What else a stage says:
+
+- Rest shape: the default points. Animated points: the cloth starts at the first frame's, and pinned vertices follow them.
+- Pins: all GeomSubsets of points in the family "pins", together.
+- Frames per second: the stage's framesPerSecond, else its timeCodesPerSecond. Duration: `warpcloth:duration`, else the
+  whole frames from start to end time code, else 1 s.
+- Gravity: `warpcloth:gravity`, else the PhysicsScene's, else 9.81 m/s² down the stage's up axis.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """One row of the table.
+
+    Attributes:
+        field: Field of `Scene`, `Pins` ("pins.…"), a term ("terms.…") or `Mesh` ("mesh.…"); in brackets what a field is
+            computed from.
+        name: Name of the attribute; <name> is any name for a term.
+        place: Where it stands: "cloth", the prim; "body", it or the nearest prim above with PhysicsDeformableBodyAPI;
+            "material", the physics material bound to it; "physics scene".
+        types: Types that it may have, of any precision; the first for one value, the last for several.
+        kilograms, metres: Powers of kilogramsPerUnit and metersPerUnit that make it SI.
+    """
+
+    field: str
+    name: str
+    place: str
+    types: tuple
+    kilograms: int = 0
+    metres: int = 0
+
+
+_T = Sdf.ValueTypeNames
+ATTRIBUTES = (
+    # Our own. Of one field, those that are first here are taken first.
+    Attribute("name", "warpcloth:name", "cloth", (_T.String,)),
+    Attribute("density", "warpcloth:density", "cloth", (_T.Double,)),
+    Attribute("masses", "warpcloth:masses", "cloth", (_T.DoubleArray,)),
+    Attribute("positions", "warpcloth:positions", "cloth", (_T.Double3Array,)),
+    Attribute("velocities", "warpcloth:velocities", "cloth", (_T.Double3Array,)),
+    Attribute("gravity", "warpcloth:gravity", "cloth", (_T.Double3,)),
+    Attribute("duration", "warpcloth:duration", "cloth", (_T.Double,)),
+    # Places of the pinned vertices, those of lower index first, a time sample for each frame.
+    Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", (_T.Double3Array,)),
+    Attribute("terms.type", "warpcloth:terms:<name>:type", "cloth", (_T.Token,)),
+    # Only where <name> is not the name of the term; empty where it has none.
+    Attribute("terms.name", "warpcloth:terms:<name>:name", "cloth", (_T.String,)),
+    Attribute("terms.stiffness", "warpcloth:terms:<name>:stiffness", "cloth", (_T.Double, _T.DoubleArray)),
+    Attribute("terms.pairs", "warpcloth:terms:<name>:pairs", "cloth", (_T.Token, _T.TokenArray, _T.Int2Array)),
+    Attribute("terms.rest_lengths", "warpcloth:terms:<name>:restLengths", "cloth", (_T.Double, _T.DoubleArray)),
+    Attribute("terms.vertices", "warpcloth:terms:<name>:vertices", "cloth", (_T.String, _T.IntArray)),
+    Attribute("terms.targets", "warpcloth:terms:<name>:targets", "cloth", (_T.Double3Array,)),
+    # What the prim's own points and curves lose. Used while they agree with these: an artist's edit wins.
+    Attribute("mesh.points", "warpcloth:points", "cloth", (_T.Double3Array,)),  # in the prim's own space
+    Attribute("mesh.edges", "warpcloth:edges", "cloth", (_T.Int2Array,)),  # of curves, in order
+    Attribute("mesh.grid_shape", "warpcloth:gridShape", "cloth", (_T.Int2,)),
+    # Standard: UsdPhysics, and the AOUSD proposal for deformable bodies.
+    Attribute("(total mass)", "physics:mass", "body", (_T.Float,), kilograms=1),  # spread evenly
+    Attribute("(mass per volume)", "physics:density", "body", (_T.Float,), kilograms=1, metres=-3),
+    Attribute("(mass per volume)", "physics:density", "material", (_T.Float,), kilograms=1, metres=-3),
+    Attribute("(thickness)", "physics:surfaceThickness", "material", (_T.Float,), metres=1),  # 1 mm where not given
+    # A spring of this stiffness on each edge: an approximation, whose stretch and shear depend on the triangulation.
+    Attribute("(stretch stiffness)", "physics:surfaceStretchStiffness", "material", (_T.Float,), kilograms=1),
+    Attribute("(bend stiffness)", "physics:surfaceBendStiffness", "material", (_T.Float,), kilograms=1, metres=2),
+    Attribute("(gravity direction)", "physics:gravityDirection", "physics scene", (_T.Vector3f,)),
+    Attribute("(gravity magnitude)", "physics:gravityMagnitude", "physics scene", (_T.Float,), metres=1),
+)
+
+# Attributes of a term, whose names say which it is.
+TERMS_NAMESPACE = "warpcloth:terms"
+
+
+class Values:
+    """The attributes of a cloth by their field, in SI.
+
+    Raises:
+        ValueError: A name in our namespace is not in the table.
+    """
+
+    def __init__(self, stage, cloth):
+        self.kilograms = UsdPhysics.GetStageKilogramsPerUnit(stage)
+        self.metres = UsdGeom.GetStageMetersPerUnit(stage)
+        self.places = {"cloth": cloth, "body": _body(cloth)}
+        self.places["material"] = UsdShade.MaterialBindingAPI(cloth).ComputeBoundMaterial("physics")[0].GetPrim()
+        names = [attribute.GetName() for attribute in cloth.GetAuthoredPropertiesInNamespace("warpcloth")]
+        # In the order of the prim's properties, which is that of their names where nothing else is said.
+        self.terms = list(dict.fromkeys(name.split(":")[2] for name in names if name.startswith(f"{TERMS_NAMESPACE}:")))
+        known = {row.name.replace("<name>", key) for row in ATTRIBUTES for key in self.terms or [""]}
+        unknown = sorted(set(names) - known)
+        if unknown:
+            allowed = ", ".join(row.name for row in ATTRIBUTES if row.name.startswith("warpcloth:"))
+            raise ValueError(f"{unknown[0]} is no attribute of a cloth, must be one of {allowed}")
+
+    def authored(self, field, key=None):
+        """The authored attributes of a field as (row, Usd.Attribute), those to be taken first at first.
+
+        Raises:
+            ValueError: An attribute has another type than its row.
+        """
+        for row in ATTRIBUTES:
+            prim = self.places.get(row.place) if row.field == field else None
+            attribute = prim and prim.GetAttribute(row.name.replace("<name>", str(key)))
+            if attribute and attribute.HasAuthoredValue():
+                if _kind(attribute.GetTypeName()) not in [_kind(type_name) for type_name in row.types]:
+                    types = " or ".join(str(type_name) for type_name in row.types)
+                    raise ValueError(f"{attribute.GetName()} has type {attribute.GetTypeName()}, must be {types}")
+                yield row, attribute
+
+    def get(self, field, key=None):
+        """The value of a field as a number, text, tuple of texts or array; None where nothing is said."""
+        for row, attribute in self.authored(field, key):
+            value = attribute.Get(Usd.TimeCode.EarliestTime())
+            if isinstance(value, str):
+                return value
+            if isinstance(value, (Vt.TokenArray, Vt.StringArray)):
+                return tuple(value)
+            value = np.array(value)[()]
+            # UsdPhysics and the proposal say 0 for a mass, density or stiffness that is not given.
+            if row.place not in ("body", "material") or value != 0:
+                scale = self.kilograms**row.kilograms * self.metres**row.metres
+                return value if scale == 1 else value * scale
+        return None
+
+
+def _kind(type_name):
+    """What a type holds, whatever its precision: text or numbers, one or several, how many components."""
+    default = type_name.scalarType.defaultValue
+    return isinstance(default, str), type_name.isArray, np.shape(default)
+
+
+def has_api(prim, name):
+    """Whether an API schema is applied, by name: the deformable ones need not be registered."""
+    return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+
+
+def _body(cloth):
+    prim = cloth
+    while prim and not has_api(prim, "PhysicsDeformableBodyAPI"):
+        prim = prim.GetParent()
+    return prim or cloth
+
+
+def author(cloth, field, value, key=None, time=None):
+    """Writes a value under the name and as the type that the table has for its field."""
+    row = next(row for row in ATTRIBUTES if row.field == field)
+    if isinstance(value, str) or np.ndim(value) == 0:
+        type_name = row.types[0]
+        value = value if isinstance(value, str) else float(value)
+    elif isinstance(value[0], str):
+        type_name, value = _T.TokenArray, Vt.TokenArray([str(text) for text in value])
+    else:
+        type_name = row.types[-1]
+        whole = np.asarray(type_name.scalarType.defaultValue).dtype.kind == "i"
+        shape = np.shape(type_name.scalarType.defaultValue)
+        array = np.ascontiguousarray(value, np.int32 if whole else np.float64)
+        sequence = type(type_name.defaultValue)
+        value = sequence.FromNumpy(array.reshape(-1, *shape)) if type_name.isArray else sequence(*array.tolist())
+    attribute = cloth.CreateAttribute(row.name.replace("<name>", str(key)), type_name)
+    attribute.Set(value, Usd.TimeCode.Default() if time is None else time)

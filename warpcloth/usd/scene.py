@@ -1,0 +1,331 @@
+"""Whole scenes read from USD stages and written as such. What stands where is said in `attributes`."""
+
+import os
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics
+
+from ..mesh import Mesh
+from ..scene import Pins, Scene
+from ..terms import TERMS, QuadraticBending, Spring
+from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
+from .layers import scene_layer
+from .stage import find_prim, first_points, open_stage, read_stage_mesh
+from .writer import export
+
+_EARTH = 9.81  # [m/s²]
+_THICKNESS = 1e-3  # [m], what the proposal says where there is none
+
+
+def read_scene(path, prim=None):
+    """Reads a scene from a stage; `simulate` then writes its animation as a layer over that stage.
+
+    Args:
+        path: A .usd, .usda, .usdc or .usdz file.
+        prim: Path or name of the cloth's prim; may be left out where there is one mesh, or one with cloth attributes.
+
+    Returns:
+        Scene: With `stage` set. A result of `write_scene` gives the scene that was written, up to: the order of pins, which
+        is that of their indices; texture coordinates, which are float32, and of meshes of edges alone are lost.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: As `read_stage_mesh`; there is no mass or no term; an attribute has another type than the table says, a
+            value that a scene or term refuses, or a name in the namespace "warpcloth" that is not in the table.
+    """
+    stage = open_stage(path)
+    cloth = _cloth_prim(stage, path, prim)
+    surroundings = read_stage_mesh(path, str(cloth.GetPath()))
+    try:
+        return _scene(stage, cloth, surroundings)
+    except ValueError as error:
+        raise ValueError(f"{path}, prim {cloth.GetPath()}: {error}") from error
+
+
+def _scene(stage, cloth, surroundings):
+    values = Values(stage, cloth)
+    rest = surroundings.mesh.points
+    surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
+    mesh = surroundings.mesh
+    fps = surroundings.fps or surroundings.time_codes_per_second
+    duration = _duration(stage, values, fps)
+    density, masses, terms = _density(values, mesh), values.get("masses"), _terms(values, mesh)
+    _refuse_missing(density is not None or masses is not None, len(terms) > 0)
+    vertices = _pinned(cloth, surroundings)
+    positions, keyframes = _motion(values, cloth, surroundings, vertices, round(duration * fps), fps)
+    if positions is not None and np.array_equal(positions, rest):
+        positions = None
+    own_positions, name = values.get("positions"), values.get("name")
+    scene = Scene(
+        mesh,
+        density=density,
+        masses=masses,
+        positions=positions if own_positions is None else own_positions,
+        velocities=values.get("velocities"),
+        terms=terms,
+        pins=Pins(vertices, keyframes),
+        gravity=_gravity(stage, values, surroundings.up_axis),
+        duration=duration,
+        fps=fps,
+        name=cloth.GetName() if name is None else name,
+        stage=surroundings,
+    )
+    for term in terms:
+        term.elements(mesh, scene.positions)  # refuses now, when the file is known, what would be refused later
+    return scene
+
+
+def _refuse_missing(mass, term):
+    wanted = {
+        "mass": (mass, ("density", "masses", "(total mass)", "(mass per volume)")),
+        "term": (term, ("terms.type", "(stretch stiffness)", "(bend stiffness)")),
+    }
+    missing = [
+        f"{what} ({', '.join(dict.fromkeys(row.name for row in ATTRIBUTES if row.field in read_from))})"
+        for what, (given, read_from) in wanted.items()
+        if not given
+    ]
+    if missing:
+        raise ValueError(f"has no {' and no '.join(missing)}, must have a mass and a term to be a cloth")
+
+
+def _cloth_prim(stage, path, prim):
+    """The prim that is named, or the only one with cloth attributes, or what `find_prim` takes."""
+    if prim is None:
+        cloths = [
+            found
+            for found in stage.Traverse(Usd.TraverseInstanceProxies())
+            if found.IsA(UsdGeom.PointBased)
+            and (found.GetAuthoredPropertiesInNamespace("warpcloth") or has_api(found, "PhysicsSurfaceDeformableSimAPI"))
+        ]
+        prim = cloths[0].GetPath() if len(cloths) == 1 else None
+    return find_prim(stage, path, prim)
+
+
+def _exact_mesh(values, cloth, surroundings):
+    """The mesh with what the prim's float32 points and its curves lose, where that still agrees with them."""
+    mesh, transform = surroundings.mesh, surroundings.transform
+    points, edges, grid_shape = (values.get(f"mesh.{name}") for name in ("points", "edges", "grid_shape"))
+    if points is not None:
+        stored = UsdGeom.PointBased(cloth).GetPointsAttr().Get()
+        stored = np.array([] if stored is None else stored, dtype=np.float32)
+        if surroundings.point_vertices is not None and len(stored):
+            stored = stored[first_points(surroundings.point_vertices)]
+        same = np.array_equal(points.astype(np.float32), stored)
+        points = points @ transform[:3, :3] + transform[3, :3] if same else None
+    if edges is not None and not np.array_equal(np.unique(np.sort(edges, axis=1), axis=0), np.sort(mesh.edges, axis=1)):
+        edges = None
+    if points is None and edges is None and grid_shape is None:
+        return mesh
+    return Mesh(
+        mesh.points if points is None else points,
+        triangles=mesh.triangles if len(mesh.triangles) else None,
+        edges=None if len(mesh.triangles) else mesh.edges if edges is None else edges,
+        texture_coordinates=mesh.texture_coordinates,
+        grid_shape=None if grid_shape is None else tuple(grid_shape.tolist()),
+    )
+
+
+def _duration(stage, values, fps):
+    """Seconds: our own, else the whole frames from start to end time code, else 1."""
+    duration = values.get("duration")
+    if duration is None:
+        seconds = stage.GetEndTimeCode() - stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
+        return max(0.0, np.floor(seconds / stage.GetTimeCodesPerSecond() * fps * (1 + 1e-9)) / fps) or 1.0
+    if not 0.0 < duration < np.inf:
+        raise ValueError(f"warpcloth:duration is {duration} s, must be finite and above 0")
+    return float(duration)
+
+
+def _density(values, mesh):
+    """Mass per area (of curves: per length), ours or from the standard names; or None."""
+    density = values.get("density")
+    if density is not None or values.get("masses") is not None:
+        return density
+    total, per_volume = values.get("(total mass)"), values.get("(mass per volume)")
+    if total is not None:
+        return total / (mesh.vertex_areas if len(mesh.triangles) else mesh.vertex_lengths).sum()
+    if len(mesh.triangles) and per_volume is not None:
+        thickness = values.get("(thickness)")
+        return per_volume * (_THICKNESS if thickness is None else thickness)
+    return None
+
+
+def _terms(values, mesh):
+    """Our own terms, or else those of a surface material."""
+    terms = [_term(values, key) for key in values.terms]
+    if not terms and len(mesh.triangles):
+        stretch, bend = values.get("(stretch stiffness)"), values.get("(bend stiffness)")
+        terms += [] if stretch is None else [Spring(pairs="edges", stiffness=float(stretch))]
+        terms += [] if bend is None else [QuadraticBending(stiffness=float(bend))]
+    return terms
+
+
+def _term(values, key):
+    prefix = f"{TERMS_NAMESPACE}:{key}"
+    given = {}
+    for row in ATTRIBUTES:
+        if row.name.startswith(f"{TERMS_NAMESPACE}:"):
+            value = values.get(row.field, key)
+            given |= {} if value is None else {row.field.removeprefix("terms."): value}
+    kind = given.pop("type", None)
+    if kind not in TERMS:
+        raise ValueError(f"{prefix}:type is {'not given' if kind is None else repr(kind)}, must be one of {', '.join(TERMS)}")
+    wrong = sorted(set(given) - {field.name for field in fields(TERMS[kind])})
+    if wrong:
+        raise ValueError(f"{prefix} has {wrong[0]}, which a {kind} has not; it must have none")
+    if "stiffness" not in given:
+        raise ValueError(f"{prefix}:stiffness is not given, must be a number or one for each element")
+    if np.ndim(given["stiffness"]) == 0:
+        given["stiffness"] = float(given["stiffness"])
+    # A term without a name of its own is called by its kind.
+    given["name"] = given.get("name", "" if key == kind else key) or None
+    return TERMS[kind](**given)
+
+
+def _pinned(cloth, surroundings):
+    """Sorted vertices of all GeomSubsets of points in the family "pins"."""
+    subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(cloth), UsdGeom.Tokens.point, "pins")
+    pins = [surroundings.pins[subset.GetPrim().GetName()] for subset in subsets]
+    return np.unique(np.concatenate([np.empty(0, np.int32), *pins]))
+
+
+def _motion(values, cloth, surroundings, vertices, frames, fps):
+    """What animated points say: where the cloth starts (n, 3), and keyframes (F, p, 3) of the pinned vertices; or None."""
+    animated = UsdGeom.PointBased(cloth).GetPointsAttr()
+    own = next(values.authored("pins.keyframes"), None)
+    positions = keyframes = None
+    if animated.GetNumTimeSamples():
+        positions = next(_frames(animated, surroundings, 0, fps))
+        if len(vertices) and own is None:
+            keyframes = np.array([points[vertices] for points in _frames(animated, surroundings, frames, fps)])
+            keyframes = None if (keyframes == keyframes[0]).all() else keyframes
+    if own is not None:
+        keyframes = [np.array(value) for value in _samples(own[1], surroundings, np.inf, fps)]
+        wrong = [len(places) for places in keyframes if len(places) != len(vertices)]
+        if wrong:
+            raise ValueError(f"{own[0].name} has {wrong[0]} places, must have one for each of {len(vertices)} pinned vertices")
+    return positions, keyframes
+
+
+def _frames(attribute, surroundings, frames, fps):
+    """Animated points of a prim, frame by frame, as positions of the mesh (n, 3) [m] in world space."""
+    shown = np.arange(len(surroundings.mesh.points))
+    if surroundings.point_vertices is not None:
+        shown = first_points(surroundings.point_vertices)
+    for value in _samples(attribute, surroundings, frames, fps):
+        if len(value) <= shown[-1]:
+            raise ValueError(f"points has {len(value)} points at a time sample, must have the same as at rest")
+        yield np.array(value, np.float64)[shown] @ surroundings.transform[:3, :3] + surroundings.transform[3, :3]
+
+
+def _samples(attribute, surroundings, frames, fps):
+    """Values of an attribute at frames 0, 1, …, up to a number of frames and no further than its last sample."""
+    rate = surroundings.time_codes_per_second / fps
+    start = surroundings.start or 0.0
+    samples = attribute.GetTimeSamples()
+    last = np.ceil((samples[-1] - start) / rate * (1 - 1e-9)) if samples else 0
+    return (attribute.Get(start + frame * rate) for frame in range(int(np.clip(last, 0, frames)) + 1))
+
+
+def _gravity(stage, values, up_axis):
+    gravity = values.get("gravity")
+    if gravity is not None:
+        return gravity
+    scenes = [prim for prim in stage.Traverse() if prim.IsA(UsdPhysics.Scene)]
+    if len(scenes) > 1:
+        raise ValueError(f"the stage has {len(scenes)} PhysicsScenes, must have one or warpcloth:gravity on the cloth")
+    values.places["physics scene"] = scenes[0] if scenes else None
+    direction, magnitude = values.get("(gravity direction)"), values.get("(gravity magnitude)")
+    if direction is None or not direction.any():
+        direction = np.array((0.0, 0.0, -1.0) if up_axis == "Z" else (0.0, -1.0, 0.0))
+    if magnitude is None or magnitude < 0:  # as UsdPhysics has it: a negative value asks for that of the earth
+        magnitude = _EARTH
+    return magnitude * direction.astype(np.float64) / np.linalg.norm(direction)
+
+
+def write_scene(scene, path):
+    """Writes a scene as a stage of its own: /World/Cloth at rest, in metres, with all of the scene as attributes.
+
+    Args:
+        scene: The `Scene`. One that was read from a stage is written without the rest of that stage.
+        path: File to write: .usd, .usda or .usdc.
+
+    Returns:
+        str: The path.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ValueError: The path has another ending or is the stage that the scene was read from, or the scene has no terms.
+        OSError: The file could not be written.
+    """
+    path = Path(os.path.abspath(path))
+    if path.suffix not in (".usd", ".usda", ".usdc"):
+        raise ValueError(f"path = {path}: must end with one of .usd, .usda, .usdc")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"path = {path}: the folder {path.parent} does not exist")
+    if scene.stage is not None and os.path.realpath(path) == os.path.realpath(scene.stage.path):
+        raise ValueError(f"path = {path}: is the stage that the scene was read from, which must not be changed")
+    if not scene.terms:
+        raise ValueError("scene.terms is empty; a scene in a stage must have one or more")
+    up_axis = scene.stage.up_axis if scene.stage else "Z" if np.argmax(np.abs(scene.gravity)) == 2 else "Y"
+    pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
+    layer, target, _ = scene_layer(scene.mesh, pins, up_axis, "Cloth")
+    stage = Usd.Stage.Open(layer)
+    stage.SetTimeCodesPerSecond(scene.fps)
+    stage.SetFramesPerSecond(scene.fps)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(scene.frames)
+    cloth = stage.GetPrimAtPath(target.prim)
+    for field, value in _scene_values(scene).items():
+        author(cloth, field, value)
+    if scene.pins.keyframes is not None:
+        order = np.argsort(scene.pins.vertices)
+        for frame, places in enumerate(scene.pins.keyframes[:, order]):
+            author(cloth, "pins.keyframes", places, time=frame)
+    keys = _term_keys(scene.terms)
+    for key, term in zip(keys, scene.terms, strict=True):
+        kind = type(term).__name__
+        given = {field.name: getattr(term, field.name) for field in fields(term)}
+        given["name"] = None if (term.name or "") == ("" if key == kind else key) else term.name or ""
+        for field, value in {"type": kind, **given}.items():
+            if value is not None:
+                author(cloth, f"terms.{field}", value, key)
+    # USD sorts properties by name, and this is how it is told of another order.
+    cloth.SetPropertyOrder([f"{TERMS_NAMESPACE}:{key}:type" for key in keys])
+    export(layer, path)
+    return str(path)
+
+
+def _scene_values(scene):
+    """All that is to be written of a scene and its mesh but for terms and pins, by field."""
+    mesh = scene.mesh
+    given = {"name": scene.name, "duration": scene.duration, "gravity": scene.gravity}
+    given |= {"masses": scene.masses} if scene.density is None else {"density": scene.density}
+    if not np.array_equal(scene.positions, mesh.points):
+        given["positions"] = scene.positions
+    if scene.velocities.any():
+        given["velocities"] = scene.velocities
+    if not np.array_equal(mesh.points, mesh.points.astype(np.float32)):
+        given["mesh.points"] = mesh.points
+    if not len(mesh.triangles) and not np.array_equal(mesh.edges, np.unique(np.sort(mesh.edges, axis=1), axis=0)):
+        given["mesh.edges"] = mesh.edges
+    if mesh.grid_shape:
+        given["mesh.grid_shape"] = mesh.grid_shape
+    return given
+
+
+def _term_keys(terms):
+    """For each term a name that an attribute can have: its own, or else its kind, counted where that is taken."""
+    keys = []
+    for term in terms:
+        kind = type(term).__name__
+        key = term.name if term.name and Sdf.Path.IsValidIdentifier(term.name) and term.name != kind else kind
+        number = 1
+        while key in keys:
+            number += 1
+            key = f"{kind}_{number}"
+        keys.append(key)
+    return keys
