@@ -57,9 +57,10 @@ def simulate(
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
         frames: Number of frames, if not those of the scene.
-        copies, vary: See :class:`warpcloth.model.Model`; ``output`` takes one copy.
+        copies: See :class:`warpcloth.model.Model`; ``output`` takes one copy.
+        vary: See :class:`warpcloth.model.Model`.
         single_file: Whether ``output`` is to be one file in the end, with nothing beside it.
-        progress: Function called with (frame, frames) after each frame, or None.
+        progress: Function called with (frame, frames) once each frame is kept, from 0, the start, on; or None.
 
     Returns:
         :class:`Animation`. A run that diverges ends with its last good frame and says so in ``status``.
@@ -72,15 +73,19 @@ def simulate(
         raise ValueError(f"frames is {frames!r}; it must be a whole number of 1 or more")
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
+    # First, for it refuses a wrong output before anything compiles.
+    recorder = None if output is None else _File(scene, output, single_file)
     start = time.perf_counter()
     model = scene.build(device=device, dtype=dtype, copies=copies, vary=vary)
     stepper = solver.bind(model)
     timings = {"compile": time.perf_counter() - start, "frames": []}
-    recorder = _Memory(model, frames) if output is None else _File(scene, output, single_file)
+    recorder = recorder or _Memory(model, frames)
     watch = Watch(model)
     status = None
     try:
         recorder.append(*_frame(stepper))
+        if progress is not None:
+            progress(0, frames)
         for frame in range(1, frames + 1):
             began = time.perf_counter()
             for _ in range(stepper.steps_per_frame):

@@ -10,6 +10,8 @@ from ..kernels import step as kernels
 from ..operators import Gradient, Hessian
 from .solver import Step, Stepper, choice, refuse_hard
 
+_INSTEAD = "PBD takes hard constraints, or give a finite stiffness"
+
 
 @dataclass(frozen=True)
 class Explicit(Step):
@@ -44,7 +46,7 @@ class Explicit(Step):
         Raises:
             ValueError: If the step is above the limit and that is not allowed, or a stiffness is infinite.
         """
-        refuse_hard(model, "Explicit", "PBD takes hard constraints, or give a finite stiffness")
+        refuse_hard(model, "Explicit", _INSTEAD)
         stepper = ExplicitStepper(self, model)
         if self.above_limit == "refuse":
             self._refuse_unstable(model, stepper.h)
@@ -80,10 +82,14 @@ def step_limits(model):
 
     Returns:
         (rest, motion); infinite where nothing is stiff.
+
+    Raises:
+        ValueError: If a stiffness is infinite.
     """
     from scipy.sparse import diags
     from scipy.sparse.linalg import eigsh
 
+    refuse_hard(model, "Explicit", _INSTEAD)
     hessian = Hessian(model)
     rest_shape = np.tile(model.scene.mesh.points, (model.copies, 1))
     hessian.assemble(model.array(rest_shape, model.vec3), 0.0)
