@@ -1,6 +1,7 @@
 """Flat square nets of equal masses and equal springs, and what is known of them."""
 
 import numpy as np
+from scipy.sparse import csr_array
 
 import warpcloth as wc
 
@@ -21,12 +22,10 @@ def net(kind, n=40, stiffness=1.0, **scene):
 
 
 def jacobian(scene):
-    """J (E, 3n) of the lengths of a net's springs at rest, dense."""
-    pairs = scene.terms[0].stencil(scene.mesh)
-    points = scene.mesh.points
+    """J (E, 3n) of the lengths of a net's springs at rest."""
+    pairs, points = scene.terms[0].stencil(scene.mesh), scene.mesh.points
     directions = points[pairs[:, 1]] - points[pairs[:, 0]]
     directions /= np.linalg.norm(directions, axis=1)[:, None]
-    J = np.zeros((len(pairs), len(points), 3))
-    J[np.arange(len(pairs)), pairs[:, 0]] = -directions
-    J[np.arange(len(pairs)), pairs[:, 1]] = directions
-    return J.reshape(len(pairs), -1)
+    columns = 3 * pairs[:, :, None] + np.arange(3)
+    values = np.stack([-directions, directions], axis=1)
+    return csr_array((values.ravel(), columns.ravel(), np.arange(len(pairs) + 1) * 6), shape=(len(pairs), 3 * len(points)))

@@ -1,9 +1,14 @@
 """Solvers against closed forms: oscillators, free fall, momentum, limits of stability, convergence."""
 
+import io
+import re
+
 import numpy as np
 import pytest
 import warp as wp
 from nets import NETS, jacobian, net
+from scipy.sparse import diags
+from scipy.sparse.linalg import eigsh
 
 import warpcloth as wc
 from warpcloth.capture import Segment, on_host
@@ -72,9 +77,9 @@ def test_oscillator_keeps_its_invariant(method, omega_h, device):
 @pytest.mark.parametrize("name", SOLVERS)
 def test_free_fall(name, dtype, device):
     """y_n = −g h² n(n+1)/2 for every method, and no strain."""
-    scene = square(duration=1.0)
+    scene = square(fps=600.0)
     stepper = SOLVERS[name].bind(scene.build(device=device, dtype=dtype))
-    start, steps = scene.mesh.points, 30
+    start, steps = scene.mesh.points, 300
     for _ in range(steps):
         stepper.step()
     drop = stepper.state.x.numpy() - start
@@ -87,10 +92,10 @@ def test_free_fall(name, dtype, device):
 
 @pytest.mark.parametrize(
     ("name", "angular"),
-    [("explicit", True), ("newton", False), ("pbd plain", True)],  # averaging by vertex keeps neither
+    [("explicit", True), ("newton", False), ("pbd plain", False)],  # averaging by vertex keeps neither
 )
 def test_momentum_is_conserved(name, angular, device):
-    """Inner forces cancel: P is kept; symplectic Euler and plain PBD keep L too, implicit Euler loses it by itself."""
+    """Inner forces cancel: P is kept; symplectic Euler keeps L too, implicit Euler and PBD lose it in x_new − x_old."""
     rng = np.random.default_rng(1)
     scene = square(gravity=(0.0, 0.0, 0.0), fps=600.0, duration=1.0, velocities=rng.normal(size=(36, 3)))
     stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
@@ -145,12 +150,9 @@ def test_plain_jacobi_converges_exactly_below_its_limit(kind, device):
     n = 40
     scene = net(kind, n=n, stiffness=np.inf)
     J = jacobian(scene)
-    diagonal = (J * J).sum(axis=1)
-    v = np.random.default_rng(0).normal(size=len(J))
-    for _ in range(3000):
-        v = J @ (J.T @ v) / diagonal
-        largest = np.linalg.norm(v)
-        v /= largest
+    diagonal = J.multiply(J).sum(axis=1)
+    largest, v = eigsh(diags(diagonal**-0.5) @ J @ J.T @ diags(diagonal**-0.5), k=1, which="LA", v0=np.ones(len(diagonal)))
+    largest, v = largest[0], diagonal**-0.5 * v[:, 0]
     assert largest == pytest.approx(NETS[kind][2], abs=0.011)
     # The mode that grows first, small enough for the springs to be linear.
     start = scene.mesh.points + 1e-6 * (J.T @ v).reshape(-1, 3)
@@ -170,20 +172,19 @@ def test_plain_jacobi_converges_exactly_below_its_limit(kind, device):
 def test_averaged_jacobi_converges(alpha, device):
     """(Σx_new + αx)/(n + α) converges for every α ≥ 0, and α damps it."""
     scene = net("shear", n=10, stiffness=np.inf)
-    rng = np.random.default_rng(0)
-    start = scene.mesh.points + 0.05 * rng.normal(size=scene.mesh.points.shape)
+    pairs = scene.terms[0].stencil(scene.mesh)
+    rest = np.linalg.norm(np.diff(scene.mesh.points[pairs], axis=1)[:, 0], axis=1)
+    start = scene.mesh.points + 0.05 * np.random.default_rng(0).normal(size=scene.mesh.points.shape)
     violations = []
-    for iterations in (1, 100, 2000):
+    for iterations in (1, 100, 1000, 10_000):
         moved = net("shear", n=10, stiffness=np.inf, positions=start)
         stepper = wc.PBD(substeps=1, iterations=iterations, alpha=alpha).bind(moved.build(device=device, dtype="float64"))
         stepper.step()
-        pairs = scene.terms[0].stencil(scene.mesh)
         x = stepper.state.x.numpy()
         lengths = np.linalg.norm(x[pairs[:, 1]] - x[pairs[:, 0]], axis=1)
-        rest = np.linalg.norm(np.diff(scene.mesh.points[pairs], axis=1)[:, 0], axis=1)
         violations.append(np.sqrt(np.mean((lengths - rest) ** 2)))
-    assert violations[1] < 0.5 * violations[0]
-    assert violations[2] < 0.2 * violations[1]
+    # The net buckles, and what is left falls like a power of the sweeps (measured −0.67 for all α), so never to rounding.
+    assert (np.array(violations[1:]) < 0.5 * np.array(violations[:-1])).all()
 
 
 @pytest.mark.parametrize("iterations", [1, 3, 10])
@@ -191,21 +192,21 @@ def test_averaged_jacobi_converges(alpha, device):
 def test_pbd_hangs_too_long_by_the_known_amount(iterations, substeps, device):
     """Static extension g h²(1−s)ⁿ/(1−(1−s)ⁿ) with s = w/(w + 1/(kh²)): PBD's stiffness depends on n and on h."""
     k, m, fps = 50.0, 0.1, 60.0
+    h = 1 / (fps * substeps)
+    s = (1 / m) / (1 / m + 1 / (k * h**2))
+    expected = 9.81 * h**2 * (1 - s) ** iterations / (1 - (1 - s) ** iterations)
     scene = wc.Scene(
         PAIR,
         masses=[m, m],
-        positions=[[0.0, 0.0, 0.0], [0.0, -1.0, 0.0]],
+        positions=[[0.0, 0.0, 0.0], [0.0, -1.0 - expected, 0.0]],
         terms=[wc.Spring(stiffness=k)],
         pins=[0],
-        duration=10.0,
         fps=fps,
     )
     stepper = wc.PBD(substeps=substeps, iterations=iterations).bind(scene.build(device=device, dtype="float64"))
-    for _ in range(600 * substeps):
+    for _ in range(20):
         stepper.step()
-    s = (1 / m) / (1 / m + 1 / (k * stepper.h**2))
-    expected = 9.81 * stepper.h**2 * (1 - s) ** iterations / (1 - (1 - s) ** iterations)
-    assert -1 - stepper.state.x.numpy()[1, 1] == pytest.approx(expected, rel=1e-9)
+    assert -1 - stepper.state.x.numpy()[1, 1] == pytest.approx(expected, rel=1e-12)
 
 
 def tensioned():
@@ -228,8 +229,8 @@ def test_newton_converges_quadratically(linear, device):
         stepper.step()
         residuals.append(stepper.residual)
     assert residuals[-1] <= 1e-12
-    r = np.array([value for value in residuals if value > 1e-11])
-    assert len(r) >= 3
+    r = np.unique([value for value in residuals if value > 1e-13])[::-1]
+    assert len(r) >= 4
     # Order from three iterates in a row, log r₂/r₁ over log r₁/r₀; CG stops at r times its right side, which keeps it at 2.
     orders = np.log(r[2:] / r[1:-1]) / np.log(r[1:-1] / r[:-2])
     assert orders[-1] > 1.7
@@ -332,10 +333,19 @@ def test_a_step_allocates_nothing(name, device):
     stepper = SOLVERS[name].bind(square(fps=600.0, pins="corners").build(device=device, dtype="float64"))
     stepper.step()
     with wp.ScopedMemoryTracker("steps", print=False) as tracker:
-        tracker.clear()
-        for _ in range(10):
-            stepper.step()
-        assert tracker.get_stats()["total_alloc_count"] == 0
+        assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1, "the tracker sees an allocation"
+        assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
+
+
+def allocations(tracker, work):
+    """Number of Warp allocations while ``work`` runs."""
+    tracker.clear()
+    keep = work()
+    report = io.StringIO()
+    tracker.report(file=report)
+    del keep
+    found = re.search(r"Total allocations: +(\d+)", report.getvalue())
+    return int(found[1]) if found else 0
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -377,7 +387,7 @@ def test_moving_pins_follow_their_keyframes(device):
         seen = []
         for _ in range(12):
             stepper.step()
-            seen.append(stepper.state.x.numpy()[0])
+            seen.append(stepper.state.x.numpy()[0].copy())
         exact = [np.interp(np.minimum(np.arange(1, 13) / 4, 2), range(3), keyframes[:, 0, i]) for i in range(3)]
         assert np.allclose(seen, np.transpose(exact), atol=4 * EPS)
         assert np.allclose(stepper.state.v.numpy()[0], 0.0)

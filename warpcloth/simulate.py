@@ -110,7 +110,7 @@ def simulate(
 def _frame(stepper):
     """Points and velocities on the host, (B·n, 3)."""
     on_host(stepper.model.device, "reading a frame")
-    return stepper.state.x.numpy(), stepper.state.v.numpy()
+    return np.array(stepper.state.x.numpy()), np.array(stepper.state.v.numpy())  # on the CPU numpy() is a view
 
 
 def _status(stepper, frames):
