@@ -69,11 +69,14 @@ def undefined(y: Any):
 
 @wp.func
 def constraint(y: Any, rest: Any):
-    c = rest[0] * rest.dtype(0.0)
+    c = wp.ddot(y, y * y.dtype(0.0))  # 0, and NaN where y is
     if not undefined(y):
-        n1 = wp.normalize(wp.cross(y[0], y[1]))
-        n2 = wp.normalize(wp.cross(y[2], y[0]))
-        c = wp.atan2(wp.dot(wp.cross(n1, n2), wp.normalize(y[0])), wp.dot(n1, n2)) - rest[0]
+        # Not wp.normalize, which makes 0 of NaN.
+        n1 = wp.cross(y[0], y[1])
+        n2 = wp.cross(y[2], y[0])
+        n1 /= wp.length(n1)
+        n2 /= wp.length(n2)
+        c = wp.atan2(wp.dot(wp.cross(n1, n2), y[0]) / wp.length(y[0]), wp.dot(n1, n2)) - rest[0]
         if c > rest.dtype(wp.pi):
             c -= rest.dtype(2.0 * wp.pi)
         if c <= -rest.dtype(wp.pi):
@@ -150,7 +153,7 @@ def curvature(y: Any, scale: Any, policy: int):
             normal = -normal
         height = wp.length(normal) / length
         foot = wp.dot(y[corner], e) / (length * length)
-        n = wp.normalize(normal)
+        n = normal / wp.length(normal)
         m = (y[corner] - foot * e) / height
         # Lengths of the covectors over the four vertices, so that the split does not depend on which is x₀.
         apex = wp.sqrt(one + foot * foot + (one - foot) * (one - foot)) / height
