@@ -15,7 +15,7 @@ For the triangle with apex distance vector a = s e + h m (m ⟂ e the way to the
 found by rotating both normals with the edge (parallel transport), where only their difference counts.
 ∂²u = ∂θ∂θᵀ + (θ − θ̄)∂²θ is semi-definite only for θ = θ̄.
 
-An apex closer to the line of the edge than 1e-6 of its distance from x₀ has no normal: C = 0 and no force there.
+A triangle no higher than 1e-6 of its longest side has no normal: C = 0 and no force there.
 θ − θ̄ is wrapped into (−π, π]; it jumps when a hinge passes through folded flat.
 """
 
@@ -58,13 +58,15 @@ def measure(rest: Any):
 
 
 @wp.func
-def has_no_normal(e: Any, a: Any, normal: Any):
-    return wp.dot(normal, normal) <= e.dtype(1.0e-12) * wp.dot(e, e) * wp.dot(a, a)
+def has_no_normal(e: Any, a: Any):
+    normal = wp.cross(e, a)
+    longest = wp.max(wp.max(wp.dot(e, e), wp.dot(a, a)), wp.dot(a - e, a - e))
+    return wp.length(normal) <= e.dtype(1.0e-6) * longest
 
 
 @wp.func
 def undefined(y: Any):
-    return has_no_normal(y[0], y[1], wp.cross(y[0], y[1])) or has_no_normal(y[0], y[2], wp.cross(y[0], y[2]))
+    return has_no_normal(y[0], y[1]) or has_no_normal(y[0], y[2])
 
 
 @wp.func
