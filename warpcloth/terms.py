@@ -125,7 +125,8 @@ class QuadraticBending(_Declared):
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh. A grid with one diagonal a
-            cell is 3 times as stiff across its diagonals, one with alternating diagonals 1 to 1.5 times.
+            cell is 3 times as stiff where it curves along its diagonals, as stiff where it folds about them or curves along
+            its rows, and 0.75 times 15° off the rows away from them; one with alternating diagonals is 1 to 1.5 times.
         name: To tell two terms of one kind apart.
     """
 
