@@ -155,7 +155,7 @@ class Model:
 
     def _broadcast(self, stiffness, E):
         """(B, 1) or (B, E) values as an array (B·E,), of stride 0 where all are one value."""
-        if np.ptp(stiffness) > 0.0 or len(stiffness) * stiffness.shape[1] == self.copies * E:
+        if (stiffness != stiffness[0, 0]).any() or len(stiffness) * stiffness.shape[1] == self.copies * E:
             return self.array(np.broadcast_to(stiffness, (self.copies, E)).ravel(), self.dtype)
         value = self.array(stiffness[0, :1], self.dtype)
         array = wp.array(ptr=value.ptr, shape=(self.copies * E,), strides=(0,), dtype=self.dtype, device=self.device)
