@@ -81,25 +81,30 @@ class Stencils(NamedTuple):
     def launch(self, kernel, *arguments):
         wp.launch(kernel, dim=len(self.x), inputs=list(arguments), device=self.device)
 
-    def energy(self):
+    def state(self, factory, correction):
+        """The kernel of a factory, its elements, and the places, with a correction d (E, K, 3) or without."""
+        corrected = () if correction is None else (True,)
+        d = None if correction is None else self.places(correction)
+        return factory(self.term, self.scalar, *corrected), *self.elements, self.places(), d
+
+    def energy(self, correction=None):
         """(E,) [J]."""
         out = wp.zeros(len(self.x), dtype=wp.float64, device=self.device)
-        self.launch(assemble.energy(self.term, self.scalar), *self.elements, self.places(), None, out)
+        self.launch(*self.state(assemble.energy, correction), out)
         return out.numpy()
 
-    def gradient(self):
+    def gradient(self, correction=None):
         """(E, K, 3) [N]."""
         out = self.places(np.zeros_like(self.x))
-        self.launch(assemble.scatter_gradient(self.term, self.scalar), *self.elements, self.places(), None, out)
+        self.launch(*self.state(assemble.scatter_gradient, correction), out)
         return out.numpy().reshape(self.x.shape)
 
-    def hessian(self, policy=RAW):
+    def hessian(self, policy=RAW, correction=None):
         """(E, 3K, 3K) [N/m]."""
         E, K = self.x.shape[:2]
         out = wp.zeros((E, K * K), dtype=assemble.types(self.scalar)[1], device=self.device)
         policies = wp.array([int(policy)], dtype=wp.int32, device=self.device)
-        kernel = assemble.hessian_blocks(self.term, self.scalar)
-        self.launch(kernel, *self.elements, self.places(), None, E, policies, out)
+        self.launch(*self.state(assemble.hessian_blocks, correction), E, policies, out)
         return out.numpy().reshape(E, K, K, 3, 3).transpose(0, 1, 3, 2, 4).reshape(E, 3 * K, 3 * K)
 
     def correction(self, inverse_mass, h):
@@ -313,6 +318,69 @@ def test_single_precision_rounds_double(term, scale, device):
     assert (norms(single.gradient() - double.gradient()) <= error * stiff).all()
     for policy in HessianPolicy:
         assert (norms(single.hessian(policy) - double.hessian(policy)) <= 10 * error * stiff / length).all()
+
+
+@every_term
+@every_dtype
+def test_a_correction_is_a_move(term, dtype, device):
+    """At x corrected by d all is as at x + d."""
+    elements = stencils(term, "random", 1.0, dtype, device)
+    correction = np.random.default_rng(10).normal(scale=0.03, size=elements.x.shape).astype(dtype)
+    moved = elements.at(elements.x + correction)
+    stiff, length = norms(moved.hessian()), smallest_length(moved.x)
+    error = FEW * eps(dtype) * np.abs(moved.x).max() * stiff
+    force = norms(moved.gradient())
+    assert (norms(elements.gradient(correction) - moved.gradient()) <= error).all()
+    assert (abs(elements.energy(correction) - moved.energy()) <= error / stiff * (force + error)).all()
+    assert (norms(elements.hessian(RAW, correction) - moved.hessian()) <= 10 * error / length).all()
+    assert (norms(elements.gradient() - moved.gradient()) > error).all(), "the correction is well above rounding"
+
+
+# --- rest
+
+
+@every_term
+@every_dtype
+@pytest.mark.parametrize("scale", SCALES)
+def test_no_force_at_rest(term, scale, dtype, device):
+    """An irregular flat sheet at rest: y is rounded by eps|x|, so the force by the Hessian times that."""
+    points = scale * np.round(rest_mesh().points * [1.0, 0.0, 1.0], 4)
+    indices = ON_MESH[term.vertices](rest_mesh())
+    rest, stiffness = term.rest_state(points, indices), np.ones(len(indices))
+    elements = Stencils(term, points[indices].astype(dtype), rest, stiffness, dtype, device)
+    error = FEW * eps(dtype) * np.abs(points).max() * norms(elements.hessian())
+    assert (norms(elements.gradient()) <= error).all() and (error > 0.0).all()
+
+
+def test_both_bending_energies_are_one_at_small_angles(device):
+    """A flat hinge of any shape, bent by θ: ½c|e|²θ²/(A₁ + A₂) to second order in θ."""
+    quadratic, dihedral = (next(term for term in CATALOGUE if term.name == name) for name in BENDING)
+    angle = 0.01
+    random = np.random.default_rng(11)
+    flat = EQUILATERAL + random.normal(scale=0.1, size=(50, 4, 3)) * [1.0, 1.0, 0.0]
+    e = unit(flat[:, 1] - flat[:, 0])
+    arm = flat[:, 3] - flat[:, 0]
+    foot = np.sum(arm * e, axis=1, keepdims=True) * e
+    bent = flat.copy()
+    bent[:, 3] = flat[:, 0] + foot + np.cos(angle) * (arm - foot) + np.sin(angle) * np.cross(e, arm - foot)
+    indices = np.arange(200).reshape(50, 4)
+    areas = sum(0.5 * np.linalg.norm(np.cross(flat[:, 1] - flat[:, 0], flat[:, i] - flat[:, 0]), axis=1) for i in (2, 3))
+    expected = 0.5 * 2.0 * np.sum((flat[:, 1] - flat[:, 0]) ** 2, axis=1) / areas * angle**2
+    for term in (quadratic, dihedral):
+        energy = Stencils(term, bent, term.rest_state(flat.reshape(-1, 3), indices), np.full(50, 2.0), device=device).energy()
+        assert (abs(energy - expected) <= angle**2 * expected).all()
+
+
+@every_dtype
+def test_a_collapsing_spring_still_pushes(dtype, device):
+    """Its force is k L however short it is; at l = 0 there is no direction, and none."""
+    spring = next(term for term in CATALOGUE if term.name == "Spring")
+    lengths, rest_length = np.array([1e-2, 1e-6, 1e-11, 0.0]), 2.0
+    x = np.zeros((4, 2, 3), dtype=dtype)
+    x[:, 1, 1] = lengths
+    elements = Stencils(spring, x, np.full((4, 1), rest_length), np.full(4, 3.0), dtype, device)
+    expected = 3.0 * (lengths - rest_length) * (lengths > 0.0)
+    assert np.allclose(elements.gradient()[:, 1, 1], expected, rtol=FEW * eps(dtype), atol=0.0)
 
 
 # --- invariance
@@ -829,6 +897,24 @@ def test_hessian_matrix_is_differences_of_the_gradient(device):
     n = len(held) // 2
     assert (matrix[:n, n:] == 0.0).all() and (matrix[n:, :n] == 0.0).all()
     assert np.linalg.norm(matrix[:n, :n] - matrix[n:, n:]) > 0.1 * np.linalg.norm(matrix)
+
+
+def test_each_copy_has_its_policy(device):
+    mesh = wc.Mesh.grid(4, 3, pattern="alternating")
+    x = 0.8 * mesh.points + np.random.default_rng(9).normal(scale=0.05, size=mesh.points.shape)
+    model = model_of(mesh, x, device=device, copies=3)
+
+    def blocks(policy):
+        hessian = Hessian(model)
+        hessian.policy.assign(np.array(policy, dtype=np.int32))
+        hessian.assemble(model.positions, 0.0)
+        matrix = hessian.matrix().toarray()
+        return [matrix[i : i + len(matrix) // 3, i : i + len(matrix) // 3] for i in range(0, len(matrix), len(matrix) // 3)]
+
+    mixed = blocks([RAW, CLAMP, ABSOLUTE])
+    for b, policy in enumerate(HessianPolicy):
+        assert (mixed[b] == blocks([policy] * 3)[b]).all()
+    assert np.linalg.eigvalsh(mixed[0])[0] < 0.0 and (mixed[0] != mixed[1]).any() and (mixed[1] != mixed[2]).any()
 
 
 # --- what a bending stiffness means
