@@ -579,12 +579,12 @@ def test_policies_are_semidefinite(term, state, dtype, device):
     # 0 ≤ clamp ≤ absolute, and both ≥ ±raw: they bound the energy from above to second order.
     for matrices in (clamp, clamp - raw, absolute - clamp, absolute + raw):
         assert (lowest(matrices) >= -error).all()
-    semidefinite = lowest(raw) >= error if term.name == "DihedralBending" else lowest(raw) >= -error
+    semidefinite = lowest(raw) >= -error
     assert (norms(clamp - raw)[semidefinite] <= error[semidefinite]).all()
     assert (norms(absolute - raw)[semidefinite] <= error[semidefinite]).all()
     assert (norms(clamp - raw)[~semidefinite] > error[~semidefinite]).all()
-    if term.name == "Spring":
-        assert semidefinite.any() and not semidefinite.all() if state == "random" else True
+    if term.name == "Spring" and state == "random":
+        assert semidefinite.any() and not semidefinite.all(), "both kinds are tested"
 
 
 @every_dtype
