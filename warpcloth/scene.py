@@ -71,6 +71,9 @@ class Scene:
         if not (np.isfinite(frames) and frames > 0.0 and abs(frames - round(frames)) < 1e-6 * frames):
             raise ValueError(f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames, 1 or more")
         keep("terms", tuple(self.terms))
+        for i, term in enumerate(self.terms):
+            if not hasattr(term, "elements"):
+                raise ValueError(f"terms[{i}] is {term!r}; it must be an energy, such as Spring(stiffness=1e3)")
         keep("gravity", _array("gravity", self.gravity, (3,)))
         keep("positions", self.mesh.points if self.positions is None else _array("positions", self.positions, (n, 3)))
         keep("velocities", np.zeros((n, 3)) if self.velocities is None else _array("velocities", self.velocities, (n, 3)))
@@ -80,9 +83,11 @@ class Scene:
     def _checked_pins(self, n):
         pins = self.pins if isinstance(self.pins, Pins) else Pins([] if self.pins is None else self.pins)
         vertices = self.mesh.select(pins.vertices) if isinstance(pins.vertices, str) else np.asarray(pins.vertices)
-        vertices = vertices.astype(np.int32) if len(vertices) == 0 else vertices
+        vertices = vertices.astype(np.int32) if vertices.size == 0 else vertices
         if vertices.ndim != 1 or vertices.dtype.kind not in "iu":
-            raise ValueError(f"pins.vertices has type {vertices.dtype}; it must be a list of whole numbers")
+            raise ValueError(
+                f"pins.vertices has shape {vertices.shape} and type {vertices.dtype}; it must be a list of whole numbers"
+            )
         wrong = np.flatnonzero((vertices < 0) | (vertices >= n))
         if len(wrong):
             raise ValueError(f"pins.vertices[{wrong[0]}] is {vertices[wrong[0]]}; it must lie in 0 … {n - 1}")
@@ -90,7 +95,7 @@ class Scene:
             raise ValueError("pins.vertices names a vertex twice; each may stand once")
         keyframes = pins.keyframes
         if keyframes is not None:
-            count = len(keyframes) if np.ndim(keyframes) == 3 else 1
+            count = max(len(keyframes), 1) if np.ndim(keyframes) == 3 else 1
             keyframes = _array("pins.keyframes", keyframes, (count, len(vertices), 3))
             gap = np.abs(keyframes[0] - self.positions[vertices]).max(initial=0.0)
             if gap > 1e-6 * np.ptp(self.positions, axis=0).max():
@@ -157,5 +162,6 @@ def _described(term):
     for field in fields(term):
         value = getattr(term, field.name)
         if value is not None:
-            parts.append(f"{field.name}={f'array{np.shape(value)}' if np.ndim(value) and np.size(value) > 4 else value!r}")
+            shown = f"array{np.shape(value)}" if np.ndim(value) and np.size(value) > 4 else repr(value)
+            parts.append(f"{field.name}={shown}")
     return f"{type(term).__name__}({', '.join(parts)})"

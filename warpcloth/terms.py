@@ -55,11 +55,16 @@ class _Declared:
             :class:`Elements`.
 
         Raises:
-            ValueError: If the stiffness is negative or NaN, or has another length than the elements.
+            ValueError: If the mesh has none, or the stiffness is negative or NaN, or has another length than the elements.
         """
         label = self.name or type(self).__name__
         stencil = self.stencil(mesh)
-        stiffness = np.asarray(self.stiffness, dtype=np.float64)
+        if len(stencil) == 0:
+            raise ValueError(f"{label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
+        try:
+            stiffness = np.asarray(self.stiffness, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"{label}.stiffness is {self.stiffness!r}; it must be numeric") from None
         if stiffness.shape not in ((), (len(stencil),)):
             raise ValueError(
                 f"{label}.stiffness has shape {stiffness.shape}; it must be one number or one for each of the "
@@ -125,7 +130,8 @@ class QuadraticBending(_Declared):
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh. A grid with one diagonal a
-            cell is 3 times as stiff across its diagonals, one with alternating diagonals 1 to 1.5 times.
+            cell is 3 times as stiff where it curves along its diagonals, as stiff where it folds about them or curves along
+            its rows, and 0.75 times 15° off the rows away from them; one with alternating diagonals is 1 to 1.5 times.
         name: To tell two terms of one kind apart.
     """
 

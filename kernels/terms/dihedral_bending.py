@@ -15,7 +15,7 @@ For the triangle with apex distance vector a = s e + h m (m ⟂ e the way to the
 found by rotating both normals with the edge (parallel transport), where only their difference counts.
 ∂²u = ∂θ∂θᵀ + (θ − θ̄)∂²θ is semi-definite only for θ = θ̄.
 
-An apex closer to the line of the edge than 1e-6 of its distance from x₀ has no normal: C = 0 and no force there.
+A triangle no higher than 1e-6 of its longest side has no normal: C = 0 and no force there.
 θ − θ̄ is wrapped into (−π, π]; it jumps when a hinge passes through folded flat.
 """
 
@@ -58,22 +58,27 @@ def measure(rest: Any):
 
 
 @wp.func
-def has_no_normal(e: Any, a: Any, normal: Any):
-    return wp.dot(normal, normal) <= e.dtype(1.0e-12) * wp.dot(e, e) * wp.dot(a, a)
+def has_no_normal(e: Any, a: Any):
+    normal = wp.cross(e, a)
+    longest = wp.max(wp.max(wp.dot(e, e), wp.dot(a, a)), wp.dot(a - e, a - e))
+    return wp.length(normal) <= e.dtype(1.0e-6) * longest
 
 
 @wp.func
 def undefined(y: Any):
-    return has_no_normal(y[0], y[1], wp.cross(y[0], y[1])) or has_no_normal(y[0], y[2], wp.cross(y[0], y[2]))
+    return has_no_normal(y[0], y[1]) or has_no_normal(y[0], y[2])
 
 
 @wp.func
 def constraint(y: Any, rest: Any):
-    c = rest[0] * rest.dtype(0.0)
+    c = wp.ddot(y, y * y.dtype(0.0))  # 0, and NaN where y is
     if not undefined(y):
-        n1 = wp.normalize(wp.cross(y[0], y[1]))
-        n2 = wp.normalize(wp.cross(y[2], y[0]))
-        c = wp.atan2(wp.dot(wp.cross(n1, n2), wp.normalize(y[0])), wp.dot(n1, n2)) - rest[0]
+        # Not wp.normalize, which makes 0 of NaN.
+        n1 = wp.cross(y[0], y[1])
+        n2 = wp.cross(y[2], y[0])
+        n1 /= wp.length(n1)
+        n2 /= wp.length(n2)
+        c = wp.atan2(wp.dot(wp.cross(n1, n2), y[0]) / wp.length(y[0]), wp.dot(n1, n2)) - rest[0]
         if c > rest.dtype(wp.pi):
             c -= rest.dtype(2.0 * wp.pi)
         if c <= -rest.dtype(wp.pi):
@@ -150,7 +155,7 @@ def curvature(y: Any, scale: Any, policy: int):
             normal = -normal
         height = wp.length(normal) / length
         foot = wp.dot(y[corner], e) / (length * length)
-        n = wp.normalize(normal)
+        n = normal / wp.length(normal)
         m = (y[corner] - foot * e) / height
         # Lengths of the covectors over the four vertices, so that the split does not depend on which is x₀.
         apex = wp.sqrt(one + foot * foot + (one - foot) * (one - foot)) / height
