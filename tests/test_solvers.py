@@ -344,7 +344,7 @@ def allocations(tracker, work):
     report = io.StringIO()
     tracker.report(file=report)
     del keep
-    found = re.search(r"Total allocations: +(\d+)", report.getvalue())
+    found = re.search(r"Total allocations:\s+\S+\s+(\d+)", report.getvalue())
     return int(found[1]) if found else 0
 
 

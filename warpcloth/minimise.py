@@ -10,6 +10,10 @@ from .kernels.term import HessianPolicy
 from .linear import ConjugateGradients, Factorised
 from .operators import Energy, Gradient, Hessian, Sums
 
+# Increase of φ, relative, that the approximate Wolfe condition takes for rounding (the value of Hager and Zhang 2005).
+NOISE = 1e-6
+# Roundings that a force takes: of the lengths, of the strain, of the products and of the sum over a vertex's elements.
+ROUNDINGS = 4.0
 # Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
 HALVINGS = 30
 
@@ -62,8 +66,6 @@ class Minimiser:
         self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square, self.rounding = scalars
         self.active, self.searching = per_copy(wp.int32), per_copy(wp.int32)
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
-        # Rounding of φ: below this part of it two values do not differ.
-        self.noise = 64.0 * float(np.finfo(model.numpy_dtype).eps)
         self._find_kernels()
         self._record()
         self.weight_of_gravity = self._weight_of_gravity()
@@ -99,7 +101,7 @@ class Minimiser:
     def minimise(self, tolerance, iterations):
         """Iterates until ‖∇φ‖ ≤ ``tolerance``·scale in every copy, or no more than rounding makes of it.
 
-        The scale of a copy is ‖m g‖ + ‖∇φ(0)‖; rounding counts with ε Σⱼ‖Hᵢⱼ‖‖xⱼ − xᵢ‖ a vertex.
+        The scale of a copy is ‖m g‖ + ‖∇φ(0)‖; rounding counts with 4ε Σⱼ‖Hᵢⱼ‖‖xⱼ − xᵢ‖ a vertex.
 
         Returns:
             (B,) bool, which copies converged.
@@ -114,7 +116,9 @@ class Minimiser:
         self.iterations = 0
         while True:
             self.residual = norm / scale
-            converged = norm <= tolerance * scale + (0.0 if self.iterations == 0 else np.sqrt(self.rounding.numpy()))
+            converged = norm <= tolerance * scale + (
+                0.0 if self.iterations == 0 else ROUNDINGS * np.sqrt(self.rounding.numpy())
+            )
             active = ~converged & ~stuck & np.isfinite(self.residual)
             if not active.any() or self.iterations == iterations:
                 return converged
@@ -184,7 +188,7 @@ class Minimiser:
     def _try_step(self):
         self._launch_trial()
         self._launch("begin_trial", 1, [], [self.trials, HALVINGS, self.proceed])
-        given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
+        given = [self.energy, self.trial_energy, self.slope, self.trial_slope, NOISE, self.trials, HALVINGS]
         self._launch("check_trial", self.model.copies, given, [self.step, self.searching, self.proceed])
         self._launch("end_trial", 1, [self.trials, HALVINGS], [self.proceed])
 

@@ -118,6 +118,8 @@ def _status(stepper, frames):
     message = result.value
     if result is Result.ITERATIONS_USED_UP:
         message = f"iterations used up in a step or more, largest residual {residual:.2g}"
+    elif result is Result.CONVERGED and residual > stepper.options.tolerance:
+        message = f"converged as far as rounding allows, largest residual {residual:.2g}"
     return Status(result, frames, residual, message)
 
 

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from ..capture import Segment
 from ..minimise import LINEAR, POLICIES, Minimiser
 from .solver import Result, Step, Stepper, choice, number, refuse_hard, whole
@@ -62,7 +64,7 @@ class NewtonStepper(Stepper):
         self._predict()
         converged = self.minimiser.minimise(self.options.tolerance, self.options.iterations)
         self._finish()
-        self.residual = max(self.residual, float(self.minimiser.residual.max()))
+        self.residual = float(np.maximum(self.residual, self.minimiser.residual.max()))  # keeps NaN
         if not converged.all():
             self.result = Result.ITERATIONS_USED_UP
         elif self.result is Result.COMPLETED:

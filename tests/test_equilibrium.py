@@ -1,0 +1,108 @@
+"""Rest shapes against closed forms: the heavy elastica, a hanging chain, the elastic catenary."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+from elastica import ASPECT, aspect
+
+import warpcloth as wc
+
+GAMMAS = (0.1, 1.0, 5.0, 10.0, 20.0, 50.0)
+
+
+def scene(name, **parameters):
+    return import_module(f"warpcloth.scenes.{name}").scene(**parameters)
+
+
+def tip_aspect(scene, points):
+    """H/W between the middle of the pinned vertices and the mean of the ends of the rows."""
+    rest = scene.mesh.points[:, 0]
+    spacing = np.unique(rest.round(9))[1]  # of vertices along the strip: half an edge, or a row
+    tip = points[rest > rest.max() - 1.5 * spacing].mean(axis=0)
+    clamp = 0.5 * rest[scene.pins.vertices].max()
+    return -tip[1] / (tip[0] - clamp)
+
+
+@pytest.mark.parametrize("gamma", ASPECT)
+def test_table_of_the_elastica(gamma):
+    assert aspect(gamma) == pytest.approx(ASPECT[gamma], rel=1e-7)
+
+
+@pytest.mark.parametrize("bending", ["quadratic", "dihedral"])
+@pytest.mark.parametrize("gamma", GAMMAS)
+def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
+    """One row of triangles bends with 8/9 of D: H/W at 9Γ/8 to 0.2 %, at second order in the mesh size."""
+    errors = []
+    for elements in (20, 40, 80):
+        strip = scene("cantilever", gamma=gamma, elements=elements, bending=bending, stretching=1e6)
+        rest = wc.equilibrium(strip, device=device)
+        assert rest.status.ok and rest.status.message == "converged"
+        errors.append(abs(tip_aspect(strip, rest.points) / aspect(9 * gamma / 8) - 1.0))
+    assert errors[2] < 0.002
+    orders = np.log2(errors[0] / errors[1]), np.log2(errors[1] / errors[2])
+    print(f"{bending} Γ={gamma:g}: errors {errors}, orders {orders}")
+    assert min(orders) > 1.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bending", ["quadratic", "dihedral"])
+@pytest.mark.parametrize("gamma", GAMMAS)
+def test_a_wide_sheet_is_the_elastica(gamma, bending, device):
+    """As wide as long and nearly inextensible its edges stay flat: H/W at Γ to 1.5 %."""
+    sheet = scene("cantilever", gamma=gamma, width=1.0, elements=30, bending=bending)
+    rest = wc.equilibrium(sheet, device=device)
+    assert rest.status.message == "converged"
+    error = tip_aspect(sheet, rest.points) / ASPECT[gamma] - 1.0
+    print(f"{bending} Γ={gamma:g}: {error:+.3%}, {rest.iterations} iterations")
+    assert abs(error) < 0.015
+
+
+@pytest.mark.parametrize("links", [1, 5, 20])
+def test_a_hanging_chain(links, device):
+    """N springs k and N masses m: the tip hangs (mg/k)·N(N+1)/2 lower."""
+    k, m = 1e3, 0.01
+    chain = scene("chain", links=links, mass=m, stiffness=k)
+    rest = wc.equilibrium(chain, tolerance=1e-13, device=device)
+    extension = -rest.points[-1, 1] - 1.0
+    assert extension == pytest.approx(m * 9.81 / k * links * (links + 1) / 2, rel=1e-9)
+
+
+@pytest.mark.parametrize(("stretching", "sag"), [(1e4, 0.29240076), (1e2, 0.29792987)])
+def test_an_elastic_catenary(stretching, sag, device):
+    """Sag of the continuous cable at second order in the number of links."""
+    errors = []
+    for links in (50, 100, 200):
+        rest = wc.equilibrium(scene("catenary", links=links, stretching=stretching), device=device)
+        assert rest.status.message == "converged"
+        errors.append(-rest.points[:, 1].min() / sag - 1.0)
+    orders = np.log2(errors[0] / errors[1]), np.log2(errors[1] / errors[2])
+    assert errors[2] < 2e-5
+    assert np.allclose(orders, 2.0, atol=0.05)
+
+
+def test_load_steps_end_in_the_same_shape(device):
+    strip = scene("cantilever", gamma=10.0, elements=20, stretching=1e5)
+    shapes = [wc.equilibrium(strip, load_steps=steps, device=device).points for steps in (1, 3)]
+    assert np.abs(shapes[0] - shapes[1]).max() < 1e-6
+
+
+def test_without_anything_that_holds_it_is_not_converged(device):
+    """A free cloth under gravity has no rest shape, and that is said."""
+    free = wc.Scene(wc.Mesh.grid(3, 3), density=0.1, terms=[wc.Spring(stiffness=10.0)])
+    rest = wc.equilibrium(free, iterations=50, device=device)
+    assert rest.status.message == "iterations used up"
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"tolerance": 0.0}, "tolerance is 0.0"),
+        ({"load_steps": 0}, "load_steps is 0"),
+        ({"iterations": 2.5}, "iterations is 2.5"),
+        ({"linear": "lu"}, "linear is 'lu'"),
+    ],
+)
+def test_options_are_checked(option, message):
+    with pytest.raises(ValueError, match=message):
+        wc.equilibrium(scene("chain"), **option)
