@@ -49,8 +49,13 @@ def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
 @pytest.mark.parametrize("bending", ["quadratic", "dihedral"])
 @pytest.mark.parametrize("gamma", GAMMAS)
 def test_a_wide_sheet_is_the_elastica(gamma, bending, device):
-    """As wide as long and nearly inextensible its edges stay flat: H/W at Γ to 1.5 %."""
-    sheet = scene("cantilever", gamma=gamma, width=1.0, elements=30, bending=bending)
+    """As wide as long and nearly inextensible its edges stay flat: H/W at Γ to 1.5 %.
+
+    They do where it bends by much more than its thickness, L√(12D/KL²). At Γ = 0.1 and KL²/D = 1e7 that is 11 times, and H/W
+    1.9 % off however fine the mesh; there the sheet is ten times stiffer.
+    """
+    stretching = 1e8 if gamma == 0.1 else 1e7
+    sheet = scene("cantilever", gamma=gamma, width=1.0, elements=45, bending=bending, stretching=stretching)
     rest = wc.equilibrium(sheet, device=device)
     assert rest.status.message == "converged"
     error = tip_aspect(sheet, rest.points) / ASPECT[gamma] - 1.0
