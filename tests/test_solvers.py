@@ -266,7 +266,7 @@ def test_policies_on_a_compressed_spring(hessian, expected, device):
         if hessian != "raw":
             assert stepper.residual <= 1e-10, "every semi-definite policy reaches the minimum"
         elif not definite:
-            assert minimiser.linear.negative.numpy()[0] == 1, "the pivots show the negative curvature"
+            assert minimiser.linear.negative.read()[0] == 1, "the pivots show the negative curvature"
 
 
 @pytest.mark.parametrize(
@@ -329,7 +329,7 @@ def test_a_frame_is_a_whole_number_of_steps(device):
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_step_allocates_nothing(name, device):
-    """Factorising is a call of the host and outside the tracker's sight but for what it puts on the device: nothing."""
+    """Of arrays of Warp; what scipy allocates to factorise on the host is outside the tracker's sight."""
     stepper = SOLVERS[name].bind(square(fps=600.0, pins="corners").build(device=device, dtype="float64"))
     stepper.step()
     with wp.ScopedMemoryTracker("steps", print=False) as tracker:

@@ -13,6 +13,43 @@ def on_host(device, what):
         raise RuntimeError(f"{what} runs on the host and cannot be part of a captured segment")
 
 
+class Mirror:
+    """A device array and its counterpart on the host, for what the host reads and writes between segments.
+
+    Built once; on the CPU both are one array. Reading and writing then allocate nothing.
+
+    Args:
+        array: The device array.
+    """
+
+    def __init__(self, array):
+        self.array = array
+        self.host = array if array.device.is_cpu else wp.empty_like(array, device="cpu", pinned=True)
+
+    def read(self):
+        """The values as NumPy, valid until the next call or launch.
+
+        Raises:
+            RuntimeError: If a graph is being captured on the device.
+        """
+        on_host(self.array.device, "reading an array")
+        if self.host is not self.array:
+            wp.copy(self.host, self.array)
+            wp.synchronize_stream(self.array.device)
+        return self.host.numpy()
+
+    def write(self, values):
+        """Sets the values from NumPy.
+
+        Raises:
+            RuntimeError: If a graph is being captured on the device.
+        """
+        on_host(self.array.device, "writing an array")
+        self.host.numpy()[...] = values
+        if self.host is not self.array:
+            wp.copy(self.array, self.host)
+
+
 class Segment:
     """Launches that always run together: recorded when built, replayed by a call, on the CPU and on CUDA.
 

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from .capture import on_host
+from .capture import Mirror
 from .kernels import linear
 
 
@@ -31,8 +31,12 @@ class ConjugateGradients:
         def per_copy(dtype):
             return wp.zeros(model.copies, dtype=dtype, device=model.device)
 
-        self.rz, self.new_rz, self.pq, self.first, self.ratio, self.tolerance = (per_copy(wp.float64) for _ in range(6))
-        self.active, self.negative = per_copy(wp.int32), per_copy(wp.int32)
+        self.rz, self.new_rz, self.pq, self.first, self.ratio = (per_copy(wp.float64) for _ in range(5))
+        self.active, self.negative, self.tolerance = (
+            per_copy(wp.int32),
+            Mirror(per_copy(wp.int32)),
+            Mirror(per_copy(wp.float64)),
+        )
         self.proceed, self.iteration = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         names = ("multiply", "invert_diagonal", "start_iteration", "advance", "new_direction")
         self.kernels = {name: model.kernel(getattr(linear, name), model.dtype) for name in names}
@@ -46,7 +50,7 @@ class ConjugateGradients:
         self._launch("invert_diagonal", N, [hessian.diagonal, hessian.values], [self.preconditioner])
         self._launch("start_iteration", N, [self.preconditioner, b], [x, self.r, self.z, self.p])
         self.sums.dot(self.r, self.z, self.rz)
-        self.negative.zero_()
+        self.negative.array.zero_()
         self._launch("start_copies", B, [self.rz], [self.first, self.active, self.iteration, self.proceed])
         wp.capture_while(self.proceed, self._iterate, x=x)
 
@@ -59,8 +63,8 @@ class ConjugateGradients:
         self._launch("advance", N, state, [x, self.r, self.z])
         self.sums.dot(self.r, self.z, self.new_rz)
         self._launch("begin_check", 1, [], [self.iteration, self.proceed])
-        given = [self.new_rz, self.pq, self.first, self.tolerance]
-        self._launch("check_copies", B, given, [self.rz, self.active, self.negative, self.ratio, self.proceed])
+        given = [self.new_rz, self.pq, self.first, self.tolerance.array]
+        self._launch("check_copies", B, given, [self.rz, self.active, self.negative.array, self.ratio, self.proceed])
         self._launch("limit_iterations", 1, [self.iteration, self.iterations], [self.proceed])
         self._launch("new_direction", N, [self.z, self.ratio, self.active, n], [self.p])
 
@@ -81,30 +85,31 @@ class Factorised:
     capturable = False
 
     def __init__(self, hessian):
-        self.model, self.hessian = hessian.model, hessian
-        self.negative = wp.zeros(self.model.copies, dtype=wp.int32, device=self.model.device)
+        self.model, self.matrix = hessian.model, hessian.matrix()
+        self.values = Mirror(hessian.values)
+        self.negative = Mirror(wp.zeros(self.model.copies, dtype=wp.int32, device=self.model.device))
+        self._mirrors = {}
 
     def solve(self, b, x):
         """x = A⁻¹ b, in double precision; 0 where A is singular."""
         from scipy.sparse.linalg import splu
 
-        model = self.model
-        on_host(model.device, "a factorisation")
-        matrix = self.hessian.matrix().tocsc().astype(np.float64)
-        right = b.numpy().astype(np.float64).ravel()
+        right, left = (self._mirrors.setdefault(id(array), Mirror(array)) for array in (b, x))
+        self.matrix.data[:] = self.values.read()
         try:
             factor = splu(
-                matrix,
+                self.matrix.tocsc(),
                 permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True, "Equil": False},
             )
         except RuntimeError:  # exactly singular: no direction to step along
-            x.zero_()
+            left.write(0.0)
             return
-        solution = factor.solve(right).reshape(model.copies, -1)
+        copies = self.model.copies
+        solution = factor.solve(right.read().astype(np.float64).ravel()).reshape(copies, -1)
         solution[~np.isfinite(solution).all(axis=1)] = 0.0
-        pivots = np.empty(len(right), dtype=bool)
+        pivots = np.empty(solution.size, dtype=bool)
         pivots[factor.perm_c] = factor.U.diagonal() < 0.0
-        self.negative.assign(pivots.reshape(model.copies, -1).any(axis=1).astype(np.int32))
-        x.assign(solution.reshape(-1, 3).astype(model.numpy_dtype))
+        self.negative.write(pivots.reshape(copies, -1).any(axis=1))
+        left.write(solution.reshape(-1, 3))

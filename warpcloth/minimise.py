@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from .capture import Segment, on_host
+from .capture import Mirror, Segment
 from .kernels import minimise as kernels
 from .kernels.linear import rounding
 from .kernels.term import HessianPolicy
@@ -65,6 +65,9 @@ class Minimiser:
         scalars = (per_copy(wp.float64) for _ in range(7))
         self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square, self.rounding = scalars
         self.active, self.searching = per_copy(wp.int32), per_copy(wp.int32)
+        self._active, self._policy = Mirror(self.active), Mirror(self.hessian.policy)
+        read = (self.square, self.rounding, self.step, self.slope)
+        self._square, self._rounding, self._step, self._slope = (Mirror(array) for array in read)
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self._find_kernels()
         self._record()
@@ -106,9 +109,8 @@ class Minimiser:
         Returns:
             (B,) bool, which copies converged.
         """
-        on_host(self.model.device, "the test of convergence")
         self._start()
-        norm = np.sqrt(self.square.numpy())
+        norm = np.sqrt(self._square.read())
         scale = self.weight_of_gravity + norm
         scale[scale == 0.0] = 1.0
         converged = np.zeros(self.model.copies, dtype=bool)
@@ -117,28 +119,28 @@ class Minimiser:
         while True:
             self.residual = norm / scale
             converged = norm <= tolerance * scale + (
-                0.0 if self.iterations == 0 else ROUNDINGS * np.sqrt(self.rounding.numpy())
+                0.0 if self.iterations == 0 else ROUNDINGS * np.sqrt(self._rounding.read())
             )
             active = ~converged & ~stuck & np.isfinite(self.residual)
             if not active.any() or self.iterations == iterations:
                 return converged
-            self.active.assign(active.astype(np.int32))
+            self._active.write(active)
             if self.linear.capturable:
-                self.linear.tolerance.assign(np.clip(self.residual, 1e-12, 0.1))
+                self.linear.tolerance.write(np.clip(self.residual, 1e-12, 0.1))
             self._find_direction()
             self._search()
-            norm = np.sqrt(self.square.numpy())
+            norm = np.sqrt(self._square.read())
             # No step was found, or there was none to look for; a gradient that is not finite stays so and is seen above.
-            stuck |= active & ((self.step.numpy() == 0.0) | ~(self.slope.numpy() < 0.0))
+            stuck |= active & ((self._step.read() == 0.0) | ~(self._slope.read() < 0.0))
             self.iterations += 1
 
     def _find_direction(self):
         if self.adaptive:
-            self.hessian.policy.fill_(int(HessianPolicy.RAW))
+            self._policy.write(int(HessianPolicy.RAW))
         self._assemble()
         self._solve()
-        if self.adaptive and self.linear.negative.numpy().any():
-            self.hessian.policy.assign(self.linear.negative.numpy() * int(HessianPolicy.CLAMP))
+        if self.adaptive and (negative := self.linear.negative.read()).any():
+            self._policy.write(negative * int(HessianPolicy.CLAMP))
             self._assemble()
             self._solve()
 

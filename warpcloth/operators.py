@@ -128,8 +128,9 @@ class Hessian:
             model.launch(self._add_blocks, len(self.values), [*gather, blocks.flatten()], [self.values])
 
     def matrix(self):
-        """``values`` on the host as a scipy matrix in block compressed rows (3N, 3N)."""
+        """The values of now on the host as a scipy matrix in block compressed rows (3N, 3N), double precision."""
         from scipy.sparse import bsr_matrix
 
         n = 3 * self.model.count
-        return bsr_matrix((self.values.numpy(), self.columns.numpy(), self.offsets.numpy()), shape=(n, n))
+        blocks = self.values.numpy().astype(np.float64)
+        return bsr_matrix((blocks, self.columns.numpy(), self.offsets.numpy()), shape=(n, n))

@@ -99,7 +99,9 @@ def step_limits(model):
     rows = np.zeros(model.count)
     for elements, blocks in zip(model.terms, hessian.blocks, strict=True):
         K = elements.term.vertices
-        norms = np.linalg.norm(blocks.numpy().astype(np.float64), ord=2, axis=(-2, -1)).reshape(-1, K, K).sum(axis=2)
+        sizes = np.abs(blocks.numpy().astype(np.float64))
+        # √(‖·‖₁‖·‖∞) is no less than the spectral norm, equal to it along the axes and diagonals of a grid, and cheap.
+        norms = np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)).reshape(-1, K, K).sum(axis=2)
         np.add.at(rows, elements.stencil.numpy(), norms)
     bound = float((rows * inverse_mass).max(initial=0.0))
     if bound == 0.0:
