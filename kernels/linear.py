@@ -2,6 +2,8 @@
 
 The matrix is in block compressed rows (offsets, columns, values); every copy is a diagonal block of it, so that nothing here
 but the sums knows of copies. ``active[copy]`` is 1 while that copy still iterates.
+
+Kernels that always run together share a module: one of ten compiles faster than ten of one.
 """
 
 from functools import cache
@@ -59,7 +61,7 @@ def multiply(dtype):
     """Kernel over block rows: q = A p."""
     vec3, mat33 = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
     def multiply_rows(
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
@@ -81,7 +83,7 @@ def rounding(dtype):
     """Kernel over block rows: out[i] = (ε Σⱼ ‖A[i, j]‖‖xⱼ − xᵢ‖)², what rounding a length by ε does to the force [N²]."""
     vec3, mat33 = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def rounding_of_rows(
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
@@ -107,7 +109,7 @@ def invert_diagonal(dtype):
     """
     _, mat33 = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
     def invert_blocks(diagonal: wp.array(dtype=wp.int32), values: wp.array(dtype=mat33), inverse: wp.array(dtype=mat33)):
         i = wp.tid()
         block = values[diagonal[i]]
@@ -125,7 +127,7 @@ def start_iteration(dtype):
     """Kernel over vertices: x = 0, r = b, z = P r, p = z."""
     vec3, mat33 = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
     def start(
         preconditioner: wp.array(dtype=mat33),
         b: wp.array(dtype=vec3),
@@ -147,7 +149,7 @@ def start_iteration(dtype):
 def start_copies():
     """Kernel over copies: every copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def start(
         rz: wp.array(dtype=wp.float64),
         first: wp.array(dtype=wp.float64),
@@ -173,7 +175,7 @@ def advance(dtype):
     """
     vec3, mat33 = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
     def advance_vertices(
         preconditioner: wp.array(dtype=mat33),
         p: wp.array(dtype=vec3),
@@ -208,7 +210,7 @@ def advance(dtype):
 def check_copies():
     """Kernel over copies: stops those that are done; ratio = new rᵀz / old rᵀz; proceed = 1 while one is left."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def check(
         new_rz: wp.array(dtype=wp.float64),
         pq: wp.array(dtype=wp.float64),
@@ -242,7 +244,7 @@ def check_copies():
 def begin_check():
     """Kernel of one thread, before :func:`check_copies`: counts the iteration; proceed = 0."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def begin(iteration: wp.array(dtype=wp.int32), proceed: wp.array(dtype=wp.int32)):
         iteration[0] = iteration[0] + 1
         proceed[0] = 0
@@ -254,7 +256,7 @@ def begin_check():
 def limit_iterations():
     """Kernel of one thread, after :func:`check_copies`: proceed = 0 once the iterations are used up."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def limit(iteration: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
         if iteration[0] >= most:
             proceed[0] = 0
@@ -267,7 +269,7 @@ def new_direction(dtype):
     """Kernel over vertices: p = z + ratio p."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
     def turn(
         z: wp.array(dtype=vec3),
         ratio: wp.array(dtype=wp.float64),

@@ -16,7 +16,7 @@ def set_trial(dtype):
     """Kernel over vertices: trial = d + step·p with the step length of the copy; clears the gradient."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def place(
         correction: wp.array(dtype=vec3),
         direction: wp.array(dtype=vec3),
@@ -38,7 +38,7 @@ def add_inertia(dtype):
     """Kernel over vertices: gradient += s m d − load m g, and 0 for pins; work[i] = s/2 m d·d − load m g·d [J]."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def add(
         mass: wp.array(dtype=dtype),
         inverse_mass: wp.array(dtype=dtype),
@@ -70,7 +70,7 @@ def negate(dtype):
     """Kernel over vertices: out = −a."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def negate_vertices(a: wp.array(dtype=vec3), out: wp.array(dtype=vec3)):
         i = wp.tid()
         out[i] = -a[i]
@@ -82,7 +82,7 @@ def negate(dtype):
 def begin_search():
     """Kernel over copies: step 1 for those that still iterate and 0 for the rest."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.minimise", enable_backward=False)
     def begin(
         active: wp.array(dtype=wp.int32),
         step: wp.array(dtype=wp.float64),
@@ -107,7 +107,7 @@ def check_trial():
     with φ(α) ≤ φ(0) + noise (the approximate Wolfe condition of Hager and Zhang 2005). NaN is never accepted.
     """
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.minimise", enable_backward=False)
     def check(
         start: wp.array(dtype=wp.float64),
         trial: wp.array(dtype=wp.float64),
@@ -142,7 +142,7 @@ def check_trial():
 def begin_trial():
     """Kernel of one thread, before :func:`check_trial`: counts the trial; proceed = 0."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.minimise", enable_backward=False)
     def begin(trials: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
         trials[0] = trials[0] + 1
         proceed[0] = 0
@@ -154,7 +154,7 @@ def begin_trial():
 def end_trial():
     """Kernel of one thread, after :func:`check_trial`: one more evaluation after the last halving, then the end."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.minimise", enable_backward=False)
     def end(trials: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
         if trials[0] > most:
             proceed[0] = 0

@@ -14,7 +14,7 @@ from .assemble import types
 def partial_sum():
     """Kernel over (copies, chunks): out[copy, chunk] = Σ values."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def sum_chunks(values: wp.array(dtype=wp.float64), per_copy: int, out: wp.array2d(dtype=wp.float64)):
         copy, chunk = wp.tid()
         total = wp.float64(0.0)
@@ -42,33 +42,10 @@ def partial_dot(dtype):
 
 
 @cache
-def partial_weighted_dot(dtype):
-    """Kernel over (copies, chunks): out[copy, chunk] = Σ wᵢ aᵢ·bᵢ over vertices."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def weighted_dot_chunks(
-        weights: wp.array(dtype=dtype),
-        a: wp.array(dtype=vec3),
-        b: wp.array(dtype=vec3),
-        per_copy: int,
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        copy, chunk = wp.tid()
-        total = wp.float64(0.0)
-        for j in range(chunk, per_copy, out.shape[1]):
-            i = copy * per_copy + j
-            total += wp.float64(weights[i]) * wp.float64(wp.dot(a[i], b[i]))
-        out[copy, chunk] = total
-
-    return weighted_dot_chunks
-
-
-@cache
 def finish_sum():
     """Kernel over copies: out[copy] = start·out[copy] + scale·Σ partial[copy], start 0 or 1."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def add_chunks(
         partial: wp.array2d(dtype=wp.float64),
         scale: wp.float64,
