@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from .checks import choice, number, whole
 from .minimise import Minimiser
-from .solvers.solver import Result, Status, choice, number, refuse_hard, whole
+from .solvers.solver import Result, Status, refuse_hard
 
 
 class Equilibrium(NamedTuple):

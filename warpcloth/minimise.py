@@ -10,8 +10,6 @@ from .kernels.term import HessianPolicy
 from .linear import ConjugateGradients, Factorised
 from .operators import Energy, Gradient, Hessian, Sums
 
-# Increase of φ, relative, that the approximate Wolfe condition takes for rounding (the value of Hager and Zhang 2005).
-NOISE = 1e-6
 # Roundings that a force takes: of the lengths, of the strain, of the products and of the sum over a vertex's elements.
 ROUNDINGS = 4.0
 # Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
@@ -69,6 +67,9 @@ class Minimiser:
         read = (self.square, self.rounding, self.step, self.slope)
         self._square, self._rounding, self._step, self._slope = (Mirror(array) for array in read)
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
+        # energy to 2ε/e, so that √ε covers strains down to √ε.
+        self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
         self._find_kernels()
         self._record()
         self.weight_of_gravity = self._weight_of_gravity()
@@ -190,7 +191,7 @@ class Minimiser:
     def _try_step(self):
         self._launch_trial()
         self._launch("begin_trial", 1, [], [self.trials, HALVINGS, self.proceed])
-        given = [self.energy, self.trial_energy, self.slope, self.trial_slope, NOISE, self.trials, HALVINGS]
+        given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
         self._launch("check_trial", self.model.copies, given, [self.step, self.searching, self.proceed])
         self._launch("end_trial", 1, [self.trials, HALVINGS], [self.proceed])
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..capture import Segment
+from ..checks import choice
 from ..kernels import step as kernels
 from ..operators import Gradient, Hessian
-from .solver import Step, Stepper, choice, refuse_hard
+from .solver import Step, Stepper, refuse_hard
 
 _INSTEAD = "PBD takes hard constraints, or give a finite stiffness"
 

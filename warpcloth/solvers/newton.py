@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..capture import Segment
+from ..checks import choice, number, whole
 from ..minimise import LINEAR, POLICIES, Minimiser
-from .solver import Result, Step, Stepper, choice, number, refuse_hard, whole
+from .solver import Result, Step, Stepper, refuse_hard
 
 
 @dataclass(frozen=True)

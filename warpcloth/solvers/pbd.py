@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..capture import Segment
+from ..checks import choice, number, whole
 from ..kernels import project as kernels
-from .solver import Step, Stepper, choice, number, whole
+from .solver import Step, Stepper
 
 
 @dataclass(frozen=True)

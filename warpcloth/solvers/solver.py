@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from ..checks import number, whole
 from ..kernels import step as kernels
 
 
@@ -139,23 +140,3 @@ def refuse_hard(model, solver, instead):
     for elements in model.terms:
         if elements.hard:
             raise ValueError(f"{solver} cannot take {elements.label} with infinite stiffness; {instead}")
-
-
-def number(name, value, above=None, least=None):
-    """Checks that an option is a finite number."""
-    rule = f"above {above:g}" if above is not None else f"of {least:g} or more"
-    good = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and np.isfinite(value)
-    if not good or (above is not None and not value > above) or (least is not None and not value >= least):
-        raise ValueError(f"{name} is {value!r}; it must be a number {rule}")
-
-
-def whole(name, value, least):
-    """Checks that an option is a whole number."""
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name} is {value!r}; it must be a whole number of {least} or more")
-
-
-def choice(name, value, allowed):
-    """Checks that an option is one of some words."""
-    if value not in allowed:
-        raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(map(repr, allowed))}")
