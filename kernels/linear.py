@@ -80,7 +80,7 @@ def multiply(dtype):
 
 @cache
 def rounding(dtype):
-    """Kernel over block rows: out[i] = (ε Σⱼ ‖A[i, j]‖‖xⱼ − xᵢ‖)², what rounding a length by ε does to the force [N²]."""
+    """Kernel over block rows: out[i] = (ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖))², rounding of the force [N²]."""
     vec3, mat33 = types(dtype)
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
@@ -89,13 +89,15 @@ def rounding(dtype):
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=mat33),
         x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
         epsilon: dtype,
         out: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
         total = dtype(0.0)
         for s in range(offsets[i], offsets[i + 1]):
-            total += wp.sqrt(wp.ddot(values[s], values[s])) * wp.length(x[columns[s]] - x[i])
+            j = columns[s]
+            total += wp.sqrt(wp.ddot(values[s], values[s])) * (wp.length(x[j] - x[i]) + wp.length(d[j]))
         out[i] = wp.float64(epsilon * total) * wp.float64(epsilon * total)
 
     return rounding_of_rows

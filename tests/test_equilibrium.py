@@ -7,6 +7,7 @@ import pytest
 from elastica import ASPECT, aspect
 
 import warpcloth as wc
+from warpcloth.equilibrium import SETTLED
 
 GAMMAS = (0.1, 1.0, 5.0, 10.0, 20.0, 50.0)
 
@@ -37,7 +38,7 @@ def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
     for elements in (20, 40, 80):
         strip = scene("cantilever", gamma=gamma, elements=elements, bending=bending, stretching=1e6)
         rest = wc.equilibrium(strip, device=device)
-        assert rest.status.ok and rest.status.message == "converged"
+        assert rest.status.result in SETTLED, rest.status
         errors.append(abs(tip_aspect(strip, rest.points) / aspect(9 * gamma / 8) - 1.0))
     assert errors[2] < 0.002
     orders = np.log2(errors[0] / errors[1]), np.log2(errors[1] / errors[2])
@@ -57,7 +58,7 @@ def test_a_wide_sheet_is_the_elastica(gamma, bending, device):
     stretching = 1e8 if gamma == 0.1 else 1e7
     sheet = scene("cantilever", gamma=gamma, width=1.0, elements=45, bending=bending, stretching=stretching)
     rest = wc.equilibrium(sheet, device=device)
-    assert rest.status.message == "converged"
+    assert rest.status.result in SETTLED, rest.status
     error = tip_aspect(sheet, rest.points) / ASPECT[gamma] - 1.0
     print(f"{bending} Γ={gamma:g}: {error:+.3%}, {rest.iterations} iterations")
     assert abs(error) < 0.015
@@ -79,7 +80,7 @@ def test_an_elastic_catenary(stretching, sag, device):
     errors = []
     for links in (50, 100, 200):
         rest = wc.equilibrium(scene("catenary", links=links, stretching=stretching), device=device)
-        assert rest.status.message == "converged"
+        assert rest.status.result in SETTLED, rest.status
         errors.append(-rest.points[:, 1].min() / sag - 1.0)
     orders = np.log2(errors[0] / errors[1]), np.log2(errors[1] / errors[2])
     assert errors[2] < 2e-5
@@ -96,7 +97,7 @@ def test_without_anything_that_holds_it_is_not_converged(device):
     """A free cloth under gravity has no rest shape, and that is said."""
     free = wc.Scene(wc.Mesh.grid(3, 3), density=0.1, terms=[wc.Spring(stiffness=10.0)])
     rest = wc.equilibrium(free, iterations=50, device=device)
-    assert rest.status.message == "iterations used up"
+    assert rest.status.result not in SETTLED
 
 
 @pytest.mark.parametrize(
@@ -111,3 +112,35 @@ def test_without_anything_that_holds_it_is_not_converged(device):
 def test_options_are_checked(option, message):
     with pytest.raises(ValueError, match=message):
         wc.equilibrium(scene("chain"), **option)
+
+
+UNSTABLE = {
+    "a chain that stands on its pin": wc.Scene(
+        wc.Mesh.chain(6, direction=(0, 1, 0)), masses=np.full(6, 0.01), terms=[wc.Spring(stiffness=1e3)], pins=[0]
+    ),
+    "a sheet upright on two corners": wc.Scene(
+        wc.Mesh(wc.Mesh.grid(9, 9).points[:, [0, 2, 1]], wc.Mesh.grid(9, 9).triangles),
+        density=0.1,
+        terms=[wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-3)],
+        pins=[0, 8],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNSTABLE)
+def test_balance_that_is_no_minimum_is_left(name, device):
+    """In exact symmetry no force says so, but the Hessian does: nudged, they fall and hang."""
+    rest = wc.equilibrium(UNSTABLE[name], device=device)
+    assert rest.status.result in SETTLED, rest.status
+    assert rest.points[:, 1].mean() < -0.4
+
+
+def test_float32_comes_near_float64(device):
+    """The noise of stiff springs, 5 % of the residual here, must not end the descent while the strip still sinks.
+
+    Taken for the last word, it did so 7 mm early. (With kL²/D = 1e7 float32 resolves the springs no better than the bending.)
+    """
+    strip = scene("cantilever", stretching=1e5)
+    single, double = (wc.equilibrium(strip, dtype=dtype, device=device) for dtype in ("float32", "float64"))
+    assert single.status.message.startswith("as far as rounding allows")
+    assert np.abs(single.points - double.points).max() < 1e-4

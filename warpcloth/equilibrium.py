@@ -7,7 +7,10 @@ import warp as wp
 
 from .checks import choice, number, whole
 from .minimise import Minimiser
-from .solvers.solver import Result, Status, refuse_hard
+from .solvers.solver import refuse_hard
+from .status import Result, Status
+
+SETTLED = (Result.CONVERGED, Result.ROUNDED)
 
 
 class Equilibrium(NamedTuple):
@@ -15,7 +18,8 @@ class Equilibrium(NamedTuple):
 
     Attributes:
         points: (n, 3) [m].
-        status: Converged, or iterations used up, with the residual ‖∇U − m g‖/(‖m g‖ + ‖∇U − m g at the start of the load‖).
+        status: How it ended, see :class:`warpcloth.status.Result`, with the residual ‖∇U − m g‖/(‖m g‖ + ‖∇U − m g where the
+            last descent began‖).
         iterations: Newton iterations in all.
     """
 
@@ -30,7 +34,8 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
     the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
     is taken with inertia, s/2‖x − x_now‖²_M, and s is lowered from there: a proximal point method, which goes downhill all
-    the way. Terms that hold only by inertia have no rest shape and are reported as not converged.
+    the way. Cloth that nothing holds has no rest shape and is reported as not converged. Where the Hessian has a negative
+    eigenvalue in the end, the shape is in balance without being a minimum: it is nudged and settles again.
 
     Args:
         scene: The :class:`warpcloth.Scene`; velocities, moving pins and duration do not matter.
@@ -58,24 +63,47 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     used = 0
 
     def settle(s, load, most):
-        """Minimises from where the cloth is, and moves it there; whether it converged."""
+        """Minimises from where the cloth is, and moves it there; how that ended."""
         nonlocal used
         minimiser.set_objective(s, load)
-        converged = minimiser.minimise(tolerance, most).all()
-        used += minimiser.iterations
+        (result,) = minimiser.minimise(tolerance, most)
+        used += max(minimiser.iterations, 1)
         base.assign(base.numpy() + minimiser.correction.numpy())
-        return bool(converged)
+        return result
 
     for part in range(1, load_steps + 1):
-        load = part / load_steps
-        s = _frequency_scale(model)
-        while not (converged := settle(0.0, load, iterations - used)) and used < iterations:
-            for _ in range(8):
-                settle(s, load, min(20, iterations - used))
-            s /= 16.0
+        result = _descend(settle, part / load_steps, _frequency_scale(model), lambda: iterations - used)
+    if result in SETTLED:
+        # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
+        minimiser.set_objective(0.0, 1.0)
+        if minimiser.curves_down():
+            base.assign(base.numpy() + _nudge(model))
+            result = _descend(settle, 1.0, _frequency_scale(model), lambda: iterations - used)
+            if result in SETTLED and minimiser.curves_down():
+                result = Result.SADDLE
     residual = float(minimiser.residual.max())
-    result = Result.CONVERGED if converged else Result.ITERATIONS_USED_UP
-    return Equilibrium(base.numpy(), Status(result, residual=residual, message=result.value), used)
+    message = result.value if result is Result.CONVERGED else f"{result.value}, residual {residual:.2g}"
+    return Equilibrium(np.array(base.numpy()), Status(result, residual=residual, message=message), used)
+
+
+def _descend(settle, load, s, left):
+    """Settles without inertia, with proximal steps in between where that does not go on; the last result."""
+    while True:
+        result = settle(0.0, load, left())
+        if result is Result.ROUNDED:  # of a long way d; from here d is short and rounds less
+            result = settle(0.0, load, left())
+        if result in SETTLED or result is Result.DIVERGED or left() <= 0:
+            return result
+        for _ in range(8):
+            settle(s, load, min(20, max(left(), 1)))
+        s /= 16.0
+
+
+def _nudge(model):
+    """A move of the free vertices by about 1e-4 of the size of the cloth, the same at every call (n, 3) [m]."""
+    size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
+    noise = np.random.default_rng(0).normal(size=(model.count, 3))
+    return 1e-4 * size * noise * (model.inverse_mass.numpy() > 0.0)[:, None]
 
 
 def _frequency_scale(model):

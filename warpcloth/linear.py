@@ -85,31 +85,35 @@ class Factorised:
     capturable = False
 
     def __init__(self, hessian):
-        self.model, self.matrix = hessian.model, hessian.matrix()
+        model = self.model = hessian.model
+        self.matrices = hessian.matrices()
         self.values = Mirror(hessian.values)
-        self.negative = Mirror(wp.zeros(self.model.copies, dtype=wp.int32, device=self.model.device))
+        self.negative = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
         self._mirrors = {}
 
     def solve(self, b, x):
-        """x = A⁻¹ b, in double precision; 0 where A is singular."""
+        """x = A⁻¹ b, in double precision; 0 for a copy whose A is singular or not finite."""
+        right, left = (self._mirrors.setdefault(id(array), Mirror(array)) for array in (b, x))
+        copies = self.model.copies
+        blocks = np.split(self.values.read(), np.cumsum([len(matrix.data) for matrix in self.matrices])[:-1])
+        sides = right.read().astype(np.float64).reshape(copies, -1)
+        solved = [self._solve(*copy) for copy in zip(self.matrices, blocks, sides, strict=True)]
+        left.write(np.concatenate([solution for solution, _ in solved]).reshape(-1, 3))
+        self.negative.write([negative for _, negative in solved])
+
+    @staticmethod
+    def _solve(matrix, blocks, right):
+        """The solution for one copy, and whether a pivot is negative."""
         from scipy.sparse.linalg import splu
 
-        right, left = (self._mirrors.setdefault(id(array), Mirror(array)) for array in (b, x))
-        self.matrix.data[:] = self.values.read()
+        nothing = np.zeros_like(right), False
+        if not np.isfinite(blocks).all():
+            return nothing
+        matrix.data[:] = blocks
+        options = {"SymmetricMode": True, "Equil": False}
         try:
-            factor = splu(
-                self.matrix.tocsc(),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True, "Equil": False},
-            )
+            factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         except RuntimeError:  # exactly singular: no direction to step along
-            left.write(0.0)
-            return
-        copies = self.model.copies
-        solution = factor.solve(right.read().astype(np.float64).ravel()).reshape(copies, -1)
-        solution[~np.isfinite(solution).all(axis=1)] = 0.0
-        pivots = np.empty(solution.size, dtype=bool)
-        pivots[factor.perm_c] = factor.U.diagonal() < 0.0
-        self.negative.write(pivots.reshape(copies, -1).any(axis=1))
-        left.write(solution.reshape(-1, 3))
+            return nothing
+        solution = factor.solve(right)
+        return (solution, bool((factor.U.diagonal() < 0.0).any())) if np.isfinite(solution).all() else nothing

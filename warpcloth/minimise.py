@@ -9,6 +9,7 @@ from .kernels.linear import rounding
 from .kernels.term import HessianPolicy
 from .linear import ConjugateGradients, Factorised
 from .operators import Energy, Gradient, Hessian, Sums
+from .status import Result
 
 # Roundings that a force takes: of the lengths, of the strain, of the products and of the sum over a vertex's elements.
 ROUNDINGS = 4.0
@@ -64,9 +65,10 @@ class Minimiser:
         self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square, self.rounding = scalars
         self.active, self.searching = per_copy(wp.int32), per_copy(wp.int32)
         self._active, self._policy = Mirror(self.active), Mirror(self.hessian.policy)
-        read = (self.square, self.rounding, self.step, self.slope)
-        self._square, self._rounding, self._step, self._slope = (Mirror(array) for array in read)
+        read = (self.energy, self.square, self.rounding, self.step, self.slope)
+        self._energy, self._square, self._rounding, self._step, self._slope = (Mirror(array) for array in read)
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
         # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
         # energy to 2ε/e, so that √ε covers strains down to √ε.
         self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
@@ -103,37 +105,46 @@ class Minimiser:
         return np.linalg.norm(free, axis=1) * np.linalg.norm(model.gravity.numpy(), axis=1)
 
     def minimise(self, tolerance, iterations):
-        """Iterates until ‖∇φ‖ ≤ ``tolerance``·scale in every copy, or no more than rounding makes of it.
+        """Iterates until ‖∇φ‖ ≤ ``tolerance``·scale in every copy, or nothing is left to gain in the model's precision.
 
-        The scale of a copy is ‖m g‖ + ‖∇φ(0)‖; rounding counts with 4ε Σⱼ‖Hᵢⱼ‖‖xⱼ − xᵢ‖ a vertex.
+        The scale of a copy is ‖m g‖ + ‖∇φ(0)‖. Nothing is left to gain when ‖∇φ‖ is no more than rounding may make of it,
+        4ε Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) a vertex, and an iteration has not lowered φ by more than its own rounding: the norm
+        alone would let the noise of stiff directions hide what soft ones still lack.
 
         Returns:
-            (B,) bool, which copies converged.
+            A :class:`Result` for each copy.
         """
+        B = self.model.copies
         self._start()
         norm = np.sqrt(self._square.read())
         scale = self.weight_of_gravity + norm
         scale[scale == 0.0] = 1.0
-        converged = np.zeros(self.model.copies, dtype=bool)
-        stuck = np.zeros(self.model.copies, dtype=bool)
+        energy = self._energy.read().copy()
+        rounded = stalled = np.zeros(B, dtype=bool)
         self.iterations = 0
         while True:
             self.residual = norm / scale
-            converged = norm <= tolerance * scale + (
-                0.0 if self.iterations == 0 else ROUNDINGS * np.sqrt(self._rounding.read())
-            )
-            active = ~converged & ~stuck & np.isfinite(self.residual)
+            finite = np.isfinite(self.residual)
+            converged = finite & (norm <= tolerance * scale)
+            active = finite & ~(converged | rounded | stalled)
             if not active.any() or self.iterations == iterations:
-                return converged
+                break
             self._active.write(active)
             if self.linear.capturable:
                 self.linear.tolerance.write(np.clip(self.residual, 1e-12, 0.1))
             self._find_direction()
             self._search()
-            norm = np.sqrt(self._square.read())
-            # No step was found, or there was none to look for; a gradient that is not finite stays so and is seen above.
-            stuck |= active & ((self._step.read() == 0.0) | ~(self._slope.read() < 0.0))
             self.iterations += 1
+            norm = np.sqrt(self._square.read())
+            noisy, before, energy = norm <= ROUNDINGS * np.sqrt(self._rounding.read()), energy, self._energy.read().copy()
+            level = before - energy <= self.resolution * np.abs(before)
+            # A copy is stuck where no step was found, or there was none to look for.
+            stuck = active & ((self._step.read() == 0.0) | ~(self._slope.read() < 0.0))
+            rounded = rounded | (active & noisy & (stuck | level))
+            stalled = stalled | (stuck & ~noisy)
+        conditions = [~finite, converged, rounded, stalled]
+        results = [Result.DIVERGED, Result.CONVERGED, Result.ROUNDED, Result.STALLED]
+        return list(np.select(conditions, np.array(results, dtype=object), Result.ITERATIONS_USED_UP))
 
     def _find_direction(self):
         if self.adaptive:
@@ -144,6 +155,17 @@ class Minimiser:
             self._policy.write(negative * int(HessianPolicy.CLAMP))
             self._assemble()
             self._solve()
+
+    def curves_down(self):
+        """Whether the unchanged Hessian at d = 0 has a negative eigenvalue in some copy, by its pivots on the host."""
+        self._start()
+        before = self.hessian.policy.numpy().copy()
+        self._policy.write(int(HessianPolicy.RAW))
+        self._assemble()
+        factorised = self.linear if isinstance(self.linear, Factorised) else Factorised(self.hessian)
+        factorised.solve(self.right, self.direction)
+        self._policy.write(before)
+        return bool(factorised.negative.read().any())
 
     # What the segments record.
 
@@ -172,7 +194,7 @@ class Minimiser:
         self.hessian.assemble(self.base, self.s, self.correction)
         self._launch("negate", self.model.count, [self.gradient], [self.right])
         hessian, model = self.hessian, self.model
-        given = [hessian.offsets, hessian.columns, hessian.values, self.base, np.finfo(model.numpy_dtype).eps]
+        given = [hessian.offsets, hessian.columns, hessian.values, self.base, self.correction, np.finfo(model.numpy_dtype).eps]
         self._launch("rounding", model.count, given, [self.work])
         model.launch(self.energy_of._sum, self.sums.partial.shape, [self.work, model.per_copy], [self.sums.partial])
         self.sums.finish(1.0, 0.0, self.rounding)

@@ -1,6 +1,6 @@
 """What is built from a scene on a device: arrays of one or more copies laid out one after another, and nothing undeclared."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,6 +44,12 @@ class DeviceElements:
     def count(self):
         """Elements of all copies, B·E."""
         return len(self.stencil)
+
+    def softened(self):
+        """The same elements with a stiffness of 1 where it is infinite."""
+        stiffness = self.stiffness.numpy()
+        array = wp.array(np.where(np.isinf(stiffness), 1.0, stiffness).astype(stiffness.dtype), device=self.stiffness.device)
+        return replace(self, stiffness=array, hard=False)
 
     @cached_property
     def incidences(self):

@@ -48,17 +48,17 @@ class Gradient:
 
 
 class Energy:
-    """U of all terms [J], per copy."""
+    """U of all terms [J], per copy; or of the ``terms`` given."""
 
-    def __init__(self, model, sums, corrected=False):
-        self.model, self.sums = model, sums
-        self.kernels = [model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in model.terms]
-        self.of_elements = [wp.zeros(elements.count, dtype=wp.float64, device=model.device) for elements in model.terms]
+    def __init__(self, model, sums, corrected=False, terms=None):
+        self.model, self.sums, self.terms = model, sums, model.terms if terms is None else terms
+        self.kernels = [model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in self.terms]
+        self.of_elements = [wp.zeros(elements.count, dtype=wp.float64, device=model.device) for elements in self.terms]
         self._sum = model.kernel(reduce.partial_sum)
 
     def add(self, x, out, correction=None):
         """out (B,) += U(x), or U(x + correction)."""
-        for elements, kernel, values in zip(self.model.terms, self.kernels, self.of_elements, strict=True):
+        for elements, kernel, values in zip(self.terms, self.kernels, self.of_elements, strict=True):
             self.model.launch(kernel, elements.count, [*elements.arguments, x, correction], [values])
             self.model.launch(self._sum, self.sums.partial.shape, [values, elements.per_copy], [self.sums.partial])
             self.sums.finish(1.0, 1.0, out)
@@ -127,10 +127,22 @@ class Hessian:
             model.launch(kernel, elements.count, arguments, [blocks])
             model.launch(self._add_blocks, len(self.values), [*gather, blocks.flatten()], [self.values])
 
-    def matrix(self):
-        """The values of now on the host as a scipy matrix in block compressed rows (3N, 3N), double precision."""
+    def matrices(self):
+        """The values of now on the host, for each copy a scipy matrix in block compressed rows (3n, 3n), double precision."""
         from scipy.sparse import bsr_matrix
 
-        n = 3 * self.model.count
-        blocks = self.values.numpy().astype(np.float64)
-        return bsr_matrix((blocks, self.columns.numpy(), self.offsets.numpy()), shape=(n, n))
+        n = self.model.per_copy
+        offsets, columns, values = (array.numpy() for array in (self.offsets, self.columns, self.values))
+        found = []
+        for first in range(0, self.model.count, n):
+            rows = offsets[first : first + n + 1]
+            blocks = slice(rows[0], rows[-1])
+            parts = values[blocks].astype(np.float64), columns[blocks] - first, rows - rows[0]
+            found.append(bsr_matrix(parts, shape=(3 * n, 3 * n)))
+        return found
+
+    def matrix(self):
+        """All copies in one scipy matrix (3N, 3N)."""
+        from scipy.sparse import block_diag
+
+        return block_diag(self.matrices(), format="csr")

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from .capture import on_host
-from .solvers.solver import Result, Status
+from .status import Result, Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,7 @@ class Animation:
             (frames+1, B, n, 3).
         velocities: The same shape [m/s].
         times: (frames+1,) [s].
-        status: :class:`warpcloth.solvers.solver.Status`.
+        status: :class:`warpcloth.status.Status`.
         timings: ``compile`` (building the model and binding the solver, with compiling what was not in the cache) and
             ``frames`` (a list) [s].
         worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame.
@@ -63,7 +63,8 @@ def simulate(
         progress: Function called with (frame, frames) once each frame is kept, from 0, the start, on; or None.
 
     Returns:
-        :class:`Animation`. A run that diverges ends with its last good frame and says so in ``status``.
+        :class:`Animation`. A run that diverges ends with its last good frame and says so in ``status``. Of several copies the
+        others go on; one that diverged is NaN from there.
 
     Raises:
         ValueError: If an argument breaks a rule.
@@ -80,8 +81,7 @@ def simulate(
     stepper = solver.bind(model)
     timings = {"compile": time.perf_counter() - start, "frames": []}
     recorder = recorder or _Memory(model, frames)
-    watch = Watch(model)
-    status = None
+    watch = Watch(model, stepper.h)
     try:
         recorder.append(*_frame(stepper))
         if progress is not None:
@@ -92,16 +92,14 @@ def simulate(
                 stepper.step()
             points, velocities = _frame(stepper)
             timings["frames"].append(time.perf_counter() - began)
-            trouble = watch.trouble(frame, points, velocities)
-            if trouble:
-                status = Status(Result.DIVERGED, frame - 1, stepper.residual, trouble)
+            if not watch.passes(frame, points, velocities):
                 break
             recorder.append(points, velocities)
             if progress is not None:
                 progress(frame, frames)
     finally:
         recorder.close()
-    status = status or _status(stepper, frames)
+    status = watch.status(stepper)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     return Animation(points, velocities, times, status, timings, watch.worst_strain, output)
@@ -113,78 +111,103 @@ def _frame(stepper):
     return np.array(stepper.state.x.numpy()), np.array(stepper.state.v.numpy())  # on the CPU numpy() is a view
 
 
-def _status(stepper, frames):
-    result, residual = stepper.result, stepper.residual
-    message = result.value
-    if result is Result.ITERATIONS_USED_UP:
-        message = f"iterations used up in a step or more, largest residual {residual:.2g}"
-    elif result is Result.CONVERGED and residual > stepper.options.tolerance:
-        message = f"converged as far as rounding allows, largest residual {residual:.2g}"
-    return Status(result, frames, residual, message)
-
-
 class Watch:
-    """Tells a run that has diverged from one that is merely fast, from frames alone and for every solver.
+    """Tells a copy that has diverged from one that is merely fast, from frames alone and for every solver.
 
-    No cloth that gains energy only from gravity, its start and its pins has a root mean square speed far above
-    v₀ + g t + √(2 g l) + v_pins + (elastic energy at the start, as edge strain times the speed it can turn into); ten times
-    that is called diverged, and so is anything that is not finite. A diverging run grows by a factor a step and passes it
-    at once.
+    No cloth that gains energy only from gravity, its start and its pins has a mass-weighted root mean square speed far above
+    v₀ + √(2U₀/m) + √(2 g l) + g t + v_pins, with U₀ the elastic energy of the start and l its size; of hard constraints the
+    start counts with what closes their gap in one step. Ten times that is called diverged, and so is anything that is not
+    finite: a diverging run grows by a factor a step and passes it at once.
+
+    Args:
+        model: The :class:`warpcloth.model.Model`.
+        h: Step of the solver [s].
+
+    Attributes:
+        good: The last good frame of each copy (B,).
+        worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame.
     """
 
-    def __init__(self, model):
+    def __init__(self, model, h):
         scene = model.scene
         self.model, self.edges = model, scene.mesh.edges
-        self.rest = np.linalg.norm(np.diff(scene.mesh.points[self.edges], axis=1)[:, 0], axis=1)
-        self.worst_strain = 0.0
-        points, velocities = model.positions.numpy(), model.velocities.numpy()
-        self.gravity = np.linalg.norm(model.gravity.numpy(), axis=1).max()
-        size = np.linalg.norm(np.ptp(points.reshape(model.copies, -1, 3), axis=1), axis=1).max()
-        self.start = self._speed(velocities) + np.sqrt(2.0 * self.gravity * size) + self._stored_speed()
+        self.rest = scene.mesh.edge_lengths
+        self.worst_strain, self.messages = 0.0, {}
+        self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
+        points, velocities = (array.numpy().astype(np.float64) for array in (model.positions, model.velocities))
+        self.mass = (
+            np.where(model.inverse_mass.numpy() > 0.0, model.mass.numpy(), 0.0).reshape(model.copies, -1).astype(np.float64)
+        )
+        self.total = np.where(self.mass.any(axis=1), self.mass.sum(axis=1), 1.0)
+        self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
+        size = np.linalg.norm(np.ptp(points.reshape(model.copies, -1, 3), axis=1), axis=1)
+        self.start = self._speed(velocities) + np.sqrt(2.0 * self.gravity * size) + self._stored_speed(h)
         if scene.pins.keyframes is not None and len(scene.pins.keyframes) > 1:
             moves = np.linalg.norm(np.diff(scene.pins.keyframes, axis=0), axis=-1)
             self.start += moves.max(initial=0.0) * scene.fps
-        # A cloth that nothing moves has no speed to compare with; one length a second is then the scale.
-        self.start = self.start or size
+        # A cloth that nothing moves has no speed to compare with; its size in a second is then the scale.
+        self.start[self.start == 0.0] = size.max()
 
     def _speed(self, velocities):
-        """Largest root mean square speed of a copy [m/s]."""
+        """Mass-weighted root mean square speed of the free vertices of each copy [m/s]."""
         squares = (velocities.astype(np.float64) ** 2).sum(axis=-1).reshape(self.model.copies, -1)
-        return float(np.sqrt(squares.mean(axis=1)).max())
+        return np.sqrt((self.mass * squares).sum(axis=1) / self.total)
 
-    def _stored_speed(self):
-        """√(2U/m) of the start, the speed that all elastic energy would turn into [m/s]; hard terms count by their gap."""
+    def _stored_speed(self, h):
+        """√(2U/m) of each copy at the start [m/s]; a hard constraint counts as ½m(gap/h)²."""
         from .operators import Energy, Sums
 
         model = self.model
-        if np.array_equal(
-            model.positions.numpy(),
-            np.tile(model.array(model.scene.mesh.points, model.vec3).numpy(), (model.copies, 1)),
-        ):
-            return 0.0
-        if any(elements.hard for elements in model.terms):
-            return np.inf
-        sums = Sums(model)
-        energy = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
-        Energy(model, sums).add(model.positions, energy)
-        mass = model.mass.numpy().reshape(model.copies, -1).sum(axis=1)
-        return float(np.sqrt(2.0 * energy.numpy() / mass).max())
+        speeds = np.zeros(model.copies)
+        for hard in (False, True):
+            terms = tuple(elements.softened() if hard else elements for elements in model.terms if elements.hard == hard)
+            if not terms:
+                continue
+            energy = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
+            Energy(model, Sums(model), terms=terms).add(model.positions, energy)
+            speeds += np.sqrt(2.0 * energy.numpy()) / (h if hard else np.sqrt(self.total))
+        return speeds
 
-    def trouble(self, frame, points, velocities):
-        """A sentence if the frame is no result, else None; keeps the worst strain of good frames."""
-        wrong = np.flatnonzero(~(np.isfinite(points).all(axis=1) & np.isfinite(velocities).all(axis=1)))
-        n = self.model.per_copy
-        if len(wrong):
-            return f"diverged in frame {frame}: vertex {wrong[0] % n} of copy {wrong[0] // n} is not finite"
-        speed, limit = self._speed(velocities), 10.0 * (self.start + self.gravity * frame / self.model.scene.fps)
-        if speed > limit:
-            return (
-                f"diverged in frame {frame}: a mean speed of {speed:.3g} m/s, above the {limit:.3g} m/s that its energy allows"
-            )
-        ends = points.astype(np.float64).reshape(self.model.copies, n, 3)[:, self.edges]
+    def passes(self, frame, points, velocities):
+        """Whether any copy is still good; marks those that no longer are, and puts NaN in their place."""
+        B, n = self.model.copies, self.model.per_copy
+        finite = (np.isfinite(points) & np.isfinite(velocities)).all(axis=1).reshape(B, n)
+        with np.errstate(over="ignore", invalid="ignore"):
+            speed, limit = self._speed(velocities), 10.0 * (self.start + self.gravity * frame / self.model.scene.fps)
+        for copy in np.flatnonzero(self.alive & ~(finite.all(axis=1) & (speed <= limit))):
+            self.alive[copy] = False
+            where = f"diverged in frame {frame}" + (f", copy {copy}" if B > 1 else "")
+            wrong = np.flatnonzero(~finite[copy])
+            if len(wrong):
+                self.messages[copy] = f"{where}: vertex {wrong[0]} is not finite"
+            else:
+                self.messages[copy] = (
+                    f"{where}: a mean speed of {speed[copy]:.3g} m/s, above the {limit[copy]:.3g} m/s that its energy allows"
+                )
+        self.good[self.alive] = frame
+        for array in (points, velocities):
+            array.reshape(B, n, 3)[~self.alive] = np.nan
+        if not self.alive.any():
+            return False
+        ends = points.astype(np.float64).reshape(B, n, 3)[self.alive][:, self.edges]
         lengths = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
-        self.worst_strain = max(self.worst_strain, float(np.abs(lengths / self.rest - 1.0).max()))
-        return None
+        with np.errstate(divide="ignore", invalid="ignore"):
+            strain = np.abs(lengths / self.rest - 1.0)[:, self.rest > 0.0]
+        self.worst_strain = max(self.worst_strain, float(strain.max(initial=0.0)))
+        return True
+
+    def status(self, stepper):
+        """The :class:`Status` of the run."""
+        results = [Result.DIVERGED if copy in self.messages else result for copy, result in enumerate(stepper.results)]
+        worst, residual = results[0], float(stepper.residual.max())
+        for result in results[1:]:
+            worst = worst.worse(result)
+        message = worst.value
+        if self.messages:
+            message = "; ".join(self.messages[copy] for copy in sorted(self.messages))
+        elif worst not in (Result.COMPLETED, Result.CONVERGED):
+            message = f"{worst.value}, in a step or more; largest residual {residual:.2g}"
+        return Status(worst, int(self.good.max()), residual, message, self.good)
 
 
 class _Memory:
@@ -217,7 +240,9 @@ class _File:
         stage, self.single_file = scene.stage, single_file
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins)
+            # The axis that gravity is along.
+            up = "Z" if abs(scene.gravity[2]) > abs(scene.gravity[1]) else "Y"
+            self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins, up_axis=up)
         else:
             self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim)
         self.append = self.writer.append

@@ -96,7 +96,7 @@ def step_limits(model):
     hessian.assemble(model.array(rest_shape, model.vec3), 0.0)
     inverse_mass = model.inverse_mass.numpy().astype(np.float64)
     root = diags(np.repeat(np.sqrt(inverse_mass), 3))
-    matrix = (root @ hessian.matrix().astype(np.float64) @ root).tocsr()
+    matrix = (root @ hessian.matrix() @ root).tocsr()
     rows = np.zeros(model.count)
     for elements, blocks in zip(model.terms, hessian.blocks, strict=True):
         K = elements.term.vertices

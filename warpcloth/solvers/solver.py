@@ -1,7 +1,6 @@
-"""What all solvers share: the options of the step, the state of a bound solver, and what a run reports."""
+"""What all solvers share: the options of the step and the state of a bound solver."""
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -9,36 +8,7 @@ import warp as wp
 
 from ..checks import number, whole
 from ..kernels import step as kernels
-
-
-class Result(Enum):
-    """How a run or a step ended; the value is what is shown."""
-
-    COMPLETED = "completed"
-    CONVERGED = "converged"
-    ITERATIONS_USED_UP = "iterations used up"
-    DIVERGED = "diverged"
-
-
-class Status(NamedTuple):
-    """How a run ended.
-
-    Attributes:
-        result: See :class:`Result`.
-        frame: The last frame that is good.
-        residual: Largest residual of any step so far, relative; 0 of methods that have none.
-        message: One sentence.
-    """
-
-    result: Result
-    frame: int = 0
-    residual: float = 0.0
-    message: str = ""
-
-    @property
-    def ok(self):
-        """False if the run diverged."""
-        return self.result is not Result.DIVERGED
+from ..status import Result
 
 
 class State(NamedTuple):
@@ -88,7 +58,8 @@ class Stepper:
         state: :class:`State`.
         h: Step [s].
         steps_per_frame: Steps a frame.
-        result, residual: Of the steps so far, see :class:`Status`.
+        results: The worst :class:`warpcloth.status.Result` of each copy so far, a list of B.
+        residual: The largest residual of each copy so far, (B,); 0 of methods that have none.
     """
 
     def __init__(self, options, model):
@@ -97,7 +68,7 @@ class Stepper:
         self.steps_per_frame = options.per_frame(fps)
         self.h = 1.0 / (fps * self.steps_per_frame)
         self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
-        self.result, self.residual = Result.COMPLETED, 0.0
+        self.results, self.residual = [Result.COMPLETED] * model.copies, np.zeros(model.copies)
         self.count = wp.zeros(1, dtype=wp.int32, device=model.device) if model.pins is not None else None
 
     def launch_pins(self):
