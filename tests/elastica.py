@@ -17,19 +17,29 @@ ASPECT = {
 }
 
 
-def aspect(gamma):
-    """H/W from φ″ = Γ u sin φ, φ'(0) = 0, φ(1) = π/2: u from the free tip, φ from vertical down; H = ∫cos φ, W = ∫sin φ."""
+def curve(gamma, count=101):
+    """Points (count, 2) from the clamp at the origin to the tip, y up, in units of L.
 
-    def shoot(tip):
+    φ″ = Γ u sin φ, φ'(0) = 0, φ(1) = π/2: u from the free tip, φ from vertical down; H = ∫cos φ, W = ∫sin φ.
+    """
+
+    def shoot(tip, at=None):
         return solve_ivp(
             lambda u, y: [y[1], gamma * u * np.sin(y[0]), np.cos(y[0]), np.sin(y[0])],
             (0.0, 1.0),
             [tip, 0.0, 0.0, 0.0],
             method="DOP853",
+            t_eval=at,
             rtol=1e-12,
             atol=1e-14,
-        ).y[:, -1]
+        ).y
 
-    tip = brentq(lambda angle: shoot(angle)[0] - np.pi / 2, 1e-9, np.pi / 2, xtol=1e-14)
-    _, _, H, W = shoot(tip)
-    return H / W
+    tip = brentq(lambda angle: shoot(angle)[0, -1] - np.pi / 2, 1e-9, np.pi / 2, xtol=1e-14)
+    _, _, H, W = shoot(tip, np.linspace(0.0, 1.0, count))[:, ::-1]
+    return np.stack([W[0] - W, H - H[0]], axis=1)
+
+
+def aspect(gamma):
+    """H/W of the tip."""
+    x, y = curve(gamma, 2)[-1]
+    return -y / x

@@ -1,0 +1,120 @@
+"""Makes the pictures of the README from animations and rest shapes: python docs/pictures.py"""
+
+import sys
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import ListedColormap, Normalize
+
+import warpcloth as wc
+from warpcloth.scenes import cantilever, hanging
+
+DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS.parent / "tests"))
+import elastica  # noqa: E402 it stands among the tests
+
+GREY = "0.35"
+
+
+def save(figure, name):
+    """A PNG in docs/, cut to what is drawn."""
+    figure.savefig(DOCS / name, dpi=130, bbox_inches="tight", pad_inches=0.08, facecolor="white")
+    plt.close(figure)
+
+
+def project(points, azimuth=-38.0, elevation=24.0):
+    """Right, up and towards the viewer (…, 3), in parallel projection; angles in degrees from +z and from the horizontal."""
+    a, e = np.radians([azimuth, elevation])
+    towards = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+    right = np.array([np.cos(a), 0.0, -np.sin(a)])
+    return points @ np.stack([right, np.cross(towards, right), towards], axis=1)
+
+
+def strain(mesh, points):
+    """Mean of l/L − 1 over the edges of a vertex, averaged over each triangle, (T,)."""
+    lengths = [np.linalg.norm(np.diff(x[mesh.edges], axis=1)[:, 0], axis=1) for x in (points, mesh.points)]
+    ends, repeated = mesh.edges.ravel(), np.repeat(lengths[0] / lengths[1] - 1.0, 2)
+    at_vertices = np.bincount(ends, repeated) / np.bincount(ends)
+    return at_vertices[mesh.triangles].mean(axis=1)
+
+
+def brightness(corners):
+    """Light from the viewer's upper left on either side of each triangle, (T,)."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    normals *= np.where(normals[:, 2] < 0.0, -1.0, 1.0)[:, None]
+    light = np.array([-0.4, 0.6, 0.7])
+    return 0.7 + 0.3 * np.clip(normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
+
+
+def picture_hanging(moments=(0.0, 0.25, 0.4, 0.5, 0.75, 1.0, 1.25), worst=0.0015):
+    """The hanging cloth side by side at some moments [s], coloured by strain up to ``worst``."""
+    scene = hanging.scene(n=64, duration=1.25)
+    animation = wc.simulate(scene, wc.Newton(dt=1 / 240))
+    assert animation.status.ok, animation.status
+    figure, axes = plt.subplots(figsize=(11.0, 2.6))
+    colours = ListedColormap(plt.get_cmap("viridis")(np.linspace(0.25, 1.0, 256)))
+    left = 0.0
+    for time in moments:
+        points = np.asarray(animation.points[round(time * scene.fps)], dtype=float)
+        seen = project(points)
+        seen[:, 0] += left - seen[:, 0].min()
+        corners = seen[scene.mesh.triangles]
+        order = np.argsort(corners[..., 2].mean(axis=1))
+        faces = colours(np.clip(strain(scene.mesh, points) / worst, 0.0, 1.0))
+        faces[:, :3] *= brightness(corners)[:, None]
+        # Edges in the colour of their triangle close the hairlines between neighbours.
+        cloth = PolyCollection(corners[order, :, :2], facecolors=faces[order], edgecolors=faces[order], linewidths=0.4)
+        axes.add_collection(cloth)
+        axes.plot(*seen[scene.pins.vertices, :2].T, "o", color="black", markersize=3.5)
+        right = seen[:, 0].max()
+        axes.text((left + right) / 2, 0.47, f"{time:g} s", ha="center", color=GREY)
+        left = right + 0.15
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.axis("off")
+    scale = ScalarMappable(Normalize(0.0, 100.0 * worst), colours)
+    bar = figure.colorbar(
+        scale, ax=axes, shrink=0.6, aspect=14, pad=0.01, extend="both", ticks=[0.0, 50.0 * worst, 100.0 * worst]
+    )
+    bar.set_label("strain [%]", color=GREY, fontsize=8)
+    bar.ax.tick_params(labelsize=8, colors=GREY)
+    bar.outline.set_visible(False)
+    save(figure, "hanging.png")
+
+
+def picture_cantilever(gammas=(1.0, 5.0, 20.0), elements=40):
+    """Vertices of the cantilever at rest on the elastica; its one row of triangles bends with 8/9 of D."""
+    figure, axes = plt.subplots(figsize=(4.6, 3.6))
+    colours = plt.get_cmap("viridis")([0.1, 0.45, 0.7])
+    for gamma, colour in zip(gammas, colours, strict=True):
+        scene = cantilever.scene(gamma=8 / 9 * gamma, elements=elements)
+        rest = wc.equilibrium(scene)
+        assert rest.status.ok, rest.status
+        clamp = scene.mesh.points[scene.pins.vertices, 0].max() / 2
+        points = rest.points[:, :2] - [clamp, 0.0]
+        axes.plot(*elastica.curve(gamma).T, "-", color=colour, linewidth=1.6, zorder=2)
+        axes.plot(*points[: elements + 1 : 2].T, "o", color=colour, markersize=4.5, markerfacecolor="white", zorder=3)
+        axes.annotate(f"Γ = {gamma:g}", points[elements], (8, -4), textcoords="offset points", color=colour)
+    axes.plot([], [], "-", color=GREY, label="elastica")
+    axes.plot([], [], "o", color=GREY, markersize=4.5, markerfacecolor="white", label="vertices at rest, every second")
+    axes.legend(frameon=False, fontsize=8, labelcolor=GREY, loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2)
+    axes.set_aspect("equal")
+    axes.margins(x=0.08)
+    axes.set_xlabel("x / L", color=GREY)
+    axes.set_ylabel("y / L", color=GREY)
+    axes.tick_params(colors=GREY, labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("0.7")
+    save(figure, "cantilever.png")
+
+
+if __name__ == "__main__":
+    picture_hanging()
+    picture_cantilever()

@@ -1,0 +1,66 @@
+"""What the README shows works as it stands there, and its tables name all that there is."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.cli import main
+from warpcloth.solvers import SOLVERS
+from warpcloth.terms import TERMS
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = [(m[1], m[2]) for m in re.finditer(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)]
+EXAMPLE, CURTAIN = (text for language, text in BLOCKS if language == "python")
+(STAGE,) = (text for language, text in BLOCKS if language == "usda")
+COMMANDS = [line for language, text in BLOCKS if language == "sh" for line in text.splitlines() if line.startswith("warpcloth")]
+
+
+def test_the_python_example(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(compile(EXAMPLE, "README.md", "exec"), names)
+    animation = names["animation"]
+    assert animation.status.ok and len(animation.points) == 61 and (tmp_path / "hanging.usdc").is_file()
+    assert "converged" in capsys.readouterr().out
+    assert np.asarray(animation.points[-1]).shape == (1024, 3)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "curtain.py").write_text(CURTAIN, encoding="utf-8")
+    (tmp_path / "cloth.usda").write_text(STAGE, encoding="utf-8")
+    arguments = shlex.split(command)[1:]
+    if arguments[0] == "run" and "--frames" not in arguments:
+        arguments += ["--frames", "2"]
+    assert main(arguments) == 0, capsys.readouterr().err
+    if arguments[0] == "run":
+        assert (tmp_path / arguments[arguments.index("-o") + 1]).is_file()
+
+
+@pytest.mark.parametrize(
+    ("head", "names"),
+    [
+        ("Term", set(TERMS)),
+        ("Solver", {record.__name__ for record in SOLVERS.values()}),
+        ("Scene", {path.stem for path in (ROOT / "scenes").glob("*.py")}),
+    ],
+)
+def test_tables_are_whole(head, names):
+    table = re.search(rf"^\| {head} \|.*?(?=\n\n)", README, re.MULTILINE | re.DOTALL)[0]
+    assert set(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) == names
+
+
+def test_links_lead_somewhere():
+    links = re.findall(r"\]\((?!https:)([^)]+)\)", README)
+    assert len(links) > 2 and all((ROOT / link).is_file() for link in links)
+
+
+def test_every_name_of_the_api_exists():
+    for name in re.findall(r"wc\.(\w+)", README):
+        assert hasattr(wc, name), name
