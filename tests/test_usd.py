@@ -360,6 +360,30 @@ def test_nothing_of_an_earlier_run_is_left(tmp_path):
     assert len(FrameSequence(tmp_path / "out.usda")) == 4
 
 
+@pytest.mark.parametrize(
+    ("ending", "single_file"), [("usdc", False), ("usda", False), ("usdc", True), ("usda", True), ("usdz", True)]
+)
+@pytest.mark.parametrize("frames", [FRAMES, 4])
+def test_frames_of_two_runs_are_never_mixed(tmp_path, ending, single_file, frames):
+    mesh, output = Mesh.grid(5, 4), tmp_path / f"out.{ending}"
+    earlier = FrameSequence(write(output, mesh, single_file=single_file))
+    assert len(earlier[:2]) == 2
+    again = write(output, mesh, frames=frames, sign=-1.0, single_file=single_file)
+    for read in (np.asarray, lambda sequence: sequence[0], lambda sequence: next(iter(sequence))):
+        with pytest.raises(RuntimeError, match=f"out.{ending}: has been written again since these frames were opened; open it"):
+            read(earlier)
+    np.testing.assert_allclose(FrameSequence(again)[-1], motion(mesh, frames - 1, sign=-1.0)[0], atol=4 * EPS)
+
+
+def test_frames_that_were_opened_outlive_their_file(tmp_path):
+    mesh = Mesh.grid(5, 4)
+    sequence = FrameSequence(write(tmp_path / "out.usdc", mesh))
+    expected = np.asarray(sequence)
+    for path in tmp_path.iterdir():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    np.testing.assert_array_equal(sequence, expected)
+
+
 @pytest.mark.parametrize("ending", ["usda", "usdz"])
 def test_an_error_keeps_the_frames_before_it(tmp_path, ending):
     mesh = Mesh.grid(5, 4)
