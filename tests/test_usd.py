@@ -375,6 +375,27 @@ def test_frames_of_two_runs_are_never_mixed(tmp_path, ending, single_file, frame
     np.testing.assert_allclose(FrameSequence(again)[-1], motion(mesh, frames - 1, sign=-1.0)[0], atol=4 * EPS)
 
 
+@pytest.mark.parametrize("there", [True, False], ids=["to a file", "to no file yet"])
+@pytest.mark.parametrize(
+    ("ending", "single_file"), [("usdc", False), ("usda", False), ("usdc", True), ("usda", True), ("usdz", True)]
+)
+def test_a_link_is_followed(tmp_path, ending, single_file, there):
+    mesh, shelf = Mesh.grid(5, 4), tmp_path / "shelf"
+    shelf.mkdir()
+    target, link, second = shelf / f"real.{ending}", tmp_path / f"link.{ending}", tmp_path / f"second.{ending}"
+    if there:
+        write(target, mesh, sign=-1.0, single_file=single_file)
+    link.symlink_to(target)
+    second.symlink_to(link.name)
+    path = write(second, mesh, single_file=single_file)
+    assert link.is_symlink() and second.is_symlink() and path == str(target)
+    assert sorted(os.listdir(tmp_path)) == sorted(["shelf", link.name, second.name])
+    assert sorted(os.listdir(shelf)) == [target.name] + ([] if single_file else ["real_frames"])
+    for name in (target, link, second):
+        np.testing.assert_allclose(FrameSequence(name)[3], motion(mesh, 3)[0], atol=4 * EPS)
+    assert validate(target) == []
+
+
 def test_frames_that_were_opened_outlive_their_file(tmp_path):
     mesh = Mesh.grid(5, 4)
     sequence = FrameSequence(write(tmp_path / "out.usdc", mesh))
@@ -600,6 +621,8 @@ def test_bad_stages_are_refused(tmp_path, make, prim, error, message):
         ({"up_axis": "X"}, ValueError, "up_axis = 'X'"),
         ({"prim": "/World/Cloth"}, ValueError, "prim = '/World/Cloth': must be a name"),
         ({"output": "taken.usda"}, ValueError, "taken_frames: is a file"),
+        ({"output": "link.usdc"}, ValueError, "output = link.usdc: is a link to .*real.usda, must end as that does"),
+        ({"output": "lost.usda"}, FileNotFoundError, "the folder .*lost does not exist"),
     ],
 )
 def test_bad_options_are_refused(tmp_path, monkeypatch, options, error, message):
@@ -610,6 +633,8 @@ def test_bad_options_are_refused(tmp_path, monkeypatch, options, error, message)
         '#usda 1.0\ndef Xform "Copy" (\n    instanceable = true\n    references = @./artist.usda@\n)\n{\n}\n'
     )
     Path("taken_frames").write_text("")
+    Path("link.usdc").symlink_to("real.usda")
+    Path("lost.usda").symlink_to("lost/real.usda")
     before = sorted(os.listdir())
     with pytest.raises(error, match=message):
         AnimationWriter(**{"output": "out.usda", "mesh": Mesh.grid(5, 4), "fps": 24, **options})
