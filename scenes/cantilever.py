@@ -1,8 +1,7 @@
 """A strip clamped at one end that bends under its own weight, Γ = ρgL³/D (Romero et al. 2021), on an equilateral mesh.
 
-Length runs along x. Of no width it is one row of triangles, which bends with 8/9 of D, for both bending energies have Poisson's
-ratio 1/3; otherwise rows of edges lie across the width. The clamp is in the middle of the pinned vertices, half an element
-from x = 0, and the free length L counts from there (to the mean of both row ends of a single row).
+Length runs along x. Of no width it is one row of triangles, which bends with 8/9 of D, for Poisson's ratio is 1/3; otherwise
+rows of edges lie across it. L counts from amid the pins, half an element from x = 0 (to the mean end of a single row).
 """
 
 import numpy as np
@@ -20,17 +19,17 @@ def scene(
     duration: float = 2.0,
 ):
     """Γ, width [m], elements along, quadratic or dihedral, kL²/D of the springs' k, L [m], duration [s]."""
+    wc.checks.number("width", width, least=0.0)
+    wc.checks.choice("bending", bending, ("quadratic", "dihedral"))
+    spacing = length / (elements - (0.25 if width == 0.0 else 0.5))
     if width == 0.0:
-        spacing = length / (elements - 0.25)
         mesh = wc.Mesh.grid(elements + 1, 2, size=spacing * elements, pattern="equilateral")
     else:
-        spacing = length / (elements - 0.5)
-        edge = spacing / np.sqrt(0.75)
-        across = max(round(width / edge), 1)
-        rows = wc.Mesh.grid(across + 1, elements + 1, size=edge * across, pattern="equilateral")
+        across = max(round(width / spacing * np.sqrt(0.75)), 1)
+        rows = wc.Mesh.grid(across + 1, elements + 1, size=across * spacing / np.sqrt(0.75), pattern="equilateral")
         mesh = wc.Mesh(rows.points[:, ::-1], rows.triangles[:, ::-1])  # x and z change places
     stiffness = 1e-3  # D [N·m]
-    bend = {"quadratic": wc.QuadraticBending, "dihedral": wc.DihedralBending}[bending]
+    bend = wc.QuadraticBending if bending == "quadratic" else wc.DihedralBending
     return wc.Scene(
         mesh,
         density=gamma * stiffness / (9.81 * length**3),

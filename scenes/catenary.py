@@ -19,6 +19,8 @@ def scene(
 ):
     """Number of springs, d [m], S [m], w [N/m], EA [N], duration [s]."""
     mesh = wc.Mesh.chain(links + 1, length=length, direction=(1.0, 0.0, 0.0))
+    if not 0.0 < span <= length:
+        raise ValueError(f"span is {span}; it must be above 0, and no more than the length, {length}")
     positions = mesh.points * (span / length)
     depth = np.sqrt(length**2 - span**2) / 2.0
     positions[:, 1] = -depth * (1.0 - np.abs(2.0 * positions[:, 0] / span - 1.0))

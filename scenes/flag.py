@@ -15,18 +15,19 @@ def scene(
     duration: float = 3.0,
 ):
     """Vertices along and down, swing to either side [°], its period [s], springs [N/m], bending [N·m], duration [s]."""
+    wc.checks.number("swing", swing, least=0.0)
+    wc.checks.number("period", period, above=0.0)
+    wc.checks.number("duration", duration, above=0.0)
     mesh = wc.Mesh.grid(nx, ny, size=(0.9, 0.6), pattern="alternating")
     fps = 60.0
     upright = mesh.points[:, [0, 2, 1]] * [1.0, -1.0, 1.0]  # the grid's z is down
     pole = np.arange(0, nx * ny, nx)
-    times = np.arange(round(duration * fps) + 1) / fps
+    times = np.arange(round(duration * fps) + 1)[:, None] / fps
     angle = np.radians(swing) * np.sin(2.0 * np.pi * times / period) * np.minimum(times / period, 1.0)
     # The pole is as thick as the flag's first cell is wide, so that turning it turns the cloth.
     held = np.concatenate([pole, pole + 1])
     x = upright[held, 0]
-    keyframes = np.stack(
-        [x * np.cos(angle)[:, None], np.tile(upright[held, 1], (len(times), 1)), x * np.sin(angle)[:, None]], axis=-1
-    )
+    keyframes = np.stack([x * np.cos(angle), np.tile(upright[held, 1], (len(times), 1)), x * np.sin(angle)], axis=-1)
     return wc.Scene(
         mesh,
         density=0.1,

@@ -17,12 +17,29 @@ import warpcloth.cli
 import warpcloth.usd
 from warpcloth import scene_files
 from warpcloth.cli import main
+from warpcloth.scene import Scene
+from warpcloth.solvers import explicit
 from warpcloth.usd import FrameSequence
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["hanging", "-p", "n=5"]
 
+# A scene whose term fails where the model is built, in a way that nobody checks for.
+FAILING = """
+import warpcloth as wc
+
+class Term(wc.Spring):
+    def elements(self, *_):
+        {}
+
+def scene():
+    return wc.Scene(wc.Mesh.grid(3, 3), density=1.0, terms=[Term(stiffness=1.0)], duration=0.1, pins=[0])
+"""
+
 SCENE_FILES = {
+    "type.py": FAILING.format("None + 'a'"),
+    "attribute.py": FAILING.format("().x"),
+    "exit.py": FAILING.format("raise SystemExit(1)"),
     "good.py": '''
 """A small sheet."""
 import warpcloth as wc
@@ -45,6 +62,10 @@ def scene():
     "syntax.py": "x = 1\ndef scene(:\n",
     "imports.py": "\nimport no_such_module_at_all\n",
     "raises.py": "def scene():\n    values = {}\n    return values['a\\nb']\n",
+    "exits.py": "import sys\n\nsys.exit(3)\n",
+    "quits.py": "def scene():\n    raise SystemExit\n",
+    "stops.py": "class Stop(BaseException):\n    pass\n\ndef scene():\n    raise Stop('here')\n",
+    "rubbish.py": "import warpcloth as wc\ndef scene():\n    return wc.Scene(mesh='sheet', density=1.0)\n",
     "number.py": "def scene():\n    return 3\n",
     "broken.usda": "no stage\n",
     "notes.txt": "no scene\n",
@@ -78,6 +99,15 @@ WRONG_USES = [
     ("info {}/syntax.py", "syntax.py, line 2: SyntaxError: "),
     ("info {}/imports.py", "imports.py, line 2: ModuleNotFoundError: No module named 'no_such_module_at_all'"),
     ("info {}/raises.py", "raises.py, line 3: KeyError: "),
+    ("info {}/exits.py", "exits.py, line 3: SystemExit: 3"),
+    ("run {}/quits.py -o {}/o.usdc", "quits.py, line 2: SystemExit\n"),
+    ("info {}/stops.py", "stops.py, line 5: Stop: here"),
+    ("info {}/rubbish.py", "rubbish.py, line 3: AttributeError: "),
+    ("info {}/type.py", "warpcloth: TypeError: unsupported operand"),
+    ("run {}/type.py -o {}/o.usdc", "'str' (run again with --debug for the traceback)\n"),
+    ("run {}/type.py --solver explicit -o {}/o.usdc", "'str' (run again with --debug for the traceback)\n"),
+    ("info {}/attribute.py", "warpcloth: AttributeError: 'tuple' object has no attribute 'x' (run again with"),
+    ("run {}/exit.py -o {}/o.usdc", "warpcloth: SystemExit: 1 (run again with"),
     ("info {}/number.py", "number.py: scene() returned a int; it must return a warpcloth.Scene"),
     # parameters
     ("info hanging -p m=3", "has no parameter 'm'; allowed are n, stiffness, bending, density, duration"),
@@ -90,6 +120,37 @@ WRONG_USES = [
     ("info hanging -p n=3 n=4", "n is given twice, as '3' and '4'"),
     ("info hanging -p n=1", "hanging.py, line 14: ValueError: nx = 1: must be"),
     ("info hanging -p duration=0.01", "ValueError: duration is 0.01 s; at fps 60.0 it must be a whole number of frames"),
+    # parameters that make no sense, of each scene that comes with the package
+    ("info cantilever -p width=-1", "ValueError: width is -1.0; it must be a number of 0 or more"),
+    ("info cantilever -p width=inf", "ValueError: width is inf; it must be a number of 0 or more"),
+    ("info cantilever -p elements=0", "ValueError: nx = 1: must be a whole number of vertices, at least 2"),
+    ("info cantilever -p elements=0 width=0.2", "ValueError: ny = 1: must be a whole number of vertices, at least 2"),
+    ("info cantilever -p length=-1 width=0.2", "must be a finite positive length"),
+    ("info cantilever -p bending=foo", "ValueError: bending is 'foo'; it must be one of 'quadratic', 'dihedral'"),
+    ("info cantilever -p gamma=0", "ValueError: density is 0.0; it must be a number above 0"),
+    ("info cantilever -p length=0", "ValueError: size = 0.0: must be a finite positive length"),
+    ("info cantilever -p stretching=-1", "Spring.stiffness[0] is -0.001; it must be 0 or more"),
+    ("info catenary -p links=0", "ValueError: n = 1: must be a whole number of vertices, at least 2"),
+    ("info catenary -p span=0", "ValueError: span is 0.0; it must be above 0, and no more than the length, 1.2"),
+    ("info catenary -p span=1.3", "ValueError: span is 1.3; it must be above 0, and no more than the length, 1.2"),
+    ("info catenary -p length=-1", "ValueError: length = -1.0: must be a finite positive length"),
+    ("info catenary -p weight=-1", "it must be a number above 0"),
+    ("info catenary -p stretching=-1", "Spring.stiffness[0] is -83.3"),
+    ("info chain -p links=0", "ValueError: n = 1: must be a whole number of vertices, at least 2"),
+    ("info chain -p length=inf", "ValueError: length = inf: must be a finite positive length"),
+    ("info chain -p mass=0", "ValueError: vertex 1 has mass 0.0 kg; a vertex that is not pinned must have one above 0"),
+    ("info chain -p stiffness=-1", "Spring.stiffness[0] is -1.0; it must be 0 or more"),
+    ("info flag -p nx=1", "ValueError: nx = 1: must be a whole number of vertices, at least 2"),
+    ("info flag -p swing=inf", "ValueError: swing is inf; it must be a number of 0 or more"),
+    ("info flag -p period=0", "ValueError: period is 0.0; it must be a number above 0"),
+    ("info flag -p duration=inf", "ValueError: duration is inf; it must be a number above 0"),
+    ("info flag -p stiffness=-1", "Spring.stiffness[0] is -1.0; it must be 0 or more"),
+    ("info flag -p bending=-1", "QuadraticBending.stiffness[0] is -1.0; it must be 0 or more"),
+    ("info hanging -p density=-1", "kg; a vertex that is not pinned must have one above 0"),
+    ("info hanging -p stiffness=-1", "Spring.stiffness[0] is -1.0; it must be 0 or more"),
+    ("info usd_cloth -p density=0", "ValueError: density is 0.0; it must be a number above 0"),
+    ("info usd_cloth -p stiffness=-1", "Spring.stiffness[0] is -1.0; it must be 0 or more"),
+    ("info usd_cloth -p bending=-1", "QuadraticBending.stiffness[0] is -1.0; it must be 0 or more"),
     ("info {}/good.py -p sag=perhaps", "sag is 'perhaps'; it must be true or false"),
     ("info {}/good.py -p hole=3", "hole takes tuple, which cannot be written as text"),
     ("info {}/needs.py", "needs.py needs a value for n; give it with -p n=…"),
@@ -138,6 +199,14 @@ def test_wrong_use_gives_one_line_and_exit_code_2(folder, capfd, argv, fragment)
     assert not list(folder.glob("o*"))
 
 
+@pytest.mark.parametrize(("name", "code"), [("type.py", "None + 'a'"), ("raises.py", "values['a")])
+def test_debug_shows_the_traceback_above_the_line(folder, capfd, name, code):
+    result, out, err = run(capfd, "info", folder / name, "--debug")
+    assert (result, out) == (2, "")
+    assert err.startswith("Traceback (most recent call last):\n") and code in err
+    assert err.splitlines()[-1].startswith("warpcloth: ") and "--debug" not in err
+
+
 def test_a_stage_that_is_none_is_refused(folder, capfd):
     refused(capfd, ["info", folder / "broken.usda"], "is no USD stage")
 
@@ -172,6 +241,7 @@ def test_each_solver_runs_with_its_default_step(tmp_path, capfd, solver, step):
     assert (code, err) == (0, "")
     assert "hanging: co" in out and "3 of 3, " in out and step in out
     assert f"{output}, with its frames in {tmp_path / 'out_frames'}\n" in out
+    assert out.endswith("(they belong together: move both, or make one file with --single-file)\n")
     assert FrameSequence(output).shape == (4, 25, 3)
 
 
@@ -218,6 +288,53 @@ def test_explicit_default_step_is_below_both_limits_and_one_less_is_not(capfd):
     substeps = solver["options"]["substeps"]
     assert 1 / (60 * substeps) < limit <= 1 / (60 * (substeps - 1))
     assert err == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [("run", []), ("info", []), ("info", ["-s", "substeps=100"]), ("info", ["-s", "above_limit=allow"])],
+)
+def test_explicit_builds_and_looks_for_its_limits_once(tmp_path, capfd, monkeypatch, command, options):
+    counts = dict.fromkeys(("build", "limits"), 0)
+
+    def counted(name, function):
+        def call(*args, **kwargs):
+            counts[name] += 1
+            return function(*args, **kwargs)
+
+        return call
+
+    monkeypatch.setattr(explicit, "step_limits", counted("limits", explicit.step_limits))
+    monkeypatch.setattr(Scene, "build", counted("build", Scene.build))
+    output = ["-o", tmp_path / "out.usdc", "--frames", 1] if command == "run" else []
+    code, out, err = run(capfd, command, *SMALL, "--solver", "explicit", "--json", *options, *output)
+    assert (code, err) == (0, "")
+    assert counts == {"build": 1, "limits": 1}
+    facts = json.loads(out)
+    shown = facts["options"] if command == "run" else facts["solver"]["options"]
+    assert shown["above_limit"] == ("allow" if "above_limit=allow" in options else "refuse")
+
+
+@pytest.mark.parametrize(
+    ("solver", "substeps", "hint"), [("explicit", 1001, True), ("explicit", 1000, False), ("pbd", 1001, False)]
+)
+@pytest.mark.parametrize("command", ["run", "info"])
+def test_very_many_explicit_substeps_give_a_hint(tmp_path, capfd, command, solver, substeps, hint):
+    output = ["-o", tmp_path / "out.usdc", "--frames", 1] if command == "run" else []
+    code, _, err = run(capfd, command, *SMALL, "--solver", solver, "-s", f"substeps={substeps}", *output)
+    expected = "warpcloth: hint: explicit takes 1,001 substeps a frame here; --solver newton may suit better\n"
+    assert (code, err) == (0, expected if hint else "")
+
+
+def test_an_output_that_is_a_link_is_written_where_it_points_to(tmp_path, capfd):
+    (tmp_path / "shelf").mkdir()
+    link = tmp_path / "link.usdc"
+    link.symlink_to("shelf/real.usdc")
+    code, out, err = run(capfd, "run", *SMALL, "--frames", 1, "--json", "-o", link)
+    assert (code, err) == (0, "") and link.is_symlink()
+    assert os.path.realpath(json.loads(out)["frames_folder"]) == os.path.realpath(tmp_path / "shelf" / "real_frames")
+    assert sorted(os.listdir(tmp_path / "shelf")) == ["real.usdc", "real_frames"]
+    assert len(FrameSequence(link)) == 2
 
 
 def test_a_step_that_is_stable_only_about_rest_warns_in_one_line(capfd):

@@ -360,6 +360,51 @@ def test_nothing_of_an_earlier_run_is_left(tmp_path):
     assert len(FrameSequence(tmp_path / "out.usda")) == 4
 
 
+@pytest.mark.parametrize(
+    ("ending", "single_file"), [("usdc", False), ("usda", False), ("usdc", True), ("usda", True), ("usdz", True)]
+)
+@pytest.mark.parametrize("frames", [FRAMES, 4])
+def test_frames_of_two_runs_are_never_mixed(tmp_path, ending, single_file, frames):
+    mesh, output = Mesh.grid(5, 4), tmp_path / f"out.{ending}"
+    earlier = FrameSequence(write(output, mesh, single_file=single_file))
+    assert len(earlier[:2]) == 2
+    again = write(output, mesh, frames=frames, sign=-1.0, single_file=single_file)
+    for read in (np.asarray, lambda sequence: sequence[0], lambda sequence: next(iter(sequence))):
+        with pytest.raises(RuntimeError, match=f"out.{ending}: has been written again since these frames were opened; open it"):
+            read(earlier)
+    np.testing.assert_allclose(FrameSequence(again)[-1], motion(mesh, frames - 1, sign=-1.0)[0], atol=4 * EPS)
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["to a file", "to no file yet"])
+@pytest.mark.parametrize(
+    ("ending", "single_file"), [("usdc", False), ("usda", False), ("usdc", True), ("usda", True), ("usdz", True)]
+)
+def test_a_link_is_followed(tmp_path, ending, single_file, there):
+    mesh, shelf = Mesh.grid(5, 4), tmp_path / "shelf"
+    shelf.mkdir()
+    target, link, second = shelf / f"real.{ending}", tmp_path / f"link.{ending}", tmp_path / f"second.{ending}"
+    if there:
+        write(target, mesh, sign=-1.0, single_file=single_file)
+    link.symlink_to(target)
+    second.symlink_to(link.name)
+    path = write(second, mesh, single_file=single_file)
+    assert link.is_symlink() and second.is_symlink() and path == str(target)
+    assert sorted(os.listdir(tmp_path)) == sorted(["shelf", link.name, second.name])
+    assert sorted(os.listdir(shelf)) == [target.name] + ([] if single_file else ["real_frames"])
+    for name in (target, link, second):
+        np.testing.assert_allclose(FrameSequence(name)[3], motion(mesh, 3)[0], atol=4 * EPS)
+    assert validate(target) == []
+
+
+def test_frames_that_were_opened_outlive_their_file(tmp_path):
+    mesh = Mesh.grid(5, 4)
+    sequence = FrameSequence(write(tmp_path / "out.usdc", mesh))
+    expected = np.asarray(sequence)
+    for path in tmp_path.iterdir():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    np.testing.assert_array_equal(sequence, expected)
+
+
 @pytest.mark.parametrize("ending", ["usda", "usdz"])
 def test_an_error_keeps_the_frames_before_it(tmp_path, ending):
     mesh = Mesh.grid(5, 4)
@@ -576,6 +621,8 @@ def test_bad_stages_are_refused(tmp_path, make, prim, error, message):
         ({"up_axis": "X"}, ValueError, "up_axis = 'X'"),
         ({"prim": "/World/Cloth"}, ValueError, "prim = '/World/Cloth': must be a name"),
         ({"output": "taken.usda"}, ValueError, "taken_frames: is a file"),
+        ({"output": "link.usdc"}, ValueError, "output = link.usdc: is a link to .*real.usda, must end as that does"),
+        ({"output": "lost.usda"}, FileNotFoundError, "the folder .*lost does not exist"),
     ],
 )
 def test_bad_options_are_refused(tmp_path, monkeypatch, options, error, message):
@@ -586,6 +633,8 @@ def test_bad_options_are_refused(tmp_path, monkeypatch, options, error, message)
         '#usda 1.0\ndef Xform "Copy" (\n    instanceable = true\n    references = @./artist.usda@\n)\n{\n}\n'
     )
     Path("taken_frames").write_text("")
+    Path("link.usdc").symlink_to("real.usda")
+    Path("lost.usda").symlink_to("lost/real.usda")
     before = sorted(os.listdir())
     with pytest.raises(error, match=message):
         AnimationWriter(**{"output": "out.usda", "mesh": Mesh.grid(5, 4), "fps": 24, **options})

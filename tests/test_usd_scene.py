@@ -481,6 +481,12 @@ def test_the_stage_of_a_scene_is_not_overwritten(tmp_path):
         write_scene(scene, tmp_path / "scene.usda")
 
 
+def test_a_scene_is_written_through_a_link(tmp_path):
+    (tmp_path / "link.usda").symlink_to("real.usda")
+    assert write_scene(chain(), tmp_path / "link.usda") == str(tmp_path / "real.usda")
+    assert (tmp_path / "link.usda").is_symlink() and len(read_scene(tmp_path / "real.usda").terms)
+
+
 def test_square_cloth_hangs(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "scenes"))
     scene = __import__("usd_cloth").scene(duration=0.25)

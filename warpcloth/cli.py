@@ -1,7 +1,8 @@
 """The command ``warpcloth``: runs scenes, lists them, and says what is in one.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
-saved), 2 wrong use (one line on stderr), 130 interrupted.
+saved), 2 wrong use (one line on stderr), 130 interrupted. Any other error ends with 2 and one line as well, for most come of
+what a scene file declares; with ``--debug`` the traceback stands above the line.
 """
 
 import argparse
@@ -12,8 +13,10 @@ import shutil
 import statistics
 import sys
 import tempfile
+import time
+import traceback
 import warnings
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +26,8 @@ from . import scene_files
 # A step that all solvers but the explicit ones take well; where no step is given the substeps come nearest to it.
 _STEPS_A_SECOND = 240
 _EXPLICIT_MARGIN = 1.1
+# More substeps a frame than this, and the implicit solver is worth a hint.
+_MANY_SUBSTEPS = 1000
 
 _EPILOG = """\
 Where neither dt nor substeps is given: newton and pbd take the substeps that come nearest to 1/240 s; explicit the fewest
@@ -41,25 +46,36 @@ def main(argv=None):
     """
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
+        debug = False
         try:
             parser = _parser()
-            arguments = parser.parse_args(argv)
+            try:
+                arguments = parser.parse_args(argv)
+            except SystemExit as done:  # --help and --version
+                return done.code
             if arguments.command is None:
                 parser.print_help(sys.stderr)
                 return 2
+            debug = arguments.debug
             return arguments.command(arguments)
         except _Interrupted as interrupted:
             return _say(interrupted, 130)
         except KeyboardInterrupt:
             return _say("interrupted; nothing was saved", 130)
-        except OSError as error:
-            return _say(f"{error.filename}: {error.strerror}" if error.strerror and error.filename else error, 2)
-        except np.linalg.LinAlgError:  # a ValueError to NumPy, but none of ours
-            raise
-        except ValueError as error:
-            return _say(error, 2)
-        except SystemExit as done:  # --help and --version
-            return done.code
+        except (Exception, SystemExit) as error:
+            if debug:
+                traceback.print_exc()
+            return _say(_sentence(error, debug), 2)
+
+
+def _sentence(error, debug):
+    """What an error says; ours are sentences, others need their kind, and a hint at how to see more."""
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.strerror and error.filename else error
+    if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError):
+        return error
+    more = "" if debug else " (run again with --debug for the traceback)"
+    return type(error).__name__ + (f": {error}" if str(error) else "") + more
 
 
 class _Interrupted(Exception):
@@ -86,6 +102,7 @@ def _parser():
         form = argparse.RawDescriptionHelpFormatter
         sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False, formatter_class=form, **more)
         sub.set_defaults(command=command)
+        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
         return sub
 
     run = add("run", _run, "Run a scene and write its animation as USD.", epilog=_EPILOG)
@@ -113,12 +130,12 @@ def _run(arguments):
     frames = scene.frames if arguments.frames is None else arguments.frames
     _check_writable(arguments.output)
     device = _device(arguments.device)
-    solver, chosen = _solver(arguments, scene, device)
-    progress = _Progress(frames)
+    setup = _setup(arguments, scene, device)
+    progress = _Progress(frames, _hint(arguments, setup, scene))
     try:
         animation = simulate(
-            scene,
-            solver,
+            scene if setup.model is None else _Built(scene, setup.model),
+            setup.checked,
             output=arguments.output,
             device=device,
             dtype=arguments.dtype,
@@ -140,10 +157,10 @@ def _run(arguments):
         "frames": status.frame,
         "frames_asked": frames,
         "seconds_per_frame": statistics.median(animation.timings["frames"]),
-        "compile_seconds": animation.timings["compile"],
+        "compile_seconds": setup.seconds + animation.timings["compile"],
         "worst_strain": animation.worst_strain,
         "residual": status.residual,
-        **_solver_facts(arguments, solver, scene.fps, chosen),
+        **_solver_facts(arguments, setup, scene.fps),
         "device": str(device),
         "dtype": arguments.dtype,
         "file": arguments.output,
@@ -156,7 +173,10 @@ def _run(arguments):
 
 
 def _summary(facts):
-    place = facts["file"] + (f", with its frames in {facts['frames_folder']}" if facts["frames_folder"] else "")
+    place = facts["file"]
+    if facts["frames_folder"]:
+        place += f", with its frames in {facts['frames_folder']}\n                "
+        place += "(they belong together: move both, or make one file with --single-file)"
     return "\n".join(
         [
             f"{facts['scene']}: {facts['message']}",
@@ -174,7 +194,8 @@ def _summary(facts):
 def _info(arguments):
     _source, values, scene = _scene(arguments)
     device = _device(arguments.device)
-    model = scene.build(device=device, dtype=arguments.dtype)
+    setup = _setup(arguments, scene, device, limits=True) if arguments.solver or arguments.s else _Setup()
+    model = setup.model or scene.build(device=device, dtype=arguments.dtype)
     facts = {
         "scene": {
             "name": scene.name,
@@ -191,17 +212,16 @@ def _info(arguments):
         },
         "solver": None,
     }
-    if arguments.solver or arguments.s:
-        solver, chosen = _solver(arguments, scene, device)
-        solver.bind(model)
-        facts["solver"] = _solver_facts(arguments, solver, scene.fps, chosen)
-        if arguments.solver == "explicit":
-            from .solvers.explicit import step_limits
-
-            rest, motion = step_limits(model)
-            facts["solver"] |= {"limit_about_rest": rest, "limit_in_any_motion": motion}
+    if setup.solver:
+        setup.checked.bind(model)
+        facts["solver"] = _solver_facts(arguments, setup, scene.fps)
+        if setup.limits:
+            facts["solver"] |= dict(zip(("limit_about_rest", "limit_in_any_motion"), setup.limits, strict=True))
     facts["model"] = model.report()
     print(_json(facts) if arguments.json else f"{scene}\n{_info_text(facts)}")
+    hint = setup.solver and _hint(arguments, setup, scene)
+    if hint:
+        print(hint, file=sys.stderr)
     return 0
 
 
@@ -268,23 +288,70 @@ def _initialise_warp(wp):
     sys.stderr.write("".join(line for line in lines if "load the NVIDIA CUDA driver" not in line))
 
 
-def _solver(arguments, scene, device):
-    """The solver with its options, and how its step was chosen, or None where it was given."""
+@dataclass
+class _Setup:
+    """A solver, and what had to be built to choose its step.
+
+    Attributes:
+        solver: With its options, as they are shown.
+        checked: The same to be run; it does not look for limits again that are known to be kept.
+        chosen: How its step was chosen, or None where it was given.
+        model: Of the scene, if it is built already.
+        limits: As ``step_limits`` gives them, if they were asked for.
+        seconds: What building and the limits took.
+    """
+
+    solver: object = None
+    checked: object = None
+    chosen: str | None = None
+    model: object = None
+    limits: tuple | None = None
+    seconds: float = 0.0
+
+
+class _Built:
+    """A scene whose model stands already."""
+
+    def __init__(self, scene, model):
+        self._scene, self._model = scene, model
+
+    def __getattr__(self, name):
+        return getattr(self._scene, name)
+
+    def build(self, **_):
+        """The model, whose device and precision are those of the whole command."""
+        return self._model
+
+
+def _setup(arguments, scene, device, limits=False):
+    """The solver that the arguments name; ``limits`` asks for those of explicit even where its step is given."""
     from .solvers import SOLVERS
 
     arguments.solver = arguments.solver or "newton"
     record = SOLVERS[arguments.solver]
     given = scene_files.options(record, scene_files.assignments(arguments.s))
-    if "dt" in given or "substeps" in given:
-        return record(**given), None
-    record(**given, substeps=1)  # a wrong option is said before anything is built
+    step_given = "dt" in given or "substeps" in given
+    solver = record(**given, **({} if step_given else {"substeps": 1}))  # a wrong option is said before anything is built
     if arguments.solver != "explicit":
-        return record(**given, substeps=max(1, round(_STEPS_A_SECOND / scene.fps))), "by default about 1/240 s"
+        if step_given:
+            return _Setup(solver, solver)
+        solver = replace(solver, substeps=max(1, round(_STEPS_A_SECOND / scene.fps)))
+        return _Setup(solver, solver, "by default about 1/240 s")
+    if step_given and not limits:
+        return _Setup(solver, solver)
     from .solvers.explicit import step_limits
 
-    rest, motion = step_limits(scene.build(device=device, dtype=arguments.dtype))
-    substeps = _fewest(scene.fps, min(rest / _EXPLICIT_MARGIN, motion))
-    return record(**given, substeps=substeps), f"by default the fewest stable ones, limits {rest:.3g} and {motion:.3g} s"
+    began = time.perf_counter()
+    model = scene.build(device=device, dtype=arguments.dtype)
+    rest, motion = step_limits(model)
+    setup = _Setup(solver, solver, None, model, (rest, motion), time.perf_counter() - began)
+    if not step_given:
+        setup.solver = replace(solver, substeps=_fewest(scene.fps, min(rest / _EXPLICIT_MARGIN, motion)))
+        setup.chosen = f"by default the fewest stable ones, limits {rest:.3g} and {motion:.3g} s"
+    setup.checked = setup.solver
+    if solver.scheme == "symplectic" and 1.0 / (scene.fps * setup.solver.per_frame(scene.fps)) < min(rest, motion):
+        setup.checked = replace(setup.solver, above_limit="allow")  # which leaves out a second search for the limits
+    return setup
 
 
 def _fewest(fps, limit):
@@ -292,9 +359,17 @@ def _fewest(fps, limit):
     return math.floor(1.0 / (fps * limit)) + 1
 
 
-def _solver_facts(arguments, solver, fps, chosen):
-    step = 1.0 / (fps * solver.per_frame(fps))
-    return {"solver": arguments.solver, "options": asdict(solver), "step": step, "step_chosen": chosen}
+def _hint(arguments, setup, scene):
+    """A line for those who may wait longer than they need, or None."""
+    substeps = setup.solver.per_frame(scene.fps)
+    if arguments.solver != "explicit" or substeps <= _MANY_SUBSTEPS:
+        return None
+    return f"warpcloth: hint: explicit takes {substeps:,} substeps a frame here; --solver newton may suit better"
+
+
+def _solver_facts(arguments, setup, fps):
+    step = 1.0 / (fps * setup.solver.per_frame(fps))
+    return {"solver": arguments.solver, "options": asdict(setup.solver), "step": step, "step_chosen": setup.chosen}
 
 
 def _solver_line(facts):
@@ -306,13 +381,15 @@ def _solver_line(facts):
 
 def _frames_folder(arguments):
     """The folder that belongs to the output, or None where the output is one file."""
+    from .usd.writer import frames_folder
+
     output = Path(arguments.output)
-    return None if arguments.single_file or output.suffix == ".usdz" else str(output.parent / f"{output.stem}_frames")
+    return None if arguments.single_file or output.suffix == ".usdz" else str(frames_folder(output))
 
 
 def _check_writable(output):
     """Finds out before the first frame, and not after ten, that a folder cannot be written."""
-    folder = os.path.dirname(os.path.abspath(output))
+    folder = os.path.dirname(os.path.realpath(output))  # of a link the folder of the file that it stands for
     try:
         if os.path.isdir(folder):
             tempfile.TemporaryFile(dir=folder).close()
@@ -323,8 +400,8 @@ def _check_writable(output):
 class _Progress:
     """Counts frames, and shows them on a terminal."""
 
-    def __init__(self, frames):
-        self.frame, self.frames, self.bar = None, frames, None
+    def __init__(self, frames, hint=None):
+        self.frame, self.frames, self.hint, self.bar = None, frames, hint, None
         if sys.stderr.isatty():
             from tqdm import tqdm
 
@@ -336,6 +413,10 @@ class _Progress:
 
     def __call__(self, frame, frames):
         self.frame = frame
+        if frame == 0 and self.hint:  # now that nothing was refused, and while it can still be followed
+            if self.bar is not None:
+                self.bar.clear()
+            print(self.hint, file=sys.stderr)
         if self.bar is None:
             return
         if frame == 0:

@@ -121,7 +121,7 @@ def _parameters(function):
 
 
 class _Located:
-    """Turns any error of a scene file into a ValueError of one line that says where in the file it arose."""
+    """Turns any error of a scene file, and an exit, into a ValueError of one line that says where in the file it arose."""
 
     def __init__(self, path):
         self.path = path
@@ -130,7 +130,7 @@ class _Located:
         return self
 
     def __exit__(self, kind, error, trace):
-        if not isinstance(error, Exception):
+        if error is None or isinstance(error, KeyboardInterrupt):
             return
         message, line = " ".join(str(error).split()), None
         names = (str(self.path), os.path.abspath(self.path))
@@ -141,7 +141,7 @@ class _Located:
                 line = trace.tb_lineno
             trace = trace.tb_next
         where = str(self.path) if line is None else f"{self.path}, line {line}"
-        raise ValueError(f"{where}: {kind.__name__}: {message}") from error
+        raise ValueError(f"{where}: {kind.__name__}" + (f": {message}" if message else "")) from error
 
 
 @dataclass(frozen=True)

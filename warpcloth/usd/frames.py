@@ -1,16 +1,20 @@
 """The frames of an animation, read from its file one at a time."""
 
+import os
+
 import numpy as np
 from pxr import UsdGeom
 
-from .stage import curve_vertices, find_prim, first_points, local_to_metres, open_stage
+from .stage import curve_vertices, find_prim, first_points, followed, local_to_metres, open_stage
 
 
 class FrameSequence:
     """Sampled points or velocities of a prim, as an array that reads from the file what is asked for.
 
     A frame is read when it is indexed, and nothing is kept, so memory stays flat however many frames there are.
-    `np.asarray(sequence)` reads all of them.
+    `np.asarray(sequence)` reads all of them. Once the file has been written again, by another run or the same, reading raises
+    a RuntimeError: USD may still hold some of the earlier frames, and would mix them with the new ones. After the file was
+    deleted reading goes on for as long as USD holds it.
 
     Attributes:
         shape: (frames, n, 3).
@@ -35,6 +39,9 @@ class FrameSequence:
         """
         if attribute not in ("points", "velocities"):
             raise ValueError(f'attribute = {attribute!r}: must be "points" or "velocities"')
+        path = followed(path)  # USD looks for the frames beside a link, and not beside the file that it stands for
+        self._file = os.path.abspath(path)
+        self._identity = _identity(self._file)  # before it is opened, so that no change is missed
         self._stage = open_stage(path)
         found = find_prim(self._stage, path, prim)
         where = f"{path}, prim {found.GetPath()}"
@@ -88,6 +95,11 @@ class FrameSequence:
         return result if dtype is None else result.astype(dtype, copy=False)
 
     def _read(self, frame):
+        if _identity(self._file) not in (None, self._identity):
+            raise RuntimeError(
+                f"{self._file}: has been written again since these frames were opened; open it again, "
+                "and give runs that are to be compared an output each"
+            )
         value = np.array(self._attribute.Get(self.time_codes[frame]), dtype=np.float32)
         if self._points is not None:
             value = value[self._points]
@@ -96,3 +108,12 @@ class FrameSequence:
         if self._offset is not None:
             value = value + self._offset
         return value.astype(np.float32, copy=False)
+
+
+def _identity(path):
+    """What differs between a file and any that takes its place; None where there is none."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size

@@ -66,8 +66,7 @@ class Target:
             values["points"] = (np.asarray(points, np.float64) - offset) @ inverse
             values["velocities"] = np.asarray(velocities, np.float64) @ inverse
             if "normals" in values:
-                # Normals are covectors: they stay at right angles to the surface, and on its front, under the
-                # transpose.
+                # Normals are covectors: they stay at right angles to the surface, and on its front, under the transpose.
                 values["normals"] = _unit(values["normals"] @ linear.T)
         if self.point_vertices is not None:
             values = {name: value[self.point_vertices] for name, value in values.items()}
@@ -84,8 +83,7 @@ class Target:
 def vertex_normals(points, triangles):
     """Unit normals (n, 3) of vertices: the normals of their triangles, weighted by area.
 
-    A vertex without area (isolated, or all its triangles collapsed) has no normal, and gets +y so that all have length
-    1.
+    A vertex without area (isolated, or all its triangles collapsed) has no normal, and gets +y so that all have length 1.
 
     Args:
         points: (n, 3).
@@ -261,8 +259,8 @@ def over_layer(source, prim, mesh):
         mesh: The `Mesh` that is simulated.
 
     Returns:
-        The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, and real paths of all files of
-        the artist's stage.
+        The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, and real paths of all files of the
+        artist's stage.
 
     Raises:
         ValueError: As `read_stage_mesh`; the prim is an instance; the mesh has another number of vertices.

@@ -12,7 +12,7 @@ from ..scene import Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
 from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
 from .layers import scene_layer
-from .stage import find_prim, first_points, open_stage, read_stage_mesh
+from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
 from .writer import export
 
 _EARTH = 9.81  # [m/s²]
@@ -261,7 +261,7 @@ def write_scene(scene, path):
         ValueError: The path has another ending or is the stage that the scene was read from, or the scene has no terms.
         OSError: The file could not be written.
     """
-    path = Path(os.path.abspath(path))
+    path = Path(os.path.abspath(followed(path)))
     if path.suffix not in (".usd", ".usda", ".usdc"):
         raise ValueError(f"path = {path}: must end with one of .usd, .usda, .usdc")
     if not path.parent.is_dir():

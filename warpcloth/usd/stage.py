@@ -23,16 +23,14 @@ class StageMesh:
         mesh: Rest shape in the stage's world space [m]; vertex i is point i of a Mesh prim.
         path: The file.
         prim: Path of the prim.
-        transform: (4, 4) float64; row vectors: x = [p, 1]·transform, from the prim's own space and units to world space
-            [m].
+        transform: (4, 4) float64; row vectors: x = [p, 1]·transform, from the prim's own space and units to world space [m].
         meters_per_unit: Metres in one unit of the stage; USD says 0.01 where the stage does not.
         up_axis: "Y" or "Z".
         fps: Frames per second, None where the stage does not say.
         time_codes_per_second: Time codes in a second; USD says 24 where the stage does not.
         start: First time code, None where the stage does not say.
         pins: Sorted vertex indices (p,) int32 by name, of every GeomSubset of points.
-        point_vertices: Curves: the vertex of each point of the prim (P,); None for a Mesh prim, where they are the
-            same.
+        point_vertices: Curves: the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
     """
 
     mesh: Mesh
@@ -64,12 +62,10 @@ def read_mesh(path, prim=None):
 def read_stage_mesh(path, prim=None):
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
-    The points at the default time are the rest shape. A stage with time samples alone is read at its first sample, with
-    a
-    warning: support for that is deprecated, for nothing says that a first frame is at rest. Polygons are cut into fans
-        of
-    triangles from their first corner, and turned where the prim is left-handed or mirrored by its transform, so that
-    triangle normals point out of the front. The up axis is reported, not changed.
+    The points at the default time are the rest shape. A stage with time samples alone is read at its first sample, with a
+    warning: support for that is deprecated, for nothing says that a first frame is at rest. Polygons are cut into fans of
+    triangles from their first corner, and turned where the prim is left-handed or mirrored by its transform, so that triangle
+    normals point out of the front. The up axis is reported, not changed.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
@@ -118,6 +114,11 @@ def read_stage_mesh(path, prim=None):
         pins=_pins(found, point_vertices),
         point_vertices=point_vertices,
     )
+
+
+def followed(path):
+    """The file that a link stands for, however many links lead there; another path as it is."""
+    return os.path.realpath(path) if os.path.islink(path) else path
 
 
 def open_stage(path):

@@ -10,7 +10,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdUtils
 
 from .layers import SAMPLED, Target, flatten, over_layer, relative_path, scene_layer
-from .stage import METADATA_KEY
+from .stage import METADATA_KEY, followed
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 _CLIP_SET = "warpcloth"
@@ -51,7 +51,8 @@ class AnimationWriter:
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
         Args:
-            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file.
+            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file. Of a link the file that it stands
+                for is written, with the folder beside that; viewers find the frames through a link in the same folder only.
             mesh: The `Mesh`; its points are the rest shape. With a source: as read from it.
             fps: Frames per second; also time codes per second.
             source: A stage to write a layer over, or None.
@@ -65,8 +66,10 @@ class AnimationWriter:
             FileNotFoundError: The output's folder or the source does not exist.
             ValueError: A parameter is not as above, or the output is a file of the source's stage.
         """
-        self._output = Path(os.path.abspath(output))
+        self._output = Path(os.path.abspath(followed(output)))
         _check_output(self._output)
+        if self._output.suffix != Path(output).suffix:
+            raise ValueError(f"output = {output}: is a link to {self._output}, must end as that does")
         _check_options(fps, up_axis, chunk)
         self._source = None if source is None else Path(os.path.abspath(source))
         start = 0.0
@@ -86,7 +89,7 @@ class AnimationWriter:
         self._root_metadata["customLayerData"] = {METADATA_KEY: {**(metadata or {}), "prim": self._target.prim}}
         self._start, self._fps, self._chunk = start, float(fps), int(chunk)
         self._count = len(mesh.points)
-        self._folder = self._output.parent / f"{self._output.stem}_frames"
+        self._folder = frames_folder(self._output)
         if self._folder.exists() and not self._folder.is_dir():
             raise ValueError(f"{self._folder}: is a file, must be free for the folder of frames")
         # A name never used before: pxr may still hold layers of an earlier run in this process, and would show those.
@@ -258,6 +261,12 @@ class AnimationWriter:
                     layer.SetTimeSample(attribute, time, chunk.QueryTimeSample(attribute, time))
             if not layer.Save():
                 raise OSError(f"{single}: could not be written")
+
+
+def frames_folder(output):
+    """The folder of frames that belongs to an output; of a link beside the file that it stands for."""
+    output = Path(followed(output))
+    return output.parent / f"{output.stem}_frames"
 
 
 def _check_output(output):
