@@ -172,7 +172,9 @@ def test_a_copy_that_diverges_leaves_the_others_alone(device):
     last = animation.status.good[1]
     assert animation.status.good.tolist() == [12, last, 12] and last < 12
     assert np.isfinite(animation.points[: last + 1, 1]).all() and np.isnan(animation.points[last + 1 :, 1]).all()
-    softer = wc.Scene(**{**vars(cloth), "density": None, "terms": [replace(cloth.terms[0], stiffness=50.0), *cloth.terms[1:]]})  # X
+    softer = wc.Scene(
+        **{**vars(cloth), "density": None, "terms": [replace(cloth.terms[0], stiffness=50.0), *cloth.terms[1:]]}
+    )  # X
     alone = wc.simulate(softer, solver, device=device, frames=12, dtype="float64").points
     assert np.array_equal(animation.points[:, 2], alone)
 

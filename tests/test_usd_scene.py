@@ -256,7 +256,7 @@ def test_an_artists_scene_runs_as_a_layer_over_it(tmp_path):
     assert [(term.name, term.pairs, term.stiffness) for term in scene.terms] == [("threads", "edges", 1000)]
     output = tmp_path / "result.usda"
     animation = wc.simulate(scene, wc.Newton(substeps=4), output=output)
-    assert animation.status.result.name == "CONVERGED"
+    assert animation.status.result.name in ("CONVERGED", "ROUNDED")
     assert path.read_bytes() == before
     assert validate(output, path) == []
     result = Usd.Stage.Open(str(output))
@@ -493,7 +493,7 @@ def test_square_cloth_hangs(tmp_path, monkeypatch):
     sys.modules.pop("usd_cloth")
     output = tmp_path / "cloth.usdc"
     animation = wc.simulate(scene, wc.Newton(dt=1 / 240), output=output)
-    assert animation.status.result.name == "CONVERGED" and animation.worst_strain < 0.05
+    assert animation.status.result.name in ("CONVERGED", "ROUNDED") and animation.worst_strain < 0.05
     assert validate(output, scene.stage.path) == []
     # The middle falls freely at first, down z of a stage that has z up, with the error of first order of 60 steps.
     fall = scene.mesh.points.mean(axis=0) - animation.points[6].mean(axis=0)

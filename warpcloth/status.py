@@ -11,7 +11,7 @@ class Result(Enum):
 
     COMPLETED = "completed"
     CONVERGED = "converged"
-    ROUNDED = "as far as rounding allows"
+    ROUNDED = "converged as far as rounding allows"
     ITERATIONS_USED_UP = "iterations used up"
     STALLED = "no step lowers the energy"
     SADDLE = "in balance, but not where the energy is least"
