@@ -19,68 +19,68 @@ from .term import Term
 
 @cache
 def multiplier(term: Term, dtype):
-    """The device function (element data, x̃, d, h) → rows (M, 3) such that Δxᵢ = W_i Σ_m wᵢ[m] rows[m]."""
+    """The device function (y, rest, inverse masses w of the corners, α̃) → rows (M, 3): Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]."""
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    square = wp.types.matrix((term.rows, term.rows), dtype)
-    y_of, weight, measure = local_coordinate(term, dtype, True), term.weight, term.measure
-    project, constraint, constraint_gradient = term.project, term.constraint, term.constraint_gradient
+    square, corners = wp.types.matrix((term.rows, term.rows), dtype), wp.types.vector(term.vertices, dtype)
+    weight, project = term.weight, term.project
+    constraint, constraint_gradient = term.constraint, term.constraint_gradient
 
-    if project is not None:
+    @wp.func
+    def onto_projection(y: y_type, r: rest_type, w: corners, compliance: dtype):
+        system = square()
+        for i in range(K):
+            system += w[i] * wp.outer(weight(r, i), weight(r, i))
+        for m in range(M):
+            system[m, m] = system[m, m] + compliance
+        rows = y_type()
+        if wp.trace(system) != dtype(0.0):
+            if wp.static(term.rows == 1):
+                rows = (project(y, r) - y) / system[0, 0]
+            else:
+                rows = wp.inverse(system) * (project(y, r) - y)
+        return rows
 
-        @wp.func
-        def rows(
-            stencil: wp.array2d(dtype=wp.int32),
-            e: int,
-            stiffness: dtype,
-            r: rest_type,
-            inverse_mass: wp.array(dtype=dtype),
-            x: wp.array(dtype=vec3),
-            d: wp.array(dtype=vec3),
-            h: dtype,
-        ):
-            y = y_of(stencil, e, r, x, d)
-            system = square()
-            for i in range(K):
-                w = weight(r, i)
-                system += inverse_mass[stencil[e, i]] * wp.outer(w, w)
-            compliance = dtype(1.0) / (stiffness * measure(r) * h * h)
+    @wp.func
+    def onto_constraint(y: y_type, r: rest_type, w: corners, compliance: dtype):
+        g = constraint_gradient(y, r)
+        total = compliance
+        for i in range(K):
+            direction = vec3()
             for m in range(M):
-                system[m, m] = system[m, m] + compliance
-            result = y_type()
-            if wp.trace(system) != dtype(0.0):
-                if wp.static(term.rows == 1):
-                    result = (project(y, r) - y) / system[0, 0]
-                else:
-                    result = wp.inverse(system) * (project(y, r) - y)
-            return result
+                direction += weight(r, i)[m] * g[m]
+            total += w[i] * wp.dot(direction, direction)
+        if total == dtype(0.0):
+            total = dtype(1.0)
+        return g * (-constraint(y, r) / total)
 
-    else:
+    return onto_constraint if project is None else onto_projection
 
-        @wp.func
-        def rows(
-            stencil: wp.array2d(dtype=wp.int32),
-            e: int,
-            stiffness: dtype,
-            r: rest_type,
-            inverse_mass: wp.array(dtype=dtype),
-            x: wp.array(dtype=vec3),
-            d: wp.array(dtype=vec3),
-            h: dtype,
-        ):
-            y = y_of(stencil, e, r, x, d)
-            g = constraint_gradient(y, r)
-            total = dtype(1.0) / (stiffness * measure(r) * h * h)
-            for i in range(K):
-                w = weight(r, i)
-                direction = vec3()
-                for m in range(M):
-                    direction += w[m] * g[m]
-                total += inverse_mass[stencil[e, i]] * wp.dot(direction, direction)
-            if total == dtype(0.0):
-                total = dtype(1.0)
-            return g * (-constraint(y, r) / total)
+
+@cache
+def element_rows(term: Term, dtype):
+    """The device function (element data, x̃, d, h) → rows of :func:`multiplier` for one element at x̃ + d."""
+    vec3, _ = types(dtype)
+    K = wp.constant(term.vertices)
+    rest_type, corners = wp.types.vector(term.parameters, dtype), wp.types.vector(term.vertices, dtype)
+    y_of, measure, rows_of = local_coordinate(term, dtype, True), term.measure, multiplier(term, dtype)
+
+    @wp.func
+    def rows(
+        stencil: wp.array2d(dtype=wp.int32),
+        e: int,
+        stiffness: dtype,
+        r: rest_type,
+        inverse_mass: wp.array(dtype=dtype),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        h: dtype,
+    ):
+        w = corners()
+        for i in range(K):
+            w[i] = inverse_mass[stencil[e, i]]
+        return rows_of(y_of(stencil, e, r, x, d), r, w, dtype(1.0) / (stiffness * measure(r) * h * h))
 
     return rows
 
@@ -91,7 +91,7 @@ def scatter_correction(term: Term, dtype):
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
-    rows, weight = multiplier(term, dtype), term.weight
+    rows, weight = element_rows(term, dtype), term.weight
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter(
@@ -123,7 +123,7 @@ def gather_correction(term: Term, dtype):
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
-    rows, weight = multiplier(term, dtype), term.weight
+    rows, weight = element_rows(term, dtype), term.weight
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather(
