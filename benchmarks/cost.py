@@ -10,6 +10,7 @@ import argparse
 import json
 import time
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -22,12 +23,11 @@ from warpcloth.solvers.explicit import step_limits
 def springs_only(n):
     """The hanging cloth without bending."""
     declared = hanging.scene(n=n)
-    return wc.Scene(**{**vars(declared), "terms": declared.terms[:1], "name": f"hanging {n}², springs only"})
+    return replace(declared, terms=declared.terms[:1], name=f"hanging {n}², springs only")
 
 
 def with_bending(n):
-    declared = hanging.scene(n=n)
-    return wc.Scene(**{**vars(declared), "name": f"hanging {n}²"})
+    return replace(hanging.scene(n=n), name=f"hanging {n}²")
 
 
 def fewest_substeps(scene, device, dtype):

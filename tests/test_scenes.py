@@ -100,7 +100,7 @@ def test_energy_over_twenty_seconds(device):
     stepper = wc.Explicit(substeps=int(np.ceil(2.0 / (60.0 * limit)))).bind(model)
     energy_of, gradient_of = Energy(model, Sums(model)), Gradient(model)
     U, gradient = wp.zeros(1, dtype=wp.float64, device=device), model.vectors()
-    mass, free = hanging.masses[:, None], (model.inverse_mass.numpy() > 0.0)[:, None]
+    mass, free = hanging.vertex_masses[:, None], (model.inverse_mass.numpy() > 0.0)[:, None]
     kinetic, total = [], []
     for _ in range(1200):
         for _ in range(stepper.steps_per_frame):

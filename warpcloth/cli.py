@@ -182,7 +182,7 @@ def _info(arguments):
             "vertices": len(scene.mesh.points),
             "triangles": len(scene.mesh.triangles),
             "edges": len(scene.mesh.edges),
-            "mass": float(scene.masses.sum()),
+            "mass": float(scene.vertex_masses.sum()),
             "gravity": scene.gravity.tolist(),
             "duration": scene.duration,
             "fps": scene.fps,

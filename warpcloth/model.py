@@ -94,7 +94,7 @@ class Model:
         self.kernels = set()
         vary = _Varied(vary or {}, copies)
 
-        masses = vary.take("masses", scene.masses)
+        masses = vary.take("masses", scene.vertex_masses)
         if scene.density is not None:
             masses = masses * (vary.take("density", np.float64(scene.density)) / scene.density)[:, None]
         inverse = 1.0 / np.where(masses > 0.0, masses, np.inf)
