@@ -422,7 +422,7 @@ def own(name, type_name, value):
         (own("mass", "Double", 1.0), "warpcloth:mass is no attribute of a cloth, must be one of .*density"),
         (
             {**OWN, "warpcloth:terms:threads:stiffness": ("Double", -1.0)},
-            r"stiffness\[0\] is -1.0; it must be 0 or more",
+            r"stiffness is -1.0; it must be 0 or more",
         ),
         (
             {**OWN, "warpcloth:terms:threads:stiffness": ("String", "stiff")},

@@ -1,23 +1,76 @@
 """Checks of single values that users give; the error names the parameter, the value and the rule."""
 
+import math
+import reprlib
+
 import numpy as np
+
+_SHORT = reprlib.Repr()
+_SHORT.maxother = _SHORT.maxstring = 60
+
+
+def shown(value):
+    """A value in one line that is not long, for the sentence of an error."""
+    return " ".join(_SHORT.repr(value.item() if isinstance(value, np.generic) else value).split())
 
 
 def number(name, value, above=None, least=None):
     """Checks that an option is a finite number."""
     rule = f"above {above:g}" if above is not None else f"of {least:g} or more"
-    good = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and np.isfinite(value)
+    good = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    good = good and _is_finite(value)
     if not good or (above is not None and not value > above) or (least is not None and not value >= least):
-        raise ValueError(f"{name} is {value!r}; it must be a number {rule}")
+        raise ValueError(f"{name} is {shown(value)}; it must be a number {rule}")
+
+
+def _is_finite(value):
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an int above all floats
+        return False
 
 
 def whole(name, value, least):
     """Checks that an option is a whole number."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name} is {value!r}; it must be a whole number of {least} or more")
+        raise ValueError(f"{name} is {shown(value)}; it must be a whole number of {least} or more")
 
 
 def choice(name, value, allowed):
     """Checks that an option is one of some words."""
-    if value not in allowed:
-        raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(map(repr, allowed))}")
+    if not isinstance(value, str) or value not in allowed:
+        raise ValueError(f"{name} is {shown(value)}; it must be one of {', '.join(map(repr, allowed))}")
+
+
+def numeric(name, value, rule):
+    """``value`` as a read-only float64 array of its own.
+
+    Raises:
+        ValueError: If it is no number and no array of numbers, which texts and truth values are not.
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # rows of different lengths
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf" and array.size:
+        raise ValueError(f"{name} is {shown(value)}, which is not numeric; it must {rule}")
+    array = np.array(array, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def array(name, value, shape):
+    """``value`` as a read-only float64 array of ``shape``, all finite."""
+    found = numeric(name, value, f"have shape {shape}")
+    if found.shape != shape:
+        raise ValueError(f"{name} has shape {found.shape}; it must be {shape}")
+    refuse(name, found, ~np.isfinite(found), "must be finite")
+    return found
+
+
+def refuse(name, values, wrong, rule):
+    """Refuses an array where ``wrong`` is true anywhere, naming the first such entry."""
+    where = np.argwhere(wrong)
+    if len(where):
+        place = where[0].tolist()
+        raise ValueError(f"{name}{place or ''} is {float(values[tuple(place)])}; it {rule}")

@@ -31,7 +31,7 @@ _MANY_SUBSTEPS = 1000
 
 _EPILOG = """\
 Where neither dt nor substeps is given: newton and pbd take the substeps that come nearest to 1/240 s; explicit the fewest
-that are 10 % below the limit about the rest shape and below the bound that holds in any motion.
+that are 10 % below the limit about the rest shape and below the bound for motion (exact for springs; hinges count as at rest).
 """
 
 
@@ -203,7 +203,7 @@ def _info(arguments):
             "vertices": len(scene.mesh.points),
             "triangles": len(scene.mesh.triangles),
             "edges": len(scene.mesh.edges),
-            "mass": float(scene.masses.sum()),
+            "mass": float(scene.vertex_masses.sum()),
             "gravity": scene.gravity.tolist(),
             "duration": scene.duration,
             "fps": scene.fps,
@@ -216,7 +216,7 @@ def _info(arguments):
         setup.checked.bind(model)
         facts["solver"] = _solver_facts(arguments, setup, scene.fps)
         if setup.limits:
-            facts["solver"] |= dict(zip(("limit_about_rest", "limit_in_any_motion"), setup.limits, strict=True))
+            facts["solver"] |= dict(zip(("limit_about_rest", "limit_in_motion"), setup.limits, strict=True))
     facts["model"] = model.report()
     print(_json(facts) if arguments.json else f"{scene}\n{_info_text(facts)}")
     hint = setup.solver and _hint(arguments, setup, scene)
@@ -234,7 +234,7 @@ def _info_text(facts):
         lines.append(f"solver: {_solver_line(solver)}")
         if "limit_about_rest" in solver:
             fps = facts["scene"]["fps"]
-            for text, key in (("about the rest shape", "limit_about_rest"), ("in any motion", "limit_in_any_motion")):
+            for text, key in (("about the rest shape", "limit_about_rest"), ("in motion", "limit_in_motion")):
                 lines.append(f"  stable {text} below {solver[key]:.4g} s, from {_fewest(fps, solver[key])} substeps a frame")
         lines.append("kernels: " + ", ".join(model["kernels"]))
     return "\n".join(lines)

@@ -1,13 +1,18 @@
 """What is built from a scene on a device: arrays of one or more copies laid out one after another, and nothing undeclared."""
 
+import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import warp as wp
 
+from .checks import array, choice, numeric, shown, whole
 from .kernels.assemble import types
 from .kernels.term import Term
+from .precision import cast, refuse_coarse
+from .scene import refuse_far_pins
 
 DTYPES = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
 
@@ -22,7 +27,6 @@ class DeviceElements:
         stencil: (B·E, K) int32.
         stiffness: (B·E,); of stride 0 where all elements share one value.
         rest: (B·E,) vectors of P.
-        host: The elements of one copy in NumPy.
         hard: Whether any stiffness is infinite.
     """
 
@@ -75,7 +79,7 @@ class Model:
             ``"Spring.stiffness"`` (B,) or (B, E).
 
     Attributes:
-        positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s].
+        positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
         mass, inverse_mass: (B·n,) [kg], [1/kg]; the inverse of a pinned vertex is 0.
         gravity: (B,) vectors [m/s²].
         pins, keyframes: Moved pins (p,) and their places (F, p) [m], or None.
@@ -83,14 +87,13 @@ class Model:
         kernels: Names of the kernels that solvers asked for.
 
     Raises:
-        ValueError: If an argument breaks a rule.
+        ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
     """
 
     def __init__(self, scene, device="cpu", dtype="float32", copies=1, vary=None):
-        if dtype not in DTYPES:
-            raise ValueError(f"dtype is {dtype!r}; it must be 'float32' or 'float64'")
-        if not isinstance(copies, int) or copies < 1:
-            raise ValueError(f"copies is {copies!r}; it must be a whole number of 1 or more")
+        choice("dtype", dtype, tuple(DTYPES))
+        whole("copies", copies, 1)
+        copies = int(copies)
         self.scene, self.copies = scene, copies
         self.device = wp.get_device(device)
         self.dtype, self.numpy_dtype = DTYPES[dtype]
@@ -98,26 +101,32 @@ class Model:
         self.per_copy = len(scene.mesh.points)
         self.count = copies * self.per_copy
         self.kernels = set()
-        vary = _Varied(vary or {}, copies)
+        vary = _Varied({} if vary is None else vary, copies)
 
-        masses = vary.take("masses", scene.masses)
-        if scene.density is not None:
-            masses = masses * (vary.take("density", np.float64(scene.density)) / scene.density)[:, None]
-        inverse = 1.0 / np.where(masses > 0.0, masses, np.inf)
+        masses = self._varied_masses(vary)
+        with np.errstate(over="ignore"):  # an inverse that no precision holds is refused below
+            inverse = 1.0 / np.where(masses > 0.0, masses, np.inf)
         inverse[:, scene.pins.vertices] = 0.0
-        free = np.setdiff1d(np.arange(self.per_copy), scene.pins.vertices)
-        if not (np.isfinite(masses).all() and (masses[:, free] > 0.0).all()):
-            raise ValueError("vary makes a mass that is not above 0; every vertex that is not pinned must have one")
         positions = vary.take("positions", scene.positions)
-        self.positions = self.array(positions.reshape(-1, 3), self.vec3)
-        self.velocities = self.array(vary.take("velocities", scene.velocities).reshape(-1, 3), self.vec3)
-        self.mass = self.array(masses.ravel(), self.dtype)
-        self.inverse_mass = self.array(inverse.ravel(), self.dtype)
-        self.gravity = self.array(vary.take("gravity", scene.gravity), self.vec3)
+        velocities = vary.take("velocities", scene.velocities)
+        velocities[:, scene.pins.vertices] = 0.0
+        if vary.has("positions"):
+            for copy, start in enumerate(positions):
+                refuse_far_pins(scene.pins, start, f" in copy {copy}")
+        refuse_coarse(scene.mesh, positions, self.numpy_dtype, lambda copy, i: self._place("vertex", copy, i))
+        self.positions = self._put("position", "m", positions, self.vec3)
+        self.velocities = self._put("velocity", "m/s", velocities, self.vec3)
+        self.mass = self._put("mass", "kg", masses, self.dtype)
+        self.inverse_mass = self._put("inverse mass", "1/kg", inverse, self.dtype)
+        self.gravity = self._put("gravity", "m/s²", vary.take("gravity", scene.gravity)[:, None], self.vec3, each=None)
         self.pins = self.keyframes = None
         if scene.pins.keyframes is not None:
-            self.pins = wp.array(scene.pins.vertices, dtype=wp.int32, device=self.device)
-            self.keyframes = self.array(scene.pins.keyframes, self.vec3)
+            places, vertices = scene.pins.keyframes, scene.pins.vertices
+            refuse_coarse(
+                scene.mesh, places, self.numpy_dtype, lambda frame, i: f"keyframe {frame} of pinned vertex {vertices[i]}"
+            )
+            self.pins = wp.array(vertices, dtype=wp.int32, device=self.device)
+            self.keyframes = self.array(places, self.vec3)
         self.terms = tuple(self._on_device(term, positions, vary) for term in scene.terms)
         vary.refuse_rest()
 
@@ -125,15 +134,49 @@ class Model:
         """``values`` on the model's device, in its precision."""
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy_dtype), dtype=dtype, device=self.device)
 
+    def _varied_masses(self, vary):
+        """Masses of all copies (B, n) [kg]."""
+        scene = self.scene
+        if vary.has("density") and vary.has("masses"):
+            raise ValueError("vary has density and masses; at most one of the two may be given")
+        if vary.has("density") and scene.density is None:
+            raise ValueError("vary['density'] needs a scene with a density, and this one has masses; vary['masses'] instead")
+        masses = vary.take("masses", scene.vertex_masses)
+        if vary.has("density"):
+            density = vary.take("density", np.float64(scene.density))
+            for copy in np.flatnonzero(~(density > 0.0)):
+                raise ValueError(f"vary['density'] is {density[copy]} in copy {copy}; it must be above 0")
+            masses = masses * (density / scene.density)[:, None]
+        allowed = masses > 0.0
+        allowed[:, scene.pins.vertices] |= masses[:, scene.pins.vertices] == 0.0
+        for copy, vertex in np.argwhere(~allowed)[:1]:
+            raise ValueError(
+                f"vary['masses'] of vertex {vertex} is {masses[copy, vertex]} kg in copy {copy}; it must be above 0, "
+                "of a pinned vertex 0 or more"
+            )
+        return masses
+
+    def _put(self, name, unit, values, dtype, each="vertex", infinite=False):
+        """Values (B, count, …) on the device, one row after another, as :func:`warpcloth.precision.cast` lets them be."""
+        held = cast(name, unit, values, self.numpy_dtype, lambda copy, i: self._place(each, copy, i), infinite)
+        return self.array(held.reshape(-1, *held.shape[2:]), dtype)
+
+    def _place(self, each, copy, i):
+        """The words for one of what ``each`` names, or for a whole copy."""
+        words = [] if each is None else [f"{each} {i}"]
+        return " of ".join(words + ([f"copy {copy}"] if self.copies > 1 else []))
+
     def vectors(self):
         """A new array of one zero vector for each vertex of all copies."""
         return wp.zeros(self.count, dtype=self.vec3, device=self.device)
 
     def kernel(self, factory, *key):
-        """The kernel that ``factory(*key)`` makes, noted for :meth:`report`."""
+        """The kernel that ``factory(*key)`` makes, noted for :meth:`report` as factory(variant).Term."""
         kernel = factory(*key)
         terms = [part.name for part in key if isinstance(part, Term)]
-        self.kernels.add(".".join([factory.__name__, *terms]))
+        variants = [name for name, part in zip(inspect.signature(factory).parameters, key, strict=False) if part is True]
+        variant = f"({', '.join(variants)})" if variants else ""
+        self.kernels.add(".".join([f"{factory.__name__}{variant}", *terms]))
         return kernel
 
     def launch(self, kernel, dim, inputs, outputs=()):
@@ -144,41 +187,47 @@ class Model:
         one = copies[0]
         E = len(one.stencil)
         stencil = one.stencil[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
-        rest = np.concatenate([copy.rest for copy in copies] * (self.copies // len(copies)))
+        rest = np.stack([copy.rest for copy in copies] * (self.copies // len(copies)))
         stiffness = vary.take_stiffness(one, E)
-        if not (stiffness >= 0.0).all():
-            raise ValueError(f"{one.label}.stiffness is {stiffness.min()} in a copy; it must be 0 or more")
+        for copy, e in np.argwhere(~(stiffness >= 0.0))[:1]:
+            raise ValueError(f"{one.label}.stiffness is {stiffness[copy, e]} in copy {copy}; it must be 0 or more")
         return DeviceElements(
             label=one.label,
             kind=one.kind,
             term=one.term,
             per_copy=E,
             stencil=wp.array(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), dtype=wp.int32, device=self.device),
-            stiffness=self._broadcast(stiffness, E),
-            rest=self.array(rest, wp.types.vector(one.term.parameters, self.dtype)),
+            stiffness=self._broadcast(one.label, stiffness, E),
+            rest=self._put(f"{one.label}: rest state", "", rest, wp.types.vector(one.term.parameters, self.dtype), "element"),
             hard=bool(np.isinf(stiffness).any()),
         )
 
-    def _broadcast(self, stiffness, E):
+    def _broadcast(self, label, stiffness, E):
         """(B, 1) or (B, E) values as an array (B·E,), of stride 0 where all are one value."""
+        name, each = f"{label}.stiffness", "element" if stiffness.shape[1] > 1 else None
         if (stiffness != stiffness[0, 0]).any() or len(stiffness) * stiffness.shape[1] == self.copies * E:
-            return self.array(np.broadcast_to(stiffness, (self.copies, E)).ravel(), self.dtype)
-        value = self.array(stiffness[0, :1], self.dtype)
+            return self._put(name, "", np.broadcast_to(stiffness, (self.copies, E)), self.dtype, each, infinite=True)
+        value = self._put(name, "", stiffness[:1, :1], self.dtype, None, infinite=True)
         array = wp.array(ptr=value.ptr, shape=(self.copies * E,), strides=(0,), dtype=self.dtype, device=self.device)
         array.value = value  # keeps the memory alive
         return array
 
     def report(self):
-        """What was built: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels."""
+        """What was built: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels.
+
+        Terms of one label are numbered from the second on: Spring, Spring 2. Kernels are factory(variant).Term.
+        """
+        labels = [elements.label for elements in self.terms]
+        before = [labels[:i].count(label) for i, label in enumerate(labels)]
         arrays = [self.positions, self.velocities, self.mass, self.inverse_mass, self.gravity]
         arrays += [array for array in (self.pins, self.keyframes) if array is not None]
         terms = [
             {
-                "term": elements.label,
+                "term": elements.label + (f" {count + 1}" if count else ""),
                 "elements": elements.count,
                 "bytes": sum(_bytes(array) for array in elements.arguments),
             }
-            for elements in self.terms
+            for elements, count in zip(self.terms, before, strict=True)
         ]
         return {
             "scene": self.scene.name,
@@ -200,6 +249,8 @@ class _Varied:
     """The values of ``vary``, taken by name; what nobody takes is refused."""
 
     def __init__(self, values, copies):
+        if not isinstance(values, Mapping):
+            raise ValueError(f"vary is {shown(values)}; it must be a dict of names and arrays, such as {{'gravity': …}}")
         self.values, self.copies, self.taken = dict(values), copies, set()
 
     def has(self, name):
@@ -210,27 +261,22 @@ class _Varied:
         if name not in self.values:
             return np.repeat(np.asarray(default, dtype=np.float64)[None], self.copies, axis=0)
         self.taken.add(name)
-        array = np.asarray(self.values[name], dtype=np.float64)
-        shape = (self.copies, *np.shape(default))
-        if array.shape != shape or not np.isfinite(array).all():
-            raise ValueError(f"vary[{name!r}] has shape {array.shape}; it must be {shape}, all finite")
-        return array
+        return array(f"vary[{name!r}]", self.values[name], (self.copies, *np.shape(default))).copy()
 
     def take_stiffness(self, elements, E):
         """Stiffness of a term as (B, 1) or (B, E)."""
         for name in (f"{elements.label}.stiffness", f"{elements.kind}.stiffness"):
             if name in self.values:
                 self.taken.add(name)
-                array = np.asarray(self.values[name], dtype=np.float64)
-                if array.shape not in ((self.copies,), (self.copies, E)):
-                    raise ValueError(
-                        f"vary[{name!r}] has shape {array.shape}; it must be ({self.copies},) or ({self.copies}, {E})"
-                    )
-                return array.reshape(self.copies, -1)
+                rule = f"({self.copies},) or ({self.copies}, {E})"
+                values = numeric(f"vary[{name!r}]", self.values[name], f"have shape {rule}")
+                if values.shape not in ((self.copies,), (self.copies, E)):
+                    raise ValueError(f"vary[{name!r}] has shape {values.shape}; it must be {rule}")
+                return values.reshape(self.copies, -1)
         return np.repeat(np.atleast_1d(elements.stiffness)[None], self.copies, axis=0)
 
     def refuse_rest(self):
-        rest = sorted(set(self.values) - self.taken)
+        rest = sorted(set(self.values) - self.taken, key=str)
         if rest:
             raise ValueError(
                 f"vary[{rest[0]!r}] names nothing in this scene; allowed are gravity, density or masses, positions, "

@@ -1,11 +1,16 @@
 """What is declared: a scene is data, and holds no solver. Any solver that supports its terms runs it unchanged."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
+from .checks import array, number, refuse, shown
 from .mesh import Mesh
+from .terms import Declared
+
+_MOST_FRAMES = 2**31 - 1  # what counts them on the device is int32
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,15 +29,16 @@ class Pins:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A cloth, what acts on it, and for how long. SI units, y up.
+    """A cloth, what acts on it, and for how long. SI units, y up. ``dataclasses.replace`` changes fields of one.
 
     Attributes:
         mesh: The :class:`Mesh`; its points are the rest shape.
         density: Mass per area [kg/m²], lumped: a third of each adjacent triangle; of a mesh of edges alone per length
             [kg/m], half of each adjacent edge.
-        masses: Mass of each vertex, (n,) [kg], in place of ``density``.
+        masses: Mass of each vertex, (n,) [kg], in place of ``density``; of a scene with a density it is None, and
+            :attr:`vertex_masses` has those of both.
         positions: Where the vertices start, (n, 3) [m]; the rest shape if not given.
-        velocities: How they start, (n, 3) [m/s]; at rest if not given.
+        velocities: How they start, (n, 3) [m/s]; at rest if not given. What they say of pinned vertices does not matter.
         terms: The energies, see :mod:`warpcloth.terms`.
         pins: :class:`Pins`, or vertices or a selection of fixed ones.
         gravity: Acceleration (3,) [m/s²].
@@ -60,29 +66,53 @@ class Scene:
     stage: object | None = None
 
     def __post_init__(self):
+        if not isinstance(self.mesh, Mesh):
+            raise ValueError(f"mesh is {shown(self.mesh)}; it must be a Mesh, such as Mesh.grid(32, 32)")
         n = len(self.mesh.points)
 
         def keep(field, value):
             object.__setattr__(self, field, value)
 
-        if not (np.isfinite(self.fps) and self.fps > 0.0):
-            raise ValueError(f"fps is {self.fps}; it must be a number above 0")
-        frames = self.duration * self.fps
-        if not (np.isfinite(frames) and frames > 0.0 and abs(frames - round(frames)) < 1e-6 * frames):
-            raise ValueError(f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames, 1 or more")
-        keep("terms", tuple(self.terms))
-        for i, term in enumerate(self.terms):
-            if not hasattr(term, "elements"):
-                raise ValueError(f"terms[{i}] is {term!r}; it must be an energy, such as Spring(stiffness=1e3)")
-        keep("gravity", _array("gravity", self.gravity, (3,)))
-        keep("positions", self.mesh.points if self.positions is None else _array("positions", self.positions, (n, 3)))
-        keep("velocities", np.zeros((n, 3)) if self.velocities is None else _array("velocities", self.velocities, (n, 3)))
+        number("fps", self.fps, above=0.0)
+        number("duration", self.duration, above=0.0)
+        frames = float(self.duration) * float(self.fps)
+        if not (0.5 < frames < _MOST_FRAMES and abs(frames - round(frames)) < 1e-6 * frames):
+            raise ValueError(
+                f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames from 1 to {_MOST_FRAMES}"
+            )
+        keep("terms", self._checked_terms())
+        keep("gravity", array("gravity", self.gravity, (3,)))
+        keep("positions", self.mesh.points if self.positions is None else array("positions", self.positions, (n, 3)))
+        keep("velocities", np.zeros((n, 3)) if self.velocities is None else array("velocities", self.velocities, (n, 3)))
         keep("pins", self._checked_pins(n))
-        keep("masses", self._checked_masses(n))
+        if (self.density is None) == (self.masses is None):
+            raise ValueError("exactly one of density and masses must be given")
+        if self.masses is None:
+            number("density", self.density, above=0.0)
+        else:
+            keep("masses", array("masses", self.masses, (n,)))
+        self._check_masses()
+
+    def _checked_terms(self):
+        rule = "it must be a list of energies, such as [Spring(stiffness=1e3)]"
+        if isinstance(self.terms, Declared):
+            raise ValueError(f"terms is one {type(self.terms).__name__} on its own; {rule}")
+        if not isinstance(self.terms, Iterable):
+            raise ValueError(f"terms is {shown(self.terms)}; {rule}")
+        terms = tuple(self.terms)
+        for i, term in enumerate(terms):
+            if not isinstance(term, Declared):
+                given = f"the class {term.__name__}" if isinstance(term, type) else shown(term)
+                raise ValueError(f"terms[{i}] is {given}; it must be an energy, such as Spring(stiffness=1e3)")
+        return terms
 
     def _checked_pins(self, n):
         pins = self.pins if isinstance(self.pins, Pins) else Pins([] if self.pins is None else self.pins)
-        vertices = self.mesh.select(pins.vertices) if isinstance(pins.vertices, str) else np.asarray(pins.vertices)
+        vertices = self.mesh.select(pins.vertices) if isinstance(pins.vertices, str) else pins.vertices
+        try:
+            vertices = np.asarray(vertices)
+        except ValueError:  # rows of different lengths
+            raise ValueError(f"pins.vertices is {shown(vertices)}; it must be a list of whole numbers") from None
         vertices = vertices.astype(np.int32) if vertices.size == 0 else vertices
         if vertices.ndim != 1 or vertices.dtype.kind not in "iu":
             raise ValueError(
@@ -96,27 +126,30 @@ class Scene:
         keyframes = pins.keyframes
         if keyframes is not None:
             count = max(len(keyframes), 1) if np.ndim(keyframes) == 3 else 1
-            keyframes = _array("pins.keyframes", keyframes, (count, len(vertices), 3))
-            gap = np.abs(keyframes[0] - self.positions[vertices]).max(initial=0.0)
-            if gap > 1e-6 * np.ptp(self.positions, axis=0).max():
-                raise ValueError(f"pins.keyframes[0] is {gap:.3g} m from where the pinned vertices start; it must be there")
-        return Pins(vertices.astype(np.int32), keyframes)
+            keyframes = array("pins.keyframes", keyframes, (count, len(vertices), 3))
+        pins = Pins(vertices.astype(np.int32), keyframes)
+        refuse_far_pins(pins, self.positions)
+        return pins
 
-    def _checked_masses(self, n):
-        if (self.density is None) == (self.masses is None):
-            raise ValueError("exactly one of density and masses must be given")
-        if self.masses is None:
-            if not (np.isfinite(self.density) and self.density > 0.0):
-                raise ValueError(f"density is {self.density}; it must be a number above 0")
-            measures = self.mesh.vertex_areas if len(self.mesh.triangles) else self.mesh.vertex_lengths
-            masses = self.density * measures
-        else:
-            masses = _array("masses", self.masses, (n,))
-        free = np.ones(n, dtype=bool)
+    def _check_masses(self):
+        masses = self.vertex_masses
+        free = np.ones(len(masses), dtype=bool)
         free[self.pins.vertices] = False
-        bad = np.flatnonzero(free & ~(masses > 0.0))
+        bad = np.flatnonzero(free & ~((masses > 0.0) & np.isfinite(masses)))
         if len(bad):
-            raise ValueError(f"vertex {bad[0]} has mass {masses[bad[0]]} kg; a vertex that is not pinned must have one above 0")
+            raise ValueError(
+                f"vertex {bad[0]} has mass {masses[bad[0]]} kg; a vertex that is not pinned must have a finite one above 0"
+            )
+        refuse("masses", masses, ~((masses >= 0.0) & np.isfinite(masses)), "must be 0 or more, pinned or not")
+
+    @cached_property
+    def vertex_masses(self):
+        """Mass of each vertex, given or lumped from the density, (n,) [kg]."""
+        if self.masses is not None:
+            return self.masses
+        with np.errstate(over="ignore"):
+            masses = self.density * (self.mesh.vertex_areas if len(self.mesh.triangles) else self.mesh.vertex_lengths)
+        masses.setflags(write=False)
         return masses
 
     @property
@@ -134,26 +167,20 @@ class Scene:
         mesh, pins = self.mesh, self.pins
         lines = [
             f"{self.name}: {len(mesh.points)} vertices, {len(mesh.triangles)} triangles, {len(mesh.edges)} edges",
-            f"  mass {self.masses.sum():.4g} kg, gravity {self.gravity.tolist()} m/s²",
+            f"  mass {self.vertex_masses.sum():.4g} kg, gravity {self.gravity.tolist()} m/s²",
             f"  {self.duration:g} s in {self.frames} frames of 1/{self.fps:g} s",
             f"  pins: {len(pins.vertices)}" + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
         ]
         return "\n".join(lines + [f"  {_described(term)}" for term in self.terms])
 
 
-def _array(name, value, shape):
-    """``value`` as a finite float64 array of ``shape``, or a ValueError that names it."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} is not numeric; it must have shape {shape}") from None
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}; it must be {shape}")
-    wrong = np.argwhere(~np.isfinite(array))
-    if len(wrong):
-        raise ValueError(f"{name}{wrong[0].tolist()} is {array[tuple(wrong[0])]}; it must be finite")
-    array.setflags(write=False)
-    return array
+def refuse_far_pins(pins, positions, copy=""):
+    """Refuses pins whose first keyframe is not where their vertices start, at ``positions`` (n, 3)."""
+    if pins.keyframes is None:
+        return
+    gap = np.abs(pins.keyframes[0] - positions[pins.vertices]).max(initial=0.0)
+    if gap > 1e-6 * np.ptp(positions, axis=0).max():
+        raise ValueError(f"pins.keyframes[0] is {gap:.3g} m from where the pinned vertices start{copy}; it must be there")
 
 
 def _described(term):

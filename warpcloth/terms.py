@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from .checks import numeric, refuse, shown
 from .kernels.term import Term
 from .kernels.terms import ATTACHMENT, DIHEDRAL_BENDING, QUADRATIC_BENDING, SPRING
 
@@ -32,13 +33,40 @@ class Elements:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Declared:
-    """What all terms have: a stiffness and a name to tell two terms of one kind apart."""
+class Declared:
+    """What all terms have: a stiffness and a name to tell two terms of one kind apart.
+
+    Raises:
+        ValueError: If a value breaks a rule; lengths are compared with the number of elements when a scene is built.
+    """
 
     term: ClassVar[Term]
 
     stiffness: float | Sequence[float] | np.ndarray
     name: str | None = None
+
+    def __post_init__(self):
+        if not (self.name is None or isinstance(self.name, str)):
+            raise ValueError(f"{type(self).__name__}.name is {shown(self.name)}; it must be a text or None")
+        stiffness = self._numeric("stiffness")
+        refuse(f"{self.label}.stiffness", stiffness, ~(stiffness >= 0.0), "must be 0 or more")
+
+    @property
+    def label(self):
+        """The name, or else that of the class."""
+        return self.name or type(self).__name__
+
+    def _numeric(self, field):
+        return numeric(f"{self.label}.{field}", getattr(self, field), "be a number or an array of numbers")
+
+    def _of_elements(self, field, count):
+        """A field as one number () or one for each element (count,)."""
+        values = self._numeric(field)
+        if values.shape not in ((), (count,)):
+            raise ValueError(
+                f"{self.label}.{field} has shape {values.shape}; it must be one number or one for each of the {count} elements"
+            )
+        return values
 
     def stencil(self, mesh):
         """Vertices of each element on ``mesh``, (E, K) int32."""
@@ -55,26 +83,13 @@ class _Declared:
             :class:`Elements`.
 
         Raises:
-            ValueError: If the mesh has none, or the stiffness is negative or NaN, or has another length than the elements.
+            ValueError: If the mesh has none, or an array has another length than the elements.
         """
-        label = self.name or type(self).__name__
         stencil = self.stencil(mesh)
         if len(stencil) == 0:
-            raise ValueError(f"{label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
-        try:
-            stiffness = np.asarray(self.stiffness, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(f"{label}.stiffness is {self.stiffness!r}; it must be numeric") from None
-        if stiffness.shape not in ((), (len(stencil),)):
-            raise ValueError(
-                f"{label}.stiffness has shape {stiffness.shape}; it must be one number or one for each of the "
-                f"{len(stencil)} elements"
-            )
-        bad = np.flatnonzero(~(np.atleast_1d(stiffness) >= 0.0))
-        if len(bad):
-            value = np.atleast_1d(stiffness)[bad[0]]
-            raise ValueError(f"{label}.stiffness[{bad[0]}] is {value}; it must be 0 or more")
-        return Elements(label, type(self).__name__, self.term, stencil, stiffness, self.rest(mesh, positions, stencil))
+            raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
+        stiffness = self._of_elements("stiffness", len(stencil))
+        return Elements(self.label, type(self).__name__, self.term, stencil, stiffness, self.rest(mesh, positions, stencil))
 
     def rest(self, mesh, positions, stencil):
         """Rest state (E, P) of the elements, from the rest shape of the mesh."""
@@ -82,13 +97,14 @@ class _Declared:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spring(_Declared):
+class Spring(Declared):
     """Springs, U = Σ ½k(l − L)² (Provot 1995).
 
     Attributes:
         pairs: Which vertices: ``"edges"`` of the mesh; of a grid ``"structural"`` (along rows and columns), ``"shear"``
             (both diagonals of each cell), ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge);
-            several of these in a tuple; or own pairs (E, 2).
+            several of these in a tuple, where a pair that belongs to more than one kind is one spring, and springs are in
+            lexicographic order; or own pairs (E, 2), as given.
         stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
         rest_lengths: L [m], one or (E,), if not those of the mesh.
         name: To tell two terms of one kind apart.
@@ -99,33 +115,29 @@ class Spring(_Declared):
     pairs: str | tuple | np.ndarray = "edges"
     rest_lengths: float | Sequence[float] | np.ndarray | None = None
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.rest_lengths is not None:
+            lengths = self._numeric("rest_lengths")
+            wrong = ~((lengths >= 0.0) & np.isfinite(lengths))
+            refuse(f"{self.label}.rest_lengths", lengths, wrong, "must be finite, 0 or more")
+
     def stencil(self, mesh):
         if isinstance(self.pairs, str):
             return mesh.springs(self.pairs)
-        if len(self.pairs) and all(isinstance(kind, str) for kind in self.pairs):
-            return np.concatenate([mesh.springs(kind) for kind in self.pairs])
-        return own_stencil(self.name or "Spring", "pairs", self.pairs, 2, len(mesh.points))
+        if isinstance(self.pairs, (tuple, list)) and self.pairs and all(isinstance(kind, str) for kind in self.pairs):
+            return np.unique(np.concatenate([mesh.springs(kind) for kind in self.pairs]), axis=0)
+        return own_stencil(self.label, "pairs", self.pairs, 2, len(mesh.points))
 
     def rest(self, mesh, positions, stencil):
         if self.rest_lengths is None:
             return super().rest(mesh, positions, stencil)
-        lengths = np.asarray(self.rest_lengths, dtype=np.float64)
-        if lengths.shape not in ((), (len(stencil),)):
-            raise ValueError(
-                f"{self.name or 'Spring'}.rest_lengths has shape {lengths.shape}; it must be one number or one for each "
-                f"of the {len(stencil)} springs"
-            )
-        bad = np.flatnonzero(~((np.atleast_1d(lengths) >= 0.0) & np.isfinite(np.atleast_1d(lengths))))
-        if len(bad):
-            raise ValueError(
-                f"{self.name or 'Spring'}.rest_lengths[{bad[0]}] is {np.atleast_1d(lengths)[bad[0]]}; it must be finite, "
-                "0 or more"
-            )
+        lengths = self._of_elements("rest_lengths", len(stencil))
         return np.broadcast_to(lengths, len(stencil))[:, None].copy()
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuadraticBending(_Declared):
+class QuadraticBending(Declared):
     """Quadratic bending of a sheet that is flat at rest, U = Σ ½D‖y‖²/(A₁+A₂) (Bergou et al. 2006). Linear forces.
 
     Attributes:
@@ -142,7 +154,7 @@ class QuadraticBending(_Declared):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DihedralBending(_Declared):
+class DihedralBending(Declared):
     """Bending by the angle between neighbouring triangles, U = Σ ½D|e|²/(A₁+A₂)(θ−θ̄)² (Grinspun et al. 2003).
 
     Attributes:
@@ -157,7 +169,7 @@ class DihedralBending(_Declared):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attachment(_Declared):
+class Attachment(Declared):
     """Vertices held by springs of no length, U = Σ ½k‖x − target‖²: a pin that gives way.
 
     Attributes:
@@ -172,19 +184,22 @@ class Attachment(_Declared):
     vertices: str | Sequence[int] | np.ndarray = field(default=())
     targets: Sequence | np.ndarray | None = None
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.targets is not None:
+            targets = self._numeric("targets")
+            refuse(f"{self.label}.targets", targets, ~np.isfinite(targets), "must be finite")
+
     def stencil(self, mesh):
         vertices = mesh.select(self.vertices) if isinstance(self.vertices, str) else self.vertices
-        vertices = np.asarray(vertices)[:, None] if np.ndim(vertices) == 1 else vertices
-        return own_stencil(self.name or "Attachment", "vertices", vertices, 1, len(mesh.points))
+        return own_stencil(self.label, "vertices", vertices, 1, len(mesh.points))
 
     def rest(self, mesh, positions, stencil):
         if self.targets is None:
             return super().rest(mesh, positions, stencil) if positions is None else positions[stencil[:, 0]]
-        targets = np.asarray(self.targets, dtype=np.float64)
-        if targets.shape != (len(stencil), 3) or not np.isfinite(targets).all():
-            raise ValueError(
-                f"{self.name or 'Attachment'}.targets has shape {targets.shape}; it must be ({len(stencil)}, 3), all finite"
-            )
+        targets = self._numeric("targets")
+        if targets.shape != (len(stencil), 3):
+            raise ValueError(f"{self.label}.targets has shape {targets.shape}; it must be ({len(stencil)}, 3)")
         return targets
 
 
@@ -192,12 +207,19 @@ TERMS = {cls.__name__: cls for cls in (Spring, QuadraticBending, DihedralBending
 
 
 def own_stencil(label, parameter, indices, vertices, count):
-    """Indices that a user gave as (E, ``vertices``) int32.
+    """Indices that a user gave, (E, ``vertices``) or (E,) of single ones, as (E, ``vertices``) int32.
 
     Raises:
         ValueError: If the shape is another, or an element names a vertex twice or one outside [0, ``count``).
     """
-    stencil = np.asarray(indices)
+    try:
+        stencil = np.asarray(indices)
+    except ValueError:  # rows of different lengths
+        stencil = np.asarray(None)
+    if vertices == 1 and stencil.ndim == 1:
+        stencil = stencil[:, None]
+    if stencil.dtype.kind not in "iu" and stencil.size:
+        raise ValueError(f"{label}.{parameter} is {shown(indices)}; it must hold integers, {vertices} for each element")
     if stencil.ndim != 2 or stencil.shape[1] != vertices or len(stencil) == 0 or stencil.dtype.kind not in "iu":
         raise ValueError(
             f"{label}.{parameter} has shape {stencil.shape} and type {stencil.dtype}; it must hold integers, "

@@ -42,7 +42,7 @@ class Explicit(Step):
         """The solver on ``model``, all scratch allocated.
 
         Warns:
-            UserWarning: If the step is above the bound that holds in any motion.
+            UserWarning: If the step is above the bound in motion, see :func:`step_limits`, which counts hinges as at rest.
 
         Raises:
             ValueError: If the step is above the limit and that is not allowed, or a stiffness is infinite.
@@ -69,17 +69,18 @@ class Explicit(Step):
         if h >= motion:
             warnings.warn(
                 f"dt is {h:.6g} s; below {rest:.6g} s it is stable about the rest shape, but only below {motion:.6g} s "
-                "in any motion",
+                "in motion, hinges counted as at rest",
                 stacklevel=3,
             )
 
 
 def step_limits(model):
-    """The largest stable steps of symplectic Euler [s]: about the rest shape, and a lower bound for any motion.
+    """The largest stable steps of symplectic Euler [s]: about the rest shape, and in motion, hinges counted as at rest.
 
     The first is 2/ω with ω² the largest eigenvalue of M⁻¹∂²U/∂x² at rest, by Lanczos iteration; the second 2/√G with
     Gershgorin's G = max over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is
-    2·Σk/m, which no motion exceeds; elements whose own Hessian grows with deformation (dihedral bending) count as at rest.
+    2·Σk/m, which no motion exceeds, and neither does one of quadratic bending. The Hessian of dihedral bending grows as the
+    cloth folds or is compressed, so for scenes with it the second is no bound there: it counts hinges as at rest.
 
     Returns:
         (rest, motion); infinite where nothing is stiff.

@@ -7,7 +7,7 @@ import numpy as np
 from ..capture import Segment
 from ..checks import choice, number, whole
 from ..kernels import project as kernels
-from .solver import Step, Stepper
+from .solver import Step, Stepper, require_model
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ class PBD(Step):
         Raises:
             ValueError: If a term has nothing to project on.
         """
+        require_model(model)
         for elements in model.terms:
             if elements.term.project is None and elements.term.constraint is None:
                 raise ValueError(

@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..checks import number, whole
+from ..checks import number, shown, whole
 from ..kernels import step as kernels
+from ..model import Model
+from ..scene import Scene
 from ..status import Result
 
 
@@ -63,6 +65,7 @@ class Stepper:
     """
 
     def __init__(self, options, model):
+        require_model(model)
         fps = model.scene.fps
         self.options, self.model = options, model
         self.steps_per_frame = options.per_frame(fps)
@@ -102,12 +105,24 @@ class Stepper:
         raise NotImplementedError  # every solver has its own
 
 
+def require_model(model):
+    """Refuses what is no model, such as the scene that one is built from.
+
+    Raises:
+        ValueError: Saying how to make one.
+    """
+    if not isinstance(model, Model):
+        given = "a Scene" if isinstance(model, Scene) else shown(model)
+        raise ValueError(f"model is {given}; bind takes a model, which scene.build() makes")
+
+
 def refuse_hard(model, solver, instead):
     """Refuses infinite stiffness for a solver that needs forces.
 
     Raises:
-        ValueError: Naming the term, the solver and what would work.
+        ValueError: Naming the term, the solver and what would work; or as :func:`require_model`.
     """
+    require_model(model)
     for elements in model.terms:
         if elements.hard:
             raise ValueError(f"{solver} cannot take {elements.label} with infinite stiffness; {instead}")
