@@ -93,13 +93,19 @@ class Factorised:
 
     def solve(self, b, x):
         """x = A⁻¹ b, in double precision; 0 for a copy whose A is singular or not finite."""
-        right, left = (self._mirrors.setdefault(id(array), Mirror(array)) for array in (b, x))
+        right, left = self._mirror(b), self._mirror(x)
         copies = self.model.copies
         blocks = np.split(self.values.read(), np.cumsum([len(matrix.data) for matrix in self.matrices])[:-1])
         sides = right.read().astype(np.float64).reshape(copies, -1)
         solved = [self._solve(*copy) for copy in zip(self.matrices, blocks, sides, strict=True)]
         left.write(np.concatenate([solution for solution, _ in solved]).reshape(-1, 3))
         self.negative.write([negative for _, negative in solved])
+
+    def _mirror(self, array):
+        """The mirror of an array, built when the array is first seen."""
+        if array.ptr not in self._mirrors:
+            self._mirrors[array.ptr] = Mirror(array)
+        return self._mirrors[array.ptr]
 
     @staticmethod
     def _solve(matrix, blocks, right):
