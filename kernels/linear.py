@@ -80,25 +80,33 @@ def multiply(dtype):
 
 @cache
 def rounding(dtype):
-    """Kernel over block rows: out[i] = (ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖))², rounding of the force [N²]."""
+    """Kernel over block rows: what rounding makes of a force and of the energy.
+
+    ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖);  force[i] = ρ² [N²],  energy[i] = ½ρ²/‖A[i, i]‖ [J].
+    """
     vec3, mat33 = types(dtype)
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def rounding_of_rows(
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
+        diagonal: wp.array(dtype=wp.int32),
         values: wp.array(dtype=mat33),
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         epsilon: dtype,
-        out: wp.array(dtype=wp.float64),
+        force: wp.array(dtype=wp.float64),
+        energy: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
         total = dtype(0.0)
         for s in range(offsets[i], offsets[i + 1]):
             j = columns[s]
             total += wp.sqrt(wp.ddot(values[s], values[s])) * (wp.length(x[j] - x[i]) + wp.length(d[j]))
-        out[i] = wp.float64(epsilon * total) * wp.float64(epsilon * total)
+        rho = wp.float64(epsilon * total)
+        block = values[diagonal[i]]
+        force[i] = rho * rho
+        energy[i] = wp.float64(0.5) * rho * rho / wp.float64(wp.sqrt(wp.ddot(block, block)))
 
     return rounding_of_rows
 

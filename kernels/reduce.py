@@ -43,12 +43,11 @@ def partial_dot(dtype):
 
 @cache
 def finish_sum():
-    """Kernel over copies: out[copy] = start·out[copy] + scale·Σ partial[copy], start 0 or 1."""
+    """Kernel over copies: out[copy] = start·out[copy] + Σ partial[copy], start 0 or 1."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def add_chunks(
         partial: wp.array2d(dtype=wp.float64),
-        scale: wp.float64,
         start: wp.float64,
         out: wp.array(dtype=wp.float64),
     ):
@@ -56,6 +55,6 @@ def finish_sum():
         total = wp.float64(0.0)
         for chunk in range(partial.shape[1]):
             total += partial[copy, chunk]
-        out[copy] = start * out[copy] + scale * total
+        out[copy] = start * out[copy] + total
 
     return add_chunks

@@ -13,6 +13,8 @@ from .status import Result
 
 # Roundings that a force takes: of the lengths, of the strain, of the products and of the sum over a vertex's elements.
 ROUNDINGS = 4.0
+# Of the energy that roundings lose at worst what they lose as a rule, adding up like a random walk.
+TYPICAL = 0.1
 # Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
 HALVINGS = 30
 
@@ -56,17 +58,18 @@ class Minimiser:
         else:
             self.linear = Factorised(self.hessian)
         self.correction, self.trial, self.gradient, self.direction, self.right = (model.vectors() for _ in range(5))
-        self.work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self.work, self.lost = (wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2))
 
         def per_copy(dtype):
             return wp.zeros(model.copies, dtype=dtype, device=model.device)
 
-        scalars = (per_copy(wp.float64) for _ in range(7))
-        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square, self.rounding = scalars
+        scalars = (per_copy(wp.float64) for _ in range(8))
+        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square = (next(scalars) for _ in range(6))
+        self.rounding, self.lost_energy = scalars
         self.active, self.searching = per_copy(wp.int32), per_copy(wp.int32)
         self._active, self._policy = Mirror(self.active), Mirror(self.hessian.policy)
-        read = (self.energy, self.square, self.rounding, self.step, self.slope)
-        self._energy, self._square, self._rounding, self._step, self._slope = (Mirror(array) for array in read)
+        read = (self.energy, self.square, self.rounding, self.lost_energy, self.step, self.slope)
+        self._energy, self._square, self._rounding, self._lost, self._step, self._slope = (Mirror(array) for array in read)
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
         # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
@@ -108,7 +111,7 @@ class Minimiser:
         """Iterates until ‖∇φ‖ ≤ ``tolerance``·scale in every copy, or nothing is left to gain in the model's precision.
 
         The scale of a copy is ‖m g‖ + ‖∇φ(0)‖. Nothing is left to gain when ‖∇φ‖ is no more than rounding may make of it,
-        4ε Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) a vertex, and an iteration has not lowered φ by more than its own rounding: the norm
+        4ε Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) a vertex, and an iteration has not lowered φ by more than rounding: the norm
         alone would let the noise of stiff directions hide what soft ones still lack.
 
         Returns:
@@ -137,7 +140,7 @@ class Minimiser:
             self.iterations += 1
             norm = np.sqrt(self._square.read())
             noisy, before, energy = norm <= ROUNDINGS * np.sqrt(self._rounding.read()), energy, self._energy.read().copy()
-            level = before - energy <= self.resolution * np.abs(before)
+            level = before - energy <= self.resolution * np.abs(before) + TYPICAL * self._lost.read()
             # A copy is stuck where no step was found, or there was none to look for.
             stuck = active & ((self._step.read() == 0.0) | ~(self._slope.read() < 0.0))
             rounded = rounded | (active & noisy & (stuck | level))
@@ -185,8 +188,7 @@ class Minimiser:
         self.gradient_of.add(self.base, self.gradient, self.trial)
         given = [model.mass, model.inverse_mass, model.gravity, n, self.s, self.load, self.trial]
         self._launch("add_inertia", N, given, [self.gradient, self.work])
-        model.launch(self.energy_of._sum, self.sums.partial.shape, [self.work, n], [self.sums.partial])
-        self.sums.finish(1.0, 0.0, self.trial_energy)
+        self.sums.sum(self.work, n, self.trial_energy)
         self.energy_of.add(self.base, self.trial_energy, self.trial)
         self.sums.dot(self.gradient, self.direction, self.trial_slope)
 
@@ -194,10 +196,10 @@ class Minimiser:
         self.hessian.assemble(self.base, self.s, self.correction)
         self._launch("negate", self.model.count, [self.gradient], [self.right])
         hessian, model = self.hessian, self.model
-        given = [hessian.offsets, hessian.columns, hessian.values, self.base, self.correction, np.finfo(model.numpy_dtype).eps]
-        self._launch("rounding", model.count, given, [self.work])
-        model.launch(self.energy_of._sum, self.sums.partial.shape, [self.work, model.per_copy], [self.sums.partial])
-        self.sums.finish(1.0, 0.0, self.rounding)
+        given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
+        self._launch("rounding", model.count, [*given, np.finfo(model.numpy_dtype).eps], [self.work, self.lost])
+        for values, total in ((self.work, self.rounding), (self.lost, self.lost_energy)):
+            self.sums.sum(values, model.per_copy, total)
 
     def _launch_solve(self):
         self.linear.solve(self.right, self.direction)

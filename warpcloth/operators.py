@@ -17,16 +17,21 @@ class Sums:
         chunks = CHUNKS if model.device.is_cuda else 1
         self.partial = wp.zeros((model.copies, chunks), dtype=wp.float64, device=model.device)
         self._finish = model.kernel(reduce.finish_sum)
+        self._sum = model.kernel(reduce.partial_sum)
         self._dot = model.kernel(reduce.partial_dot, model.dtype)
 
     def dot(self, a, b, out):
         """out (B,) = Σ a·b over the vertices of each copy."""
         self.model.launch(self._dot, self.partial.shape, [a, b, self.model.per_copy], [self.partial])
-        self.finish(1.0, 0.0, out)
+        self._add_chunks(0.0, out)
 
-    def finish(self, scale, start, out):
-        """out (B,) = start·out + scale·Σ partial."""
-        self.model.launch(self._finish, self.model.copies, [self.partial, scale, start], [out])
+    def sum(self, values, per_copy, out, start=0.0):
+        """out (B,) = start·out + Σ of the ``per_copy`` values of each copy."""
+        self.model.launch(self._sum, self.partial.shape, [values, per_copy], [self.partial])
+        self._add_chunks(start, out)
+
+    def _add_chunks(self, start, out):
+        self.model.launch(self._finish, self.model.copies, [self.partial, start], [out])
 
 
 class Gradient:
@@ -54,14 +59,12 @@ class Energy:
         self.model, self.sums, self.terms = model, sums, model.terms if terms is None else terms
         self.kernels = [model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in self.terms]
         self.of_elements = [wp.zeros(elements.count, dtype=wp.float64, device=model.device) for elements in self.terms]
-        self._sum = model.kernel(reduce.partial_sum)
 
     def add(self, x, out, correction=None):
         """out (B,) += U(x), or U(x + correction)."""
         for elements, kernel, values in zip(self.terms, self.kernels, self.of_elements, strict=True):
             self.model.launch(kernel, elements.count, [*elements.arguments, x, correction], [values])
-            self.model.launch(self._sum, self.sums.partial.shape, [values, elements.per_copy], [self.sums.partial])
-            self.sums.finish(1.0, 1.0, out)
+            self.sums.sum(values, elements.per_copy, out, start=1.0)
 
 
 class Hessian:
