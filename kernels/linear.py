@@ -82,7 +82,8 @@ def multiply(dtype):
 def rounding(dtype):
     """Kernel over block rows: what rounding makes of a force and of the energy.
 
-    ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖);  force[i] = ρ² [N²],  energy[i] = ½ρ²/‖A[i, i]‖ [J].
+    ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖);  energy[i] = ½ρ²/‖A[i, i]‖ [J],  force[i] = (ρ + ε‖A[i, i]‖ edge)² [N²], where a
+    typical edge stands for neighbours that are pinned and so not in the matrix.
     """
     vec3, mat33 = types(dtype)
 
@@ -95,6 +96,7 @@ def rounding(dtype):
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         epsilon: dtype,
+        edge: dtype,
         force: wp.array(dtype=wp.float64),
         energy: wp.array(dtype=wp.float64),
     ):
@@ -103,10 +105,12 @@ def rounding(dtype):
         for s in range(offsets[i], offsets[i + 1]):
             j = columns[s]
             total += wp.sqrt(wp.ddot(values[s], values[s])) * (wp.length(x[j] - x[i]) + wp.length(d[j]))
-        rho = wp.float64(epsilon * total)
         block = values[diagonal[i]]
+        size = wp.sqrt(wp.ddot(block, block))
+        rho = wp.float64(epsilon * (total + size * edge))
         force[i] = rho * rho
-        energy[i] = wp.float64(0.5) * rho * rho / wp.float64(wp.sqrt(wp.ddot(block, block)))
+        rho = wp.float64(epsilon * total)
+        energy[i] = wp.float64(0.5) * rho * rho / wp.float64(size)
 
     return rounding_of_rows
 
@@ -123,11 +127,13 @@ def invert_diagonal(dtype):
     def invert_blocks(diagonal: wp.array(dtype=wp.int32), values: wp.array(dtype=mat33), inverse: wp.array(dtype=mat33)):
         i = wp.tid()
         block = values[diagonal[i]]
+        size = wp.sqrt(wp.ddot(block, block))
+        block = block / size
         minor = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
         if block[0, 0] <= dtype(0.0) or minor <= dtype(0.0) or wp.determinant(block) <= dtype(0.0):
-            inverse[i] = wp.identity(n=3, dtype=dtype) / wp.sqrt(wp.ddot(block, block))
+            inverse[i] = wp.identity(n=3, dtype=dtype) / size
         else:
-            inverse[i] = wp.inverse(block)
+            inverse[i] = wp.inverse(block) / size
 
     return invert_blocks
 
@@ -157,11 +163,12 @@ def start_iteration(dtype):
 
 @cache
 def start_copies():
-    """Kernel over copies: every copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0."""
+    """Kernel over copies: every wanted copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0."""
 
     @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def start(
         rz: wp.array(dtype=wp.float64),
+        wanted: wp.array(dtype=wp.int32),
         first: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
         iteration: wp.array(dtype=wp.int32),
@@ -169,7 +176,7 @@ def start_copies():
     ):
         copy = wp.tid()
         first[copy] = rz[copy]
-        active[copy] = wp.where(rz[copy] > wp.float64(0.0), 1, 0)
+        active[copy] = wp.where(rz[copy] > wp.float64(0.0), wanted[copy], 0)
         iteration[0] = 0
         proceed[0] = 1
 

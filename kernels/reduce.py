@@ -1,4 +1,4 @@
-"""Sums per copy, in double precision and in a fixed order, so that the same run gives the same bits.
+"""Sums and maxima per copy, in double precision and in a fixed order, so that the same run gives the same bits.
 
 Two launches: (copies, chunks) threads sum every chunks-th entry of their copy, then one thread a copy adds the chunks.
 """
@@ -58,3 +58,40 @@ def finish_sum():
         out[copy] = start * out[copy] + total
 
     return add_chunks
+
+
+@cache
+def partial_largest(dtype):
+    """Kernel over (copies, chunks): out[copy, chunk] = max wᵢ‖aᵢ‖ over vertices; NaN stays."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def largest_of_chunks(
+        weights: wp.array(dtype=dtype), a: wp.array(dtype=vec3), per_copy: int, out: wp.array2d(dtype=wp.float64)
+    ):
+        copy, chunk = wp.tid()
+        most = wp.float64(0.0)
+        for j in range(chunk, per_copy, out.shape[1]):
+            i = copy * per_copy + j
+            value = wp.float64(weights[i]) * wp.float64(wp.length(a[i]))
+            if most == most and not (value <= most):
+                most = value
+        out[copy, chunk] = most
+
+    return largest_of_chunks
+
+
+@cache
+def finish_largest():
+    """Kernel over copies: out[copy] = max partial[copy]; NaN stays."""
+
+    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
+    def largest_chunk(partial: wp.array2d(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
+        copy = wp.tid()
+        most = wp.float64(0.0)
+        for chunk in range(partial.shape[1]):
+            if most == most and not (partial[copy, chunk] <= most):
+                most = partial[copy, chunk]
+        out[copy] = most
+
+    return largest_chunk

@@ -144,3 +144,39 @@ def test_float32_comes_near_float64(device):
     single, double = (wc.equilibrium(strip, dtype=dtype, device=device) for dtype in ("float32", "float64"))
     assert single.status.message.startswith("converged as far as rounding allows")
     assert np.abs(single.points - double.points).max() < 1e-4
+
+
+def test_a_saddle_that_is_not_left_is_reported(device, monkeypatch):
+    """What no nudge moves away from is in balance, and said to be no more."""
+    monkeypatch.setattr("warpcloth.minimise.Minimiser.curves_down", lambda self: True)
+    rest = wc.equilibrium(scene("chain", links=3), device=device)
+    assert rest.status.result.name == "SADDLE"
+
+
+@pytest.mark.parametrize("stretch", [1.01, 1.02, 1.05, 1.1, 1.2, 1.3])
+def test_a_circle_of_minima_is_no_saddle(stretch, device):
+    """A chain of two links too long for its span may buckle any way round: a zero eigenvalue is not a negative one."""
+    mesh = wc.Mesh([[0, 0, 0], [1, 1, 0], [2, 2, 0]], edges=[[0, 1], [1, 2]])
+    spring = wc.Spring(stiffness=10.0, rest_lengths=stretch * np.sqrt(2.0))
+    rest = wc.equilibrium(wc.Scene(mesh, masses=np.ones(3), terms=[spring], pins=[0, 2], gravity=(0, 0, 0)), device=device)
+    assert rest.status.result in SETTLED
+    lengths = np.linalg.norm(np.diff(rest.points, axis=0), axis=1)
+    assert lengths == pytest.approx(stretch * np.sqrt(2.0), rel=1e-6)
+
+
+def test_a_slack_part_does_not_hide_a_saddle(device):
+    """A link that lies slack makes the Hessian singular; the chain under pressure beside it still buckles."""
+    mesh = wc.Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 0, 0], [6, 0, 0]], edges=[[0, 1], [1, 2], [3, 4]])
+    spring = wc.Spring(stiffness=10.0, rest_lengths=[1.5, 1.5, 1.0])
+    cloth = wc.Scene(mesh, masses=np.ones(5), terms=[spring], pins=[0, 2, 3], gravity=(0, 0, 0))
+    rest = wc.equilibrium(cloth, device=device)
+    assert np.linalg.norm(rest.points[1] - rest.points[0]) == pytest.approx(1.5, rel=1e-6)
+
+
+def test_a_light_vertex_is_in_balance_beside_a_heavy_one(device):
+    """Balance is asked of every vertex: 1e6 kg elsewhere excuse nothing at 1e-3 kg."""
+    mesh = wc.Mesh([[0, 0, 0], [1, 0, 0], [3, 0, 0], [4, 0, 0]], edges=[[0, 1], [2, 3]])
+    spring = wc.Spring(stiffness=[10.0, 1e9])
+    cloth = wc.Scene(mesh, masses=[1.0, 1e-3, 1.0, 1e6], terms=[spring], pins=[0, 2])
+    rest = wc.equilibrium(cloth, device=device)
+    assert rest.points[1] == pytest.approx([0.0, -1.0 - 1e-3 * 9.81 / 10.0, 0.0], abs=1e-6)

@@ -216,6 +216,47 @@ def test_fast_is_not_diverged(name, device):
     assert animation.status.ok, animation.status
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_rest_is_not_diverged(dtype, device):
+    """Without gravity a sheet at rest has no energy but that of rounding, and moves by nothing else."""
+    mesh = wc.Mesh.grid(8, 8)
+    mesh = wc.Mesh(mesh.points + 37.0, mesh.triangles)
+    sheet = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1e3)], pins="corners", gravity=(0, 0, 0), duration=0.5)
+    assert wc.simulate(sheet, wc.Explicit(substeps=64), device=device, dtype=dtype).status.ok
+
+
+def test_a_mass_that_its_pin_swings_up_is_not_diverged(device):
+    """Driven at its own frequency it goes ½A(sin ωt − ωt cos ωt), without end."""
+    omega, amplitude, duration = 2.0 * np.pi, 0.01, 30.0
+    times = np.arange(round(60 * duration) + 1) / 60.0
+    keyframes = np.zeros((len(times), 1, 3))
+    keyframes[:, 0, 0] = amplitude * np.sin(omega * times)
+    driven = wc.Scene(
+        PAIR,
+        masses=[1.0, 1.0],
+        terms=[wc.Spring(stiffness=omega**2)],
+        pins=wc.Pins([0], keyframes),
+        gravity=(0, 0, 0),
+        duration=duration,
+    )
+    animation = wc.simulate(driven, wc.Explicit(substeps=64), device=device, dtype="float64")
+    assert animation.status.ok, animation.status
+    exact = 0.5 * amplitude * (np.sin(omega * times) - omega * times * np.cos(omega * times))
+    # Keyframes are joined by straight lines, (ωΔt)²/12 = 0.1 % less drive; symplectic Euler's phase is ωh/2 early.
+    assert np.abs(animation.points[:, 1, 0] - 1.0 - exact).max() < 0.005 * np.abs(exact).max()
+
+
+def test_a_step_without_finite_forces_ends_the_copy(device):
+    """float32 overflows at 1e18 m/s squared; Newton says so and the copy ends there."""
+    mesh = wc.Mesh.grid(6, 6)
+    velocities = np.zeros((36, 3))
+    velocities[20] = 1e18
+    cloth = wc.Scene(mesh, density=0.1, velocities=velocities, terms=[wc.Spring(stiffness=1e3)], pins="corners")
+    animation = wc.simulate(cloth, wc.Newton(substeps=1), device=device, frames=5)
+    assert not animation.status.ok
+    assert len(animation.points) < 6 and "diverged in frame" in animation.status.message
+
+
 def test_a_blown_up_projection_is_diverged(device):
     """Hard constraints have no energy to compare with, but a gap at the start that one step can close."""
     mesh = wc.Mesh.grid(8, 8)

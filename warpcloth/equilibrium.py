@@ -18,9 +18,9 @@ class Equilibrium(NamedTuple):
 
     Attributes:
         points: (n, 3) [m].
-        status: How it ended, see :class:`warpcloth.status.Result`, with the residual ‖∇U − m g‖/(‖m g‖ + ‖∇U − m g where the
-            last descent began‖).
-        iterations: Newton iterations in all.
+        status: How it ended, see :class:`warpcloth.status.Result`, with the residual: the largest unbalanced acceleration of
+            a vertex over gravity's (without any, over the largest where the last descent began).
+        iterations: Newton iterations in all, each round of proximal steps counting as one more.
     """
 
     points: np.ndarray
@@ -60,43 +60,46 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     refuse_hard(model, "equilibrium", "give a finite stiffness")
     base = wp.clone(model.positions)
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0)
-    used = 0
-
-    def settle(s, load, most):
-        """Minimises from where the cloth is, and moves it there; how that ended."""
-        nonlocal used
-        minimiser.set_objective(s, load)
-        (result,) = minimiser.minimise(tolerance, most)
-        used += max(minimiser.iterations, 1)
-        base.assign(base.numpy() + minimiser.correction.numpy())
-        return result
-
+    descent = _Descent(minimiser, base, tolerance, iterations)
     for part in range(1, load_steps + 1):
-        result = _descend(settle, part / load_steps, _frequency_scale(model), lambda: iterations - used)
-    if result in SETTLED:
-        # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
-        minimiser.set_objective(0.0, 1.0)
-        if minimiser.curves_down():
-            base.assign(base.numpy() + _nudge(model))
-            result = _descend(settle, 1.0, _frequency_scale(model), lambda: iterations - used)
-            if result in SETTLED and minimiser.curves_down():
-                result = Result.SADDLE
+        result = descent.run(part / load_steps, _frequency_scale(model))
+    # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
+    if result in SETTLED and minimiser.curves_down():
+        base.assign(base.numpy() + _nudge(model))
+        result = descent.run(1.0, _frequency_scale(model))
+        if result in SETTLED and minimiser.curves_down():
+            result = Result.SADDLE
     residual = float(minimiser.residual.max())
     message = result.value if result is Result.CONVERGED else f"{result.value}, residual {residual:.2g}"
-    return Equilibrium(np.array(base.numpy()), Status(result, residual=residual, message=message), used)
+    return Equilibrium(np.array(base.numpy()), Status(result, residual=residual, message=message), descent.used)
 
 
-def _descend(settle, load, s, left):
-    """Settles without inertia, with proximal steps in between where that does not go on; the last result."""
-    while True:
-        result = settle(0.0, load, left())
-        if result is Result.ROUNDED:  # of a long way d; from here d is short and rounds less
-            result = settle(0.0, load, left())
-        if result in SETTLED or result is Result.DIVERGED or left() <= 0:
-            return result
-        for _ in range(8):
-            settle(s, load, min(20, max(left(), 1)))
-        s /= 16.0
+class _Descent:
+    """Minimises from where the cloth is and moves it there, again and again, with so many iterations in all."""
+
+    def __init__(self, minimiser, base, tolerance, iterations):
+        self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
+        self.used = 0
+
+    def run(self, load, s):
+        """Settles without inertia, with proximal steps in between where that does not go on; the last result."""
+        while True:
+            result = self._settle(0.0, load, self.iterations)
+            if result is Result.ROUNDED:  # of a long way d; from here d is short and rounds less
+                result = self._settle(0.0, load, self.iterations)
+            if result in SETTLED or result is Result.DIVERGED or self.used >= self.iterations:
+                return result
+            for _ in range(8):
+                self._settle(s, load, 20)
+            s /= 16.0
+            self.used += 1  # so that a round which finds no direction at all ends too
+
+    def _settle(self, s, load, most):
+        self.minimiser.set_objective(s, load)
+        (result,) = self.minimiser.minimise(self.tolerance, min(most, max(self.iterations - self.used, 0)))
+        self.used += self.minimiser.iterations
+        self.base.assign(self.base.numpy() + self.minimiser.correction.numpy())
+        return result
 
 
 def _nudge(model):

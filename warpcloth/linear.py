@@ -43,15 +43,15 @@ class ConjugateGradients:
         names = ("start_copies", "begin_check", "check_copies", "limit_iterations")
         self.kernels |= {name: model.kernel(getattr(linear, name)) for name in names}
 
-    def solve(self, b, x):
-        """x = A⁻¹ b to the relative ``tolerance`` (B,) of each copy."""
+    def solve(self, b, x, wanted):
+        """x = A⁻¹ b to the relative ``tolerance`` (B,) of each copy that is wanted, 0 for the rest."""
         model, hessian = self.model, self.hessian
         N, B = model.count, model.copies
         self._launch("invert_diagonal", N, [hessian.diagonal, hessian.values], [self.preconditioner])
         self._launch("start_iteration", N, [self.preconditioner, b], [x, self.r, self.z, self.p])
         self.sums.dot(self.r, self.z, self.rz)
         self.negative.array.zero_()
-        self._launch("start_copies", B, [self.rz], [self.first, self.active, self.iteration, self.proceed])
+        self._launch("start_copies", B, [self.rz, wanted], [self.first, self.active, self.iteration, self.proceed])
         wp.capture_while(self.proceed, self._iterate, x=x)
 
     def _iterate(self, x):
@@ -87,19 +87,29 @@ class Factorised:
     def __init__(self, hessian):
         model = self.model = hessian.model
         self.matrices = hessian.matrices()
+        self.starts = np.cumsum([0, *(len(matrix.data) for matrix in self.matrices)])
         self.values = Mirror(hessian.values)
         self.negative = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
         self._mirrors = {}
 
-    def solve(self, b, x):
-        """x = A⁻¹ b, in double precision; 0 for a copy whose A is singular or not finite."""
-        right, left = self._mirror(b), self._mirror(x)
-        copies = self.model.copies
-        blocks = np.split(self.values.read(), np.cumsum([len(matrix.data) for matrix in self.matrices])[:-1])
-        sides = right.read().astype(np.float64).reshape(copies, -1)
-        solved = [self._solve(*copy) for copy in zip(self.matrices, blocks, sides, strict=True)]
-        left.write(np.concatenate([solution for solution, _ in solved]).reshape(-1, 3))
-        self.negative.write([negative for _, negative in solved])
+    def solve(self, b, x, wanted):
+        """x = A⁻¹ b, in double precision; 0 for a copy that is not wanted, or whose A is singular or not finite."""
+        right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
+        sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
+        solution, negative = np.zeros_like(sides), np.zeros(self.model.copies, dtype=bool)
+        for copy in np.flatnonzero(wanted.read()):
+            factor = self._factor(copy, 0.0)
+            found = None if factor is None else factor.solve(sides[copy])
+            if found is not None and np.isfinite(found).all():
+                solution[copy], negative[copy] = found, (factor.U.diagonal() < 0.0).any()
+        left.write(solution.reshape(-1, 3))
+        self.negative.write(negative)
+
+    def curves_down(self):
+        """Whether some copy has an eigenvalue below −1000 ε of its largest diagonal entry: beyond rounding, it is negative."""
+        shift = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
+        factors = (self._factor(copy, shift) for copy in range(self.model.copies))
+        return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
     def _mirror(self, array):
         """The mirror of an array, built when the array is first seen."""
@@ -107,19 +117,20 @@ class Factorised:
             self._mirrors[array.ptr] = Mirror(array)
         return self._mirrors[array.ptr]
 
-    @staticmethod
-    def _solve(matrix, blocks, right):
-        """The solution for one copy, and whether a pivot is negative."""
+    def _factor(self, copy, shift):
+        """The factors of a copy's matrix, or None; with ``shift`` times its largest diagonal entry added to the diagonal."""
+        from scipy.sparse import identity
         from scipy.sparse.linalg import splu
 
-        nothing = np.zeros_like(right), False
-        if not np.isfinite(blocks).all():
-            return nothing
-        matrix.data[:] = blocks
+        matrix = self.matrices[copy]
+        matrix.data[:] = self.values.read()[self.starts[copy] : self.starts[copy + 1]]
+        if not np.isfinite(matrix.data).all():
+            return None
+        columns = matrix.tocsc()
+        if shift:
+            columns = columns + shift * np.abs(columns.diagonal()).max() * identity(columns.shape[0], format="csc")
         options = {"SymmetricMode": True, "Equil": False}
         try:
-            factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-        except RuntimeError:  # exactly singular: no direction to step along
-            return nothing
-        solution = factor.solve(right)
-        return (solution, bool((factor.U.diagonal() < 0.0).any())) if np.isfinite(solution).all() else nothing
+            return splu(columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        except RuntimeError:  # exactly singular
+            return None

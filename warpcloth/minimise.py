@@ -43,7 +43,7 @@ class Minimiser:
 
     Attributes:
         correction: d (N,) [m].
-        residual: ‖∇φ‖ of each copy over its scale, (B,) on the host, after :meth:`minimise`.
+        residual: The largest unbalanced acceleration of each copy over that of gravity, (B,), after :meth:`minimise`.
         iterations: Newton iterations of the last :meth:`minimise`.
     """
 
@@ -63,13 +63,15 @@ class Minimiser:
         def per_copy(dtype):
             return wp.zeros(model.copies, dtype=dtype, device=model.device)
 
-        scalars = (per_copy(wp.float64) for _ in range(8))
+        scalars = (per_copy(wp.float64) for _ in range(9))
         self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square = (next(scalars) for _ in range(6))
-        self.rounding, self.lost_energy = scalars
+        self.rounding, self.lost_energy, self.acceleration = scalars
         self.active, self.searching = per_copy(wp.int32), per_copy(wp.int32)
         self._active, self._policy = Mirror(self.active), Mirror(self.hessian.policy)
         read = (self.energy, self.square, self.rounding, self.lost_energy, self.step, self.slope)
         self._energy, self._square, self._rounding, self._lost, self._step, self._slope = (Mirror(array) for array in read)
+        self._acceleration = Mirror(self.acceleration)
+        self.edge = float(np.median(model.scene.mesh.edge_lengths))
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
         # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
@@ -77,7 +79,7 @@ class Minimiser:
         self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
         self._find_kernels()
         self._record()
-        self.weight_of_gravity = self._weight_of_gravity()
+        self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         self.residual, self.iterations = np.zeros(model.copies), 0
 
     def _find_kernels(self):
@@ -101,46 +103,43 @@ class Minimiser:
         self.s, self.load = s, load
         self._record()
 
-    def _weight_of_gravity(self):
-        """‖m g‖ over the free vertices of each copy [N], the scale of a force where none else acts."""
-        model = self.model
-        free = np.where(model.inverse_mass.numpy() > 0.0, model.mass.numpy(), 0.0).reshape(model.copies, -1)
-        return np.linalg.norm(free, axis=1) * np.linalg.norm(model.gravity.numpy(), axis=1)
-
     def minimise(self, tolerance, iterations):
-        """Iterates until ‖∇φ‖ ≤ ``tolerance``·scale in every copy, or nothing is left to gain in the model's precision.
+        """Iterates until every vertex is in balance, or nothing is left to gain in the model's precision.
 
-        The scale of a copy is ‖m g‖ + ‖∇φ(0)‖. Nothing is left to gain when ‖∇φ‖ is no more than rounding may make of it,
-        4ε Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) a vertex, and an iteration has not lowered φ by more than rounding: the norm
-        alone would let the noise of stiff directions hide what soft ones still lack.
+        In balance is a copy with max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a, an acceleration; a is that of gravity, or without any the
+        largest at d = 0. Nothing is left to gain when ‖∇φ‖ is no more than rounding may make of it,
+        4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) a vertex, and an iteration has not lowered φ by more than rounding: the
+        norm alone would let the noise of stiff directions hide what soft ones still lack.
 
         Returns:
             A :class:`Result` for each copy.
         """
         B = self.model.copies
         self._start()
-        norm = np.sqrt(self._square.read())
-        scale = self.weight_of_gravity + norm
+        scale = np.where(self.gravity > 0.0, self.gravity, self._acceleration.read())
         scale[scale == 0.0] = 1.0
         energy = self._energy.read().copy()
         rounded = stalled = np.zeros(B, dtype=bool)
+        # Linear systems are solved no better than the residual has fallen (Eisenstat and Walker 1996).
+        first = np.maximum(self._acceleration.read() / scale, 1.0)
         self.iterations = 0
         while True:
-            self.residual = norm / scale
+            self.residual = self._acceleration.read() / scale
             finite = np.isfinite(self.residual)
-            converged = finite & (norm <= tolerance * scale)
+            converged = finite & (self.residual <= tolerance)
             active = finite & ~(converged | rounded | stalled)
             if not active.any() or self.iterations == iterations:
                 break
             self._active.write(active)
             if self.linear.capturable:
-                self.linear.tolerance.write(np.clip(self.residual, 1e-12, 0.1))
+                self.linear.tolerance.write(np.clip(self.residual / first, 1e-12, 0.1))
             self._find_direction()
             self._search()
             self.iterations += 1
-            norm = np.sqrt(self._square.read())
-            noisy, before, energy = norm <= ROUNDINGS * np.sqrt(self._rounding.read()), energy, self._energy.read().copy()
-            level = before - energy <= self.resolution * np.abs(before) + TYPICAL * self._lost.read()
+            noisy = self._square.read() <= ROUNDINGS**2 * self._rounding.read()
+            before, energy = energy, self._energy.read().copy()
+            with np.errstate(invalid="ignore"):  # of a copy that is not finite
+                level = before - energy <= self.resolution * np.abs(before) + TYPICAL * self._lost.read()
             # A copy is stuck where no step was found, or there was none to look for.
             stuck = active & ((self._step.read() == 0.0) | ~(self._slope.read() < 0.0))
             rounded = rounded | (active & noisy & (stuck | level))
@@ -160,15 +159,13 @@ class Minimiser:
             self._solve()
 
     def curves_down(self):
-        """Whether the unchanged Hessian at d = 0 has a negative eigenvalue in some copy, by its pivots on the host."""
+        """Whether the unchanged Hessian at d = 0 has a negative eigenvalue in some copy, beyond rounding."""
+        before = self._policy.read().copy()
         self._start()
-        before = self.hessian.policy.numpy().copy()
         self._policy.write(int(HessianPolicy.RAW))
         self._assemble()
-        factorised = self.linear if isinstance(self.linear, Factorised) else Factorised(self.hessian)
-        factorised.solve(self.right, self.direction)
         self._policy.write(before)
-        return bool(factorised.negative.read().any())
+        return Factorised(self.hessian).curves_down()
 
     # What the segments record.
 
@@ -178,6 +175,7 @@ class Minimiser:
         self.step.zero_()
         self._launch_trial()
         self.sums.dot(self.gradient, self.gradient, self.square)
+        self.sums.largest(self.model.inverse_mass, self.gradient, self.acceleration)
         wp.copy(self.energy, self.trial_energy)
 
     def _launch_trial(self):
@@ -197,12 +195,12 @@ class Minimiser:
         self._launch("negate", self.model.count, [self.gradient], [self.right])
         hessian, model = self.hessian, self.model
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
-        self._launch("rounding", model.count, [*given, np.finfo(model.numpy_dtype).eps], [self.work, self.lost])
+        self._launch("rounding", model.count, [*given, np.finfo(model.numpy_dtype).eps, self.edge], [self.work, self.lost])
         for values, total in ((self.work, self.rounding), (self.lost, self.lost_energy)):
             self.sums.sum(values, model.per_copy, total)
 
     def _launch_solve(self):
-        self.linear.solve(self.right, self.direction)
+        self.linear.solve(self.right, self.direction, self.active)
 
     def _launch_search(self):
         self.sums.dot(self.gradient, self.direction, self.slope)
@@ -211,6 +209,7 @@ class Minimiser:
         wp.copy(self.correction, self.trial)
         wp.copy(self.energy, self.trial_energy)
         self.sums.dot(self.gradient, self.gradient, self.square)
+        self.sums.largest(self.model.inverse_mass, self.gradient, self.acceleration)
 
     def _try_step(self):
         self._launch_trial()

@@ -10,7 +10,7 @@ CHUNKS = 256
 
 
 class Sums:
-    """Sums per copy in double precision and a fixed order."""
+    """Sums and maxima per copy in double precision and a fixed order."""
 
     def __init__(self, model):
         self.model = model
@@ -19,6 +19,8 @@ class Sums:
         self._finish = model.kernel(reduce.finish_sum)
         self._sum = model.kernel(reduce.partial_sum)
         self._dot = model.kernel(reduce.partial_dot, model.dtype)
+        self._largest = model.kernel(reduce.partial_largest, model.dtype)
+        self._finish_largest = model.kernel(reduce.finish_largest)
 
     def dot(self, a, b, out):
         """out (B,) = Σ a·b over the vertices of each copy."""
@@ -29,6 +31,11 @@ class Sums:
         """out (B,) = start·out + Σ of the ``per_copy`` values of each copy."""
         self.model.launch(self._sum, self.partial.shape, [values, per_copy], [self.partial])
         self._add_chunks(start, out)
+
+    def largest(self, weights, a, out):
+        """out (B,) = max wᵢ‖aᵢ‖ over the vertices of each copy."""
+        self.model.launch(self._largest, self.partial.shape, [weights, a, self.model.per_copy], [self.partial])
+        self.model.launch(self._finish_largest, self.model.copies, [self.partial], [out])
 
     def _add_chunks(self, start, out):
         self.model.launch(self._finish, self.model.copies, [self.partial, start], [out])

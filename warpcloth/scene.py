@@ -179,7 +179,9 @@ def refuse_far_pins(pins, positions, copy=""):
     if pins.keyframes is None:
         return
     gap = np.abs(pins.keyframes[0] - positions[pins.vertices]).max(initial=0.0)
-    if gap > 1e-6 * np.ptp(positions, axis=0).max():
+    # Either may have been float32 once, whose rounding grows with the distance from the origin.
+    near = 1e-6 * np.ptp(positions, axis=0).max() + 2.0 * np.finfo(np.float32).eps * np.abs(positions).max()
+    if gap > near:
         raise ValueError(f"pins.keyframes[0] is {gap:.3g} m from where the pinned vertices start{copy}; it must be there")
 
 

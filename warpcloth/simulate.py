@@ -92,7 +92,7 @@ def simulate(
                 stepper.step()
             points, velocities = _frame(stepper)
             timings["frames"].append(time.perf_counter() - began)
-            if not watch.passes(frame, points, velocities):
+            if not watch.passes(frame, points, velocities, stepper.results):
                 break
             recorder.append(points, velocities)
             if progress is not None:
@@ -114,10 +114,11 @@ def _frame(stepper):
 class Watch:
     """Tells a copy that has diverged from one that is merely fast, from frames alone and for every solver.
 
-    No cloth that gains energy only from gravity, its start and its pins has a mass-weighted root mean square speed far above
-    v₀ + √(2U₀/m) + √(2 g l) + g t + v_pins, with U₀ the elastic energy of the start and l its size; of hard constraints the
-    start counts with what closes their gap in one step. Ten times that is called diverged, and so is anything that is not
-    finite: a diverging run grows by a factor a step and passes it at once.
+    The mass-weighted root mean square speed of a cloth is measured against what can have made it: v₀ + √(2U₀/m) + √(2 g l) +
+    g t, with U₀ the elastic energy of the start and l its size, plus the largest speed of the pins once for each frame (pins
+    can swing a cloth up without end), plus l a second, below which nothing is called fast. Of hard constraints the start
+    counts with what closes their gap in one step. Ten times that is called diverged, and so are what is not finite and a step
+    of the solver that says so: a diverging run grows by a factor a step and passes any such bound at once.
 
     Args:
         model: The :class:`warpcloth.model.Model`.
@@ -142,11 +143,11 @@ class Watch:
         self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         size = np.linalg.norm(np.ptp(points.reshape(model.copies, -1, 3), axis=1), axis=1)
         self.start = self._speed(velocities) + np.sqrt(2.0 * self.gravity * size) + self._stored_speed(h)
+        self.start += size
+        self.pins = 0.0
         if scene.pins.keyframes is not None and len(scene.pins.keyframes) > 1:
             moves = np.linalg.norm(np.diff(scene.pins.keyframes, axis=0), axis=-1)
-            self.start += moves.max(initial=0.0) * scene.fps
-        # A cloth that nothing moves has no speed to compare with; its size in a second is then the scale.
-        self.start[self.start == 0.0] = size.max()
+            self.pins = moves.max(initial=0.0) * scene.fps
 
     def _speed(self, velocities):
         """Mass-weighted root mean square speed of the free vertices of each copy [m/s]."""
@@ -168,18 +169,22 @@ class Watch:
             speeds += np.sqrt(2.0 * energy.numpy()) / (h if hard else np.sqrt(self.total))
         return speeds
 
-    def passes(self, frame, points, velocities):
+    def passes(self, frame, points, velocities, results):
         """Whether any copy is still good; marks those that no longer are, and puts NaN in their place."""
         B, n = self.model.copies, self.model.per_copy
         finite = (np.isfinite(points) & np.isfinite(velocities)).all(axis=1).reshape(B, n)
         with np.errstate(over="ignore", invalid="ignore"):
-            speed, limit = self._speed(velocities), 10.0 * (self.start + self.gravity * frame / self.model.scene.fps)
-        for copy in np.flatnonzero(self.alive & ~(finite.all(axis=1) & (speed <= limit))):
+            speed, gained = self._speed(velocities), self.gravity * frame / self.model.scene.fps + self.pins * frame
+        limit = 10.0 * (self.start + gained)
+        stepped = np.array([result is not Result.DIVERGED for result in results])
+        for copy in np.flatnonzero(self.alive & ~(finite.all(axis=1) & (speed <= limit) & stepped)):
             self.alive[copy] = False
             where = f"diverged in frame {frame}" + (f", copy {copy}" if B > 1 else "")
             wrong = np.flatnonzero(~finite[copy])
             if len(wrong):
                 self.messages[copy] = f"{where}: vertex {wrong[0]} is not finite"
+            elif not stepped[copy]:
+                self.messages[copy] = f"{where}: the forces of a step are not finite"
             else:
                 self.messages[copy] = (
                     f"{where}: a mean speed of {speed[copy]:.3g} m/s, above the {limit[copy]:.3g} m/s that its energy allows"

@@ -14,11 +14,13 @@ from .solver import Step, Stepper, refuse_hard
 class Newton(Step):
     """Implicit Euler: x(t+h) minimises 1/(2h²)‖x − x̃‖²_M + U(x), x̃ = x + h v + h² g (Baraff and Witkin 1998).
 
+    From a state in exact balance that is no minimum, such as a straight chain under pressure, it does not move.
     Multiplies the energy of an oscillation by 1/(1 + ω²h²) a step; conserves linear, not angular momentum.
 
     Attributes:
         dt, substeps: See :class:`Step`.
-        tolerance: Of the residual ‖∇‖/(‖m g‖ + ‖∇ at x̃‖). Where rounding leaves more than that, which in float32 it does in
+        tolerance: Of the residual, the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, over gravity's (without any,
+            over the largest at x̃). Where rounding leaves more than that, which in float32 it does in
             stiff cloth, a step ends when nothing is left to gain, and says so.
         iterations: The most Newton iterations a step.
         hessian: What is done where the Hessian is indefinite (Choi and Ko 2002 for springs): ``"adaptive"`` clamps only in
@@ -30,8 +32,8 @@ class Newton(Step):
         ValueError: If an option breaks a rule.
     """
 
-    tolerance: float = 1e-4
-    iterations: int = 50
+    tolerance: float = 1e-3
+    iterations: int = 100
     hessian: str = "adaptive"
     linear: str = "cg"
 
