@@ -146,6 +146,13 @@ def test_float32_comes_near_float64(device):
     assert np.abs(single.points - double.points).max() < 1e-4
 
 
+def test_what_rounding_hides_is_no_rest_shape(device):
+    """With kL²/D = 1e6 float32 leaves forces of 40 times the weight, and the strip 0.2 m away."""
+    rest = wc.equilibrium(scene("cantilever", stretching=1e6), dtype="float32", device=device)
+    assert rest.status.result not in SETTLED
+    assert rest.status.message.startswith("rounding hides the rest shape in float32")
+
+
 def test_a_saddle_that_is_not_left_is_reported(device, monkeypatch):
     """What no nudge moves away from is in balance, and said to be no more."""
     monkeypatch.setattr("warpcloth.minimise.Minimiser.curves_down", lambda self: True)

@@ -48,6 +48,7 @@ class Mirror:
         self.host.numpy()[...] = values
         if self.host is not self.array:
             wp.copy(self.array, self.host)
+            wp.synchronize_stream(self.array.device)  # or the next write would change what is still being copied
 
 
 class Segment:

@@ -11,6 +11,8 @@ from .solvers.solver import refuse_hard
 from .status import Result, Status
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
+# Part of the size of the cloth; a descent that rounding ended after less than this has nowhere left to go.
+NEAR = 1e-5
 
 
 class Equilibrium(NamedTuple):
@@ -71,6 +73,8 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
             result = Result.SADDLE
     residual = float(minimiser.residual.max())
     message = result.value if result is Result.CONVERGED else f"{result.value}, residual {residual:.2g}"
+    if result is Result.ROUNDED and residual > 1.0:  # forces beyond the weight: nothing says that this is near the rest shape
+        result, message = Result.STALLED, f"rounding hides the rest shape in {dtype}, residual {residual:.2g}"
     return Equilibrium(np.array(base.numpy()), Status(result, residual=residual, message=message), descent.used)
 
 
@@ -79,14 +83,15 @@ class _Descent:
 
     def __init__(self, minimiser, base, tolerance, iterations):
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
-        self.used = 0
+        self.used, self.moved = 0, 0.0
+        self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
 
     def run(self, load, s):
         """Settles without inertia, with proximal steps in between where that does not go on; the last result."""
         while True:
             result = self._settle(0.0, load, self.iterations)
-            if result is Result.ROUNDED:  # of a long way d; from here d is short and rounds less
-                result = self._settle(0.0, load, self.iterations)
+            while result is Result.ROUNDED and self.moved > NEAR and self.used < self.iterations:
+                result = self._settle(0.0, load, self.iterations)  # a long d rounds much; from here it is short
             if result in SETTLED or result is Result.DIVERGED or self.used >= self.iterations:
                 return result
             for _ in range(8):
@@ -98,7 +103,9 @@ class _Descent:
         self.minimiser.set_objective(s, load)
         (result,) = self.minimiser.minimise(self.tolerance, min(most, max(self.iterations - self.used, 0)))
         self.used += self.minimiser.iterations
-        self.base.assign(self.base.numpy() + self.minimiser.correction.numpy())
+        correction = self.minimiser.correction.numpy()
+        self.moved = np.abs(correction).max(initial=0.0) / self.size
+        self.base.assign(self.base.numpy() + correction)
         return result
 
 
