@@ -26,7 +26,7 @@ class Newton(Step):
         hessian: What is done where the Hessian is indefinite (Choi and Ko 2002 for springs): ``"adaptive"`` clamps only in
             an iteration whose matrix shows it, ``"clamp"`` and ``"absolute"`` always change each element, ``"raw"`` nothing.
         linear: ``"cg"``, conjugate gradients no further than the Newton iteration needs, or ``"factorised"`` on the host
-            (4 to 6 times slower at 32² and 64² vertices of the hanging cloth, but for any stiffness).
+            (3 to 6 times slower at 32² and 64² vertices of the hanging cloth, but for any stiffness).
 
     Raises:
         ValueError: If an option breaks a rule.
