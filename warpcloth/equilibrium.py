@@ -41,7 +41,8 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
 
     Args:
         scene: The :class:`warpcloth.Scene`; velocities, moving pins and duration do not matter.
-        tolerance: Of the residual, see :class:`Equilibrium`; one no larger than rounding makes it counts as converged.
+        tolerance: Of the residual, see :class:`Equilibrium`. Where rounding leaves more, the descent ends when nothing is left
+            to gain and the status says so; with more than the weight unbalanced it does not pass for a rest shape.
         load_steps: Parts in which gravity comes on.
         iterations: The most Newton iterations in all.
         device: A Warp device.
@@ -117,7 +118,7 @@ def _nudge(model):
 
 
 def _frequency_scale(model):
-    """g over the size of the cloth [1/s²], the square of the slowest frequency that a cloth hung by its end has; or 1."""
+    """100 g over the size of the cloth [1/s²], 10 times the frequency at which it would swing by its end, squared; or 1."""
     size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
     gravity = float(np.linalg.norm(model.gravity.numpy()))
     return 100.0 * gravity / size if gravity > 0.0 else 1.0

@@ -97,8 +97,9 @@ class Factorised:
         right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
         sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
         solution, negative = np.zeros_like(sides), np.zeros(self.model.copies, dtype=bool)
+        values = self.values.read()
         for copy in np.flatnonzero(wanted.read()):
-            factor = self._factor(copy, 0.0)
+            factor = self._factor(copy, values)
             found = None if factor is None else factor.solve(sides[copy])
             if found is not None and np.isfinite(found).all():
                 solution[copy], negative[copy] = found, (factor.U.diagonal() < 0.0).any()
@@ -108,7 +109,8 @@ class Factorised:
     def curves_down(self):
         """Whether some copy has an eigenvalue below −1000 ε of its largest diagonal entry: beyond rounding, it is negative."""
         shift = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
-        factors = (self._factor(copy, shift) for copy in range(self.model.copies))
+        values = self.values.read()
+        factors = (self._factor(copy, values, shift) for copy in range(self.model.copies))
         return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
     def _mirror(self, array):
@@ -117,13 +119,13 @@ class Factorised:
             self._mirrors[array.ptr] = Mirror(array)
         return self._mirrors[array.ptr]
 
-    def _factor(self, copy, shift):
+    def _factor(self, copy, values, shift=0.0):
         """The factors of a copy's matrix, or None; with ``shift`` times its largest diagonal entry added to the diagonal."""
         from scipy.sparse import identity
         from scipy.sparse.linalg import splu
 
         matrix = self.matrices[copy]
-        matrix.data[:] = self.values.read()[self.starts[copy] : self.starts[copy + 1]]
+        matrix.data[:] = values[self.starts[copy] : self.starts[copy + 1]]
         if not np.isfinite(matrix.data).all():
             return None
         columns = matrix.tocsc()

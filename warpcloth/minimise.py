@@ -174,9 +174,7 @@ class Minimiser:
         self.direction.zero_()
         self.step.zero_()
         self._launch_trial()
-        self.sums.dot(self.gradient, self.gradient, self.square)
-        self.sums.largest(self.model.inverse_mass, self.gradient, self.acceleration)
-        wp.copy(self.energy, self.trial_energy)
+        self._launch_accept()
 
     def _launch_trial(self):
         """trial = d + step·p with its φ, ∇φ and slope φ'."""
@@ -207,6 +205,10 @@ class Minimiser:
         self._launch("begin_search", self.model.copies, [self.active], [self.step, self.searching, self.trials, self.proceed])
         wp.capture_while(self.proceed, self._try_step)
         wp.copy(self.correction, self.trial)
+        self._launch_accept()
+
+    def _launch_accept(self):
+        """φ, ‖∇φ‖² and the largest unbalanced acceleration of the trial become those of d."""
         wp.copy(self.energy, self.trial_energy)
         self.sums.dot(self.gradient, self.gradient, self.square)
         self.sums.largest(self.model.inverse_mass, self.gradient, self.acceleration)

@@ -20,8 +20,8 @@ class Newton(Step):
     Attributes:
         dt, substeps: See :class:`Step`.
         tolerance: Of the residual, the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, over gravity's (without any,
-            over the largest at x̃). Where rounding leaves more than that, which in float32 it does in
-            stiff cloth, a step ends when nothing is left to gain, and says so.
+            over the largest at x̃). Where rounding leaves more than that, which in float32 it does in stiff cloth, a step ends
+            when nothing is left to gain, and says so.
         iterations: The most Newton iterations a step.
         hessian: What is done where the Hessian is indefinite (Choi and Ko 2002 for springs): ``"adaptive"`` clamps only in
             an iteration whose matrix shows it, ``"clamp"`` and ``"absolute"`` always change each element, ``"raw"`` nothing.

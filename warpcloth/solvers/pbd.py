@@ -1,4 +1,4 @@
-"""Position based dynamics: predict, then move the vertices onto the constraints one by one, and call the move a velocity."""
+"""Position based dynamics: predict, then move the vertices onto their constraints, and call the move a velocity."""
 
 from dataclasses import dataclass
 
