@@ -1,5 +1,6 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
+from .arap import Arap
 from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
 from .scene import Pins, Scene
@@ -10,6 +11,7 @@ from .terms import Attachment, DihedralBending, QuadraticBending, Spring
 __all__ = [
     "PBD",
     "Animation",
+    "Arap",
     "Attachment",
     "DihedralBending",
     "Equilibrium",
