@@ -11,8 +11,8 @@ A = U diag(S) Vᵀ, S descending. One singular pair is split off, and the 2×2 b
 3. In right-handed frames (v, v₁, v₂) and (u, u₁, u₂) (Duff et al. 2017, *Building an orthonormal basis, revisited*) A is
    σ ⊕ B to rounding. B is the sum of a multiple of a rotation, by atan2(B₁₀ − B₀₁, B₀₀ + B₁₁), and one of a reflection.
 
-The error is a few ε of the largest singular value. A is divided by its largest entry first, so that nothing depends on its size.
-A NaN or an infinity in A makes every number of the results NaN.
+The error is a few ε of the largest singular value. A is divided by its largest entry first, so that nothing depends on its
+size. A NaN or an infinity in A makes every number of the results NaN.
 
 The "rotation" convention has det U = det V = 1, and S[2] < 0 where det A < 0; UVᵀ is then the rotation nearest to A, which
 maximises tr(RᵀA): that of Kabsch 1976 for A = Σ w q pᵀ, which turns p to q. The plain one has S ≥ 0 and det U = ±1.
@@ -135,7 +135,7 @@ def scaled3(A: Any):
     size = wp.max(wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])), wp.abs(A[2])))
     B = A / size
     if size == A.dtype(0.0):
-        B = wp.identity(n=3, dtype=A.dtype)
+        B = wp.identity(n=3, dtype=A.dtype) + A  # beside zeros A may hold a NaN, which max leaves out
     return B, size
 
 
@@ -271,3 +271,104 @@ def eigh3(C: Any):
         V = wp.matrix_from_cols(va, vb, v)
         w = wp.vector(wp.max(high, separated), wp.max(low, wp.min(high, separated)), wp.min(low, separated))
     return scale * w, V
+
+
+@wp.func
+def scaled2(A: Any):
+    """As :func:`scaled3`, of 2×2."""
+    size = wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])))
+    B = A / size
+    if size == A.dtype(0.0):
+        B = wp.identity(n=2, dtype=A.dtype) + A  # as there
+    return B, size
+
+
+@wp.func
+def nearest_rotation2(A: Any):
+    """The rotation R nearest to a 2×2 A; the identity where it is not unique, A being a multiple of a reflection."""
+    one = A.dtype(1.0)
+    B, _scale = scaled2(A)
+    f = B[0, 0] - B[1, 1]
+    g = B[1, 0] + B[0, 1]
+    least = A.dtype(3.0) * epsilon(one) * wp.sqrt(f * f + g * g)
+    c, s = unit(B[0, 0] + B[1, 1], B[1, 0] - B[0, 1], least, one, A.dtype(0.0))
+    return wp.matrix_from_cols(wp.vector(c, s), wp.vector(-s, c))
+
+
+@wp.func
+def rotation_svd2(A: Any):
+    """U, S, V of a 2×2 A with det U = det V = 1; S[1] has the sign of det A."""
+    one = A.dtype(1.0)
+    half = A.dtype(0.5)
+    B, scale = scaled2(A)
+    p = B[0, 0] + B[1, 1]
+    q = B[1, 0] - B[0, 1]
+    f = B[0, 0] - B[1, 1]
+    g = B[1, 0] + B[0, 1]
+    total = wp.sqrt(p * p + q * q)
+    difference = wp.sqrt(f * f + g * g)
+    c, s = unit(p, q, A.dtype(3.0) * epsilon(one) * difference, one, A.dtype(0.0))
+    cos, sin = half_angle(c * f + s * g, c * g - s * f, difference, epsilon(one) * epsilon(one))
+    V = wp.matrix_from_cols(wp.vector(cos, sin), wp.vector(-sin, cos))
+    U = wp.matrix_from_cols(wp.vector(c, s), wp.vector(-s, c)) * V
+    return U, scale * half * wp.vector(total + difference, total - difference), V
+
+
+@wp.func
+def svd2(A: Any):
+    """U, S, V of a 2×2 A with S ≥ 0 and det V = 1; det U has the sign of det A."""
+    U, S, V = rotation_svd2(A)
+    if S[1] < A.dtype(0.0):
+        S[1] = -S[1]
+        for i in range(2):
+            U[i, 1] = -U[i, 1]
+    return U, S, V
+
+
+@wp.func
+def polar2(A: Any):
+    """R, P of a 2×2 A = R P: the nearest rotation, and P symmetric; its lesser eigenvalue has the sign of det A."""
+    R = nearest_rotation2(A)
+    P = wp.transpose(R) * A
+    return R, A.dtype(0.5) * (P + wp.transpose(P))
+
+
+@wp.func
+def svd3x2(A: Any):
+    """U (3×2), S, V (2×2) of a 3×2 A with S ≥ 0, UᵀU = I and det V = 1.
+
+    Of rank 1, U Vᵀ is that part of the least rotation in space that turns v to u; of A = 0 the first two axes.
+    """
+    zero = A.dtype(0.0)
+    one = A.dtype(1.0)
+    scale = wp.max(wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])), wp.abs(A[2])))
+    a0 = wp.vector(A[0, 0], A[1, 0], A[2, 0]) / scale
+    a1 = wp.vector(A[0, 1], A[1, 1], A[2, 1]) / scale
+    if scale == zero:
+        a0 = wp.vector(one + A[0, 0], A[1, 0], A[2, 0])
+        a1 = wp.vector(A[0, 1], one + A[1, 1], A[2, 1])
+    f = wp.dot(a0, a0) - wp.dot(a1, a1)
+    g = A.dtype(2.0) * wp.dot(a0, a1)
+    cos, sin = half_angle(f, g, wp.sqrt(f * f + g * g), epsilon(one) * epsilon(one))
+    u = cos * a0 + sin * a1
+    size = wp.length(u)
+    u = u / size
+    w = cos * a1 - sin * a0
+    u1, u2 = complement(u)
+    p = wp.dot(u1, w)
+    q = wp.dot(u2, w)
+    # The frame of v = (cos, sin, 0) is (−sin, cos, 0) and the third axis.
+    c, s = plane_rotation(p, q, size, u1, u2, wp.vector(-sin, cos, zero), wp.vector(zero, zero, one))
+    U = wp.matrix_from_cols(u, c * u1 + s * u2)
+    V = wp.matrix_from_cols(wp.vector(cos, sin), wp.vector(-sin, cos))
+    second = wp.sqrt(p * p + q * q)
+    return U, scale * wp.vector(wp.max(size, second), wp.min(size, second)), V
+
+
+@wp.func
+def polar3x2(A: Any):
+    """R (3×2), P (2×2) of a 3×2 A = R P: the nearest matrix with RᵀR = I, and P symmetric and semi-definite."""
+    U, _S, V = svd3x2(A)
+    R = U * wp.transpose(V)
+    P = wp.transpose(R) * A
+    return R, A.dtype(0.5) * (P + wp.transpose(P))
