@@ -51,7 +51,6 @@ def one(function, matrix):
 def accuracy(count, dtype):
     """Worst of each class, on the CPU: of the SVD reconstruction, orthogonality, determinant, rotation error times gap."""
     _, matrix, vector = TYPES[dtype]
-    triple = decompose.into_three(rotation.rotation_svd3, matrix, (matrix, vector, matrix))
     single = one(rotation.nearest_rotation, matrix)
     print("| class | reconstruction | orthogonality | determinant | rotation of the SVD | nearest rotation | NaN |")
     print("|---|---|---|---|---|---|---|")
@@ -62,7 +61,7 @@ def accuracy(count, dtype):
             A = samples(name, rng, min(CHUNK, count - start), np.dtype(dtype))
             given = wp.array(A, dtype=matrix, device="cpu")
             U, S, V, R = (wp.empty(len(A), dtype=kind, device="cpu") for kind in (matrix, vector, matrix, matrix))
-            wp.launch(triple, len(A), inputs=[given], outputs=[U, S, V], device="cpu")
+            decompose.launch(decompose.into_three, rotation.rotation_svd3, given, [U, S, V])
             wp.launch(single, len(A), inputs=[given], outputs=[R], device="cpu")
             U, S, V, R = (array.numpy() for array in (U, S, V, R))
             Q, signed = reference(A)
@@ -101,10 +100,12 @@ def timings(count, device, dtype):
     scalar, matrix, vector = TYPES[dtype]
     size = wp.types.type_size_in_bytes(scalar)
     results = [wp.empty(count, dtype=kind, device=device) for kind in (matrix, vector, matrix)]
+    plain = decompose.into_three(warp_svd3, matrix, (matrix, vector, matrix), 1)
+    single = one(rotation.nearest_rotation, matrix)
     runs = [
-        ("Warp's svd3", decompose.into_three(warp_svd3, matrix, (matrix, vector, matrix)), results, 30 * size),
-        ("svd", decompose.into_three(rotation.rotation_svd3, matrix, (matrix, vector, matrix)), results, 30 * size),
-        ("nearest rotation", one(rotation.nearest_rotation, matrix), results[:1], 18 * size),
+        ("Warp's svd3", lambda A: wp.launch(plain, count, inputs=[A], outputs=results, device=device), 30 * size),
+        ("svd", lambda A: decompose.launch(decompose.into_three, rotation.rotation_svd3, A, results), 30 * size),
+        ("nearest rotation", lambda A: wp.launch(single, count, inputs=[A], outputs=results[:1], device=device), 18 * size),
     ]
     copied = None
     if device.is_cuda:
@@ -122,9 +123,8 @@ def timings(count, device, dtype):
         A = samples(name, np.random.default_rng(0), min(count, CHUNK), np.dtype(dtype))
         A = wp.array(np.resize(A, (count, 3, 3)), dtype=matrix, device=device)
         cells, first = [], None
-        for _, kernel, out, moved in runs:
-            call = partial(wp.launch, kernel, count, inputs=[A], outputs=out, device=device)
-            middle, low, high = milliseconds(device, call)
+        for _, run, moved in runs:
+            middle, low, high = milliseconds(device, partial(run, A))
             first = middle if first is None else first
             cell = f"{1e6 * middle / count:.3g} ns ({1e6 * low / count:.3g}–{1e6 * high / count:.3g}), {middle / first:.2f} ×"
             if copied:

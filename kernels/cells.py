@@ -15,6 +15,37 @@ from .rotation import nearest_rotation
 
 
 @cache
+def set_moments(dtype):
+    """Kernel over cells: gᵢ = wᵢ(Xᵢ − X̄) of their members, with the centroid X̄ = Σ wᵢ Xᵢ / Σ wᵢ."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def set_from_centroid(
+        offsets: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=dtype),
+        X: wp.array(dtype=vec3),
+        # out
+        moments: wp.array(dtype=vec3),
+    ):
+        c = wp.tid()
+        # From the first member, so that nothing is lost far from the origin.
+        origin = X[members[offsets[c]]]
+        total = dtype(0.0)
+        centroid = vec3()
+        for k in range(offsets[c], offsets[c + 1]):
+            i = members[k]
+            total += weights[i]
+            centroid += weights[i] * (X[i] - origin)
+        centroid = centroid / total
+        for k in range(offsets[c], offsets[c + 1]):
+            i = members[k]
+            moments[k] = weights[i] * ((X[i] - origin) - centroid)
+
+    return set_from_centroid
+
+
+@cache
 def fit_rotations(dtype):
     """Kernel over cells: R_c = the rotation that maximises tr(RᵀS_c), S_c = Σᵢ (xᵢ − x_o) gᵢᵀ, x_o that of the first member."""
     vec3, mat33 = types(dtype)

@@ -233,7 +233,106 @@ def test_kinds_of_arrays(device):
 )
 def test_wrong_matrices(wrong):
     for decomposed in (wc.svd, wc.polar):
-        with pytest.raises(ValueError, match=r"^A has shape .* it must be \(…, 3, 3\), \(…, 3, 2\) or \(…, 2, 2\) of float32"):
+        with pytest.raises(ValueError, match=r"^A has shape .* it must be \(…, 3, 3\) or \(…, 3, 2\) or \(…, 2, 2\) of"):
             decomposed(wrong)
     with pytest.raises(ValueError, match="convention is 'left'; it must be one of 'plain', 'rotation'"):
         wc.svd(np.eye(3), convention="left")
+
+
+def points(rng, count, shape=(), dtype=np.float64):
+    return rng.normal(size=(*shape, count, 3)).astype(dtype)
+
+
+def test_kabsch_finds_the_rotation(precision, device):
+    """Of point sets that were turned and moved, weighted or not, also 1000 sizes from the origin."""
+    rng = np.random.default_rng(11)
+    turns = matrices.rotations(rng, 200)
+    P = points(rng, 12).astype(precision)
+    weights = rng.uniform(size=12)
+    for far, eps in ((0.0, 1.0), (1e3, 1e3)):
+        X = (P + far).astype(precision)
+        Q = ((X.astype(np.float64) - far) @ turns.mT - far).astype(precision)
+        for w in (None, weights):
+            R = wc.kabsch(X, Q, weights=w)
+            assert R.shape == (200, 3, 3) and R.dtype == precision
+            # Twelve points of size 1, rounded by ε·far.
+            assert angle(R, turns).max() < 10.0 * eps * np.finfo(precision).eps
+            assert max(orthogonality(R), determinant(R, 1)) < BOUND[precision]
+
+
+def test_kabsch_against_the_svd_of_the_covariance(device):
+    rng = np.random.default_rng(12)
+    P, Q = points(rng, 30), points(rng, 30, (50,))
+    w = rng.uniform(size=(50, 30))
+    p = P - (w[..., None] * P).sum(axis=1, keepdims=True) / w.sum(axis=1)[:, None, None]
+    q = Q - (w[..., None] * Q).sum(axis=1, keepdims=True) / w.sum(axis=1)[:, None, None]
+    U, _, Vt = np.linalg.svd(np.einsum("fn,fni,fnj->fij", w, q, p))
+    U[:, :, 2] *= (np.linalg.det(U) * np.linalg.det(Vt))[:, None]
+    assert np.abs(wc.kabsch(P, Q, weights=w) - U @ Vt).max() < 1e-12
+    sets = [rng.permutation(30)[: 4 + c % 5] for c in range(40)]
+    R = wc.kabsch(P, Q, weights=w, neighbours=sets)
+    assert R.shape == (50, 40, 3, 3)
+    for c in (0, 7, 39):
+        alone = wc.kabsch(P[sets[c]], Q[:, sets[c]], weights=w[:, sets[c]])
+        assert np.array_equal(R[:, c], alone)
+
+
+def test_kabsch_where_the_rotation_is_not_unique(device):
+    """One point: the identity. Points on a line: the least rotation. In a plane: never the reflection."""
+    rng = np.random.default_rng(13)
+    P = points(rng, 5)
+    assert np.array_equal(wc.kabsch(P[:1], P[1:2]), np.eye(3))
+    t, (v, u) = np.linspace(-1, 1, 5)[:, None], rng.normal(size=(2, 3))
+    v, u = v / np.linalg.norm(v), u / np.linalg.norm(u)
+    assert np.abs(wc.kabsch(t * v, t * u) - least_rotations(v[None], u[None])[0]).max() < 1e-14
+    flat = P * [1.0, 1.0, 0.0]
+    turn = matrices.rotations(rng, 1)[0]
+    assert np.abs(wc.kabsch(flat, flat @ turn.T) - turn).max() < 1e-14
+    assert determinant(wc.kabsch(P, P * [1.0, 1.0, -1.0])[None], 1) < 1e-14
+    broken = P.copy()
+    broken[3, 1] = np.nan
+    R = wc.kabsch(P, np.stack([P, broken]))
+    assert np.isnan(R[1]).all() and np.isfinite(R[0]).all()
+    R = wc.kabsch(P, broken, neighbours=[[0, 1, 2], [1, 2, 3]])
+    assert np.isnan(R[1]).all() and np.isfinite(R[0]).all()
+
+
+def test_kabsch_of_warp_arrays(device):
+    rng = np.random.default_rng(14)
+    P, Q = points(rng, 20, (3,), np.float32), points(rng, 20, (3,), np.float32)
+    sets = np.stack([rng.permutation(20)[:6] for _ in range(20)])
+    expected = wc.kabsch(P, Q, neighbours=sets)
+    vectors = [wp.array(a, dtype=wp.vec3, device=device) for a in (P, Q)]
+    R = wc.kabsch(*vectors, neighbours=wp.array(sets.astype(np.int32), device=device))
+    assert R.shape == (3, 20) and R.device == vectors[0].device and np.abs(R.numpy() - expected).max() < 1e-5
+    numbers = [wp.array(a, dtype=wp.float32, device=device) for a in (P, Q)]
+    R = wc.kabsch(*numbers, neighbours=sets)
+    assert R.shape == (3, 20, 3, 3) and np.abs(R.numpy() - expected).max() < 1e-5
+
+
+_P = np.eye(3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"Q": np.zeros((2, 3))}, r"P has shape \(3, 3\) and Q \(2, 3\); both must be"),
+        ({"Q": np.zeros((3, 2))}, r"Q has shape \(3, 2\) and type"),
+        ({"Q": _P.astype(np.float32)}, "P is a NumPy array of float64 on cpu and Q a NumPy array of float32"),
+        ({"P": np.zeros((0, 3)), "Q": np.zeros((0, 3))}, "with one n above 0"),
+        ({"P": np.zeros(3), "Q": np.zeros(3)}, "with one n above 0"),
+        ({"P": np.zeros((2, 3, 3)), "Q": np.zeros((4, 3, 3))}, r"leading dimensions \(2,\), \(4,\) and \(\); they must fit"),
+        ({"weights": [1, 1]}, r"weights has shape \(2,\); it must be \(3,\) or"),
+        ({"weights": [1, -1, 1]}, r"weights\[1\] is -1.0; it must be 0 or more"),
+        ({"weights": [0, 0, 0]}, "weights of a set of points are all 0"),
+        ({"weights": "even"}, "weights is 'even', which is not numeric"),
+        ({"neighbours": [[0, 1], []]}, r"neighbours\[1\] is \[\]; it must be an array \(C, k\) of indices or C lists"),
+        ({"neighbours": [[0, 1], [2, 3]]}, r"neighbours\[1\] has 3; it must be an index of the 3 points"),
+        ({"neighbours": [[0, 1.5]]}, r"neighbours\[0\] is \[0, 1.5\]; it must be"),
+        ({"neighbours": [0, 1]}, r"neighbours\[0\] is 0; it must be"),
+        ({"neighbours": 3}, "neighbours is 3; it must be"),
+    ],
+)
+def test_wrong_points(arguments, says):
+    with pytest.raises(ValueError, match=says):
+        wc.kabsch(**({"P": _P, "Q": _P} | arguments))

@@ -3,7 +3,7 @@
 from .arap import Arap
 from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
-from .rotation import polar, svd
+from .rotation import kabsch, polar, svd
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
 from .solvers import PBD, Explicit, Newton
@@ -24,6 +24,7 @@ __all__ = [
     "Scene",
     "Spring",
     "equilibrium",
+    "kabsch",
     "polar",
     "simulate",
     "svd",

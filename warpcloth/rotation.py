@@ -1,10 +1,10 @@
-"""Singular values, polar decomposition and best rotations of arrays of small matrices, on the CPU and on CUDA."""
+"""Singular values, polar decomposition and best rotations of arrays of small matrices and points, on the CPU and on CUDA."""
 
 import numpy as np
 import warp as wp
 
-from .checks import choice, shown
-from .kernels import decompose, rotation
+from .checks import choice, numeric, refuse, shown
+from .kernels import cells, decompose, rotation
 
 _TYPES = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 _SVD = {
@@ -34,10 +34,9 @@ def svd(A, convention="plain"):
         ValueError: A is of another shape or type, or there is no such convention.
     """
     choice("convention", convention, tuple(_SVD))
-    batch = _Batch("A", A)
+    batch = _Batch("A", A, tuple(_POLAR))
     n = batch.shape[1]
-    functions, results = _SVD[convention], (batch.shape, (n,), (n, n))
-    return batch.apply(decompose.into_three, functions[batch.shape], results)
+    return _decomposed(batch, decompose.into_three, _SVD[convention][batch.shape], batch.shape, (n,), (n, n))
 
 
 def polar(A):
@@ -53,53 +52,149 @@ def polar(A):
     Raises:
         ValueError: A is of another shape or type.
     """
-    batch = _Batch("A", A)
+    batch = _Batch("A", A, tuple(_POLAR))
     n = batch.shape[1]
-    return batch.apply(decompose.into_two, _POLAR[batch.shape], (batch.shape, (n, n)))
+    return _decomposed(batch, decompose.into_two, _POLAR[batch.shape], batch.shape, (n, n))
+
+
+def kabsch(P, Q, weights=None, neighbours=None):
+    """The rotations R that turn points P to Q best, about their centroids: min Σ w ‖(q − q̄) − R(p − p̄)‖² (Kabsch 1976).
+
+    With p̄ = Σ w p / Σ w. Reflections are never taken; of points on a line R is the least of the best rotations, of one point
+    the identity. A point or a weight that is not finite makes R NaN. Far from the origin nothing is lost but what the
+    coordinates have lost.
+
+    Args:
+        P: (..., n, 3) [m], a NumPy array or a Warp array of numbers or of vectors, float32 or float64.
+        Q: The same, of the same kind and type; leading dimensions may differ as in NumPy's arithmetic.
+        weights: (n,) or with leading dimensions too, 0 or more; 1 where not given. Of a point in several sets it is the same.
+        neighbours: Sets of points, each of which has its own rotation: (C, k) indices of points, or C lists of any lengths,
+            as `scipy.spatial.cKDTree` gives them; of all points together where not given.
+
+    Returns:
+        R (..., 3, 3), with neighbours (..., C, 3, 3), of the kind of array that P is.
+
+    Raises:
+        ValueError: An array has the wrong shape or type, a set is empty or has another index than 0 to n − 1, or a weight is
+            negative, or they are all 0.
+    """
+    rest, turned = _Batch("P", P, ((3,),)), _Batch("Q", Q, ((3,),))
+    if (rest.warp, rest.scalar, rest.device) != (turned.warp, turned.scalar, turned.device):
+        raise ValueError(f"P is a {rest.words} and Q a {turned.words}; they must be of one kind and type, on one device")
+    if not rest.batch or not turned.batch or rest.batch[-1] != turned.batch[-1] or not rest.batch[-1]:
+        raise ValueError(
+            f"P has shape {(*rest.batch, 3)} and Q {(*turned.batch, 3)}; both must be (…, n, 3) with one n above 0"
+        )
+    n = rest.batch[-1]
+    sizes, members = _sets(neighbours, n)
+    w = np.ones(n) if weights is None else numeric("weights", _on_host(weights), f"have shape {(n,)} or (…, {n})")
+    if w.ndim == 0 or w.shape[-1] != n:
+        raise ValueError(f"weights has shape {w.shape}; it must be {(n,)} or (…, {n})")
+    refuse("weights", w, w < 0.0, "must be 0 or more")
+    if (w == 0.0).all(axis=-1).any():
+        raise ValueError("weights of a set of points are all 0; one of them must be above")
+    shapes = rest.batch[:-1], turned.batch[:-1], w.shape[:-1]
+    try:
+        leading = np.broadcast_shapes(*shapes)
+    except ValueError:
+        raise ValueError("P, Q and weights have leading dimensions {}, {} and {}; they must fit".format(*shapes)) from None
+    count = int(np.prod(leading, dtype=np.int64))
+    # Every leading index has points, weights and sets of its own; sets are found once.
+    offsets = np.concatenate([[0], np.cumsum(np.tile(sizes, count))])
+    members = (members + n * np.arange(count)[:, None]).ravel()
+    device, vec3, mat33 = rest.device, wp.types.vector(3, rest.scalar), wp.types.matrix((3, 3), rest.scalar)
+    offsets, members = (wp.array(part.astype(np.int32), dtype=wp.int32, device=device) for part in (offsets, members))
+    w = wp.array(np.broadcast_to(w, (*leading, n)).reshape(-1), dtype=rest.scalar, device=device)
+    X, x = (batch.spread((*leading, n)) for batch in (rest, turned))
+    moments = wp.empty(len(members), dtype=vec3, device=device)
+    R = wp.empty(len(offsets) - 1, dtype=mat33, device=device)
+    wp.launch(cells.set_moments(rest.scalar), len(R), inputs=[offsets, members, w, X], outputs=[moments], device=device)
+    wp.launch(cells.fit_rotations(rest.scalar), len(R), inputs=[offsets, members, moments, x], outputs=[R], device=device)
+    return rest.like(R, leading if neighbours is None else (*leading, len(sizes)), (3, 3))
+
+
+def _sets(neighbours, n):
+    """Number of members of each set (C,), and all members one after another."""
+    if neighbours is None:
+        return np.array([n]), np.arange(n)
+    rule = f"it must be an array (C, k) of indices or C lists of them, of the {n} points, none of them empty"
+    given = _on_host(neighbours)
+    try:
+        sets = [np.asarray(members) for members in given]
+    except (TypeError, ValueError):
+        raise ValueError(f"neighbours is {shown(neighbours)}; {rule}") from None
+    for c, members in enumerate(sets):
+        if members.ndim != 1 or not len(members) or members.dtype.kind not in "iu":
+            raise ValueError(f"neighbours[{c}] is {shown(given[c])}; {rule}")
+    sizes = np.array([len(members) for members in sets], dtype=int)
+    members = np.concatenate([*sets, np.empty(0, dtype=int)]).astype(int)
+    for k in np.flatnonzero((members < 0) | (members >= n))[:1]:
+        c = np.searchsorted(np.cumsum(sizes), k, side="right")
+        raise ValueError(f"neighbours[{c}] has {members[k]}; it must be an index of the {n} points, 0 to {n - 1}")
+    return sizes, members
+
+
+def _on_host(array):
+    return array.numpy() if isinstance(array, wp.array) else array
+
+
+def _decomposed(batch, factory, function, *shapes):
+    """The results of a device function of all matrices, each of a shape."""
+    kinds = [wp.types.vector(s[0], batch.scalar) if len(s) == 1 else wp.types.matrix(s, batch.scalar) for s in shapes]
+    out = [wp.empty(len(batch.items), dtype=kind, device=batch.device) for kind in kinds]
+    decompose.launch(factory, function, batch.items, out)
+    return tuple(batch.like(array, batch.batch, shape) for array, shape in zip(out, shapes, strict=True))
 
 
 class _Batch:
-    """An array of small matrices as one row of Warp matrices, and results of the same kind of array.
+    """An array of vectors or small matrices as one row of Warp's, and results as the same kind of array.
 
     Attributes:
-        shape: Of one matrix.
+        batch, shape: Leading dimensions, and those of one item.
+        items: All items in a row.
+        words: What kind of array it is.
     """
 
-    def __init__(self, name, A):
+    def __init__(self, name, A, shapes):
         self.warp = isinstance(A, wp.array)
-        self.typed = self.warp and len(getattr(A.dtype, "_shape_", ())) == 2  # of matrices, not of numbers
+        inner = getattr(A.dtype, "_shape_", ()) if self.warp else ()
+        self.typed = len(inner) == len(shapes[0])  # items, not numbers
         if not self.warp:
             A = np.asarray(A)
             A = A.astype(np.float64) if A.dtype.kind in "iu" else A
-        scalar = A.dtype._wp_scalar_type_ if self.typed else A.dtype if self.warp else _TYPES.get(A.dtype)
-        shape = (*A.shape, *A.dtype._shape_) if self.typed else A.shape
-        self.batch, self.shape, self.scalar = shape[:-2], shape[-2:], scalar
-        if scalar not in _TYPES.values() or self.shape not in _POLAR:
-            raise ValueError(
-                f"{name} has shape {shape} and type {shown(A.dtype)}; it must be (…, 3, 3), (…, 3, 2) or (…, 2, 2) of float32 "
-                "or float64"
-            )
+        scalar = _TYPES.get(A.dtype) if not self.warp else A.dtype._wp_scalar_type_ if self.typed else A.dtype
+        shape, split = (*A.shape, *inner), -len(shapes[0])
+        self.batch, self.shape, self.scalar = shape[:split], shape[split:], scalar
+        if scalar not in _TYPES.values() or self.shape not in shapes:
+            allowed = " or ".join(f"(…, {', '.join(map(str, s))})" for s in shapes)
+            raise ValueError(f"{name} has shape {shape} and type {shown(A.dtype)}; it must be {allowed} of float32 or float64")
         self.device = A.device if self.warp else wp.get_device("cpu")
-        self.matrix = wp.types.matrix(self.shape, scalar)
-        self.count = int(np.prod(self.batch, dtype=np.int64))
-        self.A = A.contiguous() if self.warp else np.ascontiguousarray(A)
-
-    def apply(self, factory, function, shapes):
-        """The results of a kernel over the matrices, each of a shape."""
-        types = tuple(wp.types.vector(s[0], self.scalar) if len(s) == 1 else wp.types.matrix(s, self.scalar) for s in shapes)
+        self.words = f"{'Warp' if self.warp else 'NumPy'} array of {scalar.__name__} on {self.device}"
+        vector = len(self.shape) == 1
+        self.kind = wp.types.vector(self.shape[0], scalar) if vector else wp.types.matrix(self.shape, scalar)
+        count = int(np.prod(self.batch, dtype=np.int64))
         if self.warp:
-            A = wp.array(ptr=self.A.ptr, shape=self.count, dtype=self.matrix, device=self.device)
+            self.source = A.contiguous()  # keeps the memory alive
+            self.items = wp.array(ptr=self.source.ptr, shape=count, dtype=self.kind, device=self.device)
         else:
-            A = wp.array(self.A.reshape(self.count, *self.shape), dtype=self.matrix, device="cpu", copy=False)
-        out = [wp.empty(self.count, dtype=dtype, device=self.device) for dtype in types]
-        decompose.launch(factory, function, A, out)
-        return tuple(self._like(array, shape) for array, shape in zip(out, shapes, strict=True))
+            A = np.ascontiguousarray(A).reshape(count, *self.shape)
+            self.items = wp.array(A, dtype=self.kind, device="cpu", copy=False)
 
-    def _like(self, array, shape):
+    def spread(self, batch):
+        """The items repeated to other leading dimensions, in a row."""
+        if batch == self.batch:
+            return self.items
+        rows = np.broadcast_to(np.arange(len(self.items)).reshape(self.batch), batch).ravel()
+        return self.items[wp.array(rows.astype(np.int32), dtype=wp.int32, device=self.device)].contiguous()
+
+    def like(self, array, batch, shape):
+        """A row of items as an array of leading dimensions and items of a shape, of the kind that this one is."""
         if not self.warp:
-            return array.numpy().reshape(*self.batch, *shape)
+            return array.numpy().reshape(*batch, *shape)
+        if self.typed and batch:
+            return array.reshape(batch)
         if self.typed:
-            return array.reshape(self.batch)
-        numbers = wp.array(ptr=array.ptr, shape=(*self.batch, *shape), dtype=self.scalar, device=self.device)
-        numbers.matrices = array  # keeps the memory alive
+            return array
+        numbers = wp.array(ptr=array.ptr, shape=(*batch, *shape), dtype=self.scalar, device=self.device)
+        numbers.items = array  # keeps the memory alive
         return numbers
