@@ -43,19 +43,21 @@ def partial_dot(dtype):
 
 @cache
 def finish_sum():
-    """Kernel over copies: out[copy] = start·out[copy] + Σ partial[copy], start 0 or 1."""
+    """Kernel over copies: out[copy] = Σ partial[copy], and what out held too where ``accumulate`` is 1."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def add_chunks(
         partial: wp.array2d(dtype=wp.float64),
-        start: wp.float64,
+        accumulate: int,
         out: wp.array(dtype=wp.float64),
     ):
         copy = wp.tid()
         total = wp.float64(0.0)
+        if accumulate == 1:  # a factor of 0 would keep a NaN
+            total = out[copy]
         for chunk in range(partial.shape[1]):
             total += partial[copy, chunk]
-        out[copy] = start * out[copy] + total
+        out[copy] = total
 
     return add_chunks
 

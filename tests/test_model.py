@@ -547,6 +547,18 @@ def energy_and_gradient(model):
     return energy.numpy(), gradient.numpy().reshape(model.copies, -1, 3)
 
 
+def test_a_sum_replaces_what_an_overflow_left(device):
+    """After a trial whose energy was infinite the next one counts alone."""
+    model = scene().build(device=device)
+    values = wp.full(model.count, 2.0, dtype=wp.float64, device=device)
+    out = wp.full(1, np.nan, dtype=wp.float64, device=device)
+    sums = Sums(model)
+    sums.sum(values, model.count, out)
+    assert out.numpy()[0] == 2.0 * model.count
+    sums.sum(values, model.count, out, accumulate=1)
+    assert out.numpy()[0] == 4.0 * model.count
+
+
 @pytest.mark.parametrize("names", [[name] for name in VARIED] + [list(VARIED)], ids=[*VARIED, "all at once"])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_copy_is_a_scene_of_its_own(names, dtype, device):

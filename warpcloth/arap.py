@@ -281,8 +281,7 @@ class Arap:
             launch(cells.fit_rotations(self._scalar), n, [*rows, x], rotations)
             launch(kernel(self._scalar), len(elements), [elements, weights, placed, rotations, x], energies)
             launch(reduce.partial_sum(), partial.shape, [energies, len(elements)], partial)
-            self._energy.array.zero_()  # the next kernel would multiply what a failed call left
-            launch(reduce.finish_sum(), 1, [partial, 1.0], self._energy.array)
+            launch(reduce.finish_sum(), 1, [partial, 0], self._energy.array)
             if len(self._b):
                 launch(cells.gather(self._scalar), len(self._b), [*columns, rotations, self._start.array], self._b)
 

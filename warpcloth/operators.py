@@ -25,20 +25,20 @@ class Sums:
     def dot(self, a, b, out):
         """out (B,) = Σ a·b over the vertices of each copy."""
         self.model.launch(self._dot, self.partial.shape, [a, b, self.model.per_copy], [self.partial])
-        self._add_chunks(0.0, out)
+        self._add_chunks(0, out)
 
-    def sum(self, values, per_copy, out, start=0.0):
-        """out (B,) = start·out + Σ of the ``per_copy`` values of each copy."""
+    def sum(self, values, per_copy, out, accumulate=0):
+        """out (B,) = Σ of the ``per_copy`` values of each copy, and what out held too where ``accumulate`` is 1."""
         self.model.launch(self._sum, self.partial.shape, [values, per_copy], [self.partial])
-        self._add_chunks(start, out)
+        self._add_chunks(accumulate, out)
 
     def largest(self, weights, a, out):
         """out (B,) = max wᵢ‖aᵢ‖ over the vertices of each copy."""
         self.model.launch(self._largest, self.partial.shape, [weights, a, self.model.per_copy], [self.partial])
         self.model.launch(self._finish_largest, self.model.copies, [self.partial], [out])
 
-    def _add_chunks(self, start, out):
-        self.model.launch(self._finish, self.model.copies, [self.partial, start], [out])
+    def _add_chunks(self, accumulate, out):
+        self.model.launch(self._finish, self.model.copies, [self.partial, accumulate], [out])
 
 
 class Gradient:
@@ -71,7 +71,7 @@ class Energy:
         """out (B,) += U(x), or U(x + correction)."""
         for elements, kernel, values in zip(self.terms, self.kernels, self.of_elements, strict=True):
             self.model.launch(kernel, elements.count, [*elements.arguments, x, correction], [values])
-            self.sums.sum(values, elements.per_copy, out, start=1.0)
+            self.sums.sum(values, elements.per_copy, out, accumulate=1)
 
 
 class Hessian:
