@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import warpcloth.cli
+import warpcloth.cli.run
 import warpcloth.usd
 from warpcloth import scene_files
 from warpcloth.cli import main
@@ -371,13 +371,13 @@ def test_a_diverged_run_exits_with_1_and_leaves_its_good_frames(tmp_path, capfd,
 
 
 def test_an_interrupted_run_exits_with_130_and_says_what_is_saved(tmp_path, capfd, monkeypatch):
-    class Interrupting(warpcloth.cli._Progress):
+    class Interrupting(warpcloth.cli.run.Progress):
         def __call__(self, frame, frames):
             super().__call__(frame, frames)
             if frame == 2:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(warpcloth.cli, "_Progress", Interrupting)
+    monkeypatch.setattr(warpcloth.cli.run, "Progress", Interrupting)
     output = tmp_path / "out.usdc"
     code, out, err = run(capfd, "run", *SMALL, "-o", output)
     assert (code, out) == (130, "")
