@@ -2,6 +2,7 @@
 
 from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
+from .rotation import polar, svd
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
 from .solvers import PBD, Explicit, Newton
@@ -21,5 +22,7 @@ __all__ = [
     "Scene",
     "Spring",
     "equilibrium",
+    "polar",
     "simulate",
+    "svd",
 ]

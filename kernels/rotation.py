@@ -1,0 +1,374 @@
+"""Rotations and singular values of 3×3, 3×2 and 2×2 matrices: device functions for float32 and float64, without iteration.
+
+A = U diag(S) Vᵀ, S descending. One singular pair is split off, and the 2×2 block that is left has a closed form:
+
+1. The eigenvalues of AᵀA, less their mean and scaled, are the roots of x³ − 3x = 2r with |r| ≤ 1 (Smith 1961, *Eigenvalues of
+   a symmetric 3×3 matrix*). For r ≥ 0 the largest, for r < 0 the smallest is at least √3 from both others, so that it and its
+   eigenvector v, a column of an adjugate, are well conditioned for every A (the choice of Eberly 2014, *A robust eigensolver
+   for 3×3 symmetric matrices*).
+2. u = Av/‖Av‖ for the largest. For the smallest u = cof(A)v/‖cof(A)v‖, which divides by no small singular value and has the
+   orientation of UVᵀ.
+3. In right-handed frames (v, v₁, v₂) and (u, u₁, u₂) (Duff et al. 2017, *Building an orthonormal basis, revisited*) A is
+   σ ⊕ B to rounding. B is the sum of a multiple of a rotation, by atan2(B₁₀ − B₀₁, B₀₀ + B₁₁), and one of a reflection.
+
+The error is a few ε of the largest singular value. A is divided by its largest entry first, so that nothing depends on its
+size. A NaN or an infinity in A makes every number of the results NaN.
+
+The "rotation" convention has det U = det V = 1, and S[2] < 0 where det A < 0; UVᵀ is then the rotation nearest to A, which
+maximises tr(RᵀA): that of Kabsch 1976 for A = Σ w q pᵀ, which turns p to q. The plain one has S ≥ 0 and det U = ±1.
+
+Where the nearest rotation is not unique because S[1] + S[2] is below 3ε S[0], as of rank 1, it is the least one that turns v to
+u; of A = 0 it is the identity.
+"""
+
+from typing import Any
+
+import warp as wp
+
+
+@wp.func
+def epsilon(x: wp.float32):
+    """The step from 1 to the next number of this precision."""
+    return wp.float32(wp.static(2.0**-23))
+
+
+@wp.func
+def epsilon(x: wp.float64):  # noqa: F811 - Warp chooses by type
+    return wp.float64(wp.static(2.0**-52))
+
+
+@wp.func
+def unit(c: Any, s: Any, least: Any, c_else: Any, s_else: Any):
+    """(c, s) made a unit vector; where it is not longer than ``least`` the other one, and (1, 0) where that is 0 too."""
+    length = wp.sqrt(c * c + s * s)
+    if length <= least:
+        c = c_else
+        s = s_else
+        length = wp.sqrt(c * c + s * s)
+        if length == type(c)(0.0):
+            c = type(c)(1.0)
+            length = type(c)(1.0)
+    return c / length, s / length
+
+
+@wp.func
+def half_angle(c: Any, s: Any, length: Any, least: Any):
+    """The unit vector at half the angle of (c, s), which has that length; (1, 0) where it is not above ``least``."""
+    # Of the two forms of tan(φ/2) the one that does not cancel.
+    x = length + c
+    y = s
+    if c < type(c)(0.0):
+        x = s
+        y = length - c
+    return unit(x, y, least, type(c)(1.0), type(c)(0.0))
+
+
+@wp.func
+def complement(n: Any):
+    """Two unit vectors t₁, t₂ such that (n, t₁, t₂) is a right-handed frame; of the first axis the other two axes."""
+    one = n.dtype(1.0)
+    sign = wp.where(n[0] < n.dtype(0.0), -one, one)
+    a = -one / (sign + n[0])
+    b = n[1] * n[2] * a
+    return (
+        wp.vector(-sign * n[1], one + sign * n[1] * n[1] * a, sign * b),
+        wp.vector(-n[2], b, sign + n[2] * n[2] * a),
+    )
+
+
+@wp.func
+def separated_eigenvector(C: Any):
+    """Unit eigenvector of a symmetric 3×3 C of about unit size, for the eigenvalue farthest from the others.
+
+    Returns:
+        It, and 1 where that eigenvalue is the largest, −1 where it is the smallest.
+    """
+    one = C.dtype(1.0)
+    mean = wp.trace(C) / C.dtype(3.0)
+    d0 = C[0, 0] - mean
+    d1 = C[1, 1] - mean
+    d2 = C[2, 2] - mean
+    e0 = C[1, 2]
+    e1 = C[0, 2]
+    e2 = C[0, 1]
+    spread = (d0 * d0 + d1 * d1 + d2 * d2 + C.dtype(2.0) * (e0 * e0 + e1 * e1 + e2 * e2)) / C.dtype(6.0)
+    scale = one / wp.sqrt(spread)
+    # Far below rounding C is isotropic, and the square of the spread could underflow.
+    tiny = epsilon(mean) * epsilon(mean) * mean
+    if spread <= tiny * tiny:
+        scale = C.dtype(0.0)
+    d0 *= scale
+    d1 *= scale
+    d2 *= scale
+    e0 *= scale
+    e1 *= scale
+    e2 *= scale
+    r = C.dtype(0.5) * (d0 * (d1 * d2 - e0 * e0) + e2 * (e0 * e1 - e2 * d2) + e1 * (e2 * e0 - d1 * e1))
+    side = wp.where(r < C.dtype(0.0), -one, one)
+    r = wp.min(wp.abs(r), one)
+    # x = 2 cos(acos(r)/3): a cubic good to 8e-5, and Newton's method, which squares that twice.
+    x = C.dtype(1.732133) + r * (C.dtype(0.330661) + r * (C.dtype(-0.081382) + r * C.dtype(0.018639)))
+    for _ in range(2):
+        square = x * x
+        x = C.dtype(2.0) * (x * square + r) / (C.dtype(3.0) * (square - one))
+    d0 -= side * x
+    d1 -= side * x
+    d2 -= side * x
+    # The adjugate is v vᵀ times a number from 6 to 9: its longest column has the largest diagonal entry.
+    a00 = d1 * d2 - e0 * e0
+    a11 = d0 * d2 - e1 * e1
+    a22 = d0 * d1 - e2 * e2
+    a01 = e0 * e1 - e2 * d2
+    a02 = e2 * e0 - e1 * d1
+    a12 = e1 * e2 - e0 * d0
+    v = wp.vector(a00, a01, a02)
+    if a11 > wp.max(a00, a22):
+        v = wp.vector(a01, a11, a12)
+    elif a22 > a00:
+        v = wp.vector(a02, a12, a22)
+    return v / wp.length(v), side
+
+
+@wp.func
+def scaled3(A: Any):
+    """A 3×3 A divided by its largest entry, that entry; the identity and 0 of A = 0."""
+    size = wp.max(wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])), wp.abs(A[2])))
+    B = A / size
+    if size == A.dtype(0.0):
+        B = wp.identity(n=3, dtype=A.dtype) + A  # beside zeros A may hold a NaN, which max leaves out
+    return B, size
+
+
+@wp.func
+def separated_pair(A: Any):
+    """The singular pair u, v of a scaled 3×3 A that is split off, its side, and ‖Av‖ or ‖cof(A)v‖, which is never small."""
+    v, side = separated_eigenvector(wp.transpose(A) * A)
+    u = A * v
+    if side < A.dtype(0.0):
+        a0 = wp.vector(A[0, 0], A[1, 0], A[2, 0])
+        a1 = wp.vector(A[0, 1], A[1, 1], A[2, 1])
+        a2 = wp.vector(A[0, 2], A[1, 2], A[2, 2])
+        u = v[0] * wp.cross(a1, a2) + v[1] * wp.cross(a2, a0) + v[2] * wp.cross(a0, a1)
+    size = wp.length(u)
+    return u / size, v, side, size
+
+
+@wp.func
+def plane_rotation(c: Any, s: Any, size: Any, u1: Any, u2: Any, v1: Any, v2: Any):
+    """Cosine and sine of the rotation in the plane, of (c, s) or else the least one of the frames."""
+    least = type(c)(3.0) * epsilon(c) * size
+    return unit(c, s, least, wp.dot(u1, v1) + wp.dot(u2, v2), wp.dot(u2, v1) - wp.dot(u1, v2))
+
+
+@wp.func
+def descending(s0: Any, s1: Any, s2: Any):
+    """Three values, which rounding may have put out of order, with |s₂| the least; its sign stays the last one's."""
+    high = wp.max(s0, s1)
+    low = wp.min(s0, s1)
+    last = wp.min(low, wp.abs(s2))
+    middle = wp.max(low, wp.abs(s2))
+    return wp.vector(wp.max(high, middle), wp.min(high, middle), wp.where(s2 < type(s2)(0.0), -last, last))
+
+
+@wp.func
+def nearest_rotation(A: Any):
+    """The rotation R nearest to a 3×3 A, which maximises tr(RᵀA): of Kabsch 1976 for A = Σ w q pᵀ, and the polar one."""
+    B, _size = scaled3(A)
+    u, v, _side, size = separated_pair(B)
+    v1, v2 = complement(v)
+    u1, u2 = complement(u)
+    w1 = B * v1
+    w2 = B * v2
+    c, s = plane_rotation(wp.dot(u1, w1) + wp.dot(u2, w2), wp.dot(u2, w1) - wp.dot(u1, w2), size, u1, u2, v1, v2)
+    return wp.outer(u, v) + wp.outer(c * u1 + s * u2, v1) + wp.outer(c * u2 - s * u1, v2)
+
+
+@wp.func
+def rotation_svd3(A: Any):
+    """U, S, V of a 3×3 A with det U = det V = 1; S[2] has the sign of det A."""
+    half = A.dtype(0.5)
+    B, scale = scaled3(A)
+    u, v, side, size = separated_pair(B)
+    v1, v2 = complement(v)
+    u1, u2 = complement(u)
+    w1 = B * v1
+    w2 = B * v2
+    b00 = wp.dot(u1, w1)
+    b01 = wp.dot(u1, w2)
+    b10 = wp.dot(u2, w1)
+    b11 = wp.dot(u2, w2)
+    # The rotation (p, q) and the reflection (f, g) that the block is the sum of, both twice.
+    p = b00 + b11
+    q = b10 - b01
+    f = b00 - b11
+    g = b10 + b01
+    total = wp.sqrt(p * p + q * q)
+    difference = wp.sqrt(f * f + g * g)
+    c, s = plane_rotation(p, q, size, u1, u2, v1, v2)
+    # What the rotation leaves is symmetric, with axes at half the angle between the two.
+    cos, sin = half_angle(c * f + s * g, c * g - s * f, difference, epsilon(size) * epsilon(size) * size)
+    x1 = c * u1 + s * u2
+    x2 = c * u2 - s * u1
+    va = cos * v1 + sin * v2
+    vb = cos * v2 - sin * v1
+    ua = cos * x1 + sin * x2
+    ub = cos * x2 - sin * x1
+    high = half * (total + difference)
+    low = half * (total - difference)
+    U = wp.matrix_from_cols(u, ua, ub)
+    V = wp.matrix_from_cols(v, va, vb)
+    S = descending(size, high, low)
+    if side < A.dtype(0.0):
+        U = wp.matrix_from_cols(ua, ub, u)
+        V = wp.matrix_from_cols(va, vb, v)
+        S = descending(high, low, wp.dot(u, B * v))
+    return U, scale * S, V
+
+
+@wp.func
+def svd3(A: Any):
+    """U, S, V of a 3×3 A with S ≥ 0 and det V = 1; det U has the sign of det A."""
+    U, S, V = rotation_svd3(A)
+    if S[2] < A.dtype(0.0):
+        S[2] = -S[2]
+        for i in range(3):
+            U[i, 2] = -U[i, 2]
+    return U, S, V
+
+
+@wp.func
+def polar3(A: Any):
+    """R, P of a 3×3 A = R P: the nearest rotation, and P symmetric; its least eigenvalue has the sign of det A."""
+    R = nearest_rotation(A)
+    P = wp.transpose(R) * A
+    return R, A.dtype(0.5) * (P + wp.transpose(P))
+
+
+@wp.func
+def eigh3(C: Any):
+    """w, V of a symmetric 3×3 C = V diag(w) Vᵀ, w descending, det V = 1; the lower triangle of C is not read."""
+    half = C.dtype(0.5)
+    one = C.dtype(1.0)
+    B, scale = scaled3(wp.matrix_from_rows(C[0], wp.vector(C[0, 1], C[1, 1], C[1, 2]), wp.vector(C[0, 2], C[1, 2], C[2, 2])))
+    v, side = separated_eigenvector(B)
+    v1, v2 = complement(v)
+    w1 = B * v1
+    w2 = B * v2
+    a = wp.dot(v1, w1)
+    b = wp.dot(v2, w2)
+    f = a - b
+    g = C.dtype(2.0) * wp.dot(v1, w2)
+    difference = wp.sqrt(f * f + g * g)
+    cos, sin = half_angle(f, g, difference, epsilon(one) * epsilon(one))
+    va = cos * v1 + sin * v2
+    vb = cos * v2 - sin * v1
+    high = half * (a + b + difference)
+    low = half * (a + b - difference)
+    separated = wp.dot(v, B * v)
+    V = wp.matrix_from_cols(v, va, vb)
+    w = wp.vector(wp.max(separated, high), wp.max(wp.min(separated, high), low), wp.min(wp.min(separated, high), low))
+    if side < C.dtype(0.0):
+        V = wp.matrix_from_cols(va, vb, v)
+        w = wp.vector(wp.max(high, separated), wp.max(low, wp.min(high, separated)), wp.min(low, separated))
+    return scale * w, V
+
+
+@wp.func
+def scaled2(A: Any):
+    """As :func:`scaled3`, of 2×2."""
+    size = wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])))
+    B = A / size
+    if size == A.dtype(0.0):
+        B = wp.identity(n=2, dtype=A.dtype) + A  # as there
+    return B, size
+
+
+@wp.func
+def nearest_rotation2(A: Any):
+    """The rotation R nearest to a 2×2 A; the identity where it is not unique, A being a multiple of a reflection."""
+    one = A.dtype(1.0)
+    B, _scale = scaled2(A)
+    f = B[0, 0] - B[1, 1]
+    g = B[1, 0] + B[0, 1]
+    least = A.dtype(3.0) * epsilon(one) * wp.sqrt(f * f + g * g)
+    c, s = unit(B[0, 0] + B[1, 1], B[1, 0] - B[0, 1], least, one, A.dtype(0.0))
+    return wp.matrix_from_cols(wp.vector(c, s), wp.vector(-s, c))
+
+
+@wp.func
+def rotation_svd2(A: Any):
+    """U, S, V of a 2×2 A with det U = det V = 1; S[1] has the sign of det A."""
+    one = A.dtype(1.0)
+    half = A.dtype(0.5)
+    B, scale = scaled2(A)
+    p = B[0, 0] + B[1, 1]
+    q = B[1, 0] - B[0, 1]
+    f = B[0, 0] - B[1, 1]
+    g = B[1, 0] + B[0, 1]
+    total = wp.sqrt(p * p + q * q)
+    difference = wp.sqrt(f * f + g * g)
+    c, s = unit(p, q, A.dtype(3.0) * epsilon(one) * difference, one, A.dtype(0.0))
+    cos, sin = half_angle(c * f + s * g, c * g - s * f, difference, epsilon(one) * epsilon(one))
+    V = wp.matrix_from_cols(wp.vector(cos, sin), wp.vector(-sin, cos))
+    U = wp.matrix_from_cols(wp.vector(c, s), wp.vector(-s, c)) * V
+    return U, scale * half * wp.vector(total + difference, total - difference), V
+
+
+@wp.func
+def svd2(A: Any):
+    """U, S, V of a 2×2 A with S ≥ 0 and det V = 1; det U has the sign of det A."""
+    U, S, V = rotation_svd2(A)
+    if S[1] < A.dtype(0.0):
+        S[1] = -S[1]
+        for i in range(2):
+            U[i, 1] = -U[i, 1]
+    return U, S, V
+
+
+@wp.func
+def polar2(A: Any):
+    """R, P of a 2×2 A = R P: the nearest rotation, and P symmetric; its lesser eigenvalue has the sign of det A."""
+    R = nearest_rotation2(A)
+    P = wp.transpose(R) * A
+    return R, A.dtype(0.5) * (P + wp.transpose(P))
+
+
+@wp.func
+def svd3x2(A: Any):
+    """U (3×2), S, V (2×2) of a 3×2 A with S ≥ 0, UᵀU = I and det V = 1.
+
+    Of rank 1, U Vᵀ is that part of the least rotation in space that turns v to u; of A = 0 the first two axes.
+    """
+    zero = A.dtype(0.0)
+    one = A.dtype(1.0)
+    scale = wp.max(wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])), wp.abs(A[2])))
+    a0 = wp.vector(A[0, 0], A[1, 0], A[2, 0]) / scale
+    a1 = wp.vector(A[0, 1], A[1, 1], A[2, 1]) / scale
+    if scale == zero:
+        a0 = wp.vector(one + A[0, 0], A[1, 0], A[2, 0])
+        a1 = wp.vector(A[0, 1], one + A[1, 1], A[2, 1])
+    f = wp.dot(a0, a0) - wp.dot(a1, a1)
+    g = A.dtype(2.0) * wp.dot(a0, a1)
+    cos, sin = half_angle(f, g, wp.sqrt(f * f + g * g), epsilon(one) * epsilon(one))
+    u = cos * a0 + sin * a1
+    size = wp.length(u)
+    u = u / size
+    w = cos * a1 - sin * a0
+    u1, u2 = complement(u)
+    p = wp.dot(u1, w)
+    q = wp.dot(u2, w)
+    # The frame of v = (cos, sin, 0) is (−sin, cos, 0) and the third axis.
+    c, s = plane_rotation(p, q, size, u1, u2, wp.vector(-sin, cos, zero), wp.vector(zero, zero, one))
+    U = wp.matrix_from_cols(u, c * u1 + s * u2)
+    V = wp.matrix_from_cols(wp.vector(cos, sin), wp.vector(-sin, cos))
+    second = wp.sqrt(p * p + q * q)
+    return U, scale * wp.vector(wp.max(size, second), wp.min(size, second)), V
+
+
+@wp.func
+def polar3x2(A: Any):
+    """R (3×2), P (2×2) of a 3×2 A = R P: the nearest matrix with RᵀR = I, and P symmetric and semi-definite."""
+    U, _S, V = svd3x2(A)
+    R = U * wp.transpose(V)
+    P = wp.transpose(R) * A
+    return R, A.dtype(0.5) * (P + wp.transpose(P))
