@@ -1,5 +1,6 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
+from .arap import Arap
 from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
 from .rotation import polar, svd
@@ -11,6 +12,7 @@ from .terms import Attachment, DihedralBending, QuadraticBending, Spring
 __all__ = [
     "PBD",
     "Animation",
+    "Arap",
     "Attachment",
     "DihedralBending",
     "Equilibrium",

@@ -1,9 +1,11 @@
-"""The only thing that solves a sparse system: conjugate gradients on the device, or a factorisation on the host."""
+"""The only thing that solves a sparse system: conjugate gradients on the device, or a factorisation."""
+
+import importlib.util
 
 import numpy as np
 import warp as wp
 
-from .capture import Mirror
+from .capture import Mirror, on_host
 from .kernels import linear
 
 
@@ -136,3 +138,84 @@ class Factorised:
             return splu(columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         except RuntimeError:  # exactly singular
             return None
+
+
+def constant_factor(matrix, device, dtype):
+    """The factors of a constant matrix: :class:`CholeskyFactor` where cholespy is installed, else :class:`LUFactor`.
+
+    Of several CUDA devices cholespy knows the first alone.
+    """
+    if importlib.util.find_spec("cholespy") and not (device.is_cuda and device.ordinal):
+        return CholeskyFactor(matrix, device, dtype)
+    return LUFactor(matrix, device, dtype)
+
+
+class CholeskyFactor:
+    """Solves A x = b for a constant symmetric positive definite A by cholespy: CHOLMOD on the CPU, its own kernels on CUDA.
+
+    A is factorised once, in double precision, and solved on its device without copies of vectors.
+
+    Args:
+        matrix: A, a scipy sparse matrix (n, n), n at least 1.
+        device: The Warp device of the vectors.
+        dtype: Their scalar type, ``wp.float32`` or ``wp.float64``.
+
+    Raises:
+        ValueError: If A is not finite or not positive definite.
+    """
+
+    def __init__(self, matrix, device, dtype):
+        import cholespy
+
+        self.device = device
+        columns = _finite_columns(matrix)
+        parts = zip((columns.indptr, columns.indices, columns.data), (wp.int32, wp.int32, wp.float64), strict=True)
+        compressed = [wp.array(part, dtype=kind, device=device) for part, kind in parts]
+        solver = {wp.float32: cholespy.CholeskySolverF, wp.float64: cholespy.CholeskySolverD}[dtype]
+        try:
+            self.solver = solver(columns.shape[0], *compressed, cholespy.MatrixType.CSC)
+        except ValueError:
+            raise ValueError(_INDEFINITE) from None
+
+    def solve(self, b, x):
+        """x = A⁻¹ b; both (n,) vectors or (n, k) numbers. NaN in b is NaN in x."""
+        on_host(self.device, "a sparse factorisation")
+        wp.synchronize_device(self.device)  # on CUDA cholespy has a stream of its own
+        self.solver.solve(b, x)
+        wp.synchronize_device(self.device)
+
+
+class LUFactor:
+    """Solves A x = b as :class:`CholeskyFactor` does, by scipy's SuperLU on the host, in double precision.
+
+    Arguments and what is raised are those of :class:`CholeskyFactor`.
+    """
+
+    def __init__(self, matrix, device, dtype):
+        from scipy.sparse.linalg import splu
+
+        options = {"SymmetricMode": True, "Equil": False}
+        try:
+            self.factors = splu(_finite_columns(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        except RuntimeError:  # exactly singular
+            raise ValueError(_INDEFINITE) from None
+        if not (self.factors.U.diagonal() > 0.0).all():
+            raise ValueError(_INDEFINITE)
+        self._mirrors = {}
+
+    def solve(self, b, x):
+        """x = A⁻¹ b; both (n,) vectors or (n, k) numbers. NaN in b is NaN in x."""
+        right, left = (self._mirrors.get(array.ptr) or self._mirrors.setdefault(array.ptr, Mirror(array)) for array in (b, x))
+        left.write(self.factors.solve(right.read().astype(np.float64)))
+
+
+_INDEFINITE = "the matrix is not positive definite, so it has no Cholesky factors"
+
+
+def _finite_columns(matrix):
+    """A sparse matrix in sorted compressed columns of double precision."""
+    columns = matrix.tocsc().astype(np.float64)
+    columns.sort_indices()
+    if not np.isfinite(columns.data).all():
+        raise ValueError(f"the matrix has {np.count_nonzero(~np.isfinite(columns.data))} entries that are not finite")
+    return columns

@@ -1,0 +1,128 @@
+"""Factories of kernels over cells: any number of vertices each, that one rotation per cell turns.
+
+Cells are compressed rows: entries offsets[c] to offsets[c+1] of ``members`` are the vertices of cell c, at least one each. Each
+entry has a moment gᵢ, a constant vector with Σᵢ gᵢ = 0 over the cell, so that S_c = Σᵢ (xᵢ − x_o) gᵢᵀ is its covariance for
+whatever reference x_o. With weights wᵢ and the centroid X̄ that they give, gᵢ = wᵢ(Xᵢ − X̄) makes it that of a weighted point set
+(Kabsch 1976); with edges of weight w_ij in the cell, gᵢ = Σⱼ w_ij (Xᵢ − Xⱼ) makes it that of the edges.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .assemble import types
+from .rotation import nearest_rotation
+
+
+@cache
+def fit_rotations(dtype):
+    """Kernel over cells: R_c = the rotation that maximises tr(RᵀS_c), S_c = Σᵢ (xᵢ − x_o) gᵢᵀ, x_o that of the first member."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def fit(
+        offsets: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        moments: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # out
+        rotations: wp.array(dtype=mat33),
+    ):
+        c = wp.tid()
+        first = offsets[c]
+        origin = x[members[first]]
+        S = mat33()
+        for k in range(first + 1, offsets[c + 1]):
+            S += wp.outer(x[members[k]] - origin, moments[k])
+        rotations[c] = nearest_rotation(S)
+
+    return fit
+
+
+@cache
+def gather(dtype):
+    """Kernel over vertices, the transpose of the sums in :func:`fit_rotations`: b_i = start_i + Σ_{c∋i} R_c g_ic.
+
+    Entries offsets[i] to offsets[i+1] of ``cells`` and ``moments`` are the cells of vertex i and its moments in them.
+    """
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather_moments(
+        offsets: wp.array(dtype=wp.int32),
+        cells: wp.array(dtype=wp.int32),
+        moments: wp.array(dtype=vec3),
+        rotations: wp.array(dtype=mat33),
+        start: wp.array(dtype=vec3),
+        # out
+        b: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        total = start[i]
+        for k in range(offsets[i], offsets[i + 1]):
+            total += rotations[cells[k]] * moments[k]
+        b[i] = total
+
+    return gather_moments
+
+
+@cache
+def edge_energy(dtype):
+    """Kernel over edges: out[e] = w_ij (‖d − R_i D‖² + ‖d − R_j D‖²), d = xⱼ − xᵢ, D = Xⱼ − Xᵢ: in the cells of both ends.
+
+    A sum of squares, so that nothing cancels where the motion is nearly rigid.
+    """
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def energy_of_edges(
+        edges: wp.array(dtype=wp.vec2i),
+        weights: wp.array(dtype=dtype),
+        rest: wp.array(dtype=vec3),
+        rotations: wp.array(dtype=mat33),
+        x: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        e = wp.tid()
+        i, j = edges[e][0], edges[e][1]
+        d, D = x[j] - x[i], rest[j] - rest[i]
+        out[e] = wp.float64(weights[e] * (wp.length_sq(d - rotations[i] * D) + wp.length_sq(d - rotations[j] * D)))
+
+    return energy_of_edges
+
+
+@cache
+def triangle_energy(dtype):
+    """Kernel over triangles: out[t] = Σᵥ Σₑ w_e ‖dₑ − Rᵥ Dₑ‖² over its vertices and edges: in the cells of its vertices.
+
+    With the edge vectors d and D of x and of the rest shape; edge k is opposite vertex k.
+    """
+    vec3, mat33 = types(dtype)
+
+    @wp.func
+    def of_one_rotation(w: vec3, R: mat33, d1: vec3, d2: vec3, D1: vec3, D2: vec3):
+        r1, r2 = d1 - R * D1, d2 - R * D2
+        return w[1] * wp.length_sq(r1) + w[2] * wp.length_sq(r2) + w[0] * wp.length_sq(r1 - r2)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def energy_of_triangles(
+        triangles: wp.array(dtype=wp.vec3i),
+        weights: wp.array(dtype=vec3),
+        rest: wp.array(dtype=vec3),
+        rotations: wp.array(dtype=mat33),
+        x: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        t = wp.tid()
+        i, j, k = triangles[t][0], triangles[t][1], triangles[t][2]
+        w = weights[t]
+        # Edge 1 runs from vertex 0 to 2, edge 2 from 0 to 1, edge 0 is their difference.
+        d1, d2, D1, D2 = x[k] - x[i], x[j] - x[i], rest[k] - rest[i], rest[j] - rest[i]
+        total = of_one_rotation(w, rotations[i], d1, d2, D1, D2)
+        total += of_one_rotation(w, rotations[j], d1, d2, D1, D2)
+        total += of_one_rotation(w, rotations[k], d1, d2, D1, D2)
+        out[t] = wp.float64(total)
+
+    return energy_of_triangles
