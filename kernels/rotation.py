@@ -38,6 +38,17 @@ def epsilon(x: wp.float64):  # noqa: F811 - Warp chooses by type
 
 
 @wp.func
+def smallest(x: wp.float32):
+    """The smallest number of this precision with all its digits."""
+    return wp.float32(wp.static(2.0**-126))
+
+
+@wp.func
+def smallest(x: wp.float64):  # noqa: F811 - likewise
+    return wp.float64(wp.static(2.0**-1022))
+
+
+@wp.func
 def unit(c: Any, s: Any, least: Any, c_else: Any, s_else: Any):
     """(c, s) made a unit vector; where it is not longer than ``least`` the other one, and (1, 0) where that is 0 too."""
     length = wp.sqrt(c * c + s * s)
@@ -48,7 +59,8 @@ def unit(c: Any, s: Any, least: Any, c_else: Any, s_else: Any):
         if length == type(c)(0.0):
             c = type(c)(1.0)
             length = type(c)(1.0)
-    return c / length, s / length
+    inverse = type(c)(1.0) / length
+    return inverse * c, inverse * s
 
 
 @wp.func
@@ -84,15 +96,15 @@ def separated_eigenvector(C: Any):
         It, and 1 where that eigenvalue is the largest, −1 where it is the smallest.
     """
     one = C.dtype(1.0)
-    mean = wp.trace(C) / C.dtype(3.0)
+    mean = C.dtype(0.3333333333333333) * wp.trace(C)
     d0 = C[0, 0] - mean
     d1 = C[1, 1] - mean
     d2 = C[2, 2] - mean
     e0 = C[1, 2]
     e1 = C[0, 2]
     e2 = C[0, 1]
-    spread = (d0 * d0 + d1 * d1 + d2 * d2 + C.dtype(2.0) * (e0 * e0 + e1 * e1 + e2 * e2)) / C.dtype(6.0)
-    scale = one / wp.sqrt(spread)
+    spread = d0 * d0 + d1 * d1 + d2 * d2 + C.dtype(2.0) * (e0 * e0 + e1 * e1 + e2 * e2)
+    scale = C.dtype(2.449489742783178) / wp.sqrt(spread)  # √6, of the roots
     # Far below rounding C is isotropic, and the square of the spread could underflow.
     tiny = epsilon(mean) * epsilon(mean) * mean
     if spread <= tiny * tiny:
@@ -126,17 +138,19 @@ def separated_eigenvector(C: Any):
         v = wp.vector(a01, a11, a12)
     elif a22 > a00:
         v = wp.vector(a02, a12, a22)
-    return v / wp.length(v), side
+    return (one / wp.length(v)) * v, side
 
 
 @wp.func
 def scaled3(A: Any):
     """A 3×3 A divided by its largest entry, that entry; the identity and 0 of A = 0."""
     size = wp.max(wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])), wp.abs(A[2])))
-    B = A / size
+    scale = wp.max(size, smallest(size))  # whose inverse is finite
+    B = (A.dtype(1.0) / scale) * A
     if size == A.dtype(0.0):
         B = wp.identity(n=3, dtype=A.dtype) + A  # beside zeros A may hold a NaN, which max leaves out
-    return B, size
+        scale = size
+    return B, scale
 
 
 @wp.func
@@ -150,7 +164,7 @@ def separated_pair(A: Any):
         a2 = wp.vector(A[0, 2], A[1, 2], A[2, 2])
         u = v[0] * wp.cross(a1, a2) + v[1] * wp.cross(a2, a0) + v[2] * wp.cross(a0, a1)
     size = wp.length(u)
-    return u / size, v, side, size
+    return (A.dtype(1.0) / size) * u, v, side, size
 
 
 @wp.func
@@ -277,10 +291,12 @@ def eigh3(C: Any):
 def scaled2(A: Any):
     """As :func:`scaled3`, of 2×2."""
     size = wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])))
-    B = A / size
+    scale = wp.max(size, smallest(size))
+    B = (A.dtype(1.0) / scale) * A
     if size == A.dtype(0.0):
         B = wp.identity(n=2, dtype=A.dtype) + A  # as there
-    return B, size
+        scale = size
+    return B, scale
 
 
 @wp.func
@@ -341,10 +357,12 @@ def svd3x2(A: Any):
     """
     zero = A.dtype(0.0)
     one = A.dtype(1.0)
-    scale = wp.max(wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])), wp.abs(A[2])))
-    a0 = wp.vector(A[0, 0], A[1, 0], A[2, 0]) / scale
-    a1 = wp.vector(A[0, 1], A[1, 1], A[2, 1]) / scale
-    if scale == zero:
+    largest = wp.max(wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])), wp.abs(A[2])))
+    scale = wp.max(largest, smallest(largest))
+    a0 = (one / scale) * wp.vector(A[0, 0], A[1, 0], A[2, 0])
+    a1 = (one / scale) * wp.vector(A[0, 1], A[1, 1], A[2, 1])
+    if largest == zero:
+        scale = zero
         a0 = wp.vector(one + A[0, 0], A[1, 0], A[2, 0])
         a1 = wp.vector(A[0, 1], one + A[1, 1], A[2, 1])
     f = wp.dot(a0, a0) - wp.dot(a1, a1)
@@ -352,7 +370,7 @@ def svd3x2(A: Any):
     cos, sin = half_angle(f, g, wp.sqrt(f * f + g * g), epsilon(one) * epsilon(one))
     u = cos * a0 + sin * a1
     size = wp.length(u)
-    u = u / size
+    u = (one / size) * u
     w = cos * a1 - sin * a0
     u1, u2 = complement(u)
     p = wp.dot(u1, w)

@@ -89,8 +89,7 @@ def test_symmetric_eigenvalues(precision, device):
     C = upper + np.triu(A, 1).mT
     types = (wp.types.vector(3, WARP[precision]), wp.types.matrix((3, 3), WARP[precision]))
     w, V = (wp.empty(len(A), dtype=dtype, device=device) for dtype in types)
-    kernel = decompose.into_two(rotation.eigh3, types[1], types)
-    wp.launch(kernel, len(A), inputs=[on(device, upper)], outputs=[w, V], device=device)
+    decompose.launch(decompose.into_two, rotation.eigh3, on(device, upper), [w, V])
     w, V = numpy([w, V])
     bound = BOUND[precision]
     assert reconstruction(C, times(V, w), V.mT) <= bound

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
-from scipy.sparse import coo_matrix, diags, triu
-from scipy.sparse.csgraph import connected_components
 
 from .capture import Mirror, Segment
 from .checks import choice, number, numeric, shown, whole
@@ -84,6 +82,8 @@ class Arap:
     """
 
     def __init__(self, mesh, handles, weights="cotangent", energy="spokes", device="cpu", dtype="float64"):
+        from scipy.sparse import coo_matrix, diags
+
         choice("weights", weights, ("cotangent", "clamped", "intrinsic", "uniform"))
         choice("energy", energy, ("spokes", "spokes_and_rims"))
         choice("dtype", dtype, tuple(DTYPES))
@@ -226,6 +226,8 @@ class Arap:
         Raises:
             ValueError: If a part has no handle.
         """
+        from scipy.sparse.csgraph import connected_components
+
         count, parts = connected_components(adjacency, directed=False)
         loose = np.setdiff1d(np.arange(count), parts[self.handles])
         if len(loose):
@@ -279,7 +281,8 @@ class Arap:
             launch(cells.fit_rotations(self._scalar), n, [*rows, x], rotations)
             launch(kernel(self._scalar), len(elements), [elements, weights, placed, rotations, x], energies)
             launch(reduce.partial_sum(), partial.shape, [energies, len(elements)], partial)
-            launch(reduce.finish_sum(), 1, [partial, 0.0], self._energy.array)
+            self._energy.array.zero_()  # the next kernel would multiply what a failed call left
+            launch(reduce.finish_sum(), 1, [partial, 1.0], self._energy.array)
             if len(self._b):
                 launch(cells.gather(self._scalar), len(self._b), [*columns, rotations, self._start.array], self._b)
 
@@ -336,7 +339,9 @@ def _half_cotangents(mesh):
 
 
 def _edge_weights(mesh, weights):
-    """Pairs of vertices (E, 2), the smaller index first, and their weights (E,)."""
+    """Pairs of vertices (E, 2), of a matrix the smaller index first, and their weights (E,)."""
+    from scipy.sparse import coo_matrix, triu
+
     if weights == "uniform":
         return mesh.edges, np.ones(len(mesh.edges))
     n = len(mesh.points)

@@ -92,7 +92,7 @@ class _Batch:
         else:
             A = wp.array(self.A.reshape(self.count, *self.shape), dtype=self.matrix, device="cpu", copy=False)
         out = [wp.empty(self.count, dtype=dtype, device=self.device) for dtype in types]
-        wp.launch(factory(function, self.matrix, types), self.count, inputs=[A], outputs=out, device=self.device)
+        decompose.launch(factory, function, A, out)
         return tuple(self._like(array, shape) for array, shape in zip(out, shapes, strict=True))
 
     def _like(self, array, shape):
