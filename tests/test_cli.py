@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import warpcloth.cli
+import warpcloth.cli.run
 import warpcloth.usd
 from warpcloth import scene_files
 from warpcloth.cli import main
@@ -151,6 +151,17 @@ WRONG_USES = [
     ("info flag -p bending=-1", "QuadraticBending.stiffness is -1.0; it must be 0 or more"),
     ("info hanging -p density=-1", "kg; a vertex that is not pinned must have a finite one above 0"),
     ("info hanging -p stiffness=-1", "Spring.stiffness is -1.0; it must be 0 or more"),
+    ("info bar_twist -p angle=inf", "ValueError: angle is inf; it must be a number that is finite"),
+    ("info bar_twist -p cells=0", "ValueError: cells is 0; it must be a whole number of 1 or more"),
+    ("info bar_twist -p duration=0", "ValueError: duration is 0.0; it must be a number above 0"),
+    ("info bar_twist -p duration=0.01", "ValueError: duration is 0.01 s; at fps 24.0 it must be a whole number of frames"),
+    ("info bar_twist -p stiffness=-1", "Spring.stiffness is -1.0; it must be 0 or more"),
+    ("info bar_twist -p bending=-1", "DihedralBending.stiffness is -1.0; it must be 0 or more"),
+    ("info bunny -p angle=inf", "ValueError: angle is inf; it must be a number that is finite"),
+    ("info bunny -p lift=inf", "ValueError: lift is inf; it must be a number that is finite"),
+    ("info bunny -p duration=inf", "ValueError: duration is inf; it must be a number above 0"),
+    ("info bunny -p stiffness=-1", "Spring.stiffness is -1.0; it must be 0 or more"),
+    ("info bunny -p bending=-1", "DihedralBending.stiffness is -1.0; it must be 0 or more"),
     ("info usd_cloth -p density=0", "ValueError: density is 0.0; it must be a number above 0"),
     ("info usd_cloth -p stiffness=-1", "Spring.stiffness is -1.0; it must be 0 or more"),
     ("info usd_cloth -p bending=-1", "QuadraticBending.stiffness is -1.0; it must be 0 or more"),
@@ -371,13 +382,13 @@ def test_a_diverged_run_exits_with_1_and_leaves_its_good_frames(tmp_path, capfd,
 
 
 def test_an_interrupted_run_exits_with_130_and_says_what_is_saved(tmp_path, capfd, monkeypatch):
-    class Interrupting(warpcloth.cli._Progress):
+    class Interrupting(warpcloth.cli.run.Progress):
         def __call__(self, frame, frames):
             super().__call__(frame, frames)
             if frame == 2:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(warpcloth.cli, "_Progress", Interrupting)
+    monkeypatch.setattr(warpcloth.cli.run, "Progress", Interrupting)
     output = tmp_path / "out.usdc"
     code, out, err = run(capfd, "run", *SMALL, "-o", output)
     assert (code, out) == (130, "")

@@ -15,7 +15,7 @@ from warpcloth.terms import TERMS
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = [(m[1], m[2]) for m in re.finditer(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)]
-EXAMPLE, CURTAIN = (text for language, text in BLOCKS if language == "python")
+EXAMPLE, CURTAIN, DEFORMATION = (text for language, text in BLOCKS if language == "python")
 (STAGE,) = (text for language, text in BLOCKS if language == "usda")
 COMMANDS = [line for language, text in BLOCKS if language == "sh" for line in text.splitlines() if line.startswith("warpcloth")]
 
@@ -30,16 +30,24 @@ def test_the_python_example(tmp_path, monkeypatch, capsys):
     assert np.asarray(animation.points[-1]).shape == (1024, 3)
 
 
+def test_the_deformation(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(DEFORMATION, "README.md", "exec"), {"wc": wc})
+    converged, angle = capsys.readouterr().out.splitlines()[-2:]
+    assert converged.startswith("True ") and np.radians(115.0) < float(angle) < np.radians(125.0)
+    assert (tmp_path / "twisted.usdc").is_file()
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "curtain.py").write_text(CURTAIN, encoding="utf-8")
     (tmp_path / "cloth.usda").write_text(STAGE, encoding="utf-8")
     arguments = shlex.split(command)[1:]
-    if arguments[0] == "run" and "--frames" not in arguments:
+    if arguments[0] in ("run", "deform") and "--frames" not in arguments:
         arguments += ["--frames", "2"]
     assert main(arguments) == 0, capsys.readouterr().err
-    if arguments[0] == "run":
+    if "-o" in arguments:
         assert (tmp_path / arguments[arguments.index("-o") + 1]).is_file()
 
 

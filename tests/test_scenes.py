@@ -274,6 +274,8 @@ SMALL = {
     "catenary": {"links": 10, "stretching": 50.0},
     "flag": {"nx": 9, "ny": 6},
     "usd_cloth": {},
+    "bar_twist": {"cells": 2},
+    "bunny": {"stiffness": 10.0, "bending": 1e-4},
 }
 SOLVERS = {
     "newton": wc.Newton(substeps=4),

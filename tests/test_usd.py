@@ -33,11 +33,17 @@ def motion(mesh, frame, sign=1.0):
     return points, sign * np.stack([np.full(len(vertex), frame), vertex[:, 0] / len(vertex), -0.5 + vertex[:, 0] % 3], 1)
 
 
+def measures(mesh, frame, primvars):
+    """Values of primvars that tell the frame and the vertex or triangle that they belong to."""
+    counts = {"vertex": len(mesh.points), "uniform": len(mesh.triangles)}
+    return {name: 100.0 * frame + np.arange(counts[interpolation]) for name, interpolation in primvars.items()}
+
+
 def write(output, mesh, frames=FRAMES, fps=24, single_file=False, sign=1.0, **options):
     """Writes some frames, and returns the path of the result."""
     with AnimationWriter(output, mesh, fps, **{"chunk": CHUNK, **options}) as writer:
         for frame in range(frames):
-            writer.append(*motion(mesh, frame, sign))
+            writer.append(*motion(mesh, frame, sign), measures(mesh, frame, options.get("primvars", {})))
         writer.close(single_file=single_file)
     return writer.path
 
@@ -165,6 +171,7 @@ def result(request, tmp_path_factory):
     make, ending, single_file = request.param
     folder = tmp_path_factory.mktemp("usd")
     mesh, options = make(folder)
+    options["primvars"] = {"turn": "vertex", "warpcloth:strain": "uniform"} if len(mesh.triangles) else {"turn": "vertex"}
     path = write(folder / f"result.{ending}", mesh, single_file=single_file, **options)
     return path, mesh, options, single_file
 
@@ -189,6 +196,54 @@ def test_frames_come_back_in_metres_and_world_space(result):
             tolerance = EPS * (np.abs(local).max() * np.linalg.norm(linear, 2) + np.abs(expected).max())
             np.testing.assert_allclose(values, expected, rtol=0, atol=tolerance)
         np.testing.assert_allclose(sequence.times, np.arange(FRAMES) / 24, atol=1e-12)
+
+
+def test_primvars_come_back(result):
+    path, mesh, options, _ = result
+    _stage, prim = animated_prim(path)
+    for name, interpolation in options["primvars"].items():
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(name)
+        assert (primvar.GetInterpolation(), primvar.GetTypeName()) == (interpolation, Sdf.ValueTypeNames.FloatArray)
+        assert primvar.GetAttr().GetTimeSamples() == prim.GetAttribute("points").GetTimeSamples()
+        sequence = FrameSequence(path, attribute=f"primvars:{name}", scale=0.5)
+        expected = [0.5 * measures(mesh, frame, options["primvars"])[name] for frame in range(FRAMES)]
+        assert sequence.ndim == 2 and sequence.shape == np.shape(expected)
+        np.testing.assert_array_equal(sequence, np.float32(expected))
+        np.testing.assert_array_equal(sequence[1:3, 4], np.float32(expected)[1:3, 4])
+
+
+def test_primvars_over_polygons_and_over_others_of_their_name(tmp_path):
+    """A face has the mean of its triangles; what the artist has under the same name, of any type, is not seen."""
+    stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    old = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("strain", Sdf.ValueTypeNames.Color3fArray, "faceVarying")
+    old.Set([Gf.Vec3f(1)])
+    old.SetIndices([0] * 8)
+    stage.Save()
+    cloth = read_mesh(tmp_path / "a.usda")
+    primvars = {"strain": "uniform"}
+    for ending in ("usdc", "usdz"):
+        path = write(tmp_path / f"out.{ending}", cloth, source=tmp_path / "a.usda", primvars=primvars)
+        _stage, prim = animated_prim(path)
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("strain")
+        assert primvar.GetInterpolation() == "uniform" and not primvar.IsIndexed() and primvar.Get() is None
+        assert list(primvar.ComputeFlattened(2)) == [201.0, 203.0]
+        assert FrameSequence(path, attribute="primvars:strain")[1].tolist() == [101.0, 103.0]
+
+
+@pytest.mark.parametrize(
+    ("attribute", "message"),
+    [
+        ("normals", 'must be "points", "velocities" or a primvar'),
+        ("primvars:turn", "primvars:turn have no time samples"),
+        ("primvars:colour", r"primvars:colour has type color3f\[\], must be float\[\]"),
+    ],
+)
+def test_what_a_sequence_cannot_read(tmp_path, attribute, message):
+    stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("colour", Sdf.ValueTypeNames.Color3fArray).Set([Gf.Vec3f(1)], 3)
+    stage.Save()
+    with pytest.raises(ValueError, match=message):
+        FrameSequence(tmp_path / "a.usda", attribute=attribute)
 
 
 def test_rest_shape_is_the_default(result):
@@ -619,6 +674,20 @@ def test_bad_stages_are_refused(tmp_path, make, prim, error, message):
         ({"fps": 0}, ValueError, "fps = 0: must be positive"),
         ({"chunk": 0}, ValueError, "chunk = 0: must be a whole number, at least 1"),
         ({"up_axis": "X"}, ValueError, "up_axis = 'X'"),
+        ({"primvars": {"max strain": "vertex"}}, ValueError, "primvars: 'max strain' must be a name such as rotationAngle"),
+        (
+            {"primvars": {"primvars:turn": "vertex"}},
+            ValueError,
+            "'primvars:turn' must be a name .* without primvars: before it",
+        ),
+        ({"primvars": {"turn:indices": "vertex"}}, ValueError, "'turn:indices' must be a name"),
+        ({"primvars": {"st": "vertex"}}, ValueError, "'st' has a meaning already, must be none of normals, st, displayColor"),
+        ({"primvars": {"turn": "varying"}}, ValueError, "primvars.'turn'. = 'varying': must be 'vertex' or 'uniform'"),
+        (
+            {"primvars": {"turn": "uniform"}, "mesh": Mesh.chain(3)},
+            ValueError,
+            "= 'uniform': must be 'vertex' of a mesh of edges",
+        ),
         ({"prim": "/World/Cloth"}, ValueError, "prim = '/World/Cloth': must be a name"),
         ({"output": "taken.usda"}, ValueError, "taken_frames: is a file"),
         ({"output": "link.usdc"}, ValueError, "output = link.usdc: is a link to .*real.usda, must end as that does"),
@@ -669,6 +738,27 @@ def test_bad_frames_are_refused(tmp_path, points, velocities, message):
     assert len(FrameSequence(writer.path)) == 1
     with pytest.raises(ValueError, match="is closed"):
         writer.append(GOOD, GOOD)
+
+
+@pytest.mark.parametrize(
+    ("primvars", "message"),
+    [
+        (None, "primvars: none at frame 1, must be 'turn', 'strain'"),
+        ({"turn": GOOD[:, 0], "stress": GOOD[:, 0]}, "primvars: 'turn', 'stress' at frame 1, must be 'turn', 'strain'"),
+        ({"turn": GOOD, "strain": np.zeros(24)}, r"primvars\['turn'\]: shape \(20, 3\) at frame 1, must be \(20,\)"),
+        (
+            {"turn": with_value(np.nan, 7)[:, 1], "strain": np.zeros(24)},
+            r"\['turn'\]: nan at frame 1, vertex 7, must be finite",
+        ),
+        ({"turn": GOOD[:, 0], "strain": np.geomspace(1, 1e39, 24)}, r"\['strain'\]: 1e\+39 at frame 1, triangle 23, must be"),
+    ],
+)
+def test_bad_primvars_are_refused(tmp_path, primvars, message):
+    declared = {"turn": "vertex", "strain": "uniform"}
+    writer = AnimationWriter(tmp_path / "a.usda", Mesh.grid(5, 4), 24, primvars=declared)
+    writer.append(GOOD, GOOD, measures(Mesh.grid(5, 4), 0, declared))
+    with pytest.raises(ValueError, match=message):
+        writer.append(GOOD, GOOD, primvars)
 
 
 def test_unanimated_prims_have_no_frames(tmp_path):

@@ -1,6 +1,7 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
 from .arap import Arap
+from .deform import Deformation, deform
 from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
 from .rotation import kabsch, polar, svd
@@ -14,6 +15,7 @@ __all__ = [
     "Animation",
     "Arap",
     "Attachment",
+    "Deformation",
     "DihedralBending",
     "Equilibrium",
     "Explicit",
@@ -23,6 +25,7 @@ __all__ = [
     "QuadraticBending",
     "Scene",
     "Spring",
+    "deform",
     "equilibrium",
     "kabsch",
     "polar",

@@ -16,7 +16,7 @@ def shown(value):
 
 def number(name, value, above=None, least=None):
     """Checks that an option is a finite number."""
-    rule = f"above {above:g}" if above is not None else f"of {least:g} or more"
+    rule = "that is finite" if above is least is None else f"above {above:g}" if above is not None else f"of {least:g} or more"
     good = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     good = good and _is_finite(value)
     if not good or (above is not None and not value > above) or (least is not None and not value >= least):

@@ -84,7 +84,8 @@ class Scene:
         keep("gravity", array("gravity", self.gravity, (3,)))
         keep("positions", self.mesh.points if self.positions is None else array("positions", self.positions, (n, 3)))
         keep("velocities", np.zeros((n, 3)) if self.velocities is None else array("velocities", self.velocities, (n, 3)))
-        keep("pins", self._checked_pins(n))
+        keep("pins", checked_pins(self.pins, self.mesh))
+        refuse_far_pins(self.pins, self.positions)
         if (self.density is None) == (self.masses is None):
             raise ValueError("exactly one of density and masses must be given")
         if self.masses is None:
@@ -105,31 +106,6 @@ class Scene:
                 given = f"the class {term.__name__}" if isinstance(term, type) else shown(term)
                 raise ValueError(f"terms[{i}] is {given}; it must be an energy, such as Spring(stiffness=1e3)")
         return terms
-
-    def _checked_pins(self, n):
-        pins = self.pins if isinstance(self.pins, Pins) else Pins([] if self.pins is None else self.pins)
-        vertices = self.mesh.select(pins.vertices) if isinstance(pins.vertices, str) else pins.vertices
-        try:
-            vertices = np.asarray(vertices)
-        except ValueError:  # rows of different lengths
-            raise ValueError(f"pins.vertices is {shown(vertices)}; it must be a list of whole numbers") from None
-        vertices = vertices.astype(np.int32) if vertices.size == 0 else vertices
-        if vertices.ndim != 1 or vertices.dtype.kind not in "iu":
-            raise ValueError(
-                f"pins.vertices has shape {vertices.shape} and type {vertices.dtype}; it must be a list of whole numbers"
-            )
-        wrong = np.flatnonzero((vertices < 0) | (vertices >= n))
-        if len(wrong):
-            raise ValueError(f"pins.vertices[{wrong[0]}] is {vertices[wrong[0]]}; it must lie in 0 … {n - 1}")
-        if len(np.unique(vertices)) < len(vertices):
-            raise ValueError("pins.vertices names a vertex twice; each may stand once")
-        keyframes = pins.keyframes
-        if keyframes is not None:
-            count = max(len(keyframes), 1) if np.ndim(keyframes) == 3 else 1
-            keyframes = array("pins.keyframes", keyframes, (count, len(vertices), 3))
-        pins = Pins(vertices.astype(np.int32), keyframes)
-        refuse_far_pins(pins, self.positions)
-        return pins
 
     def _check_masses(self):
         masses = self.vertex_masses
@@ -157,6 +133,11 @@ class Scene:
         """Number of frames after the first."""
         return round(self.duration * self.fps)
 
+    @property
+    def up_axis(self):
+        """The axis that gravity is along, "Y" or "Z"; "Y" without gravity."""
+        return "Z" if abs(self.gravity[2]) > abs(self.gravity[1]) else "Y"
+
     def build(self, device="cpu", dtype="float32", copies=1, vary=None):
         """The scene on a device, see :class:`warpcloth.model.Model`."""
         from .model import Model
@@ -172,6 +153,35 @@ class Scene:
             f"  pins: {len(pins.vertices)}" + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
         ]
         return "\n".join(lines + [f"  {_described(term)}" for term in self.terms])
+
+
+def checked_pins(pins, mesh):
+    """`Pins` whose vertices are indices of a mesh, int32, from all that a scene takes as pins.
+
+    Raises:
+        ValueError: A vertex that the mesh has not, or twice; keyframes of a wrong shape or not finite.
+    """
+    pins, n = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins), len(mesh.points)
+    vertices = mesh.select(pins.vertices) if isinstance(pins.vertices, str) else pins.vertices
+    try:
+        vertices = np.asarray(vertices)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"pins.vertices is {shown(vertices)}; it must be a list of whole numbers") from None
+    vertices = vertices.astype(np.int32) if vertices.size == 0 else vertices
+    if vertices.ndim != 1 or vertices.dtype.kind not in "iu":
+        raise ValueError(
+            f"pins.vertices has shape {vertices.shape} and type {vertices.dtype}; it must be a list of whole numbers"
+        )
+    wrong = np.flatnonzero((vertices < 0) | (vertices >= n))
+    if len(wrong):
+        raise ValueError(f"pins.vertices[{wrong[0]}] is {vertices[wrong[0]]}; it must lie in 0 … {n - 1}")
+    if len(np.unique(vertices)) < len(vertices):
+        raise ValueError("pins.vertices names a vertex twice; each may stand once")
+    keyframes = pins.keyframes
+    if keyframes is not None:
+        count = max(len(keyframes), 1) if np.ndim(keyframes) == 3 else 1
+        keyframes = array("pins.keyframes", keyframes, (count, len(vertices), 3))
+    return Pins(vertices.astype(np.int32), keyframes)
 
 
 def refuse_far_pins(pins, positions, copy=""):

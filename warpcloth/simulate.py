@@ -245,9 +245,7 @@ class _File:
         stage, self.single_file = scene.stage, single_file
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
-            # The axis that gravity is along.
-            up = "Z" if abs(scene.gravity[2]) > abs(scene.gravity[1]) else "Y"
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins, up_axis=up)
+            self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis)
         else:
             self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim)
         self.append = self.writer.append

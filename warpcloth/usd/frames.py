@@ -3,13 +3,15 @@
 import os
 
 import numpy as np
-from pxr import UsdGeom
+from pxr import Sdf, UsdGeom
 
 from .stage import curve_vertices, find_prim, first_points, followed, local_to_metres, open_stage
 
+_VECTORS = ("points", "velocities")
+
 
 class FrameSequence:
-    """Sampled points or velocities of a prim, as an array that reads from the file what is asked for.
+    """Sampled points, velocities or numbers of a prim, as an array that reads from the file what is asked for.
 
     A frame is read when it is indexed, and nothing is kept, so memory stays flat however many frames there are.
     `np.asarray(sequence)` reads all of them. Once the file has been written again, by another run or the same, reading raises
@@ -17,7 +19,7 @@ class FrameSequence:
     deleted reading goes on for as long as USD holds it.
 
     Attributes:
-        shape: (frames, n, 3).
+        shape: (frames, n, 3); of a primvar (frames, n), or where it is uniform (frames, faces of the prim).
         dtype: float32.
         time_codes: Time code of each frame (frames,).
         times: Seconds since the first frame (frames,).
@@ -25,20 +27,21 @@ class FrameSequence:
 
     dtype = np.dtype(np.float32)
 
-    def __init__(self, path, prim=None, attribute="points"):
+    def __init__(self, path, prim=None, attribute="points", scale=1.0):
         """Opens the file.
 
         Args:
             path: A .usd, .usda, .usdc or .usdz file.
             prim: Path or name of the prim; see `read_stage_mesh`.
-            attribute: "points", in world space [m], or "velocities" [m/s].
+            attribute: "points", in world space [m], "velocities" [m/s], or a primvar of single numbers, "primvars:<name>".
+            scale: Factor on a primvar, for another unit than the file's.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is no stage, the prim cannot be told, or the attribute is not animated.
+            ValueError: It is no stage, the prim cannot be told, or the attribute is not animated or of another type.
         """
-        if attribute not in ("points", "velocities"):
-            raise ValueError(f'attribute = {attribute!r}: must be "points" or "velocities"')
+        if attribute not in _VECTORS and not str(attribute).startswith("primvars:"):
+            raise ValueError(f'attribute = {attribute!r}: must be "points", "velocities" or a primvar, "primvars:<name>"')
         path = followed(path)  # USD looks for the frames beside a link, and not beside the file that it stands for
         self._file = os.path.abspath(path)
         self._identity = _identity(self._file)  # before it is opened, so that no change is missed
@@ -46,25 +49,29 @@ class FrameSequence:
         found = find_prim(self._stage, path, prim)
         where = f"{path}, prim {found.GetPath()}"
         self._attribute = found.GetAttribute(attribute)
-        self.time_codes = np.array(self._attribute.GetTimeSamples())
+        self.time_codes = np.array(self._attribute.GetTimeSamples() if self._attribute else [])
         if not len(self.time_codes):
             raise ValueError(f"{where}: {attribute} have no time samples, the prim is not animated")
+        vectors = attribute in _VECTORS
+        if not vectors and self._attribute.GetTypeName() != Sdf.ValueTypeNames.FloatArray:
+            raise ValueError(f"{where}: {attribute} has type {self._attribute.GetTypeName()}, must be float[]")
         self.times = (self.time_codes - self.time_codes[0]) / self._stage.GetTimeCodesPerSecond()
         transform = local_to_metres(found, where)
-        self._linear = None if np.array_equal(transform[:3, :3], np.eye(3)) else transform[:3, :3]
+        self._linear = transform[:3, :3] if vectors and not np.array_equal(transform[:3, :3], np.eye(3)) else None
+        self._scale = 1.0 if vectors else scale
         self._offset = transform[3, :3] if attribute == "points" and transform[3, :3].any() else None
         count = len(self._attribute.Get(self.time_codes[0]))
         # Curves show a vertex several times where they meet; the first is read.
         self._points = None
-        if not found.IsA(UsdGeom.Mesh):
+        if not found.IsA(UsdGeom.Mesh) and (vectors or UsdGeom.Primvar(self._attribute).GetInterpolation() == "vertex"):
             self._points = first_points(curve_vertices(found, count))
             count = len(self._points)
-        self.shape = (len(self.time_codes), count, 3)
+        self.shape = (len(self.time_codes), count, 3)[: 3 if vectors else 2]
 
     @property
     def ndim(self):
-        """Three."""
-        return 3
+        """Three, of a primvar two."""
+        return len(self.shape)
 
     def __len__(self):
         return self.shape[0]
@@ -107,6 +114,8 @@ class FrameSequence:
             value = value.astype(np.float64) @ self._linear
         if self._offset is not None:
             value = value + self._offset
+        if self._scale != 1.0:
+            value = value * self._scale
         return value.astype(np.float32, copy=False)
 
 

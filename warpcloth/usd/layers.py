@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pxr import Ar, Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
@@ -18,6 +18,8 @@ SAMPLED = {
 }
 # Attributes of the artist's prim that would be used instead of ours, or beside ours with values of another motion.
 _BLOCKED = ("accelerations", "primvars:normals", "primvars:normals:indices")
+# Primvars that say something else already.
+_TAKEN = ("normals", "st", "displayColor", "displayOpacity", VERTEX_PRIMVAR)
 _COLOUR = (0.17, 0.35, 0.58)
 # Curves are drawn as tubes this thick, as a part of the mean edge length.
 _CURVE_WIDTH = 0.05
@@ -33,7 +35,8 @@ class Target:
         transform: (4, 4) from the prim's space to metres, as in `StageMesh`; None where they are the same.
         point_vertices: Vertex of each point of the prim, or None where they are the same.
         half_width: How far the shape reaches around its points, in the prim's units; curves have a width.
-        attributes: Names of the sampled attributes.
+        face_triangles: Number of triangles of each face of the prim (F,), or None where each has one.
+        primvars: Interpolation of each sampled primvar, "vertex" or "uniform", by name.
     """
 
     prim: str
@@ -41,22 +44,46 @@ class Target:
     transform: np.ndarray | None = None
     point_vertices: np.ndarray | None = None
     half_width: float = 0.0
+    face_triangles: np.ndarray | None = None
+    primvars: dict = field(default_factory=dict)
 
     @property
     def attributes(self):
-        """Names of the sampled attributes; curves are drawn as tubes, which need no normals."""
-        return [name for name in SAMPLED if name != "normals" or len(self.triangles)]
+        """Types of the sampled attributes by name; curves are drawn as tubes, which need no normals."""
+        own = {name: kind for name, kind in SAMPLED.items() if name != "normals" or len(self.triangles)}
+        return own | {f"primvars:{name}": Sdf.ValueTypeNames.FloatArray for name in self.primvars}
 
-    def samples(self, points, velocities):
+    def declare(self, layer, names):
+        """Makes sure that a layer has some of the sampled attributes, without giving them values."""
+        prim = layer.GetPrimAtPath(self.prim) or Sdf.CreatePrimInLayer(layer, self.prim)
+        for name in names:
+            if name not in prim.attributes:
+                Sdf.AttributeSpec(prim, name, self.attributes[name])
+            if name.startswith("primvars:"):
+                prim.attributes[name].SetInfo("interpolation", self.primvars[name.removeprefix("primvars:")])
+
+    def samples(self, points, velocities, primvars=None):
         """The attribute values of a frame.
 
         Args:
             points: (n, 3) [m], world space.
             velocities: (n, 3) [m/s].
+            primvars: Values by name, (n,) or, where uniform, one for each triangle (T,).
 
         Returns:
             dict: An array of pxr for each of `attributes`.
         """
+        own = self._vectors(points, velocities)
+        for name, value in (primvars or {}).items():
+            if self.primvars[name] == "vertex":
+                value = value if self.point_vertices is None else value[self.point_vertices]
+            elif self.face_triangles is not None:
+                starts = np.cumsum(self.face_triangles) - self.face_triangles
+                value = np.add.reduceat(value, starts) / self.face_triangles
+            own[f"primvars:{name}"] = Vt.FloatArray.FromNumpy(np.ascontiguousarray(value, dtype=np.float32))
+        return own
+
+    def _vectors(self, points, velocities):
         values = {"points": points, "velocities": velocities}
         if len(self.triangles):
             values["normals"] = vertex_normals(points, self.triangles)
@@ -78,6 +105,24 @@ class Target:
         # A column at a time: NumPy reduces a short last axis several times slower.
         low, high = [c.min() for c in points.T], [c.max() for c in points.T]
         return np.array([low, high], dtype=np.float32) + np.float32([[-self.half_width], [self.half_width]])
+
+
+def check_primvars(primvars, mesh):
+    """Refuses primvars, interpolation by name, that a mesh cannot have.
+
+    Raises:
+        ValueError: A name that is none or is taken, or an interpolation that is not "vertex" or, of triangles, "uniform".
+    """
+    for name, interpolation in primvars.items():
+        valid = isinstance(name, str) and Sdf.Path.IsValidNamespacedIdentifier(name) and not name.endswith(":indices")
+        if not valid or name.startswith("primvars:"):
+            raise ValueError(f"primvars: {name!r} must be a name such as rotationAngle, without primvars: before it")
+        if name in _TAKEN:
+            raise ValueError(f"primvars: {name!r} has a meaning already, must be none of {', '.join(_TAKEN)}")
+        allowed = ("vertex", "uniform") if len(mesh.triangles) else ("vertex",)
+        if interpolation not in allowed:
+            of = "" if len(mesh.triangles) else " of a mesh of edges"
+            raise ValueError(f"primvars[{name!r}] = {interpolation!r}: must be {' or '.join(map(repr, allowed))}{of}")
 
 
 def vertex_normals(points, triangles):
@@ -248,7 +293,7 @@ def _bind_material(stage, geometry):
     UsdShade.MaterialBindingAPI.Apply(geometry.GetPrim()).Bind(material)
 
 
-def over_layer(source, prim, mesh):
+def over_layer(source, prim, mesh, primvars):
     """A layer of opinions on the artist's prim, to be animated: it says how to read normals, and has no points.
 
     The artist's default points stay the rest shape; only where there are none (samples alone) ours are given.
@@ -257,6 +302,7 @@ def over_layer(source, prim, mesh):
         source: File of the stage.
         prim: Path or name of the prim, or None.
         mesh: The `Mesh` that is simulated.
+        primvars: Names of those that will be sampled; the artist's of the same name are blocked.
 
     Returns:
         The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, and real paths of all files of the
@@ -290,10 +336,12 @@ def over_layer(source, prim, mesh):
         Sdf.AttributeSpec(over, name, SAMPLED[name]).default = rest[name]
     if "normals" in defaults:
         over.attributes["normals"].SetInfo("interpolation", UsdGeom.Tokens.vertex)
-    for name in _BLOCKED:
+    sampled = [f"primvars:{name}" for name in primvars]
+    for name in (*_BLOCKED, *sampled, *(f"{name}:indices" for name in sampled)):
         attribute = artist.GetAttribute(name)
         if attribute and attribute.HasAuthoredValue():
-            Sdf.AttributeSpec(over, name, attribute.GetTypeName()).default = Sdf.ValueBlock()
+            kind = Sdf.ValueTypeNames.FloatArray if name in sampled else attribute.GetTypeName()
+            Sdf.AttributeSpec(over, name, kind).default = Sdf.ValueBlock()
     files = {os.path.realpath(used.realPath) for used in stage.GetUsedLayers() if used.realPath}
     return layer, target, root_metadata(stage), surroundings, files
 
@@ -304,12 +352,15 @@ def _artist_target(artist, surroundings):
     if artist.IsA(UsdGeom.Curves):
         widths = UsdGeom.Curves(artist).GetWidthsAttr().Get()
         half_width = float(np.max(widths)) / 2 if widths else 0.0
+    counts = UsdGeom.Mesh(artist).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()) if artist.IsA(UsdGeom.Mesh) else []
+    face_triangles = np.array(counts, dtype=np.int32) - 2
     return Target(
         surroundings.prim,
         surroundings.mesh.triangles,
         transform=None if identity else surroundings.transform,
         point_vertices=surroundings.point_vertices,
         half_width=half_width,
+        face_triangles=face_triangles if (face_triangles > 1).any() else None,
     )
 
 

@@ -4,12 +4,13 @@ import os
 import re
 import secrets
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pxr import Sdf, Usd, UsdUtils
 
-from .layers import SAMPLED, Target, flatten, over_layer, relative_path, scene_layer
+from .layers import check_primvars, flatten, over_layer, relative_path, scene_layer
 from .stage import METADATA_KEY, followed
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
@@ -39,6 +40,9 @@ class AnimationWriter:
     own space and units, and blocks accelerations and `primvars:normals`, which would be used instead. Time codes start
     at the source's own first one (at the same second, where fps differs from its time codes per second), or else at 0.
 
+    Numbers that go with the motion are float primvars, `primvars:<name>`, sampled as the points are. An artist's faces
+    with more corners than three have the mean over the triangles that they were cut into.
+
     Edge meshes become linear BasisCurves along paths of edges (a chain: one curve, its vertices in order); where curves
     meet each has a point for the vertex, and `primvars:warpcloth:vertex` says which vertex a point is.
 
@@ -47,7 +51,9 @@ class AnimationWriter:
         frames: Number of frames appended.
     """
 
-    def __init__(self, output, mesh, fps, source=None, prim=None, pins=None, up_axis="Y", chunk=10, metadata=None):
+    def __init__(
+        self, output, mesh, fps, source=None, prim=None, pins=None, up_axis="Y", chunk=10, metadata=None, primvars=None
+    ):
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
         Args:
@@ -61,6 +67,8 @@ class AnimationWriter:
             up_axis: "Y" or "Z"; a source has its own.
             chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
             metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers or texts.
+            primvars: Interpolation of each primvar that `append` will be given, by name: "vertex", a value for each
+                vertex, or "uniform", one for each triangle.
 
         Raises:
             FileNotFoundError: The output's folder or the source does not exist.
@@ -71,6 +79,8 @@ class AnimationWriter:
         if self._output.suffix != Path(output).suffix:
             raise ValueError(f"output = {output}: is a link to {self._output}, must end as that does")
         _check_options(fps, up_axis, chunk)
+        primvars = dict(primvars or {})
+        check_primvars(primvars, mesh)
         self._source = None if source is None else Path(os.path.abspath(source))
         start = 0.0
         if source is None:
@@ -81,14 +91,17 @@ class AnimationWriter:
         else:
             if pins:
                 raise ValueError("pins: a source has its own, and a layer over it writes none; leave them out")
-            self._rest, self._target, self._root_metadata, stage, files = over_layer(source, prim, mesh)
+            self._rest, self._target, self._root_metadata, stage, files = over_layer(source, prim, mesh, primvars)
             if os.path.realpath(self._output) in files:
                 raise ValueError(f"output = {output}: is a file of the source's stage, which must not be changed")
             if stage.start is not None:
                 start = stage.start * fps / stage.time_codes_per_second
+        self._target = replace(self._target, primvars=primvars)
+        # Clips have samples alone; a name, type and interpolation have to stand on the stage itself.
+        self._target.declare(self._rest, [f"primvars:{name}" for name in primvars])
         self._root_metadata["customLayerData"] = {METADATA_KEY: {**(metadata or {}), "prim": self._target.prim}}
         self._start, self._fps, self._chunk = start, float(fps), int(chunk)
-        self._count = len(mesh.points)
+        self._counts = {"vertex": len(mesh.points), "uniform": len(mesh.triangles)}
         self._folder = frames_folder(self._output)
         if self._folder.exists() and not self._folder.is_dir():
             raise ValueError(f"{self._folder}: is a file, must be free for the folder of frames")
@@ -111,22 +124,28 @@ class AnimationWriter:
             self._write_chunk()
             self._closed = True
 
-    def append(self, points, velocities):
+    def append(self, points, velocities, primvars=None):
         """Adds a frame; every `chunk` frames they are written.
 
         Args:
             points: (n, 3) [m], world space.
             velocities: (n, 3) [m/s].
+            primvars: Values by name of all primvars that were declared, (n,) or, where uniform, (T,).
 
         Raises:
-            ValueError: A wrong shape, or a value that is not finite as float32, with the frame and the vertex; the
-                writer is closed.
+            ValueError: Other primvars than declared, a wrong shape, or a value that is not finite as float32, with the
+                frame and the vertex or triangle; the writer is closed.
         """
         if self._closed:
             raise ValueError(f"{self._output}: is closed, no frame can be appended")
         points = self._checked("points", points)
         velocities = self._checked("velocities", velocities)
-        samples = self._target.samples(points, velocities)
+        declared, primvars = self._target.primvars, primvars or {}
+        if primvars.keys() != declared.keys():
+            names = ", ".join(map(repr, primvars)) or "none"
+            raise ValueError(f"primvars: {names} at frame {self.frames}, must be {', '.join(map(repr, declared)) or 'none'}")
+        primvars = {name: self._checked(f"primvars[{name!r}]", primvars[name], declared[name], ()) for name in declared}
+        samples = self._target.samples(points, velocities, primvars)
         self._pending.append((self._start + self.frames, samples))
         self.frames += 1
         if len(self._pending) >= self._chunk:
@@ -150,17 +169,17 @@ class AnimationWriter:
         if self._chunks and (single_file or self._output.suffix == ".usdz"):
             self._write_single_file()
 
-    def _checked(self, name, values):
+    def _checked(self, name, values, interpolation="vertex", components=(3,)):
         values = np.asarray(values)
-        if values.shape != (self._count, 3):
-            raise ValueError(f"{name}: shape {values.shape} at frame {self.frames}, must be {(self._count, 3)}")
+        shape = (self._counts[interpolation], *components)
+        if values.shape != shape:
+            raise ValueError(f"{name}: shape {values.shape} at frame {self.frames}, must be {shape}")
         with np.errstate(over="ignore"):
             finite = np.isfinite(values.astype(np.float32, copy=False))
         if not finite.all():
-            vertex = int(np.argmin(finite)) // 3
-            raise ValueError(
-                f"{name}: {values[vertex].tolist()} at frame {self.frames}, vertex {vertex}, must be finite in float32"
-            )
+            row = int(np.argmin(finite)) // (3 if components else 1)
+            where = f"frame {self.frames}, {'vertex' if interpolation == 'vertex' else 'triangle'} {row}"
+            raise ValueError(f"{name}: {values[row].tolist()} at {where}, must be finite in float32")
         return values
 
     def _write_chunk(self):
@@ -170,7 +189,7 @@ class AnimationWriter:
         if not self._chunks:
             self._start_run()
         layer = Sdf.Layer.CreateAnonymous(".usdc")
-        _declare(layer, self._target)
+        self._target.declare(layer, self._target.attributes)
         for time, values in self._pending:
             for name, value in values.items():
                 layer.SetTimeSample(f"{self._target.prim}.{name}", time, value)
@@ -188,7 +207,7 @@ class AnimationWriter:
         self._run.mkdir(parents=True, exist_ok=True)
         export(self._rest, self._run / "rest.usdc")
         manifest = Sdf.Layer.CreateAnonymous(".usda")
-        _declare(manifest, self._target)
+        self._target.declare(manifest, self._target.attributes)
         export(manifest, self._run / "manifest.usda")
 
     def _write_root(self):
@@ -230,7 +249,7 @@ class AnimationWriter:
     def _write_single_file(self):
         packed = self._output.suffix == ".usdz"
         flat = flatten(self._base_paths(), self._describe, None if packed else self._output.parent)
-        _declare(flat, self._target)
+        self._target.declare(flat, self._target.attributes)
         for name in self._target.attributes:
             flat.GetAttributeAtPath(f"{self._target.prim}.{name}").ClearInfo("timeSamples")
         single = self._run / f"{self._output.stem}.usdc"
@@ -285,14 +304,6 @@ def _check_options(fps, up_axis, chunk):
         raise ValueError(f'up_axis = {up_axis!r}: must be "Y" or "Z"')
     if int(chunk) != chunk or chunk < 1:
         raise ValueError(f"chunk = {chunk}: must be a whole number, at least 1")
-
-
-def _declare(layer, target: Target):
-    """Makes sure that a layer has the sampled attributes, without giving them values."""
-    prim = layer.GetPrimAtPath(target.prim) or Sdf.CreatePrimInLayer(layer, target.prim)
-    for name in target.attributes:
-        if name not in prim.attributes:
-            Sdf.AttributeSpec(prim, name, SAMPLED[name])
 
 
 def export(layer, path, unfinished_in=None):

@@ -1,0 +1,113 @@
+"""The command ``warpcloth``: runs scenes, lists them, says what is in one, and deforms meshes.
+
+Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
+saved), 2 wrong use (one line on stderr), 130 interrupted. Any other error ends with 2 and one line as well, for most come of
+what a scene file declares; with ``--debug`` the traceback stands above the line.
+"""
+
+import argparse
+import sys
+import traceback
+import warnings
+
+import numpy as np
+
+from . import deform, run
+from .terminal import Interrupted, say, show_warning
+
+
+def main(argv=None):
+    """Runs the command line.
+
+    Args:
+        argv: Arguments, or those of the process.
+
+    Returns:
+        int: The exit code.
+    """
+    with warnings.catch_warnings():
+        warnings.showwarning = show_warning
+        debug = False
+        try:
+            parser = _parser()
+            try:
+                arguments = parser.parse_args(argv)
+            except SystemExit as done:  # --help and --version
+                return done.code
+            if arguments.command is None:
+                parser.print_help(sys.stderr)
+                return 2
+            debug = arguments.debug
+            return arguments.command(arguments)
+        except Interrupted as interrupted:
+            return say(interrupted, 130)
+        except KeyboardInterrupt:
+            return say("interrupted; nothing was saved", 130)
+        except (Exception, SystemExit) as error:
+            if debug:
+                traceback.print_exc()
+            return say(_sentence(error, debug), 2)
+
+
+def _sentence(error, debug):
+    """What an error says; ours are sentences, others need their kind, and a hint at how to see more."""
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.strerror and error.filename else error
+    if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError):
+        return error
+    more = "" if debug else " (run again with --debug for the traceback)"
+    return type(error).__name__ + (f": {error}" if str(error) else "") + more
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message):
+        raise ValueError(f"{message}; see {self.prog} --help")
+
+
+def _parser():
+    from ..model import DTYPES
+    from ..solvers import SOLVERS
+
+    parser = _Parser(prog="warpcloth", description="Cloth simulation, written as USD.", allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"warpcloth {_version()}")
+    parser.set_defaults(command=None)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+
+    def add(name, command, text, **more):
+        form = argparse.RawDescriptionHelpFormatter
+        sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False, formatter_class=form, **more)
+        sub.set_defaults(command=command)
+        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        return sub
+
+    runs = add("run", run.run, "Run a scene and write its animation as USD.", epilog=run.EPILOG)
+    info = add("info", run.info, "Say what is in a scene, and what is built from it.", epilog=run.EPILOG)
+    deforms = add("deform", deform.deform, "Deform a mesh as rigidly as its handles allow.", epilog=deform.EPILOG)
+    deform.add_arguments(deforms)
+    for sub in (runs, info):
+        sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
+        sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
+        sub.add_argument("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
+        sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    runs.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not the scene's")
+    for sub in (runs, info, deforms):
+        sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+        sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub is deforms else "float32")
+        sub.add_argument("--json", action="store_true", help="print one JSON object")
+    for sub in (runs, deforms):
+        sub.add_argument("-o", "--output", required=True, metavar="FILE", help="the .usd, .usda, .usdc or .usdz file to write")
+        sub.add_argument("--single-file", action="store_true", help="one file in the end, with no folder of frames beside it")
+    scenes = add("scenes", run.scenes, "List scenes and their parameters.")
+    scenes.add_argument("folder", nargs="?", help="a folder of .py files, if not the ones whose scenes are known by name")
+    return parser
+
+
+def _version():
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("warpcloth")
+    except PackageNotFoundError:
+        return "(a checkout that is not installed)"

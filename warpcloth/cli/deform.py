@@ -1,0 +1,243 @@
+"""The command ``deform``: a mesh whose handles the command line moves, or a scene whose pins are moved already."""
+
+import argparse
+import math
+import re
+import statistics
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .. import scene_files
+from ..checks import whole
+from .run import named_scene
+from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place
+
+_FRAMES, _FPS = 24, 24.0
+
+EPILOG = """\
+--fix holds vertices where they are. --move takes others along, as the --rotate and --translate after it say, up to the next
+--move: over the frames it turns them by DEGREES about AXIS through (CX, CY, CZ), where not given their centroid, and shifts
+them, both evenly from rest. So --rotate comes first, whichever stands first, and 720 degrees are two turns. AXIS is x, y, z or
+a vector such as 1,0,-1. A selection is a text such as "y < 0.1 and not boundary" or "nearest(0, 1.5, 0, 40)".
+
+  warpcloth deform bunny.usd --fix "y < 0.2" --move "y > 1.3" --rotate 60 x --translate 0 0 0.3 -o out.usdc
+"""
+
+
+@dataclass
+class _Move:
+    """One --move: ``turn`` is degrees, axis (3,) and centre (3,) or None; ``shift`` is (3,) [m]."""
+
+    selection: str
+    turn: tuple | None = None
+    shift: np.ndarray | None = None
+
+
+def add_arguments(parser):
+    """Adds what the command takes but for what all commands do."""
+    # argparse would take "-1e-3" and "-1,0,0" for options, before Python 3.14.
+    parser._negative_number_matcher = re.compile(r"-\.?\d")
+    text = "a mesh file, a USD stage, or a scene whose pins move: a .py file or a known name"
+    parser.add_argument("mesh", metavar="MESH", help=text)
+    hold = "vertices that stay; may be repeated"
+    parser.add_argument("--fix", action="append", default=[], metavar="SELECTION", help=hold)
+    take = "vertices that move as what follows says; may be repeated"
+    parser.add_argument("--move", action=_AddMove, dest="moves", default=[], metavar="SELECTION", help=take)
+    turn = "of the --move before it: DEGREES AXIS [CX CY CZ]"
+    parser.add_argument("--rotate", action=_AddRotation, dest="moves", nargs="+", metavar=("DEGREES", "AXIS"), help=turn)
+    shift = "of the --move before it [m]"
+    parser.add_argument("--translate", action=_AddTranslation, dest="moves", nargs=3, metavar=("X", "Y", "Z"), help=shift)
+    parser.add_argument("--frames", type=int, metavar="N", help=f"frames after the first: {_FRAMES}, or the scene's keyframes")
+    parser.add_argument("--fps", type=float, help=f"frames per second: the stage's or scene's, or {_FPS:g}")
+    parser.add_argument("--prim", help="path or name of the prim, or geometry, of a file with several")
+    parser.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    parser.add_argument("--weights", choices=("cotangent", "intrinsic", "uniform", "clamped"), default="cotangent")
+    parser.add_argument("--energy", choices=("spokes", "spokes_and_rims"), default="spokes")
+    parser.add_argument("--iterations", type=int, default=500, metavar="N", help="most of a frame, 500 where not given")
+    parser.add_argument("--tolerance", type=float, default=1e-6, help="at which a frame has converged, 1e-6 where not given")
+
+
+class _AddMove(argparse.Action):
+    def __call__(self, parser, namespace, values, option_string=None):
+        namespace.moves = [*namespace.moves, _Move(values)]
+
+
+class _AddRotation(argparse.Action):
+    def __call__(self, parser, namespace, values, option_string=None):
+        move = _last(namespace, option_string, "turn")
+        if len(values) not in (2, 5):
+            raise ValueError(f"--rotate {' '.join(values)}: it takes DEGREES AXIS, or DEGREES AXIS CX CY CZ")
+        unit = dict(zip("xyz", np.eye(3), strict=True)).get(values[1])
+        axis = _vector("the AXIS of --rotate", values[1].split(",")) if unit is None else unit
+        if len(axis) != 3 or not axis.any():
+            raise ValueError(f"the AXIS of --rotate is {values[1]!r}; it must be x, y, z or a vector such as 1,0,-1")
+        centre = _vector("the centre of --rotate", values[2:]) if len(values) == 5 else None
+        move.turn = (_number("DEGREES of --rotate", values[0]), axis / np.linalg.norm(axis), centre)
+
+
+class _AddTranslation(argparse.Action):
+    def __call__(self, parser, namespace, values, option_string=None):
+        _last(namespace, option_string, "shift").shift = _vector("--translate", values)
+
+
+def _last(namespace, option, field):
+    """The move that an option belongs to."""
+    if not namespace.moves:
+        raise ValueError(f"{option} stands before any --move; it says how the --move before it goes")
+    move = namespace.moves[-1]
+    if getattr(move, field) is not None:
+        raise ValueError(f"--move {move.selection!r} has {option} twice; each may follow it once")
+    return move
+
+
+def _number(name, text):
+    value = scene_files.convert(name, text, (float,))
+    if not math.isfinite(value):
+        raise ValueError(f"{name} is {text!r}; it must be finite")
+    return value
+
+
+def _vector(name, texts):
+    return np.array([_number(name, text) for text in texts])
+
+
+def deform(arguments):
+    from ..deform import deform
+
+    name, values, given = _given(arguments)
+    frames = len(given["pins"].keyframes) - 1
+    check_writable(arguments.output)
+    device = find_device(arguments.device)
+    options = {option: getattr(arguments, option) for option in ("weights", "energy", "iterations", "tolerance", "dtype")}
+    progress = Progress(frames, first="factorising")
+    try:
+        found = deform(
+            **given, **options, device=device, output=arguments.output, single_file=arguments.single_file, progress=progress
+        )
+    except KeyboardInterrupt:
+        raise Interrupted(progress.interrupted(arguments.output)) from None
+    finally:
+        progress.close()
+    late = np.flatnonzero(~found.converged)
+    facts = {
+        "mesh": name,
+        "source": arguments.mesh,
+        "parameters": values,
+        "converged": not len(late),
+        "message": f"{len(late)} frames did not converge, the first is {late[0]}" if len(late) else "converged",
+        "vertices": len(given["mesh"].points),
+        "handles": len(given["pins"].vertices),
+        "frames": frames,
+        "seconds_per_frame": statistics.median(found.timings["frames"]),
+        "factorise_seconds": found.timings["factorise"],
+        "median_iterations": float(np.median(found.iterations)),
+        "most_iterations": int(found.iterations.max()),
+        # float32 has no π, and the nearest it has is larger.
+        "largest_angle": min(180.0, math.degrees(max(float(angles.max()) for angles in found.angles))),
+        "last_energy": float(found.energies[-1]),
+        **options,
+        "device": str(device),
+        "file": arguments.output,
+        "frames_folder": frames_folder_of(arguments),
+    }
+    print(as_json(facts) if arguments.json else _summary(facts))
+    return 0
+
+
+def _summary(facts):
+    return "\n".join(
+        [
+            f"{facts['mesh']}: {facts['message']}",
+            f"  frames        {facts['frames']}, {facts['seconds_per_frame']:.3g} s each (median)",
+            f"  handles       {facts['handles']} of {facts['vertices']} vertices",
+            f"  iterations    {facts['median_iterations']:g} a frame (median), at most {facts['most_iterations']}",
+            f"  largest angle {facts['largest_angle']:.4g}° from rest",
+            f"  energy        {facts['last_energy']:.4g} m² in the last frame",
+            f"  method        {facts['energy']}, {facts['weights']} weights, tolerance {facts['tolerance']:g}",
+            f"  device        {facts['device']}, {facts['dtype']}",
+            f"  file          {place(facts)}",
+        ]
+    )
+
+
+def _given(arguments):
+    """(name, values of a scene's parameters, arguments of `deform`) that the command line stands for."""
+    from ..scene import Pins
+
+    path = Path(arguments.mesh)
+    if arguments.frames is not None:
+        whole("frames", arguments.frames, least=1)
+    if path.suffix == ".py" or (path.name == arguments.mesh and not path.suffix):
+        _source, values, scene = named_scene(argparse.Namespace(scene=arguments.mesh, p=arguments.p))
+        _refuse(arguments, ("fix", "moves", "fps", "prim"), "is a scene, whose pins and keyframes are taken as they are")
+        keyframes = scene.pins.keyframes
+        if keyframes is None:
+            raise ValueError(
+                f"the pins of {scene.name} do not move; give a scene whose pins have keyframes, or a mesh and --move"
+            )
+        if arguments.frames is not None:  # pins are at rest after the last keyframe
+            keyframes = keyframes[np.minimum(np.arange(arguments.frames + 1), len(keyframes) - 1)]
+        pins = Pins(scene.pins.vertices, keyframes)
+        given = {"mesh": scene.mesh, "pins": pins, "fps": scene.fps, "stage": scene.stage, "up_axis": scene.up_axis}
+        return scene.name, values, given
+    _refuse(arguments, ("p",), "is a mesh and has no parameters")
+    if path.suffix.lower() in scene_files.STAGES:
+        from ..usd import read_stage_mesh
+
+        stage = read_stage_mesh(arguments.mesh, arguments.prim)
+        mesh, fps = stage.mesh, stage.fps or _FPS
+    else:
+        from ..mesh import Mesh
+
+        stage, mesh, fps = None, Mesh.load(arguments.mesh, arguments.prim), _FPS
+    pins = Pins(*_handles(mesh, arguments.fix, arguments.moves, arguments.frames or _FRAMES))
+    return path.name, {}, {"mesh": mesh, "pins": pins, "fps": fps if arguments.fps is None else arguments.fps, "stage": stage}
+
+
+def _refuse(arguments, names, why):
+    options = {"fix": "--fix", "moves": "--move", "fps": "--fps", "prim": "--prim", "p": "-p"}
+    for name in names:
+        if getattr(arguments, name) not in (None, []):
+            raise ValueError(f"{options[name]} is given, and {arguments.mesh} {why}; leave it out")
+
+
+def _handles(mesh, fixes, moves, frames):
+    """Vertices (p,) that are held or moved, and their places (frames + 1, p, 3)."""
+    if not moves:
+        raise ValueError("nothing moves; give --move SELECTION and after it --rotate or --translate")
+    for move in moves:
+        if move.turn is None and move.shift is None:
+            raise ValueError(f"--move {move.selection!r} does not say how; --rotate or --translate must follow it")
+    groups = [(f"--fix {text!r}", mesh.select(text), None) for text in fixes]
+    groups += [(f"--move {move.selection!r}", mesh.select(move.selection), move) for move in moves]
+    owners = np.full(len(mesh.points), -1)
+    time = np.linspace(0.0, 1.0, frames + 1)
+    places = np.tile(mesh.points, (frames + 1, 1, 1))
+    for number, (option, vertices, move) in enumerate(groups):
+        if not len(vertices):
+            low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in (mesh.points.min(0), mesh.points.max(0)))
+            raise ValueError(f"{option} names no vertex; the mesh reaches from ({low}) to ({high})")
+        if move is not None:
+            taken = vertices[owners[vertices] >= 0]
+            if len(taken):
+                other = groups[owners[taken[0]]][0]
+                raise ValueError(f"{option} and {other} both name vertex {taken[0]}; one alone may say where it goes")
+            places[:, vertices] = _path(move, mesh.points[vertices], time)
+        owners[vertices] = number
+    handles = np.flatnonzero(owners >= 0)
+    return handles, places[:, handles]
+
+
+def _path(move, points, time):
+    """Places (F, p, 3) of points that a move takes along, at times (F,) from 0 to 1."""
+    from scipy.spatial.transform import Rotation
+
+    path = np.tile(points, (len(time), 1, 1))
+    if move.turn is not None:
+        degrees, axis, centre = move.turn
+        centre = points.mean(axis=0) if centre is None else centre
+        rotations = Rotation.from_rotvec(np.radians(degrees) * time[:, None] * axis).as_matrix()
+        path = (path - centre) @ rotations.transpose(0, 2, 1) + centre
+    return path if move.shift is None else path + time[:, None, None] * move.shift

@@ -1,0 +1,245 @@
+"""The commands on scenes: ``run``, ``info`` and ``scenes``."""
+
+import math
+import statistics
+import sys
+import time
+from dataclasses import asdict, dataclass, replace
+
+from .. import scene_files
+from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place, say
+
+# A step that all solvers but the explicit ones take well; where no step is given the substeps come nearest to it.
+_STEPS_A_SECOND = 240
+_EXPLICIT_MARGIN = 1.1
+# More substeps a frame than this, and the implicit solver is worth a hint.
+_MANY_SUBSTEPS = 1000
+
+EPILOG = """\
+Where neither dt nor substeps is given: newton and pbd take the substeps that come nearest to 1/240 s; explicit the fewest
+that are 10 % below the limit about the rest shape and below the bound for motion (exact for springs; hinges count as at rest).
+"""
+
+
+def run(arguments):
+    from ..simulate import simulate
+
+    source, values, scene = named_scene(arguments)
+    frames = scene.frames if arguments.frames is None else arguments.frames
+    check_writable(arguments.output)
+    device = find_device(arguments.device)
+    setup = _setup(arguments, scene, device)
+    progress = Progress(frames, _hint(arguments, setup, scene))
+    try:
+        animation = simulate(
+            scene if setup.model is None else _Built(scene, setup.model),
+            setup.checked,
+            output=arguments.output,
+            device=device,
+            dtype=arguments.dtype,
+            frames=frames,
+            single_file=arguments.single_file,
+            progress=progress,
+        )
+    except KeyboardInterrupt:
+        raise Interrupted(progress.interrupted(arguments.output)) from None
+    finally:
+        progress.close()
+    status = animation.status
+    facts = {
+        "scene": scene.name,
+        "source": str(source.path),
+        "parameters": values,
+        "status": status.result.value,
+        "message": status.message,
+        "frames": status.frame,
+        "frames_asked": frames,
+        "seconds_per_frame": statistics.median(animation.timings["frames"]),
+        "compile_seconds": setup.seconds + animation.timings["compile"],
+        "worst_strain": animation.worst_strain,
+        "residual": status.residual,
+        **_solver_facts(arguments, setup, scene.fps),
+        "device": str(device),
+        "dtype": arguments.dtype,
+        "file": arguments.output,
+        "frames_folder": frames_folder_of(arguments),
+    }
+    print(as_json(facts) if arguments.json else _summary(facts))
+    if status.ok:
+        return 0
+    return say(f"{status.message}; the last good frame is {status.frame}, in {arguments.output}", 1)
+
+
+def _summary(facts):
+    return "\n".join(
+        [
+            f"{facts['scene']}: {facts['message']}",
+            f"  frames        {facts['frames']} of {facts['frames_asked']}, {facts['seconds_per_frame']:.3g} s each (median)",
+            f"  compiling     {facts['compile_seconds']:.3g} s",
+            f"  worst strain  {100.0 * facts['worst_strain']:.3g} %",
+            f"  residual      {facts['residual']:.2g}",
+            f"  solver        {_solver_line(facts)}",
+            f"  device        {facts['device']}, {facts['dtype']}",
+            f"  file          {place(facts)}",
+        ]
+    )
+
+
+def info(arguments):
+    _source, values, scene = named_scene(arguments)
+    device = find_device(arguments.device)
+    setup = _setup(arguments, scene, device, limits=True) if arguments.solver or arguments.s else _Setup()
+    model = setup.model or scene.build(device=device, dtype=arguments.dtype)
+    facts = {
+        "scene": {
+            "name": scene.name,
+            "parameters": values,
+            "vertices": len(scene.mesh.points),
+            "triangles": len(scene.mesh.triangles),
+            "edges": len(scene.mesh.edges),
+            "mass": float(scene.vertex_masses.sum()),
+            "gravity": scene.gravity.tolist(),
+            "duration": scene.duration,
+            "fps": scene.fps,
+            "frames": scene.frames,
+            "pins": len(scene.pins.vertices),
+        },
+        "solver": None,
+    }
+    if setup.solver:
+        setup.checked.bind(model)
+        facts["solver"] = _solver_facts(arguments, setup, scene.fps)
+        if setup.limits:
+            facts["solver"] |= dict(zip(("limit_about_rest", "limit_in_motion"), setup.limits, strict=True))
+    facts["model"] = model.report()
+    print(as_json(facts) if arguments.json else f"{scene}\n{_info_text(facts)}")
+    hint = setup.solver and _hint(arguments, setup, scene)
+    if hint:
+        print(hint, file=sys.stderr)
+    return 0
+
+
+def _info_text(facts):
+    model, solver = facts["model"], facts["solver"]
+    lines = ["parameters: " + (", ".join(f"{k}={v!r}" for k, v in facts["scene"]["parameters"].items()) or "none")]
+    lines.append(f"model on {model['device']}, {model['dtype']}: {model['bytes']:,} bytes")
+    lines += [f"  {term['term']}: {term['elements']} elements, {term['bytes']:,} bytes" for term in model["terms"]]
+    if solver:
+        lines.append(f"solver: {_solver_line(solver)}")
+        if "limit_about_rest" in solver:
+            fps = facts["scene"]["fps"]
+            for text, key in (("about the rest shape", "limit_about_rest"), ("in motion", "limit_in_motion")):
+                lines.append(f"  stable {text} below {solver[key]:.4g} s, from {_fewest(fps, solver[key])} substeps a frame")
+        lines.append("kernels: " + ", ".join(model["kernels"]))
+    return "\n".join(lines)
+
+
+def scenes(arguments):
+    folders = [arguments.folder] if arguments.folder else scene_files.folders()
+    for folder, scenes in [(folder, scene_files.list_scenes(folder)) for folder in folders]:
+        print(f"{folder}:")
+        for listed in scenes:
+            details = [listed.summary, ", ".join(listed.parameters), listed.meaning]
+            print(f"  {listed.name}")
+            print("".join(f"      {detail}\n" for detail in details if detail), end="")
+    if not folders:
+        print("no folder ./scenes, and none that came with the package; give a folder")
+    return 0
+
+
+def named_scene(arguments):
+    """(source, values of its parameters, scene) that the arguments name."""
+    source = scene_files.find_source(arguments.scene)
+    values = source.values(scene_files.assignments(arguments.p))
+    return source, values, source.scene(values)
+
+
+@dataclass
+class _Setup:
+    """A solver, and what had to be built to choose its step.
+
+    Attributes:
+        solver: With its options, as they are shown.
+        checked: The same to be run; it does not look for limits again that are known to be kept.
+        chosen: How its step was chosen, or None where it was given.
+        model: Of the scene, if it is built already.
+        limits: As ``step_limits`` gives them, if they were asked for.
+        seconds: What building and the limits took.
+    """
+
+    solver: object = None
+    checked: object = None
+    chosen: str | None = None
+    model: object = None
+    limits: tuple | None = None
+    seconds: float = 0.0
+
+
+class _Built:
+    """A scene whose model stands already."""
+
+    def __init__(self, scene, model):
+        self._scene, self._model = scene, model
+
+    def __getattr__(self, name):
+        return getattr(self._scene, name)
+
+    def build(self, **_):
+        """The model, whose device and precision are those of the whole command."""
+        return self._model
+
+
+def _setup(arguments, scene, device, limits=False):
+    """The solver that the arguments name; ``limits`` asks for those of explicit even where its step is given."""
+    from ..solvers import SOLVERS
+
+    arguments.solver = arguments.solver or "newton"
+    record = SOLVERS[arguments.solver]
+    given = scene_files.options(record, scene_files.assignments(arguments.s))
+    step_given = "dt" in given or "substeps" in given
+    solver = record(**given, **({} if step_given else {"substeps": 1}))  # a wrong option is said before anything is built
+    if arguments.solver != "explicit":
+        if step_given:
+            return _Setup(solver, solver)
+        solver = replace(solver, substeps=max(1, round(_STEPS_A_SECOND / scene.fps)))
+        return _Setup(solver, solver, "by default about 1/240 s")
+    if step_given and not limits:
+        return _Setup(solver, solver)
+    from ..solvers.explicit import step_limits
+
+    began = time.perf_counter()
+    model = scene.build(device=device, dtype=arguments.dtype)
+    rest, motion = step_limits(model)
+    setup = _Setup(solver, solver, None, model, (rest, motion), time.perf_counter() - began)
+    if not step_given:
+        setup.solver = replace(solver, substeps=_fewest(scene.fps, min(rest / _EXPLICIT_MARGIN, motion)))
+        setup.chosen = f"by default the fewest stable ones, limits {rest:.3g} and {motion:.3g} s"
+    setup.checked = setup.solver
+    if solver.scheme == "symplectic" and 1.0 / (scene.fps * setup.solver.per_frame(scene.fps)) < min(rest, motion):
+        setup.checked = replace(setup.solver, above_limit="allow")  # which leaves out a second search for the limits
+    return setup
+
+
+def _fewest(fps, limit):
+    """The fewest substeps a frame whose step is below ``limit``."""
+    return math.floor(1.0 / (fps * limit)) + 1
+
+
+def _hint(arguments, setup, scene):
+    """A line for those who may wait longer than they need, or None."""
+    substeps = setup.solver.per_frame(scene.fps)
+    if arguments.solver != "explicit" or substeps <= _MANY_SUBSTEPS:
+        return None
+    return f"warpcloth: hint: explicit takes {substeps:,} substeps a frame here; --solver newton may suit better"
+
+
+def _solver_facts(arguments, setup, fps):
+    step = 1.0 / (fps * setup.solver.per_frame(fps))
+    return {"solver": arguments.solver, "options": asdict(setup.solver), "step": step, "step_chosen": setup.chosen}
+
+
+def _solver_line(facts):
+    options = ", ".join(f"{name}={value}" for name, value in facts["options"].items() if value is not None)
+    return f"{facts['solver']}({options}), step 1/{1.0 / facts['step']:.6g} s" + (
+        f" ({facts['step_chosen']})" if facts["step_chosen"] else ""
+    )

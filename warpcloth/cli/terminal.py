@@ -1,0 +1,132 @@
+"""What the commands share: the device by its name, progress and results on a terminal, and where results go."""
+
+import json
+import math
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+
+class Interrupted(Exception):
+    """A run was interrupted; the message says what is saved."""
+
+
+def find_device(name):
+    """The Warp device of a name, with Warp's greeting left out."""
+    import warp as wp
+
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    _initialise_warp(wp)
+    devices = [device.alias for device in wp.get_devices()]
+    if name not in devices and not (name == "cuda" and len(devices) > 1):
+        raise ValueError(f"device is {name!r}; on this machine there are {', '.join(devices)}")
+    return wp.get_device(name)
+
+
+def _initialise_warp(wp):
+    """Initialises Warp without its native line about a missing CUDA driver, which is no news where only a CPU is asked for."""
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as said:
+        before = os.dup(2)
+        try:
+            os.dup2(said.fileno(), 2)
+            wp.init()
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
+            said.seek(0)
+            lines = said.read().decode(errors="replace").splitlines(keepends=True)
+    sys.stderr.write("".join(line for line in lines if "load the NVIDIA CUDA driver" not in line))
+
+
+def frames_folder_of(arguments):
+    """The folder that belongs to the output, or None where the output is one file."""
+    from ..usd.writer import frames_folder
+
+    output = Path(arguments.output)
+    return None if arguments.single_file or output.suffix == ".usdz" else str(frames_folder(output))
+
+
+def place(facts):
+    """Where the output is, in the words of a summary."""
+    if not facts["frames_folder"]:
+        return facts["file"]
+    folder, together = facts["frames_folder"], "(they belong together: move both, or make one file with --single-file)"
+    return f"{facts['file']}, with its frames in {folder}\n                {together}"
+
+
+def check_writable(output):
+    """Finds out before the first frame, and not after ten, that a folder cannot be written."""
+    folder = os.path.dirname(os.path.realpath(output))  # of a link the folder of the file that it stands for
+    try:
+        if os.path.isdir(folder):
+            tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise ValueError(f"output = {output}: the folder {folder} cannot be written ({error.strerror})") from None
+
+
+class Progress:
+    """Counts frames, and shows them on a terminal."""
+
+    def __init__(self, frames, hint=None, first="compiling"):
+        self.frame, self.frames, self.hint, self.bar = None, frames, hint, None
+        if sys.stderr.isatty():
+            from tqdm import tqdm
+
+            form = "{desc}{percentage:3.0f}%|{bar}| {n_fmt} of {total_fmt} frames{postfix}, {remaining} left"
+            # tqdm hides the bar on a terminal that does not know its size.
+            size = shutil.get_terminal_size()
+            shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
+            self.bar = tqdm(total=frames, desc=f"{first}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
+
+    def __call__(self, frame, frames):
+        self.frame = frame
+        if frame == 0 and self.hint:  # now that nothing was refused, and while it can still be followed
+            if self.bar is not None:
+                self.bar.clear()
+            print(self.hint, file=sys.stderr)
+        if self.bar is None:
+            return
+        if frame == 0:
+            self.bar.set_description("running", refresh=False)
+            self.bar.reset()
+        else:
+            elapsed = self.bar.format_dict["elapsed"]
+            self.bar.set_postfix_str(f"{elapsed / frame:.3g} s each", refresh=False)
+            self.bar.update()
+
+    def close(self):
+        if self.bar is not None:
+            self.bar.close()
+
+    def interrupted(self, output):
+        """What a run leaves that ends here."""
+        if self.frame is None:
+            return "interrupted before the first frame; nothing was saved"
+        return f"interrupted after frame {self.frame} of {self.frames}; frames 0 to {self.frame} are in {output}"
+
+
+def as_json(facts):
+    return json.dumps(_plain(facts), allow_nan=False)
+
+
+def _plain(value):
+    """``value`` with numbers that JSON does not have as texts: "inf", "nan"."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)
+
+
+def show_warning(message, category, filename, lineno, file=None, line=None):
+    print(f"warpcloth: warning: {message}", file=sys.stderr)
+
+
+def say(message, code):
+    print("warpcloth:", " ".join(str(message).split()), file=sys.stderr)
+    return code
