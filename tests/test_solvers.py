@@ -1,7 +1,9 @@
 """Solvers against closed forms: oscillators, free fall, momentum, limits of stability, convergence."""
 
+import gc
 import io
 import re
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -400,3 +402,17 @@ def test_a_host_call_inside_a_captured_segment_raises(device):
     at = wp.get_device(device)
     with pytest.raises(RuntimeError, match="cannot be part of a captured segment"):
         Segment(at, lambda: on_host(at, "reading a frame"))
+
+
+def test_a_segment_keeps_what_its_launches_read(device):
+    """A graph holds addresses only: on CUDA an array that nobody else refers to would be freed and its memory used again."""
+    at = wp.get_device(device)
+
+    def recorded():
+        source, target = wp.zeros(4, device=at), wp.zeros(4, device=at)
+        return Segment(at, lambda: wp.copy(target, source)), weakref.ref(source)
+
+    segment, source = recorded()
+    gc.collect()
+    assert source() is not None
+    segment()

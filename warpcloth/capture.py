@@ -61,6 +61,7 @@ class Segment:
 
     def __init__(self, device, record):
         self.device = device
+        self.record = record  # the graph has addresses only; what the function refers to must not be freed
         with wp.ScopedCapture(device=device) as capture:
             record()
         self.graph = capture.graph
