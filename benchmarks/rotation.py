@@ -37,13 +37,14 @@ def warp_svd3(A: wp.mat33d):  # noqa: F811 - Warp chooses by type
     return U, S, V
 
 
-def one(function, matrix):
+def one(function, matrix, block):
     """Kernel over matrices: R[i] = function(A[i])."""
+    load, store = decompose.access(matrix, block)
 
     @wp.kernel(module="unique", enable_backward=False)
     def rotate(A: wp.array(dtype=matrix), R: wp.array(dtype=matrix)):
         i = wp.tid()
-        R[i] = function(A[i])
+        store(R, i, function(load(A, i)))
 
     return rotate
 
@@ -51,7 +52,7 @@ def one(function, matrix):
 def accuracy(count, dtype):
     """Worst of each class, on the CPU: of the SVD reconstruction, orthogonality, determinant, rotation error times gap."""
     _, matrix, vector = TYPES[dtype]
-    single = one(rotation.nearest_rotation, matrix)
+    single = one(rotation.nearest_rotation, matrix, 1)
     print("| class | reconstruction | orthogonality | determinant | rotation of the SVD | nearest rotation | NaN |")
     print("|---|---|---|---|---|---|---|")
     for name in CLASSES:
@@ -101,11 +102,17 @@ def timings(count, device, dtype):
     size = wp.types.type_size_in_bytes(scalar)
     results = [wp.empty(count, dtype=kind, device=device) for kind in (matrix, vector, matrix)]
     plain = decompose.into_three(warp_svd3, matrix, (matrix, vector, matrix), 1)
-    single = one(rotation.nearest_rotation, matrix)
+    block = decompose.BLOCK if device.is_cuda else 1
+    threads = -(-count // block) * block
+    single = one(rotation.nearest_rotation, matrix, block)
     runs = [
         ("Warp's svd3", lambda A: wp.launch(plain, count, inputs=[A], outputs=results, device=device), 30 * size),
         ("svd", lambda A: decompose.launch(decompose.into_three, rotation.rotation_svd3, A, results), 30 * size),
-        ("nearest rotation", lambda A: wp.launch(single, count, inputs=[A], outputs=results[:1], device=device), 18 * size),
+        (
+            "nearest rotation",
+            lambda A: wp.launch(single, threads, inputs=[A], outputs=results[:1], device=device, block_dim=block),
+            18 * size,
+        ),
     ]
     copied = None
     if device.is_cuda:

@@ -14,6 +14,7 @@ from .kernels.assemble import types
 from .linear import constant_factor
 from .model import DTYPES
 from .operators import CHUNKS
+from .rotation import kabsch
 
 # Cotangents are numbers near 1, so that a weight below this is one of rounding.
 _ROUNDING = 1e-12
@@ -71,6 +72,7 @@ class Arap:
 
     Attributes:
         handles: (h,) int32, in the order in which :meth:`solve` takes their positions.
+        parts: Number of the part of the mesh that each vertex belongs to (n,): what hangs together by edges with a weight.
         laplacian: L (n, n), scipy CSR, with L_ij = −w_ij and rows that sum to 0.
         negative_edges: (k, 2) pairs of vertices with a negative weight. With "spokes" each of them adds a negative energy, so
             that even a rigid motion may not be a minimum, and there is a warning.
@@ -120,7 +122,7 @@ class Arap:
         adjacency = coo_matrix((w, pairs.T), shape=(n, n)).tocsr()
         adjacency = adjacency + adjacency.T
         self.laplacian = (diags(np.asarray(adjacency.sum(axis=1))[:, 0]) - adjacency).tocsr()
-        self._parts = self._connected(adjacency)
+        self.parts = self._connected(adjacency)
 
         # The free vertices come first, so that what the system solves for is a slice of every array.
         self._order = np.concatenate([np.delete(np.arange(n), self.handles), self.handles])
@@ -133,6 +135,8 @@ class Arap:
         # scales without rounding.
         self._unit = 2.0 ** np.ceil(np.log2(np.ptp(mesh.points, axis=0).max()))
         self._rest = (mesh.points - mesh.points[self.handles].mean(axis=0)) / self._unit
+        # The energy of edges that are all strained by 1.
+        self._size = 2.0 * float(np.abs(w) @ (np.diff(self._rest[pairs], axis=1)[:, 0] ** 2).sum(axis=1))
         # What rounding of coordinates of size 1 makes of the energy.
         self._rounding = 16.0 * np.finfo(self._numpy).eps ** 2 * np.abs(adjacency).sum()
 
@@ -141,9 +145,8 @@ class Arap:
         self._x_free = self._x.array[:f]
         self._start, self._b = Mirror(self._zeros(f, vec3)), self._zeros(f, vec3)
         self._rotations = Mirror(self._zeros(n, mat33))
-        self._part_rotations = Mirror(self._zeros(int(self._parts.max()) + 1, mat33))
         self._energy = Mirror(self._zeros(1, wp.float64))
-        self._fit_parts, self._local = self._record(mesh, pairs, w, rims)
+        self._local = self._record(mesh, pairs, w, rims)
 
     def solve(self, positions, iterations=100, tolerance=1e-6, initial=None):
         """Moves the handles and lets the rest follow. Reuses the factors and all arrays of earlier calls.
@@ -151,8 +154,8 @@ class Arap:
         Args:
             positions: Targets of the handles (h, 3) [m], in their order.
             iterations: The most iterations, each of one solve and one fit of rotations.
-            tolerance: It has converged when an iteration lowers the energy by no more than this share of it, or by what
-                rounding makes of it; 0 to make all iterations.
+            tolerance: It has converged when an iteration lowers the energy by no more than this share of it, or than edges
+                strained by this much have, or by what rounding makes of it; 0 to make all iterations.
             initial: Points to start from (n, 3) [m], where those of handles do not count. Default: the rest shape, each
                 part of the mesh moved rigidly to where its handles fit their targets best, so that a rigid motion of all
                 handles is followed exactly.
@@ -170,20 +173,20 @@ class Arap:
         with np.errstate(over="ignore", invalid="ignore"):  # the energy shows it
             held = (targets - origin) / self._unit
             if initial is None:
-                x = self._moved_rigidly(held)
+                x = self.carry(self._rest, self._rest[self.handles], held)
             else:
                 x = (_points("initial", initial, len(self._order), lambda i: f" of vertex {i}") - origin) / self._unit
-                x[self.handles] = held
+            x[self.handles] = held
             self._x.write(x[self._order])
             self._start.write(-(self._coupling @ held))
         energies = [self._fit(0)]
-        threshold = self._rounding * np.abs(x).max() ** 2 * self._unit**2
+        least = max(self._rounding * np.abs(x).max() ** 2, tolerance**2 * self._size) * self._unit**2
         converged = f == 0
         while f and len(energies) <= iterations and not converged:
             self._factor.solve(self._b, self._x_free)
             energies.append(self._fit(len(energies)))
             fall = energies[-2] - energies[-1]
-            converged = tolerance > 0.0 and fall <= max(tolerance * abs(energies[-1]), threshold)
+            converged = tolerance > 0.0 and fall <= max(tolerance * abs(energies[-1]), least)
         points = self._x.read()[self._place] * self._unit + origin
         points[self.handles] = targets
         rotations = self._rotations.read()[self._place].astype(np.float64)
@@ -203,22 +206,22 @@ class Arap:
             )
         return energy
 
-    def _moved_rigidly(self, held):
-        """The rest shape with each part moved to where its handles fit ``held`` best, but these there (n, 3)."""
-        x = self._rest.copy()
-        x[self.handles] = held
-        self._x.write(x[self._order])
-        self._fit_parts()
-        rotations = self._part_rotations.read().astype(np.float64)[self._parts]
-        rest, moved = (self._centroids(points)[self._parts] for points in (self._rest[self.handles], held))
-        x = np.einsum("nij,nj->ni", rotations, self._rest - rest) + moved
-        x[self.handles] = held
-        return x
+    def carry(self, points, before, after):
+        """Points moved along with the handles: each part of the mesh rigidly, as fits best how its handles went.
 
-    def _centroids(self, points):
-        """Of the handles of each part, at ``points`` (h, 3)."""
-        part = self._parts[self.handles]
-        return np.stack([np.bincount(part, axis) for axis in points.T], axis=1) / np.bincount(part)[:, None]
+        Args:
+            points: (n, 3) [m].
+            before: Where its handles were (h, 3) [m], in their order.
+            after: Where they went (h, 3) [m].
+
+        Returns:
+            np.ndarray: (n, 3) [m].
+        """
+        own = self.parts[self.handles]
+        sets = np.split(np.argsort(own, kind="stable"), np.cumsum(np.bincount(own))[:-1])
+        rotations = kabsch(before, after, neighbours=sets)
+        old, new = (np.stack([places[members].mean(axis=0) for members in sets]) for places in (before, after))
+        return np.einsum("nij,nj->ni", rotations[self.parts], points - old[self.parts]) + new[self.parts]
 
     def _connected(self, adjacency):
         """The part of the mesh that each vertex belongs to (n,), numbered from 0.
@@ -239,7 +242,7 @@ class Arap:
         return parts
 
     def _record(self, mesh, pairs, w, rims):
-        """The segments that fit the rotations of the parts, and those of the cells with energy and right-hand side."""
+        """The segment that fits the rotations of the cells and finds the energy and the right-hand side."""
         rest, place, n = self._rest, self._place, len(self._order)
         vec3, _ = types(self._scalar)
         if rims:
@@ -259,9 +262,6 @@ class Arap:
         rows = self._compressed(cell, member, moments, n)
         # Every edge is in 2 cells, or every side of a triangle in 3, so that the sum over cells is that often L x = b.
         columns = self._compressed(member, cell, moments / (3 if rims else 2), n)
-        part = self._parts[self.handles]
-        from_centroid = rest[self.handles] - self._centroids(rest[self.handles])[part]
-        part_rows = self._compressed(part, place[self.handles], from_centroid, self._parts.max() + 1)
 
         index = wp.types.vector(elements.shape[1], wp.int32)
         elements = wp.array(place[elements].astype(np.int32), dtype=index, device=self.device)
@@ -273,10 +273,6 @@ class Arap:
         def launch(kernel, dim, inputs, output):
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=[output], device=self.device)
 
-        def fit_parts():
-            parts = self._part_rotations.array
-            launch(cells.fit_rotations(self._scalar), len(parts), [*part_rows, x], parts)
-
         def fit_cells():
             launch(cells.fit_rotations(self._scalar), n, [*rows, x], rotations)
             launch(kernel(self._scalar), len(elements), [elements, weights, placed, rotations, x], energies)
@@ -285,7 +281,7 @@ class Arap:
             if len(self._b):
                 launch(cells.gather(self._scalar), len(self._b), [*columns, rotations, self._start.array], self._b)
 
-        return Segment(self.device, fit_parts), Segment(self.device, fit_cells)
+        return Segment(self.device, fit_cells)
 
     def _compressed(self, rows, columns, values, count):
         """(offsets, columns, values) on the device, sorted by row and column, of entries with vectors as values."""

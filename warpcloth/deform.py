@@ -57,7 +57,8 @@ def deform(
 ):
     """Deforms a mesh as rigidly as its moved handles allow (Sorkine & Alexa 2007).
 
-    Each solve starts from the frame before it, so that handles may turn as far as they like in steps of less than half a turn.
+    Each solve starts from the frame before it, carried along with the handles (:meth:`warpcloth.Arap.carry`): they may turn
+    as far as they like in steps of less than half a turn, and what they take along rigidly costs one iteration.
     A scene with moved pins is deformed by ``deform(scene.mesh, scene.pins, fps=scene.fps, stage=scene.stage)``; of the scene
     its keyframes count, and where it starts does not.
 
@@ -101,8 +102,9 @@ def deform(
     try:
         for frame, places in enumerate(pins.keyframes):
             start = time.perf_counter()
+            initial = None if points is None else arap.carry(points, pins.keyframes[frame - 1], places)
             try:
-                result = arap.solve(places, iterations=iterations, tolerance=tolerance, initial=points)
+                result = arap.solve(places, iterations=iterations, tolerance=tolerance, initial=initial)
             except ValueError as error:
                 raise ValueError(f"frame {frame}: {error}") from error
             velocities = np.zeros_like(result.points) if points is None else (result.points - points) * fps
