@@ -168,6 +168,15 @@ def separated_pair(A: Any):
 
 
 @wp.func
+def frame(n: Any, a: Any, b: Any, side: Any):
+    """The right-handed columns (n, a, b), or (a, b, n) where the value of n is the smallest."""
+    columns = wp.matrix_from_cols(n, a, b)
+    if side < type(side)(0.0):
+        columns = wp.matrix_from_cols(a, b, n)
+    return columns
+
+
+@wp.func
 def plane_rotation(c: Any, s: Any, size: Any, u1: Any, u2: Any, v1: Any, v2: Any):
     """Cosine and sine of the rotation in the plane, of (c, s) or else the least one of the frames."""
     least = type(c)(3.0) * epsilon(c) * size
@@ -223,18 +232,12 @@ def rotation_svd3(A: Any):
     cos, sin = half_angle(c * f + s * g, c * g - s * f, difference, epsilon(size) * epsilon(size) * size)
     x1 = c * u1 + s * u2
     x2 = c * u2 - s * u1
-    va = cos * v1 + sin * v2
-    vb = cos * v2 - sin * v1
-    ua = cos * x1 + sin * x2
-    ub = cos * x2 - sin * x1
+    U = frame(u, cos * x1 + sin * x2, cos * x2 - sin * x1, side)
+    V = frame(v, cos * v1 + sin * v2, cos * v2 - sin * v1, side)
     high = half * (total + difference)
     low = half * (total - difference)
-    U = wp.matrix_from_cols(u, ua, ub)
-    V = wp.matrix_from_cols(v, va, vb)
     S = descending(size, high, low)
     if side < A.dtype(0.0):
-        U = wp.matrix_from_cols(ua, ub, u)
-        V = wp.matrix_from_cols(va, vb, v)
         S = descending(high, low, wp.dot(u, B * v))
     return U, scale * S, V
 
@@ -274,17 +277,12 @@ def eigh3(C: Any):
     g = C.dtype(2.0) * wp.dot(v1, w2)
     difference = wp.sqrt(f * f + g * g)
     cos, sin = half_angle(f, g, difference, epsilon(one) * epsilon(one))
-    va = cos * v1 + sin * v2
-    vb = cos * v2 - sin * v1
+    V = frame(v, cos * v1 + sin * v2, cos * v2 - sin * v1, side)
     high = half * (a + b + difference)
     low = half * (a + b - difference)
-    separated = wp.dot(v, B * v)
-    V = wp.matrix_from_cols(v, va, vb)
-    w = wp.vector(wp.max(separated, high), wp.max(wp.min(separated, high), low), wp.min(wp.min(separated, high), low))
-    if side < C.dtype(0.0):
-        V = wp.matrix_from_cols(va, vb, v)
-        w = wp.vector(wp.max(high, separated), wp.max(low, wp.min(high, separated)), wp.min(low, separated))
-    return scale * w, V
+    # Largest or smallest, but for rounding.
+    x = wp.dot(v, B * v)
+    return scale * wp.vector(wp.max(x, high), wp.max(wp.min(x, high), low), wp.min(x, low)), V
 
 
 @wp.func
