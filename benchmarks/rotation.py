@@ -50,21 +50,28 @@ def one(function, matrix, block):
 
 
 def accuracy(count, dtype):
-    """Worst of each class, on the CPU: of the SVD reconstruction, orthogonality, determinant, rotation error times gap."""
+    """Worst of each class, on the CPU: reconstruction, orthogonality, determinant, rotation error times gap; Warp's svd3 beside."""
     _, matrix, vector = TYPES[dtype]
     single = one(rotation.nearest_rotation, matrix, 1)
-    print("| class | reconstruction | orthogonality | determinant | rotation of the SVD | nearest rotation | NaN |")
-    print("|---|---|---|---|---|---|---|")
+    theirs = decompose.into_three(warp_svd3, matrix, (matrix, vector, matrix), 1)
+    heads = (
+        "reconstruction | orthogonality | determinant | rotation of the SVD | nearest rotation | NaN | reconstruction by svd3"
+    )
+    print(f"| class | {heads} |")
+    print("|---|---|---|---|---|---|---|---|")
     for name in CLASSES:
         rng = np.random.default_rng(0)
-        worst, nans = np.zeros(5), 0
+        worst, nans = np.zeros(6), 0
         for start in range(0, count, CHUNK):
             A = samples(name, rng, min(CHUNK, count - start), np.dtype(dtype))
             given = wp.array(A, dtype=matrix, device="cpu")
             U, S, V, R = (wp.empty(len(A), dtype=kind, device="cpu") for kind in (matrix, vector, matrix, matrix))
             decompose.launch(decompose.into_three, rotation.rotation_svd3, given, [U, S, V])
             wp.launch(single, len(A), inputs=[given], outputs=[R], device="cpu")
-            U, S, V, R = (array.numpy() for array in (U, S, V, R))
+            U, S, V, R = (array.numpy().copy() for array in (U, S, V, R))
+            other = [wp.empty(len(A), dtype=kind, device="cpu") for kind in (matrix, vector, matrix)]
+            wp.launch(theirs, len(A), inputs=[given], outputs=other, device="cpu")
+            X, x, Y = (array.numpy() for array in other)
             Q, signed = reference(A)
             gap = np.maximum(signed[:, 1] + signed[:, 2], 0.0) / np.where(signed[:, 0] > 0, signed[:, 0], 1)
             found = [
@@ -73,10 +80,12 @@ def accuracy(count, dtype):
                 max(determinant(X, 1) for X in (U, V, R)),
                 (angle(U.astype(np.float64) @ V.mT, Q) * gap).max(),
                 (angle(R, Q) * gap).max(),
+                reconstruction(A, times(X, x), Y.mT),
             ]
             worst = np.maximum(worst, found)
             nans += sum(int(np.isnan(X).sum()) for X in (U, S, V, R))
-        print(f"| {name} | " + " | ".join(f"{value:.1e}" for value in worst) + f" | {nans} |", flush=True)
+        *ours, other = (f"{value:.1e}" for value in worst)
+        print(f"| {name} | {' | '.join(ours)} | {nans} | {other} |", flush=True)
 
 
 def milliseconds(device, launch):
