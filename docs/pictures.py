@@ -13,13 +13,14 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import ListedColormap, Normalize
 
 import warpcloth as wc
-from warpcloth.scenes import cantilever, hanging
+from warpcloth.scenes import bar_twist, bunny, cantilever, hanging
 
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent / "tests"))
 import elastica  # noqa: E402 it stands among the tests
 
 GREY = "0.35"
+COLOURS = ListedColormap(plt.get_cmap("viridis")(np.linspace(0.25, 1.0, 256)))
 
 
 def save(figure, name):
@@ -53,39 +54,45 @@ def brightness(corners):
     return 0.7 + 0.3 * np.clip(normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
 
 
+def draw(axes, mesh, seen, values, colours):
+    """The triangles of a mesh from the back to the front, coloured by values from 0 to 1 (T,)."""
+    corners = seen[mesh.triangles]
+    order = np.argsort(corners[..., 2].mean(axis=1))
+    faces = colours(np.clip(values, 0.0, 1.0))
+    faces[:, :3] *= brightness(corners)[:, None]
+    # Edges in the colour of their triangle close the hairlines between neighbours.
+    axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=faces[order], edgecolors=faces[order], linewidths=0.4))
+
+
+def finish(figure, axes, colours, most, label, extend):
+    """Equal scales, no axes, and a bar of the colours from 0 to ``most``."""
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.axis("off")
+    scale = ScalarMappable(Normalize(0.0, most), colours)
+    bar = figure.colorbar(scale, ax=axes, shrink=0.6, aspect=14, pad=0.01, extend=extend, ticks=[0.0, most / 2, most])
+    bar.set_label(label, color=GREY, fontsize=8)
+    bar.ax.tick_params(labelsize=8, colors=GREY)
+    bar.outline.set_visible(False)
+
+
 def picture_hanging(moments=(0.0, 0.25, 0.4, 0.5, 0.75, 1.0, 1.25), worst=0.0015):
     """The hanging cloth side by side at some moments [s], coloured by strain up to ``worst``."""
     scene = hanging.scene(n=64, duration=1.25)
     animation = wc.simulate(scene, wc.Newton(dt=1 / 240))
     assert animation.status.ok, animation.status
     figure, axes = plt.subplots(figsize=(11.0, 2.6))
-    colours = ListedColormap(plt.get_cmap("viridis")(np.linspace(0.25, 1.0, 256)))
     left = 0.0
     for time in moments:
         points = np.asarray(animation.points[round(time * scene.fps)], dtype=float)
         seen = project(points)
         seen[:, 0] += left - seen[:, 0].min()
-        corners = seen[scene.mesh.triangles]
-        order = np.argsort(corners[..., 2].mean(axis=1))
-        faces = colours(np.clip(strain(scene.mesh, points) / worst, 0.0, 1.0))
-        faces[:, :3] *= brightness(corners)[:, None]
-        # Edges in the colour of their triangle close the hairlines between neighbours.
-        cloth = PolyCollection(corners[order, :, :2], facecolors=faces[order], edgecolors=faces[order], linewidths=0.4)
-        axes.add_collection(cloth)
+        draw(axes, scene.mesh, seen, strain(scene.mesh, points) / worst, COLOURS)
         axes.plot(*seen[scene.pins.vertices, :2].T, "o", color="black", markersize=3.5)
         right = seen[:, 0].max()
         axes.text((left + right) / 2, 0.47, f"{time:g} s", ha="center", color=GREY)
         left = right + 0.15
-    axes.set_aspect("equal")
-    axes.autoscale_view()
-    axes.axis("off")
-    scale = ScalarMappable(Normalize(0.0, 100.0 * worst), colours)
-    bar = figure.colorbar(
-        scale, ax=axes, shrink=0.6, aspect=14, pad=0.01, extend="both", ticks=[0.0, 50.0 * worst, 100.0 * worst]
-    )
-    bar.set_label("strain [%]", color=GREY, fontsize=8)
-    bar.ax.tick_params(labelsize=8, colors=GREY)
-    bar.outline.set_visible(False)
+    finish(figure, axes, COLOURS, 100.0 * worst, "strain [%]", "both")
     save(figure, "hanging.png")
 
 
@@ -115,6 +122,29 @@ def picture_cantilever(gammas=(1.0, 5.0, 20.0), elements=40):
     save(figure, "cantilever.png")
 
 
+def picture_deformation(frames=(0, 16, 32, 48), most=150.0):
+    """Frames of bar_twist below each other and of bunny beside them, coloured by the angle of rotation up to ``most`` [°]."""
+    figure, axes = plt.subplots(figsize=(11.0, 3.4))
+    left = 0.0
+    for scene, azimuth, gap in ((bar_twist.scene(), -30.0, 0.05), (bunny.scene(), 25.0, 0.1)):
+        found = wc.deform(scene.mesh, scene.pins, fps=scene.fps, energy="spokes_and_rims")
+        assert found.converged.all()
+        size = np.ptp(scene.mesh.points[:, 1]) * (3.2 if scene.name == "bar_twist" else 0.5)
+        down = 0.0
+        for frame in frames if scene.name == "bar_twist" else frames[::3]:
+            seen = project(found.points[frame] / size, azimuth, 18.0)
+            seen[:, :2] += [left - seen[:, 0].min(), down - seen[:, 1].max()]
+            draw(axes, scene.mesh, seen, np.degrees(found.angles[frame])[scene.mesh.triangles].mean(axis=1) / most, COLOURS)
+            if scene.name == "bar_twist":
+                down = seen[:, 1].min() - gap
+            else:
+                left = seen[:, 0].max() + gap
+        left = max(left, seen[:, 0].max() + 0.3)
+    finish(figure, axes, COLOURS, most, "rotation [°]", "neither")
+    save(figure, "deformation.png")
+
+
 if __name__ == "__main__":
     picture_hanging()
+    picture_deformation()
     picture_cantilever()
