@@ -50,7 +50,7 @@ def one(function, matrix, block):
 
 
 def accuracy(count, dtype):
-    """Worst of each class, on the CPU: reconstruction, orthogonality, determinant, rotation error times gap; Warp's svd3 beside."""
+    """Worst of each class, on the CPU: reconstruction, orthogonality, determinant, rotation error times gap; svd3 beside."""
     _, matrix, vector = TYPES[dtype]
     single = one(rotation.nearest_rotation, matrix, 1)
     theirs = decompose.into_three(warp_svd3, matrix, (matrix, vector, matrix), 1)

@@ -1,4 +1,4 @@
-"""A bar with a closed surface, held at one end, whose other end is turned about its axis by keyframes; it buckles near 170°."""
+"""A bar with a closed surface, held at one end, whose other end is turned about its axis by keyframes."""
 
 import numpy as np
 

@@ -5,6 +5,7 @@ import os
 
 import numpy as np
 import pytest
+import trimesh
 import warp.examples
 from pxr import Gf, Usd, UsdGeom
 from test_cli import refused, run
@@ -169,7 +170,17 @@ WRONG_USES = [
     (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --translate 0 0 1", "--move 'x>0.9' has --translate twice; each may follow it once"),
     ("{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90", "--rotate 90: it takes DEGREES AXIS, or DEGREES AXIS CX CY CZ"),
     ("{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90 x 1 2", "--rotate 90 x 1 2: it takes DEGREES AXIS, or"),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90 w", "the AXIS of --rotate is 'w'; it must be a number"),
+    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90 w", "the AXIS of --rotate is 'w'; it must be x, y, z or a vector"),
+    (
+        "{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 720 x --frames 4",
+        "turns by 180° a frame, which must be less than 180°; give --frames 5",
+    ),
+    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 1e39 0 0", "cannot be written: a file holds float32"),
+    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 1 0 0 --fps 1e300", "velocities of pins.keyframes[0, "),
+    (
+        "{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 1 0 0 --tolerance -1",
+        "tolerance is -1.0; it must be a number of 0 or more",
+    ),
     (
         "{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90 0,0,0",
         "AXIS of --rotate is '0,0,0'; it must be x, y, z or a vector such",
@@ -297,10 +308,79 @@ def test_a_scene_is_deformed_by_its_keyframes(tmp_path, capfd, frames):
     np.testing.assert_allclose(points[-1][ends], keyframes[min(frames, 6)], atol=4 * EPS)
 
 
-def test_frames_beyond_float32_end_it_with_what_was_good(folder, tmp_path, capfd):
-    argv = ["--move", "x>0.9", "--translate", "1e39", 0, 0, "--fix", "x<0.1", "--frames", 1, "-o", tmp_path / "out.usdc"]
-    refused(capfd, ["deform", folder / "bar.obj", *argv], " at frame 1, vertex ")
-    assert len(FrameSequence(tmp_path / "out.usdc")) == 1
+def test_a_refused_command_leaves_an_earlier_result(folder, tmp_path, capfd):
+    argv = [
+        "deform",
+        folder / "bar.obj",
+        "--fix",
+        "x<0.1",
+        "--move",
+        "x>0.9",
+        "--translate",
+        "0.1",
+        0,
+        0,
+        "-o",
+        tmp_path / "out.usdc",
+    ]
+    assert run(capfd, *argv)[0] == 0
+    refused(capfd, [*argv, "--fps", "1e300"], "cannot be written")
+    assert len(FrameSequence(tmp_path / "out.usdc")) == 25
+
+
+@pytest.mark.parametrize("axis", ["0,0,2", "0,0,1e200", "0,0,1e-200"])
+def test_the_length_of_an_axis_does_not_matter(axis, folder, tmp_path, capfd):
+    common = [
+        "deform",
+        folder / "bar.obj",
+        "--fix",
+        "x<0.1",
+        "--move",
+        "x>0.9",
+        "--frames",
+        3,
+        "--energy",
+        "spokes_and_rims",
+        "--json",
+    ]
+    code, out, err = run(capfd, *common, "--rotate", 90, axis, "-o", tmp_path / "one.usdc")
+    assert (code, err) == (0, "") and json.loads(out)["energy"] == "spokes_and_rims"
+    run(capfd, *common, "--rotate", 90, "z", "-o", tmp_path / "other.usdc")
+    one, other = (np.asarray(FrameSequence(tmp_path / f"{name}.usdc")) for name in ("one", "other"))
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-6)
+
+
+def test_a_stage_keeps_its_times(tmp_path, capfd):
+    """25 frames a second from 1001 on, and a scene from a stage is a layer over it."""
+    stage = Usd.Stage.Open(BUNNY)
+    stage.SetTimeCodesPerSecond(25)
+    stage.SetFramesPerSecond(25)
+    stage.SetStartTimeCode(1001)
+    stage.SetEndTimeCode(1002)
+    stage.Export(str(tmp_path / "bunny.usda"))
+    argv = ["--fix", "y<0.1", "--move", "y>1.2", "--translate", 0, 0.1, 0, "--frames", 2, "--iterations", 3]
+    assert run(capfd, "deform", tmp_path / "bunny.usda", *argv, "-o", tmp_path / "out.usdc")[0] == 0
+    result = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    assert (result.GetStartTimeCode(), result.GetEndTimeCode(), result.GetFramesPerSecond()) == (1001, 1003, 25)
+    assert run(capfd, "deform", "bunny", "--frames", 2, "--iterations", 3, "-o", tmp_path / "scene.usdc")[0] == 0
+    layered = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    used = {os.path.basename(layer.realPath) for layer in layered.GetUsedLayers()}
+    assert "bunny.usd" in used
+
+
+def test_single_file_and_times(tmp_path):
+    mesh, pins = bar()
+    found = wc.deform(mesh, pins, fps=10.0, output=str(tmp_path / "one.usdc"), single_file=True)
+    assert os.listdir(tmp_path) == ["one.usdc"]
+    np.testing.assert_allclose(found.times, np.arange(6) / 10.0)
+    np.testing.assert_allclose(found.largest_angles, np.asarray(found.angles).max(axis=1), rtol=1e-6)
+    assert (np.diff(found.energies) > 0.0).all()  # more and more twisted
+
+
+def test_the_bar_is_closed():
+    mesh = bar_twist.scene().mesh
+    solid = trimesh.Trimesh(mesh.points, mesh.triangles, process=False)
+    assert solid.is_watertight and solid.is_winding_consistent and solid.volume == pytest.approx(0.04)
 
 
 def test_an_interrupted_deformation_keeps_its_frames(folder, tmp_path, capfd, monkeypatch):

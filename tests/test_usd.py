@@ -213,11 +213,12 @@ def test_primvars_come_back(result):
 
 
 def test_primvars_over_polygons_and_over_others_of_their_name(tmp_path):
-    """A face has the mean of its triangles; what the artist has under the same name, of any type, is not seen."""
+    """A face has the mean of its triangles; what the artist has under the same name is not seen, its indices and sizes too."""
     stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
-    old = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("strain", Sdf.ValueTypeNames.Color3fArray, "faceVarying")
-    old.Set([Gf.Vec3f(1)])
+    old = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("strain", Sdf.ValueTypeNames.FloatArray, "faceVarying", 3)
+    old.Set([1.0, 2.0, 3.0])
     old.SetIndices([0] * 8)
+    stage.SetDefaultPrim(mesh.GetPrim())
     stage.Save()
     cloth = read_mesh(tmp_path / "a.usda")
     primvars = {"strain": "uniform"}
@@ -226,8 +227,45 @@ def test_primvars_over_polygons_and_over_others_of_their_name(tmp_path):
         _stage, prim = animated_prim(path)
         primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("strain")
         assert primvar.GetInterpolation() == "uniform" and not primvar.IsIndexed() and primvar.Get() is None
-        assert list(primvar.ComputeFlattened(2)) == [201.0, 203.0]
+        assert list(primvar.ComputeFlattened(2)) == [201.0, 203.0] and primvar.GetElementSize() == 1
+        assert validate(path, tmp_path / "a.usda") == []
         assert FrameSequence(path, attribute="primvars:strain")[1].tolist() == [101.0, 103.0]
+
+
+def test_what_a_layer_over_a_prim_cannot_be(tmp_path):
+    """USD takes the type of an attribute from its strongest opinion and calls the others wrong; triangles are the prim's."""
+    stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("strain", Sdf.ValueTypeNames.Double).Set(1.0)
+    stage.Save()
+    cloth = read_mesh(tmp_path / "a.usda")
+    with pytest.raises(ValueError, match=r"primvars:strain has type double, must be float\[\] or not be there"):
+        AnimationWriter(tmp_path / "out.usdc", cloth, 24, source=tmp_path / "a.usda", primvars={"strain": "vertex"})
+    other = Mesh(cloth.points, cloth.triangles[:, ::-1])
+    with pytest.raises(ValueError, match="has other triangles than the mesh"):
+        AnimationWriter(tmp_path / "out.usdc", other, 24, source=tmp_path / "a.usda")
+
+
+@pytest.mark.parametrize("replaced", [2, 3, 4, 5, 6])
+def test_an_interrupted_chunk_is_written_again(tmp_path, monkeypatch, replaced):
+    """Whichever rename of a run is interrupted, closing leaves all frames that were appended."""
+    mesh = Mesh.grid(3, 3)
+    real, calls = os.replace, []
+
+    def replace(*paths):
+        calls.append(paths)
+        if len(calls) == replaced:
+            raise KeyboardInterrupt
+        real(*paths)
+
+    monkeypatch.setattr(os, "replace", replace)
+    writer = AnimationWriter(tmp_path / "out.usdc", mesh, 24, chunk=2)
+    appended = 0
+    with pytest.raises(KeyboardInterrupt):
+        for frame in range(6):
+            appended += 1
+            writer.append(mesh.points + frame, np.zeros_like(mesh.points))
+    writer.close()
+    assert len(FrameSequence(tmp_path / "out.usdc")) == appended
 
 
 @pytest.mark.parametrize(

@@ -99,8 +99,8 @@ class Arap:
             raise ValueError(f'weights is {weights!r}, which needs triangles, and this is an edge mesh; use "uniform"')
         if len(mesh.isolated):
             raise ValueError(
-                f"vertex {mesh.isolated[0]} is isolated, as are {len(mesh.isolated)} of the mesh in all: in no triangle, on no "
-                "edge; remove them, for nothing says where they go"
+                f"vertex {mesh.isolated[0]} is in no triangle and on no edge (isolated vertices of the mesh: "
+                f"{len(mesh.isolated)}); remove such vertices, for nothing says where they go"
             )
         self.device, self.dtype = wp.get_device(device), dtype
         self._scalar, self._numpy = DTYPES[dtype]
@@ -111,11 +111,11 @@ class Arap:
         pairs, w = _edge_weights(mesh, weights)
         self.negative_edges = pairs[w < -_ROUNDING]
         if len(self.negative_edges) and not rims:
+            others = "" if weights == "intrinsic" else 'weights = "intrinsic" do inside the mesh, '
             warnings.warn(
                 f"negative weights: {len(self.negative_edges)}, the most negative {w.min():.3g} of edge "
                 f"{pairs[w.argmin()].tolist()}, so that the energy can be negative and lowest where nothing is rigid; "
-                'energy = "spokes_and_rims" avoids it, weights = "intrinsic" do inside the mesh, and weights = "clamped" do at '
-                "the price of linear precision",
+                f'energy = "spokes_and_rims" avoids it, {others}and weights = "clamped" do at the price of linear precision',
                 stacklevel=2,
             )
         pairs, w = pairs[w != 0.0], w[w != 0.0]
@@ -180,7 +180,7 @@ class Arap:
             self._x.write(x[self._order])
             self._start.write(-(self._coupling @ held))
         energies = [self._fit(0)]
-        least = max(self._rounding * np.abs(x).max() ** 2, tolerance**2 * self._size) * self._unit**2
+        least = max(self._rounding * np.abs(x).max() ** 2, tolerance * tolerance * self._size) * self._unit**2
         converged = f == 0
         while f and len(energies) <= iterations and not converged:
             self._factor.solve(self._b, self._x_free)
@@ -268,18 +268,20 @@ class Arap:
         energies = self._zeros(len(elements), wp.float64)
         partial = self._zeros((1, CHUNKS if self.device.is_cuda else 1), wp.float64)
         placed = self._array(rest[self._order], vec3)
-        x, rotations = self._x.array, self._rotations.array
+        # By themselves: a graph that held its owner would keep the factors until garbage is collected.
+        device, scalar, x, rotations = self.device, self._scalar, self._x.array, self._rotations.array
+        total, start, b = self._energy.array, self._start.array, self._b
 
         def launch(kernel, dim, inputs, output):
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[output], device=self.device)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[output], device=device)
 
         def fit_cells():
-            launch(cells.fit_rotations(self._scalar), n, [*rows, x], rotations)
-            launch(kernel(self._scalar), len(elements), [elements, weights, placed, rotations, x], energies)
+            launch(cells.fit_rotations(scalar), n, [*rows, x], rotations)
+            launch(kernel(scalar), len(elements), [elements, weights, placed, rotations, x], energies)
             launch(reduce.partial_sum(), partial.shape, [energies, len(elements)], partial)
-            launch(reduce.finish_sum(), 1, [partial, 0], self._energy.array)
-            if len(self._b):
-                launch(cells.gather(self._scalar), len(self._b), [*columns, rotations, self._start.array], self._b)
+            launch(reduce.finish_sum(), 1, [partial, 0], total)
+            if len(b):
+                launch(cells.gather(scalar), len(b), [*columns, rotations, start], b)
 
         return Segment(self.device, fit_cells)
 

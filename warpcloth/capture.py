@@ -1,5 +1,8 @@
 """Graph capture, on the CPU too: a segment of launches is recorded once and replayed."""
 
+import gc
+from contextlib import contextmanager
+
 import warp as wp
 
 
@@ -51,6 +54,18 @@ class Mirror:
             wp.synchronize_stream(self.array.device)  # or the next write would change what is still being copied
 
 
+@contextmanager
+def _uncollected():
+    """No collection of garbage meanwhile: what it frees on CUDA (the factors of cholespy) would break a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 class Segment:
     """Launches that always run together: recorded when built, replayed by a call, on the CPU and on CUDA.
 
@@ -62,7 +77,7 @@ class Segment:
     def __init__(self, device, record):
         self.device = device
         self.record = record  # the graph has addresses only; what the function refers to must not be freed
-        with wp.ScopedCapture(device=device) as capture:
+        with _uncollected(), wp.ScopedCapture(device=device) as capture:
             record()
         self.graph = capture.graph
 

@@ -20,7 +20,8 @@ def number(name, value, above=None, least=None):
     good = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     good = good and _is_finite(value)
     if not good or (above is not None and not value > above) or (least is not None and not value >= least):
-        raise ValueError(f"{name} is {shown(value)}; it must be a number {rule}")
+        kind = "finite number" if isinstance(value, float) and math.isinf(value) else "number"
+        raise ValueError(f"{name} is {shown(value)}; it must be a {kind} {rule}")
 
 
 def _is_finite(value):

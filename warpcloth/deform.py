@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arap import Arap
-from .checks import number, shown
+from .checks import number, refuse, shown, whole
 from .mesh import Mesh
 from .scene import checked_pins
 
@@ -19,6 +19,7 @@ class Deformation:
 
     Attributes:
         points: (F, n, 3) [m]; in memory, or read from ``output`` when asked for (float32 then).
+        largest_angles: Largest of the angles of each frame (F,) [rad].
         angles: Angle by which the neighbourhood of each vertex is turned from its rest shape, (F, n) [rad], 0 to π: no turn
             counts twice. In the file it is ``primvars:rotationAngle``, in degrees.
         energies: Energy that is left in each frame (F,) [m²].
@@ -31,6 +32,7 @@ class Deformation:
 
     points: np.ndarray
     angles: np.ndarray
+    largest_angles: np.ndarray
     energies: np.ndarray
     iterations: np.ndarray
     converged: np.ndarray
@@ -89,10 +91,14 @@ def deform(
     if not isinstance(mesh, Mesh):
         raise ValueError(f"mesh is {shown(mesh)}; it must be a Mesh, such as Mesh.load(path)")
     number("fps", fps, above=0.0)
+    whole("iterations", iterations, least=0)
+    number("tolerance", tolerance, least=0.0)
     pins = checked_pins(pins, mesh)
     if pins.keyframes is None:
         raise ValueError("pins.keyframes is None; a deformation needs places for its handles, (F, p, 3), in each frame")
     frames = len(pins.keyframes)
+    if output is not None:  # before an earlier result is replaced
+        _refuse_beyond_float32(pins.keyframes, fps)
     # First, for it refuses a wrong output before anything is factorised.
     recorder = _Memory(mesh, frames) if output is None else _File(mesh, pins, fps, output, single_file, stage, up_axis)
     start = time.perf_counter()
@@ -110,15 +116,26 @@ def deform(
             velocities = np.zeros_like(result.points) if points is None else (result.points - points) * fps
             points = result.points
             timings["frames"].append(time.perf_counter() - start)
-            recorder.append(points, velocities, rotation_angles(result.rotations))
-            results.append((result.energies[-1], result.iterations, result.converged))
+            angles = rotation_angles(result.rotations)
+            recorder.append(points, velocities, angles)
+            results.append((result.energies[-1], result.iterations, result.converged, angles.max()))
             if progress is not None:
                 progress(frame, frames - 1)
     finally:
         recorder.close()
-    energies, iterations, converged = (np.array(values) for values in zip(*results, strict=True))
+    energies, iterations, converged, largest = (np.array(values) for values in zip(*results, strict=True))
     points, angles = recorder.read()
-    return Deformation(points, angles, energies, iterations, converged, np.arange(frames) / fps, timings, output)
+    return Deformation(points, angles, largest, energies, iterations, converged, np.arange(frames) / fps, timings, output)
+
+
+def _refuse_beyond_float32(keyframes, fps):
+    """Refuses handles whose places or velocities a file of float32 does not hold."""
+    limit = np.finfo(np.float32).max
+    rule = f"cannot be written: a file holds float32, up to {limit:.2g}"
+    refuse("pins.keyframes", keyframes, ~(np.abs(keyframes) <= limit), rule)
+    with np.errstate(over="ignore"):
+        velocities = np.diff(keyframes, axis=0) * fps
+    refuse("velocities of pins.keyframes", velocities, ~(np.abs(velocities) <= limit), rule)
 
 
 def rotation_angles(rotations):

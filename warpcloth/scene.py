@@ -179,7 +179,9 @@ def checked_pins(pins, mesh):
         raise ValueError("pins.vertices names a vertex twice; each may stand once")
     keyframes = pins.keyframes
     if keyframes is not None:
-        count = max(len(keyframes), 1) if np.ndim(keyframes) == 3 else 1
+        if np.ndim(keyframes) == 3 and not len(keyframes):
+            raise ValueError("pins.keyframes has no frame; it must have one or more, (F, p, 3)")
+        count = len(keyframes) if np.ndim(keyframes) == 3 else 1
         keyframes = array("pins.keyframes", keyframes, (count, len(vertices), 3))
     return Pins(vertices.astype(np.int32), keyframes)
 

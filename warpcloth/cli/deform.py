@@ -20,7 +20,8 @@ EPILOG = """\
 --fix holds vertices where they are. --move takes others along, as the --rotate and --translate after it say, up to the next
 --move: over the frames it turns them by DEGREES about AXIS through (CX, CY, CZ), where not given their centroid, and shifts
 them, both evenly from rest. So --rotate comes first, whichever stands first, and 720 degrees are two turns. AXIS is x, y, z or
-a vector such as 1,0,-1. A selection is a text such as "y < 0.1 and not boundary" or "nearest(0, 1.5, 0, 40)".
+a vector such as 1,0,-1. In a frame a turn must be less than 180 degrees. A selection is a text such as "y < 0.1 and not
+boundary" or "nearest(0, 1.5, 0, 40)", in metres and in world space, whatever the units of the file.
 
   warpcloth deform bunny.usd --fix "y < 0.2" --move "y > 1.3" --rotate 60 x --translate 0 0 0.3 -o out.usdc
 """
@@ -69,10 +70,14 @@ class _AddRotation(argparse.Action):
         move = _last(namespace, option_string, "turn")
         if len(values) not in (2, 5):
             raise ValueError(f"--rotate {' '.join(values)}: it takes DEGREES AXIS, or DEGREES AXIS CX CY CZ")
-        unit = dict(zip("xyz", np.eye(3), strict=True)).get(values[1])
-        axis = _vector("the AXIS of --rotate", values[1].split(",")) if unit is None else unit
+        axis = dict(zip("xyz", np.eye(3), strict=True)).get(values[1])
+        try:
+            axis = _vector("AXIS", values[1].split(",")) if axis is None else axis
+        except ValueError:
+            axis = np.zeros(3)
         if len(axis) != 3 or not axis.any():
             raise ValueError(f"the AXIS of --rotate is {values[1]!r}; it must be x, y, z or a vector such as 1,0,-1")
+        axis = axis / np.abs(axis).max()  # squares of what is left do not overflow
         centre = _vector("the centre of --rotate", values[2:]) if len(values) == 5 else None
         move.turn = (_number("DEGREES of --rotate", values[0]), axis / np.linalg.norm(axis), centre)
 
@@ -121,12 +126,13 @@ def deform(arguments):
     finally:
         progress.close()
     late = np.flatnonzero(~found.converged)
+    unmet = f"{len(late)} of the frames did not converge, the first is {late[0]}" if len(late) else "converged"
     facts = {
         "mesh": name,
         "source": arguments.mesh,
         "parameters": values,
         "converged": not len(late),
-        "message": f"{len(late)} frames did not converge, the first is {late[0]}" if len(late) else "converged",
+        "message": unmet,
         "vertices": len(given["mesh"].points),
         "handles": len(given["pins"].vertices),
         "frames": frames,
@@ -134,8 +140,7 @@ def deform(arguments):
         "factorise_seconds": found.timings["factorise"],
         "median_iterations": float(np.median(found.iterations)),
         "most_iterations": int(found.iterations.max()),
-        # float32 has no π, and the nearest it has is larger.
-        "largest_angle": min(180.0, math.degrees(max(float(angles.max()) for angles in found.angles))),
+        "largest_angle": math.degrees(found.largest_angles.max()),
         "last_energy": float(found.energies[-1]),
         **options,
         "device": str(device),
@@ -213,21 +218,29 @@ def _handles(mesh, fixes, moves, frames):
     groups = [(f"--fix {text!r}", mesh.select(text), None) for text in fixes]
     groups += [(f"--move {move.selection!r}", mesh.select(move.selection), move) for move in moves]
     owners = np.full(len(mesh.points), -1)
-    time = np.linspace(0.0, 1.0, frames + 1)
-    places = np.tile(mesh.points, (frames + 1, 1, 1))
     for number, (option, vertices, move) in enumerate(groups):
         if not len(vertices):
             low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in (mesh.points.min(0), mesh.points.max(0)))
             raise ValueError(f"{option} names no vertex; the mesh reaches from ({low}) to ({high})")
-        if move is not None:
-            taken = vertices[owners[vertices] >= 0]
-            if len(taken):
-                other = groups[owners[taken[0]]][0]
-                raise ValueError(f"{option} and {other} both name vertex {taken[0]}; one alone may say where it goes")
-            places[:, vertices] = _path(move, mesh.points[vertices], time)
+        taken = vertices[owners[vertices] >= 0]
+        if move is not None and len(taken):
+            other = groups[owners[taken[0]]][0]
+            raise ValueError(f"{option} and {other} both name vertex {taken[0]}; one alone may say where it goes")
+        if move is not None and move.turn is not None and abs(move.turn[0]) >= 180.0 * frames:
+            least = math.floor(abs(move.turn[0]) / 180.0) + 1
+            raise ValueError(
+                f"{option} turns by {abs(move.turn[0]) / frames:g}° a frame, which must be less than 180°; "
+                f"give --frames {least} or more"
+            )
         owners[vertices] = number
     handles = np.flatnonzero(owners >= 0)
-    return handles, places[:, handles]
+    time = np.linspace(0.0, 1.0, frames + 1)
+    places = np.tile(mesh.points[handles], (frames + 1, 1, 1))
+    for number, (_, _, move) in enumerate(groups):
+        if move is not None:
+            own = owners[handles] == number
+            places[:, own] = _path(move, mesh.points[handles[own]], time)
+    return handles, places
 
 
 def _path(move, points, time):

@@ -309,13 +309,16 @@ def over_layer(source, prim, mesh, primvars):
         artist's stage.
 
     Raises:
-        ValueError: As `read_stage_mesh`; the prim is an instance; the mesh has another number of vertices.
+        ValueError: As `read_stage_mesh`; the prim is an instance; the mesh has another number of vertices or other triangles;
+            a primvar of the artist has another type than float[].
     """
     surroundings = read_stage_mesh(source, prim)
     where = f"{source}, prim {surroundings.prim}"
     count = len(surroundings.mesh.points)
     if count != len(mesh.points):
         raise ValueError(f"{where}: has {count} vertices, must have as many as the mesh, {len(mesh.points)}")
+    if not np.array_equal(surroundings.mesh.triangles, mesh.triangles):
+        raise ValueError(f"{where}: has other triangles than the mesh; read the mesh from this prim")
     stage = open_stage(source)
     artist = find_prim(stage, source, surroundings.prim)
     if artist.IsInstanceProxy():
@@ -340,8 +343,13 @@ def over_layer(source, prim, mesh, primvars):
     for name in (*_BLOCKED, *sampled, *(f"{name}:indices" for name in sampled)):
         attribute = artist.GetAttribute(name)
         if attribute and attribute.HasAuthoredValue():
-            kind = Sdf.ValueTypeNames.FloatArray if name in sampled else attribute.GetTypeName()
-            Sdf.AttributeSpec(over, name, kind).default = Sdf.ValueBlock()
+            kind = attribute.GetTypeName()
+            if name in sampled and kind != Sdf.ValueTypeNames.FloatArray:
+                raise ValueError(f"{where}: {name} has type {kind}, must be float[] or not be there; a layer cannot change it")
+            blocked = Sdf.AttributeSpec(over, name, kind)
+            blocked.default = Sdf.ValueBlock()
+            if name in sampled:
+                blocked.SetInfo("elementSize", 1)  # or the artist's would hold
     files = {os.path.realpath(used.realPath) for used in stage.GetUsedLayers() if used.realPath}
     return layer, target, root_metadata(stage), surroundings, files
 

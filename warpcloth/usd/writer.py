@@ -197,10 +197,11 @@ class AnimationWriter:
         layer.startTimeCode, layer.endTimeCode = self._pending[0][0], self._pending[-1][0]
         path = self._run / f"frames_{len(self._chunks):06d}.usdc"
         export(layer, path)
-        self._chunks.append((self._pending[0][0], path))
-        self._pending = []
-        self._write_root()
-        if len(self._chunks) == 1:
+        chunks = [*self._chunks, (self._pending[0][0], path)]
+        self._write_root(chunks)
+        # Only now, so that a chunk whose writing was interrupted is written again by close.
+        self._chunks, self._pending = chunks, []
+        if len(chunks) == 1:
             self._remove_other_runs()
 
     def _start_run(self):
@@ -210,17 +211,18 @@ class AnimationWriter:
         self._target.declare(manifest, self._target.attributes)
         export(manifest, self._run / "manifest.usda")
 
-    def _write_root(self):
+    def _write_root(self, chunks):
+        """Writes a root that has these chunks."""
         folder = Path(self.path).parent
         end = self._start + self.frames - 1
         layer = Sdf.Layer.CreateAnonymous(".usda")
         stage = Usd.Stage.Open(layer)
         clips = Usd.ClipsAPI(stage.OverridePrim(self._target.prim))
-        asset_paths = [Sdf.AssetPath(relative_path(path, folder)) for _, path in self._chunks]
+        asset_paths = [Sdf.AssetPath(relative_path(path, folder)) for _, path in chunks]
         clips.SetClipAssetPaths(asset_paths, _CLIP_SET)
         clips.SetClipManifestAssetPath(Sdf.AssetPath(relative_path(self._run / "manifest.usda", folder)), _CLIP_SET)
         clips.SetClipPrimPath(self._target.prim, _CLIP_SET)
-        clips.SetClipActive([(time, index) for index, (time, _) in enumerate(self._chunks)], _CLIP_SET)
+        clips.SetClipActive([(time, index) for index, (time, _) in enumerate(chunks)], _CLIP_SET)
         # Clip time is stage time. One frame has one time: listed twice, USD 25.5 reports the frame twice.
         clips.SetClipTimes([(time, time) for time in sorted({self._start, end})], _CLIP_SET)
         del clips, stage
