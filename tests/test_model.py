@@ -62,7 +62,7 @@ BAD_SCENES = {
     "pins unreadable": ({"pins": "x <"}, "column"),
     "keyframes too few": ({"pins": wc.Pins([0, 1], frames_at(MESH.points[0]))}, "pins.keyframes has shape (1, 1, 3)"),
     "keyframes flat": ({"pins": wc.Pins([0], MESH.points[:1])}, "pins.keyframes has shape (1, 3)"),
-    "keyframes empty": ({"pins": wc.Pins([0], np.zeros((0, 1, 3)))}, "pins.keyframes has shape (0, 1, 3)"),
+    "keyframes empty": ({"pins": wc.Pins([0], np.zeros((0, 1, 3)))}, "pins.keyframes has no frame; it must have one or more"),
     "keyframes elsewhere": ({"pins": wc.Pins([0], frames_at([0.0, 1.0, 0.0]))}, "1 m from where the pinned vertices start"),
     "keyframe NaN": ({"pins": wc.Pins([0], frames_at([0.0, np.nan, 0.0]))}, "pins.keyframes[0, 0, 1] is nan"),
     "no time": ({"duration": 0.0}, "duration is 0.0; it must be a number above 0"),

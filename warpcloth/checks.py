@@ -17,11 +17,12 @@ def shown(value):
 def number(name, value, above=None, least=None):
     """Checks that an option is a finite number."""
     rule = "that is finite" if above is least is None else f"above {above:g}" if above is not None else f"of {least:g} or more"
+    if isinstance(value, float) and math.isinf(value) and value > 0.0 and rule != "that is finite":
+        rule += ", and finite"
     good = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     good = good and _is_finite(value)
     if not good or (above is not None and not value > above) or (least is not None and not value >= least):
-        kind = "finite number" if isinstance(value, float) and math.isinf(value) else "number"
-        raise ValueError(f"{name} is {shown(value)}; it must be a {kind} {rule}")
+        raise ValueError(f"{name} is {shown(value)}; it must be a number {rule}")
 
 
 def _is_finite(value):
