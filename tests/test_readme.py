@@ -15,7 +15,7 @@ from warpcloth.terms import TERMS
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = [(m[1], m[2]) for m in re.finditer(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)]
-EXAMPLE, CURTAIN, DEFORMATION = (text for language, text in BLOCKS if language == "python")
+EXAMPLE, CURTAIN, DEFORMATION, ROTATIONS = (text for language, text in BLOCKS if language == "python")
 (STAGE,) = (text for language, text in BLOCKS if language == "usda")
 COMMANDS = [line for language, text in BLOCKS if language == "sh" for line in text.splitlines() if line.startswith("warpcloth")]
 
@@ -36,6 +36,13 @@ def test_the_deformation(tmp_path, monkeypatch, capsys):
     converged, angle = capsys.readouterr().out.splitlines()[-2:]
     assert converged.startswith("True ") and np.radians(115.0) < float(angle) < np.radians(125.0)
     assert (tmp_path / "twisted.usdc").is_file()
+
+
+def test_the_rotations():
+    names = {}
+    exec(compile(ROTATIONS, "README.md", "exec"), names)
+    assert np.abs(names["turned"] - names["R"][0]).max() < 1e-5
+    assert np.abs(names["R"] @ names["P"] - names["A"]).max() < 1e-5
 
 
 @pytest.mark.parametrize("command", COMMANDS)
