@@ -53,7 +53,7 @@ BAD_SCENES = {
     "gravity a word": ({"gravity": "down"}, "gravity is 'down', which is not numeric"),
     "pin outside": ({"pins": [0, 35]}, "pins.vertices[1] is 35; it must lie in 0 … 34"),
     "pin negative": ({"pins": [-1]}, "pins.vertices[0] is -1"),
-    "pin twice": ({"pins": [3, 4, 3]}, "names a vertex twice"),
+    "pin twice": ({"pins": [3, 4, 3]}, "names vertex 3 twice"),
     "pin a fraction": ({"pins": [0.5]}, "pins.vertices has shape (1,) and type float64"),
     "pin mask": ({"pins": np.ones(VERTICES, dtype=bool)}, "pins.vertices has shape (35,) and type bool"),
     "pins one number": ({"pins": 5}, "pins.vertices has shape ()"),

@@ -15,6 +15,7 @@ from .linear import constant_factor
 from .model import DTYPES
 from .operators import CHUNKS
 from .rotation import kabsch
+from .selection import distinct_vertices
 
 # Cotangents are numbers near 1, so that a weight below this is one of rounding.
 _ROUNDING = 1e-12
@@ -104,7 +105,9 @@ class Arap:
             )
         self.device, self.dtype = wp.get_device(device), dtype
         self._scalar, self._numpy = DTYPES[dtype]
-        self.handles = _handles(mesh, handles)
+        self.handles = distinct_vertices("handles", handles, mesh)
+        if not len(self.handles):
+            raise ValueError(f"handles is {shown(handles)}, which names no vertex; at least one is needed")
         n = len(mesh.points)
         f = n - len(self.handles)
 
@@ -297,25 +300,6 @@ class Arap:
 
     def _zeros(self, shape, dtype):
         return wp.zeros(shape, dtype=dtype, device=self.device)
-
-
-def _handles(mesh, handles):
-    """The handles as vertex indices (h,), int32, checked."""
-    if isinstance(handles, str):
-        found = mesh.select(handles)
-        if not len(found):
-            raise ValueError(f"handles = {handles!r} selects no vertex; at least one is needed")
-        return found
-    n = len(mesh.points)
-    found = np.asarray(handles)
-    if found.ndim != 1 or not len(found) or found.dtype.kind not in "iu":
-        raise ValueError(f"handles is {shown(handles)}; it must be a selection or a list of vertex indices, at least one")
-    for k in np.flatnonzero((found < 0) | (found >= n))[:1]:
-        raise ValueError(f"handles[{k}] is {found[k]}; it must be one of the {n} vertices, 0 to {n - 1}")
-    vertices, counts = np.unique(found, return_counts=True)
-    for vertex in vertices[counts > 1][:1]:
-        raise ValueError(f"handles has vertex {vertex} {counts[vertices == vertex][0]} times; it may be there once")
-    return found.astype(np.int32)
 
 
 def _points(name, value, count, place):

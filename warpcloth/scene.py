@@ -8,6 +8,7 @@ import numpy as np
 
 from .checks import array, number, refuse, shown
 from .mesh import Mesh
+from .selection import distinct_vertices
 from .terms import Declared
 
 _MOST_FRAMES = 2**31 - 1  # what counts them on the device is int32
@@ -161,29 +162,15 @@ def checked_pins(pins, mesh):
     Raises:
         ValueError: A vertex that the mesh has not, or twice; keyframes of a wrong shape or not finite.
     """
-    pins, n = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins), len(mesh.points)
-    vertices = mesh.select(pins.vertices) if isinstance(pins.vertices, str) else pins.vertices
-    try:
-        vertices = np.asarray(vertices)
-    except ValueError:  # rows of different lengths
-        raise ValueError(f"pins.vertices is {shown(vertices)}; it must be a list of whole numbers") from None
-    vertices = vertices.astype(np.int32) if vertices.size == 0 else vertices
-    if vertices.ndim != 1 or vertices.dtype.kind not in "iu":
-        raise ValueError(
-            f"pins.vertices has shape {vertices.shape} and type {vertices.dtype}; it must be a list of whole numbers"
-        )
-    wrong = np.flatnonzero((vertices < 0) | (vertices >= n))
-    if len(wrong):
-        raise ValueError(f"pins.vertices[{wrong[0]}] is {vertices[wrong[0]]}; it must lie in 0 … {n - 1}")
-    if len(np.unique(vertices)) < len(vertices):
-        raise ValueError("pins.vertices names a vertex twice; each may stand once")
+    pins = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins)
+    vertices = distinct_vertices("pins.vertices", pins.vertices, mesh)
     keyframes = pins.keyframes
     if keyframes is not None:
         if np.ndim(keyframes) == 3 and not len(keyframes):
             raise ValueError("pins.keyframes has no frame; it must have one or more, (F, p, 3)")
         count = len(keyframes) if np.ndim(keyframes) == 3 else 1
         keyframes = array("pins.keyframes", keyframes, (count, len(vertices), 3))
-    return Pins(vertices.astype(np.int32), keyframes)
+    return Pins(vertices, keyframes)
 
 
 def refuse_far_pins(pins, positions, copy=""):

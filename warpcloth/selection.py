@@ -4,6 +4,8 @@ import re
 
 import numpy as np
 
+from .checks import shown
+
 # Points often come from float32 files, and 0.1 from a text: nearer than this share of the mesh's size is equal.
 _EQUAL = 1e-6
 
@@ -42,6 +44,30 @@ def select(mesh, text):
     if not isinstance(text, str):
         raise ValueError(f"selection = {text!r}: must be a text")
     return _Reader(mesh, text).read()
+
+
+def distinct_vertices(name, vertices, mesh):
+    """Vertices (p,) of a mesh, int32, each once, in the order given, from indices or a selection.
+
+    Raises:
+        ValueError: What ``vertices`` are not, under their name.
+    """
+    if isinstance(vertices, str):
+        return select(mesh, vertices)
+    n = len(mesh.points)
+    try:
+        found = np.asarray(vertices)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"{name} is {shown(vertices)}; it must be a list of whole numbers") from None
+    found = found.astype(np.int32) if found.size == 0 else found
+    if found.ndim != 1 or found.dtype.kind not in "iu":
+        raise ValueError(f"{name} has shape {found.shape} and type {found.dtype}; it must be a list of whole numbers")
+    for k in np.flatnonzero((found < 0) | (found >= n))[:1]:
+        raise ValueError(f"{name}[{k}] is {found[k]}; it must lie in 0 … {n - 1}")
+    values, counts = np.unique(found, return_counts=True)
+    for vertex in values[counts > 1][:1]:
+        raise ValueError(f"{name} names vertex {vertex} twice; each may stand once")
+    return found.astype(np.int32)
 
 
 class _Reader:
