@@ -362,7 +362,7 @@ def test_a_step_that_is_stable_only_about_rest_warns_in_one_line(capfd):
 @pytest.mark.parametrize(
     "options",
     [
-        ["--solver", "pbd", "-s", "averaging=none", "relaxation=1.9", "iterations=1"],
+        ["--solver", "pbd", "-s", "sweep=jacobi", "relaxation=1.9", "iterations=1"],
         ["--solver", "explicit", "-s", "above_limit=allow", "substeps=11"],
     ],
     ids=["pbd", "explicit"],
