@@ -12,7 +12,8 @@ XPBD adds Δλ up in λ; for PBD λ is 0. With an infinite stiffness α̃ = 0 an
 2006 (*Position based dynamics*). A stencil of pins alone has nothing to move and gives 0, and so does a stiffness of 0.
 
 The factories share the key (term, dtype, scalar, multipliers, per_step): whether the scalar constraint is used, which is for
-terms that have one; whether there is λ, else the array may be None; whether finite stiffness is spread over the sweeps of a step.
+terms that have one; whether there is λ, else the array may be None; whether finite stiffness is spread over the sweeps of a
+step.
 """
 
 from functools import cache

@@ -24,7 +24,7 @@ def colours(stencil, free):
         stencil: (E, K).
         free: Which vertices move, (n,); pinned ones may be shared (the hinges of ``bunny`` then need 17 colours, not 20).
     """
-    elements, vertices = np.repeat(np.arange(len(stencil)), stencil.shape[1]), stencil.ravel()
+    elements, vertices = np.repeat(np.arange(len(stencil), dtype=np.int32), stencil.shape[1]), stencil.ravel()
     keep = free[vertices]
     order = np.argsort(vertices[keep], kind="stable")
     elements, vertices = elements[keep][order], vertices[keep][order]
@@ -35,7 +35,7 @@ def colours(stencil, free):
     pairs = np.stack([np.repeat(elements, before), elements[place]], axis=1)
     found = wp.zeros(len(stencil), dtype=wp.int32, device="cpu")
     if len(pairs):
-        wp.utils.graph_coloring_assign(wp.array(pairs.astype(np.int32), dtype=wp.int32, device="cpu"), found)
+        wp.utils.graph_coloring_assign(wp.array(pairs, dtype=wp.int32, device="cpu"), found)
     return found.numpy()
 
 

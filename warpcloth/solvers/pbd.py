@@ -17,12 +17,12 @@ class PBD(Step):
     finite one by the part s = w/(w + α̃) that the material would move by itself in a step. Spent once a sweep, s makes the
     cloth stiffer with iterations and with 1/h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest, n the iterations.
     Spent once a step, as s′ = 1 − (1−s)^(1/n) a sweep, it stretches by g h²(1−s)/s whatever n is, which with this s is mg/k;
-    several constraints at one vertex still stiffen one another with n.
+    where constraints meet, the result still depends on n.
 
     Jacobi sweeps move by the sum of all corrections at once. Times ω it diverges iff ω λ_max(D⁻¹JWJᵀ) > 2. Averaged by vertex
     (Σx_new + αx)/(n + α), n its constraints, it converges for every α ≥ 0, but momentum is not conserved; averaged by
     constraint, with 1/max n of its vertices for all of them, linear momentum is. Gauss–Seidel sweeps conserve linear
-    momentum too and converge in fewer sweeps; their order changes the result where not all constraints can be met.
+    momentum too and converge in fewer sweeps; their order changes the result.
 
     Attributes:
         dt, substeps: See :class:`Step`.
@@ -31,7 +31,7 @@ class PBD(Step):
             ``"sequential"``: elements in the order of the scene, by one thread, which on a GPU is for small scenes.
         alpha: α ≥ 0, weight of the old place when averaging by vertex.
         relaxation: ω > 0, a factor of every move.
-        stiffness: Whether finite stiffness is spent ``"per sweep"`` (s) or ``"per step"`` (s′).
+        stiffness: Whether finite stiffness is spent ``"per-sweep"`` (s) or ``"per-step"`` (s′).
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -41,7 +41,7 @@ class PBD(Step):
     sweep: str = "coloured"
     alpha: float = 0.0
     relaxation: float = 1.0
-    stiffness: str = "per sweep"
+    stiffness: str = "per-sweep"
 
     def __post_init__(self):
         super().__post_init__()
@@ -49,7 +49,7 @@ class PBD(Step):
         choice("sweep", self.sweep, SWEEPS)
         number("alpha", self.alpha, least=0.0)
         number("relaxation", self.relaxation, above=0.0)
-        choice("stiffness", self.stiffness, ("per sweep", "per step"))
+        choice("stiffness", self.stiffness, ("per-sweep", "per-step"))
         if self.sweep != "vertex-averaged" and self.alpha != 0.0:
             raise ValueError(f"alpha is {self.alpha:g}; it belongs to sweep='vertex-averaged' and must be 0 without")
 
@@ -73,7 +73,7 @@ class PBDStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model)
-        spread = options.iterations if options.stiffness == "per step" else None
+        spread = options.iterations if options.stiffness == "per-step" else None
         self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)
         self._start = Segment(model.device, self._launch_start)
         self._sweep = Segment(model.device, self.sweep.launch)
