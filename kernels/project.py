@@ -1,12 +1,19 @@
-"""Factories of the local projections: one Jacobi sweep over the elements of a term.
+"""Factories of the local projections: sweeps over the elements of a term, Jacobi, by colour, or one after the other.
 
 With ``assemble`` the only kernels that know stencils; none of them knows a material. The step of one element is
 
-    Δλ = (G W Gᵀ + α̃ I)⁻¹ (p(y) − y),   Δxᵢ = wᵢ-weighted rows of Δλ / mᵢ,   α̃ = 1/(k A h²)
+    Δλ = (G W Gᵀ + α̃ I)⁻¹ (p(y) − y − α̃ λ),   Δxᵢ = wᵢ-weighted rows of Δλ / mᵢ,   α̃ = 1/(k A h²)
 
-with G the weights of y and W the inverse masses; with an infinite stiffness α̃ = 0 and, for springs, this is the projection of
-Müller et al. 2006 (*Position based dynamics*). Terms without ``project`` use their scalar constraint,
-Δλ = −C/(Σ wᵢ‖∇C‖² + α̃). A stencil of pins alone has nothing to move and gives 0.
+with G the weights of y and W the inverse masses, or on the scalar constraint of a term (Macklin et al. 2016, *XPBD*)
+
+    Δλ = −(C + α̃ λ)/(Σ wᵢ‖∇C‖² + α̃),   Δxᵢ = ∇ᵢC Δλ / mᵢ.
+
+XPBD adds Δλ up in λ; for PBD λ is 0. With an infinite stiffness α̃ = 0 and, for springs, this is the projection of Müller et al.
+2006 (*Position based dynamics*). A stencil of pins alone has nothing to move and gives 0, and so does a stiffness of 0.
+
+The factories share the key (term, dtype, scalar, multipliers, per_step): whether the scalar constraint is used, which is for
+terms that have one; whether there is λ, else the array may be None; whether finite stiffness is spread over the sweeps of a
+step.
 """
 
 from functools import cache
@@ -17,57 +24,90 @@ from .assemble import local_coordinate, types
 from .term import Term
 
 
+def multiplier_type(term: Term, dtype, scalar: bool):
+    """The type of λ of one element: a number, or M rows of 3."""
+    return dtype if scalar else wp.types.matrix((term.rows, 3), dtype)
+
+
 @cache
-def multiplier(term: Term, dtype):
-    """The device function (y, rest, inverse masses w of the corners, α̃) → rows (M, 3): Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]."""
+def spread_compliance(dtype):
+    """The device function (w, α̃, n) → α̃′ by which n sweeps move a constraint by itself as far as one with α̃ does.
+
+    Of w/(w + α̃) = s it makes w/(w + α̃′) = s′ = 1 − (1 − s)^(1/n) (Müller et al. 2006). In double precision, for 1 − s ≈ 1.
+    """
+
+    @wp.func
+    def spread(w: dtype, compliance: dtype, sweeps: int):
+        rest = wp.float64(compliance) / (wp.float64(w) + wp.float64(compliance))
+        rest = wp.pow(rest, wp.float64(1.0) / wp.float64(sweeps))
+        return dtype(wp.float64(w) * rest / (wp.float64(1.0) - rest))
+
+    return spread
+
+
+@cache
+def multiplier(term: Term, dtype, scalar: bool, per_step: bool):
+    """The device function (y, rest, inverse masses w of the corners, α̃, λ, sweeps) → (Δλ, rows (M, 3)).
+
+    Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]. Where G W Gᵀ is no multiple of I its mean diagonal stands for w when spreading.
+    """
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     square, corners = wp.types.matrix((term.rows, term.rows), dtype), wp.types.vector(term.vertices, dtype)
     weight, project = term.weight, term.project
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
+    spread = spread_compliance(dtype)
 
     @wp.func
-    def onto_projection(y: y_type, r: rest_type, w: corners, compliance: dtype):
+    def of_projection(y: y_type, r: rest_type, w: corners, compliance: dtype, multipliers: y_type, sweeps: int):
         system = square()
         for i in range(K):
             system += w[i] * wp.outer(weight(r, i), weight(r, i))
-        for m in range(M):
-            system[m, m] = system[m, m] + compliance
+        mean = wp.trace(system) * dtype(wp.static(1.0 / term.rows))
         rows = y_type()
-        if wp.trace(system) != dtype(0.0):
+        if wp.isfinite(compliance) and mean != dtype(0.0):
+            if wp.static(per_step):
+                compliance = spread(mean, compliance, sweeps)
+            for m in range(M):
+                system[m, m] = system[m, m] + compliance
+            gap = project(y, r) - y - compliance * multipliers
             if wp.static(term.rows == 1):
-                rows = (project(y, r) - y) / system[0, 0]
+                rows = gap / system[0, 0]
             else:
-                rows = wp.inverse(system) * (project(y, r) - y)
-        return rows
+                rows = wp.inverse(system) * gap
+        return rows, rows
 
     @wp.func
-    def onto_constraint(y: y_type, r: rest_type, w: corners, compliance: dtype):
+    def of_constraint(y: y_type, r: rest_type, w: corners, compliance: dtype, multipliers: dtype, sweeps: int):
         g = constraint_gradient(y, r)
-        total = compliance
+        total = dtype(0.0)
         for i in range(K):
             direction = vec3()
             for m in range(M):
                 direction += weight(r, i)[m] * g[m]
             total += w[i] * wp.dot(direction, direction)
-        if total == dtype(0.0):
-            total = dtype(1.0)
-        return g * (-constraint(y, r) / total)
+        change = dtype(0.0)
+        if wp.isfinite(compliance) and total != dtype(0.0):
+            if wp.static(per_step):
+                compliance = spread(total, compliance, sweeps)
+            change = -(constraint(y, r) + compliance * multipliers) / (total + compliance)
+        return change, g * change
 
-    return onto_constraint if project is None else onto_projection
+    return of_constraint if scalar else of_projection
 
 
 @cache
-def element_rows(term: Term, dtype):
-    """The device function (element data, x̃, d, h) → rows of :func:`multiplier` for one element at x̃ + d."""
+def element_change(term: Term, dtype, scalar: bool, per_step: bool):
+    """The device function (element data, x̃, d, h, λ, sweeps) → (Δλ, rows) of :func:`multiplier` for one element at x̃ + d."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, corners = wp.types.vector(term.parameters, dtype), wp.types.vector(term.vertices, dtype)
-    y_of, measure, rows_of = local_coordinate(term, dtype, True), term.measure, multiplier(term, dtype)
+    y_of, measure, change_of = local_coordinate(term, dtype, True), term.measure, multiplier(term, dtype, scalar, per_step)
+    lambda_type = multiplier_type(term, dtype, scalar)
 
     @wp.func
-    def rows(
+    def change(
         stencil: wp.array2d(dtype=wp.int32),
         e: int,
         stiffness: dtype,
@@ -76,22 +116,28 @@ def element_rows(term: Term, dtype):
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         h: dtype,
+        multipliers: lambda_type,
+        sweeps: int,
     ):
         w = corners()
         for i in range(K):
             w[i] = inverse_mass[stencil[e, i]]
-        return rows_of(y_of(stencil, e, r, x, d), r, w, dtype(1.0) / (stiffness * measure(r) * h * h))
+        compliance = dtype(1.0) / (stiffness * measure(r) * h * h)
+        return change_of(y_of(stencil, e, r, x, d), r, w, compliance, multipliers, sweeps)
 
-    return rows
+    return change
 
 
 @cache
-def scatter_correction(term: Term, dtype):
-    """Kernel over elements: adds Δxᵢ [m] of every element to out. For the CPU, where it runs in order."""
+def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
+    """Kernel over elements: adds factorₑ Δxᵢ [m] of every element to out, factorₑ Δλ to λ. For the CPU, where it runs in order.
+
+    One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
+    """
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
-    rest_type = wp.types.vector(term.parameters, dtype)
-    rows, weight = element_rows(term, dtype), term.weight
+    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
+    change, weight = element_change(term, dtype, scalar, per_step), term.weight
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter(
@@ -102,28 +148,40 @@ def scatter_correction(term: Term, dtype):
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         h: dtype,
+        sweeps: int,
+        factor: wp.array(dtype=dtype),
+        # in and out
+        lambdas: wp.array(dtype=lambda_type),
         out: wp.array(dtype=vec3),
     ):
         e = wp.tid()
         r = rest[e]
-        q = rows(stencil, e, stiffness[e], r, inverse_mass, x, d, h)
+        before = lambda_type(dtype(0.0))
+        if wp.static(multipliers):
+            before = lambdas[e]
+        more, rows = change(stencil, e, stiffness[e], r, inverse_mass, x, d, h, before, sweeps)
+        if wp.static(multipliers):
+            lambdas[e] = before + factor[e] * more
         for i in range(K):
             w = weight(r, i)
             move = vec3()
             for m in range(M):
-                move += w[m] * q[m]
-            wp.atomic_add(out, stencil[e, i], inverse_mass[stencil[e, i]] * move)
+                move += w[m] * rows[m]
+            wp.atomic_add(out, stencil[e, i], (inverse_mass[stencil[e, i]] * factor[e]) * move)
 
     return scatter
 
 
 @cache
-def gather_correction(term: Term, dtype):
-    """Kernel over vertices: the same sum in a fixed order, through the incidences of :func:`assemble.gather_gradient`."""
+def gather_correction(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
+    """Kernel over vertices: the same sum in a fixed order, through the incidences of :func:`assemble.gather_gradient`.
+
+    It leaves λ as it is: :func:`advance_multipliers` follows.
+    """
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
-    rest_type = wp.types.vector(term.parameters, dtype)
-    rows, weight = element_rows(term, dtype), term.weight
+    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
+    change, weight = element_change(term, dtype, scalar, per_step), term.weight
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather(
@@ -136,6 +194,10 @@ def gather_correction(term: Term, dtype):
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         h: dtype,
+        sweeps: int,
+        factor: wp.array(dtype=dtype),
+        lambdas: wp.array(dtype=lambda_type),
+        # in and out
         out: wp.array(dtype=vec3),
     ):
         v = wp.tid()
@@ -143,20 +205,100 @@ def gather_correction(term: Term, dtype):
         for n in range(offsets[v], offsets[v + 1]):
             e = incidences[n] // K
             r = rest[e]
-            q = rows(stencil, e, stiffness[e], r, inverse_mass, x, d, h)
+            before = lambda_type(dtype(0.0))
+            if wp.static(multipliers):
+                before = lambdas[e]
+            _more, rows = change(stencil, e, stiffness[e], r, inverse_mass, x, d, h, before, sweeps)
             w = weight(r, incidences[n] - e * K)
             for m in range(M):
-                total += w[m] * q[m]
+                total += (factor[e] * w[m]) * rows[m]
         out[v] = out[v] + inverse_mass[v] * total
 
     return gather
 
 
 @cache
+def advance_multipliers(term: Term, dtype, scalar: bool):
+    """Kernel over elements, after :func:`gather_correction` and before its sum is applied: λ += factorₑ Δλ."""
+    vec3, _ = types(dtype)
+    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
+    change = element_change(term, dtype, scalar, False)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance(
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        inverse_mass: wp.array(dtype=dtype),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        h: dtype,
+        sweeps: int,
+        factor: wp.array(dtype=dtype),
+        # in and out
+        lambdas: wp.array(dtype=lambda_type),
+    ):
+        e = wp.tid()
+        more, _rows = change(stencil, e, stiffness[e], rest[e], inverse_mass, x, d, h, lambdas[e], sweeps)
+        lambdas[e] = lambdas[e] + factor[e] * more
+
+    return advance
+
+
+@cache
+def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
+    """Kernel of a Gauss–Seidel sweep: each element sees what those before it did; d += ω Δx, λ += ω Δλ.
+
+    A thread takes ``each`` elements one after the other, from first + thread·each on: 1 of a colour, in which no two share a
+    vertex that moves, or all of a copy. Pins are never written, so elements may share them.
+    """
+    vec3, _ = types(dtype)
+    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
+    change, weight = element_change(term, dtype, scalar, per_step), term.weight
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def correct(
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        inverse_mass: wp.array(dtype=dtype),
+        x: wp.array(dtype=vec3),
+        first: int,
+        each: int,
+        h: dtype,
+        sweeps: int,
+        relaxation: dtype,
+        # in and out
+        lambdas: wp.array(dtype=lambda_type),
+        d: wp.array(dtype=vec3),
+    ):
+        start = first + wp.tid() * each
+        for e in range(start, start + each):
+            r = rest[e]
+            before = lambda_type(dtype(0.0))
+            if wp.static(multipliers):
+                before = lambdas[e]
+            more, rows = change(stencil, e, stiffness[e], r, inverse_mass, x, d, h, before, sweeps)
+            if wp.static(multipliers):
+                lambdas[e] = before + relaxation * more
+            for i in range(K):
+                v = stencil[e, i]
+                if inverse_mass[v] > dtype(0.0):
+                    w = weight(r, i)
+                    move = vec3()
+                    for m in range(M):
+                        move += w[m] * rows[m]
+                    d[v] = d[v] + (inverse_mass[v] * relaxation) * move
+
+    return correct
+
+
+@cache
 def apply_correction(dtype):
     """Kernel over vertices: d += scaleᵢ Σ Δx, and the sum back to 0.
 
-    scaleᵢ is the relaxation ω, or ω/(nᵢ + α) when averaged over the nᵢ constraints of the vertex.
+    scaleᵢ is 1, or 1/(nᵢ + α) when averaged over the nᵢ constraints of the vertex.
     """
     vec3, _ = types(dtype)
 
@@ -172,3 +314,22 @@ def apply_correction(dtype):
         total[i] = vec3()
 
     return apply
+
+
+@cache
+def add_momentum(dtype):
+    """Kernel over vertices: out += s mᵢ dᵢ; with s = 1/h² the force [N] of the inertia that a correction d [m] calls up."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        mass: wp.array(dtype=dtype),
+        d: wp.array(dtype=vec3),
+        s: dtype,
+        # in and out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        out[i] = out[i] + (s * mass[i]) * d[i]
+
+    return add

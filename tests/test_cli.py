@@ -247,7 +247,12 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(capfd):
 
 @pytest.mark.parametrize(
     ("solver", "step"),
-    [("newton", "substeps=4"), ("pbd", "substeps=4"), ("explicit", "by default the fewest stable ones, limits ")],
+    [
+        ("newton", "substeps=4"),
+        ("pbd", "substeps=4"),
+        ("xpbd", "substeps=4"),
+        ("explicit", "by default the fewest stable ones, limits "),
+    ],
 )
 def test_each_solver_runs_with_its_default_step(tmp_path, capfd, solver, step):
     output = tmp_path / "out.usdc"
@@ -362,7 +367,7 @@ def test_a_step_that_is_stable_only_about_rest_warns_in_one_line(capfd):
 @pytest.mark.parametrize(
     "options",
     [
-        ["--solver", "pbd", "-s", "averaging=none", "relaxation=1.9", "iterations=1"],
+        ["--solver", "pbd", "-s", "sweep=jacobi", "relaxation=1.9", "iterations=1"],
         ["--solver", "explicit", "-s", "above_limit=allow", "substeps=11"],
     ],
     ids=["pbd", "explicit"],

@@ -309,7 +309,7 @@ def test_what_float32_holds_is_built(fields):
     scene(**fields).build()
 
 
-@pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1), wc.PBD(substeps=1)])
+@pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1), wc.PBD(substeps=1), wc.XPBD(substeps=1)])
 @pytest.mark.parametrize(("given", "shown"), [(scene(), "a Scene"), (None, "None"), (3, "3")])
 def test_a_solver_binds_a_model(solver, given, shown):
     with pytest.raises(ValueError, match=rf"^model is {shown}; bind takes a model, which scene.build\(\) makes$"):
@@ -683,7 +683,7 @@ def probed(tmp_path, solver, declared, device):
 ALL_HOMES = ["attachment", "dihedral_bending", "quadratic_bending", "spring"]
 ALL_NAMES = ["Attachment", "DihedralBending", "QuadraticBending", "Spring"]
 BUILDS = {
-    **{f"{solver} of springs": (solver, "springs", ["spring"], ["Spring"]) for solver in ("Explicit", "Newton", "PBD")},
+    **{f"{solver} of springs": (solver, "springs", ["spring"], ["Spring"]) for solver in ("Explicit", "Newton", "PBD", "XPBD")},
     "PBD of all, to show that the probe sees them": ("PBD", "all", ALL_HOMES, ALL_NAMES),
 }
 

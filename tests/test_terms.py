@@ -111,8 +111,9 @@ class Stencils(NamedTuple):
         """Δx (E, K, 3) [m] of one projection, for a step of h [s]."""
         out = self.places(np.zeros_like(self.x))
         masses, zero = self.array(inverse_mass.ravel(), self.scalar), self.places(np.zeros_like(self.x))
-        kernel = project.scatter_correction(self.term, self.scalar)
-        self.launch(kernel, *self.elements, masses, self.places(), zero, h, out)
+        factor = self.array(np.ones(len(self.x)), self.scalar)
+        kernel = project.scatter_correction(self.term, self.scalar, self.term.project is None)
+        self.launch(kernel, *self.elements, masses, self.places(), zero, h, 1, factor, None, out)
         return out.numpy().reshape(self.x.shape)
 
     def weights(self):
@@ -847,25 +848,37 @@ def test_gathering_is_scattering(term, dtype, device):
     (elements,) = model.terms
     zero, x, scalar = model.vectors(), model.positions, model.dtype
 
-    def run(factory, *between):
+    def run(factory, *between, key=()):
         out = model.vectors()
         out.fill_(model.vec3(1.0, 2.0, 3.0))  # both add to what is there
         gathers = factory.__name__.startswith("gather")
         dim = len(elements.incidences[0]) - 1 if gathers else elements.count
         inputs = [*(elements.incidences if gathers else ()), *elements.arguments, *between]
-        model.launch(model.kernel(factory, term, scalar), dim, inputs, [out])
+        model.launch(model.kernel(factory, term, scalar, *key), dim, inputs, [out])
         return out.numpy()
 
+    factor = model.array(random.uniform(0.2, 1.0, elements.count), scalar)
+    start = random.normal(scale=1e-3, size=(elements.count, *(() if term.project is None else (term.rows, 3))))
     forces = [run(assemble.scatter_gradient, x, zero), *(run(assemble.gather_gradient, x, zero) for _ in range(2))]
     corrections = [
-        run(factory, model.inverse_mass, x, zero, 0.1)
+        run(factory, model.inverse_mass, x, zero, 0.1, 1, factor, None, key=[term.project is None])
         for factory in (project.scatter_correction, project.gather_correction, project.gather_correction)
     ]
+    key, lambdas = (term.project is None, True), []
+    for factory in (project.scatter_correction, project.gather_correction):
+        lambdas.append(model.array(start, project.multiplier_type(term, scalar, key[0])))
+        given = [model.inverse_mass, x, zero, 0.1, 1, factor, lambdas[-1]]
+        corrections.append(run(factory, *given, key=key))
+    advance = model.kernel(project.advance_multipliers, term, scalar, key[0])
+    model.launch(advance, elements.count, [*elements.arguments, *given])
+    one, two = (array.numpy() for array in lambdas)
+    assert np.abs(one - two).max() <= FEW * eps(dtype) * 10.0 * np.abs(one).max() and (one != start).any()
     # Only the order of the sum differs, and the compiler's use of fused multiplication.
     size = np.abs(mesh.points).max() + 1.0
     assert (np.linalg.norm(forces[0] - forces[1], axis=1) <= FEW * eps(dtype) * (4.0 + size * row_sums(model))).all()
     assert np.abs(corrections[0] - corrections[1]).max() <= FEW * eps(dtype) * 10.0 * np.abs(corrections[0]).max()
-    for first, again in (forces[1:], corrections[1:]):
+    assert np.abs(corrections[3] - corrections[4]).max() <= FEW * eps(dtype) * 10.0 * np.abs(corrections[3]).max()
+    for first, again in (forces[1:], corrections[1:3]):
         assert (first == again).all() and (first != [1.0, 2.0, 3.0]).any()
 
 

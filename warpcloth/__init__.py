@@ -7,11 +7,12 @@ from .mesh import Mesh
 from .rotation import kabsch, polar, svd
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
-from .solvers import PBD, Explicit, Newton
+from .solvers import PBD, XPBD, Explicit, Newton
 from .terms import Attachment, DihedralBending, QuadraticBending, Spring
 
 __all__ = [
     "PBD",
+    "XPBD",
     "Animation",
     "Arap",
     "Attachment",

@@ -55,6 +55,16 @@ class DeviceElements:
         array = wp.array(np.where(np.isinf(stiffness), 1.0, stiffness).astype(stiffness.dtype), device=self.stiffness.device)
         return replace(self, stiffness=array, hard=False)
 
+    def reordered(self, order):
+        """The same elements with those of index ``order`` (B·E,) in that order."""
+
+        def put(array):
+            if 0 in array.strides:
+                return array
+            return wp.array(array.numpy()[order], dtype=array.dtype, device=array.device)
+
+        return replace(self, **{name: put(getattr(self, name)) for name in ("stencil", "stiffness", "rest")})
+
     @cached_property
     def incidences(self):
         """(offsets (N+1,), incidences (B·E·K,)): for each vertex K·element + corner, in order. Built when first asked for."""
@@ -207,8 +217,14 @@ class Model:
         name, each = f"{label}.stiffness", "element" if stiffness.shape[1] > 1 else None
         if (stiffness != stiffness[0, 0]).any() or len(stiffness) * stiffness.shape[1] == self.copies * E:
             return self._put(name, "", np.broadcast_to(stiffness, (self.copies, E)), self.dtype, each, infinite=True)
-        value = self._put(name, "", stiffness[:1, :1], self.dtype, None, infinite=True)
-        array = wp.array(ptr=value.ptr, shape=(self.copies * E,), strides=(0,), dtype=self.dtype, device=self.device)
+        return self._repeat(self._put(name, "", stiffness[:1, :1], self.dtype, None, infinite=True), self.copies * E)
+
+    def constant(self, value, count):
+        """An array (count,) of one value, of stride 0."""
+        return self._repeat(self.array([value], self.dtype), count)
+
+    def _repeat(self, value, count):
+        array = wp.array(ptr=value.ptr, shape=(count,), strides=(0,), dtype=self.dtype, device=self.device)
         array.value = value  # keeps the memory alive
         return array
 

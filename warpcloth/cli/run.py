@@ -16,7 +16,7 @@ _EXPLICIT_MARGIN = 1.1
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
-Where neither dt nor substeps is given: newton and pbd take the substeps that come nearest to 1/240 s; explicit the fewest
+Where neither dt nor substeps is given: newton, pbd and xpbd take the substeps that come nearest to 1/240 s; explicit the fewest
 that are 10 % below the limit about the rest shape and below the bound for motion (exact for springs; hinges count as at rest).
 """
 

@@ -3,7 +3,8 @@
 from .explicit import Explicit
 from .newton import Newton
 from .pbd import PBD
+from .xpbd import XPBD
 
-SOLVERS = {"explicit": Explicit, "newton": Newton, "pbd": PBD}
+SOLVERS = {"explicit": Explicit, "newton": Newton, "pbd": PBD, "xpbd": XPBD}
 
-__all__ = ["PBD", "SOLVERS", "Explicit", "Newton"]
+__all__ = ["PBD", "SOLVERS", "XPBD", "Explicit", "Newton"]

@@ -11,7 +11,7 @@ from ..kernels import step as kernels
 from ..operators import Gradient, Hessian
 from .solver import Step, Stepper, refuse_hard
 
-_INSTEAD = "PBD takes hard constraints, or give a finite stiffness"
+_INSTEAD = "PBD and XPBD take hard constraints, or give a finite stiffness"
 
 
 @dataclass(frozen=True)

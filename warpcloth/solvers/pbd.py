@@ -2,53 +2,56 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from ..capture import Segment
 from ..checks import choice, number, whole
-from ..kernels import project as kernels
+from ..sweeps import SWEEPS, Sweep, refuse_unprojectable
 from .solver import Step, Stepper, require_model
 
 
 @dataclass(frozen=True)
 class PBD(Step):
-    """Position based dynamics (Müller et al. 2006), Jacobi sweeps.
+    """Position based dynamics (Müller et al. 2006).
 
     A sweep moves the vertices of each constraint, weighted by inverse mass (equal masses: half and half), by
     Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y) with α̃ = 1/(kAh²): fully onto it for infinite stiffness k, the classical method; with a
-    finite one by the part s = w/(w + α̃) that the material would move by itself in a step. As s is spent once a sweep, the
-    cloth stiffens with iterations and with 1/h. One hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest.
+    finite one by the part s = w/(w + α̃) that the material would move by itself in a step. Spent once a sweep, s makes the
+    cloth stiffer with iterations and with 1/h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest, n the iterations.
+    Spent once a step, as s′ = 1 − (1−s)^(1/n) a sweep, it stretches by g h²(1−s)/s whatever n is, which with this s is mg/k;
+    where constraints meet, the result still depends on n.
 
-    Averaged over its n constraints a vertex goes to (Σx_new + αx)/(n + α), which converges for every α ≥ 0; the plain sum
-    with relaxation ω diverges iff ω λ_max(D⁻¹JWJᵀ) > 2. Averaging by vertex does not conserve momentum.
+    Jacobi sweeps move by the sum of all corrections at once. Times ω it diverges iff ω λ_max(D⁻¹JWJᵀ) > 2. Averaged by vertex
+    (Σx_new + αx)/(n + α), n its constraints, it converges for every α ≥ 0, but momentum is not conserved; averaged by
+    constraint, with 1/max n of its vertices for all of them, linear momentum is. Gauss–Seidel sweeps conserve linear
+    momentum too and converge in fewer sweeps; their order changes the result.
 
     Attributes:
         dt, substeps: See :class:`Step`.
         iterations: Sweeps a step.
-        sweep: ``"jacobi"``.
-        averaging: ``"vertex"`` or ``"none"``.
-        alpha: α ≥ 0, weight of the old place when averaging.
+        sweep: Jacobi ``"vertex-averaged"``, ``"constraint-averaged"`` or plain ``"jacobi"``; Gauss–Seidel ``"coloured"``, or
+            ``"sequential"``: elements in the order of the scene, by one thread, which on a GPU is for small scenes.
+        alpha: α ≥ 0, weight of the old place when averaging by vertex.
         relaxation: ω > 0, a factor of every move.
+        stiffness: Whether finite stiffness is spent ``"per-sweep"`` (s) or ``"per-step"`` (s′).
 
     Raises:
         ValueError: If an option breaks a rule.
     """
 
     iterations: int = 20
-    sweep: str = "jacobi"
-    averaging: str = "vertex"
+    sweep: str = "coloured"
     alpha: float = 0.0
     relaxation: float = 1.0
+    stiffness: str = "per-sweep"
 
     def __post_init__(self):
         super().__post_init__()
         whole("iterations", self.iterations, 1)
-        choice("sweep", self.sweep, ("jacobi",))
-        choice("averaging", self.averaging, ("vertex", "none"))
+        choice("sweep", self.sweep, SWEEPS)
         number("alpha", self.alpha, least=0.0)
         number("relaxation", self.relaxation, above=0.0)
-        if self.averaging == "none" and self.alpha != 0.0:
-            raise ValueError(f"alpha is {self.alpha:g}; it belongs to averaging='vertex' and must be 0 without")
+        choice("stiffness", self.stiffness, ("per-sweep", "per-step"))
+        if self.sweep != "vertex-averaged" and self.alpha != 0.0:
+            raise ValueError(f"alpha is {self.alpha:g}; it belongs to sweep='vertex-averaged' and must be 0 without")
 
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
@@ -57,11 +60,7 @@ class PBD(Step):
             ValueError: If a term has nothing to project on.
         """
         require_model(model)
-        for elements in model.terms:
-            if elements.term.project is None and elements.term.constraint is None:
-                raise ValueError(
-                    f"PBD cannot project {elements.label}, whose energy is no distance to a constraint; Newton or Explicit can"
-                )
+        refuse_unprojectable(model, "PBD")
         return PBDStepper(self, model)
 
 
@@ -69,45 +68,20 @@ class PBDStepper(Stepper):
     """:class:`PBD` on a model.
 
     Attributes:
-        correction: x − x̃ of the last step, (N,) [m].
+        sweep: The :class:`warpcloth.sweeps.Sweep`, with x − x̃ of the last step.
     """
 
     def __init__(self, options, model):
         super().__init__(options, model)
-        self.correction, self._total = model.vectors(), model.vectors()
-        self._scale = model.array(self._scales(), model.dtype)
-        cuda = model.device.is_cuda
-        factory = kernels.gather_correction if cuda else kernels.scatter_correction
-        self._project = [
-            (model.kernel(factory, elements.term, model.dtype), elements, elements.incidences if cuda else ())
-            for elements in model.terms
-        ]
-        self._apply = model.kernel(kernels.apply_correction, model.dtype)
+        spread = options.iterations if options.stiffness == "per-step" else None
+        self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)
         self._start = Segment(model.device, self._launch_start)
-        self._sweep = Segment(model.device, self._launch_sweep)
-        self._finish = Segment(model.device, lambda: self.launch_finish(self.correction))
-
-    def _scales(self):
-        """ω, or ω/(n + α) for a vertex of n constraints."""
-        options, constraints = self.options, np.zeros(self.model.count)
-        if options.averaging == "none":
-            return np.full(self.model.count, options.relaxation)
-        for elements in self.model.terms:
-            constraints += np.bincount(elements.stencil.numpy().ravel(), minlength=self.model.count)
-        return options.relaxation / np.maximum(constraints + options.alpha, np.finfo(np.float32).tiny)
+        self._sweep = Segment(model.device, self.sweep.launch)
+        self._finish = Segment(model.device, lambda: self.launch_finish(self.sweep.correction))
 
     def _launch_start(self):
         self.launch_prediction()
-        self.correction.zero_()
-        self._total.zero_()
-
-    def _launch_sweep(self):
-        model = self.model
-        for kernel, elements, incidences in self._project:
-            dim = len(incidences[0]) - 1 if incidences else elements.count
-            given = [*incidences, *elements.arguments, model.inverse_mass, self.state.x, self.correction, self.h]
-            model.launch(kernel, dim, given, [self._total])
-        model.launch(self._apply, model.count, [self._scale], [self._total, self.correction])
+        self.sweep.launch_start()
 
     def step(self):
         self._start()

@@ -1,0 +1,160 @@
+"""Sweeps over the constraints of a model: Jacobi with three ways to keep it from overshooting, Gauss–Seidel by colour or not.
+
+Gauss–Seidel lets each constraint see what those before it did. Constraints of one colour share no vertex that moves, so that
+their order is no matter and they run at once; between colours, and between terms, the order is fixed and changes the result.
+"""
+
+import numpy as np
+import warp as wp
+
+from .kernels import project as kernels
+
+# By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
+# the largest n of its vertices. Jacobi: the plain sum.
+SWEEPS = ("vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential")
+
+
+def colours(stencil, free):
+    """Colours of elements, so that no two of one colour share a free vertex: (E,) int, from 0 without gaps.
+
+    By Warp's maximum cardinality search: 8 colours for the structural and shear springs of a grid, which is the least, and 18
+    for the hinges of an alternating one.
+
+    Args:
+        stencil: (E, K).
+        free: Which vertices move, (n,); pinned ones may be shared (the hinges of ``bunny`` then need 17 colours, not 20).
+    """
+    elements, vertices = np.repeat(np.arange(len(stencil), dtype=np.int32), stencil.shape[1]), stencil.ravel()
+    keep = free[vertices]
+    order = np.argsort(vertices[keep], kind="stable")
+    elements, vertices = elements[keep][order], vertices[keep][order]
+    # Each element at a vertex is a neighbour of those before it there.
+    first = np.searchsorted(vertices, vertices)
+    before = np.arange(len(vertices)) - first
+    place = np.arange(before.sum()) - np.repeat(np.cumsum(before) - before - first, before)
+    pairs = np.stack([np.repeat(elements, before), elements[place]], axis=1)
+    found = wp.zeros(len(stencil), dtype=wp.int32, device="cpu")
+    if len(pairs):
+        wp.utils.graph_coloring_assign(wp.array(pairs, dtype=wp.int32, device="cpu"), found)
+    return found.numpy()
+
+
+def refuse_unprojectable(model, solver):
+    """Refuses terms that have nothing to project on.
+
+    Raises:
+        ValueError: Naming the term, the solver and what would work.
+    """
+    for elements in model.terms:
+        if elements.term.project is None and elements.term.constraint is None:
+            raise ValueError(
+                f"{solver} cannot project {elements.label}, whose energy is no distance to a constraint; Newton or Explicit can"
+            )
+
+
+class Sweep:
+    """One sweep over all constraints of a model, term by term as declared: ``launch`` moves the correction d from x̃ on.
+
+    Args:
+        model: The :class:`warpcloth.model.Model`.
+        x: x̃, (N,) vectors [m]; read only.
+        h: Step [s].
+        kind: One of :data:`SWEEPS`.
+        relaxation: ω, a factor of every Δλ.
+        alpha: α of the average by vertex.
+        scalar: Whether terms that have both are taken by their scalar constraint.
+        multipliers: Whether λ adds up over the sweeps of a step (XPBD).
+        spread: The number of sweeps that finite stiffness is spread over, or None.
+
+    Attributes:
+        correction: d (N,) [m].
+        multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, in the order of ``elements``, or Nones.
+        elements: :class:`warpcloth.model.DeviceElements` of each term, in the order of the sweep.
+        ranges: Of each term what one launch takes, as (first, count).
+    """
+
+    def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None):
+        self.model, self.x, self.h, self.relaxation = model, x, h, relaxation
+        self.spread = spread or 1
+        self.in_place, self.ordered = kind in ("coloured", "sequential"), kind == "sequential"
+        self.correction = model.vectors()
+        self.elements, self.ranges = list(model.terms), [[(0, elements.count)] for elements in model.terms]
+        if kind == "coloured":
+            self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True) if model.terms else ((), ())
+        keys = []
+        for elements in model.terms:
+            of_constraint = elements.term.project is None or (scalar and elements.term.constraint is not None)
+            keys.append((elements.term, model.dtype, of_constraint))
+        self.multipliers = [
+            wp.zeros(elements.count, dtype=kernels.multiplier_type(*key), device=model.device) if multipliers else None
+            for elements, key in zip(model.terms, keys, strict=True)
+        ]
+        more, cuda = (multipliers, spread is not None), model.device.is_cuda
+        if self.in_place:
+            self._kernels = [model.kernel(kernels.correct_in_place, *key, *more) for key in keys]
+            return
+        factory = kernels.gather_correction if cuda else kernels.scatter_correction
+        self._kernels = [model.kernel(factory, *key, *more) for key in keys]
+        self._advance = [model.kernel(kernels.advance_multipliers, *key) for key in keys if multipliers and cuda]
+        self._incidences = [elements.incidences if cuda else () for elements in model.terms]
+        self._apply = model.kernel(kernels.apply_correction, model.dtype)
+        self._total = model.vectors()
+        self._weigh(kind, alpha)
+
+    def _by_colour(self, elements):
+        """The elements of all copies by colour, and the range of each colour."""
+        model = self.model
+        free = model.inverse_mass.numpy()[: model.per_copy] > 0.0
+        colour = np.tile(colours(elements.stencil.numpy()[: elements.per_copy], free), model.copies)
+        counts = np.bincount(colour)
+        firsts = np.cumsum(counts) - counts
+        return elements.reordered(np.argsort(colour, kind="stable")), list(zip(firsts.tolist(), counts.tolist(), strict=True))
+
+    def _weigh(self, kind, alpha):
+        """Factors of elements and of vertices."""
+        model, terms = self.model, self.model.terms
+        if kind == "jacobi":
+            self._factors = [model.constant(self.relaxation, elements.count) for elements in terms]
+            self._scale = model.constant(1.0, model.count)
+            return
+        constraints = np.zeros(model.count)
+        for elements in terms:
+            constraints += np.bincount(elements.stencil.numpy().ravel(), minlength=model.count)
+        if kind == "vertex-averaged":
+            self._factors = [model.constant(self.relaxation, elements.count) for elements in terms]
+            self._scale = model.array(1.0 / np.maximum(constraints + alpha, np.finfo(np.float32).tiny), model.dtype)
+            return
+        constraints[model.inverse_mass.numpy() == 0.0] = 1.0  # what does not move cannot overshoot
+        largest = [constraints[elements.stencil.numpy()].max(axis=1) for elements in terms]
+        self._factors = [model.array(self.relaxation / each, model.dtype) for each in largest]
+        self._scale = model.constant(1.0, model.count)
+
+    def launch_start(self):
+        """d = 0, λ = 0."""
+        for array in (self.correction, *self.multipliers):
+            if array is not None:
+                array.zero_()
+        if not self.in_place:
+            self._total.zero_()
+
+    def launch(self):
+        """One sweep."""
+        if self.in_place:
+            self._launch_in_place()
+            return
+        model = self.model
+        for i, elements in enumerate(self.elements):
+            given = [*elements.arguments, model.inverse_mass, self.x, self.correction, self.h, self.spread, self._factors[i]]
+            dim = len(self._incidences[i][0]) - 1 if self._incidences[i] else elements.count
+            model.launch(self._kernels[i], dim, [*self._incidences[i], *given], [self.multipliers[i], self._total])
+            if self._advance:
+                model.launch(self._advance[i], elements.count, given, [self.multipliers[i]])
+        model.launch(self._apply, model.count, [self._scale], [self._total, self.correction])
+
+    def _launch_in_place(self):
+        model = self.model
+        for i, elements in enumerate(self.elements):
+            each = elements.per_copy if self.ordered else 1
+            for first, count in self.ranges[i]:
+                given = [*elements.arguments, model.inverse_mass, self.x, first, each, self.h, self.spread, self.relaxation]
+                model.launch(self._kernels[i], count // each, given, [self.multipliers[i], self.correction])
