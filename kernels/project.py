@@ -6,15 +6,29 @@ With ``assemble`` the only kernels that know stencils; none of them knows a mate
 
 with G the weights of y and W the inverse masses; with an infinite stiffness α̃ = 0 and, for springs, this is the projection of
 Müller et al. 2006 (*Position based dynamics*). Terms without ``project`` use their scalar constraint,
-Δλ = −C/(Σ wᵢ‖∇C‖² + α̃). A stencil of pins alone has nothing to move and gives 0.
+Δλ = −C/(Σ wᵢ‖∇C‖² + α̃). A stencil of pins alone has nothing to move and gives 0; one with so few free vertices that the matrix
+is singular moves y as near to p(y) as they can take it, by the pseudo-inverse.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from .assemble import local_coordinate, types
+from .rotation import epsilon
 from .term import Term
+
+
+@wp.func
+def pseudo_inverse2(A: Any):
+    """A⁻¹ of a symmetric semi-definite 2×2 A, or that of its larger eigenvalue alone where the other is below 4ε of it."""
+    trace = wp.trace(A)
+    B = A / trace
+    determinant = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
+    if determinant > A.dtype(4.0) * epsilon(trace):
+        B = wp.matrix_from_rows(wp.vector(B[1, 1], -B[0, 1]), wp.vector(-B[1, 0], B[0, 0])) / determinant
+    return B / trace
 
 
 @cache
@@ -26,6 +40,8 @@ def multiplier(term: Term, dtype):
     square, corners = wp.types.matrix((term.rows, term.rows), dtype), wp.types.vector(term.vertices, dtype)
     weight, project = term.weight, term.project
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
+    if project is not None and term.rows > 2:
+        raise NotImplementedError(f"{term.name} projects {term.rows} rows; two at most")
 
     @wp.func
     def onto_projection(y: y_type, r: rest_type, w: corners, compliance: dtype):
@@ -39,7 +55,7 @@ def multiplier(term: Term, dtype):
             if wp.static(term.rows == 1):
                 rows = (project(y, r) - y) / system[0, 0]
             else:
-                rows = wp.inverse(system) * (project(y, r) - y)
+                rows = pseudo_inverse2(system) * (project(y, r) - y)
         return rows
 
     @wp.func

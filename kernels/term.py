@@ -31,7 +31,8 @@ class Term:
         vertices: K.
         rows: M.
         parameters: P.
-        rest_state: NumPy function (points (n, 3) [m], stencil (E, K)) → (E, P), the rest state of every element.
+        rest_state: NumPy function (points (n, 3) [m], stencil (E, K), …) → (E, P), the rest state of every element; further
+            arguments, by keyword, are what the material has beside its stiffness.
         weight: (rest, i) → (M,), the weights of vertex i in y; also ∂y/∂xᵢ.
         measure: (rest) → Aₑ.
         energy: (y, rest) → u.

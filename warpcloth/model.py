@@ -191,6 +191,7 @@ class Model:
         stiffness = vary.take_stiffness(one, E)
         for copy, e in np.argwhere(~(stiffness >= 0.0))[:1]:
             raise ValueError(f"{one.label}.stiffness is {stiffness[copy, e]} in copy {copy}; it must be 0 or more")
+        rest_type = wp.types.vector(one.term.parameters, self.dtype)
         return DeviceElements(
             label=one.label,
             kind=one.kind,
@@ -198,7 +199,7 @@ class Model:
             per_copy=E,
             stencil=wp.array(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), dtype=wp.int32, device=self.device),
             stiffness=self._broadcast(one.label, stiffness, E),
-            rest=self._put(f"{one.label}: rest state", "", rest, wp.types.vector(one.term.parameters, self.dtype), "element"),
+            rest=self._put(f"{one.label}: rest state", "", rest, rest_type, "element", infinite=True),  # a limit may be none
             hard=bool(np.isinf(stiffness).any()),
         )
 
