@@ -8,6 +8,7 @@ from test_terms import DENSITIES, FEW, eps, every_dtype, material_of, random_rot
 import warpcloth as wc
 from warpcloth.equilibrium import SETTLED
 from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.solvers.explicit import step_limits
 
 STIFFNESS = 50.0
 WEIGHTLESS = (0.0, 0.0, 0.0)
@@ -275,6 +276,20 @@ def test_finite_limits_serve_solvers_that_need_forces(kind, solver, device):
         assert animation.status.ok, animation.status
         worst.append(measured(kind(most=1.05), mesh, animation.points[-1]).max())
     assert worst[0] > 1.3 and worst[1] < 1.1
+
+
+@pytest.mark.parametrize(
+    ("limit", "material"),
+    [
+        (wc.SpringLimit(most=1.1, stiffness=100.0), wc.Spring(stiffness=100.0)),
+        (wc.StrainLimit(least=0.8, stiffness=100.0), wc.CorotatedMembrane(stiffness=100.0)),
+    ],
+)
+def test_explicit_steps_count_limits_as_reached(limit, material, device):
+    """A limit at rest has no stiffness, but the steps must hold when it has: they are those of the material beyond it."""
+    models = (flung("irregular", term).build(device=device, dtype="float64", copies=2) for term in (limit, material))
+    of_limit, of_material = (step_limits(model) for model in models)
+    assert of_limit == pytest.approx(of_material, rel=1e-6) and 0.0 < of_limit[0] < 1.0
 
 
 @pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1)])

@@ -55,6 +55,14 @@ class DeviceElements:
         array = wp.array(np.where(np.isinf(stiffness), 1.0, stiffness).astype(stiffness.dtype), device=self.stiffness.device)
         return replace(self, stiffness=array, hard=False)
 
+    def taut(self, points):
+        """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
+        if not self.term.slack:
+            return self
+        rest = self.term.rest_state(points, self.stencil.numpy() % len(points), least=1.0, most=1.0)
+        held = rest.astype(wp.dtype_to_numpy(self.stiffness.dtype))
+        return replace(self, rest=wp.array(held, dtype=self.rest.dtype, device=self.rest.device))
+
     @cached_property
     def incidences(self):
         """(offsets (N+1,), incidences (B·E·K,)): for each vertex K·element + corner, in order. Built when first asked for."""

@@ -67,5 +67,6 @@ SPRING_LIMIT = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
+    slack=True,
     project=project,
 )

@@ -52,5 +52,6 @@ STRAIN_LIMIT = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
+    slack=True,
     project=project,
 )
