@@ -22,8 +22,13 @@ from .term import Term
 
 @wp.func
 def pseudo_inverse2(A: Any):
-    """A⁻¹ of a symmetric semi-definite 2×2 A, or that of its larger eigenvalue alone where the other is below 4ε of it."""
+    """A⁻¹ of a symmetric semi-definite 2×2 A, or that of its larger eigenvalue alone where the other is below 4ε of it.
+
+    0 of an infinite A, which is that of no stiffness.
+    """
     trace = wp.trace(A)
+    if wp.isinf(trace):
+        return A.dtype(0.0) * wp.identity(n=2, dtype=A.dtype)
     B = A / trace
     determinant = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
     if determinant > A.dtype(4.0) * epsilon(trace):

@@ -588,6 +588,14 @@ def test_correction_solves_the_local_step(term, dtype, hard, device):
     )
 
 
+@pytest.mark.parametrize("term", **named([term for term in CATALOGUE if moves(term)]))
+@every_dtype
+def test_without_stiffness_nothing_is_corrected(term, dtype, device):
+    elements = stencils(term, "random", 1.0, dtype, device)
+    slack = elements._replace(stiffness=np.zeros(len(elements.x)))
+    assert (slack.correction(np.ones(elements.x.shape[:2]), 0.1) == 0.0).all()
+
+
 @every_dtype
 @pytest.mark.parametrize("hard", [True, False], ids=["hard", "soft"])
 @pytest.mark.parametrize("name", ["CorotatedMembrane", "StrainLimit"])
