@@ -9,7 +9,8 @@ with G the weights of y and W the inverse masses, or on the scalar constraint of
     Δλ = −(C + α̃ λ)/(Σ wᵢ‖∇C‖² + α̃),   Δxᵢ = ∇ᵢC Δλ / mᵢ.
 
 XPBD adds Δλ up in λ; for PBD λ is 0. With an infinite stiffness α̃ = 0 and, for springs, this is the projection of Müller et al.
-2006 (*Position based dynamics*). A stencil of pins alone has nothing to move and gives 0, and so does a stiffness of 0.
+2006 (*Position based dynamics*). A stencil of pins alone has nothing to move and gives 0, and so does no stiffness; one with
+so few free vertices that the matrix is singular moves y as near to p(y) as they can take it, by the pseudo-inverse.
 
 The factories share the key (term, dtype, scalar, multipliers, per_step): whether the scalar constraint is used, which is for
 terms that have one; whether there is λ, else the array may be None; whether finite stiffness is spread over the sweeps of a
@@ -17,16 +18,29 @@ step.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from .assemble import local_coordinate, types
+from .rotation import epsilon
 from .term import Term
 
 
 def multiplier_type(term: Term, dtype, scalar: bool):
     """The type of λ of one element: a number, or M rows of 3."""
     return dtype if scalar else wp.types.matrix((term.rows, 3), dtype)
+
+
+@wp.func
+def pseudo_inverse2(A: Any):
+    """A⁻¹ of a symmetric semi-definite 2×2 A, or that of its larger eigenvalue alone where the other is below 4ε of it."""
+    trace = wp.trace(A)
+    B = A / trace
+    determinant = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
+    if determinant > A.dtype(4.0) * epsilon(trace):
+        B = wp.matrix_from_rows(wp.vector(B[1, 1], -B[0, 1]), wp.vector(-B[1, 0], B[0, 0])) / determinant
+    return B / trace
 
 
 @cache
@@ -58,6 +72,8 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool):
     weight, project = term.weight, term.project
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
     spread = spread_compliance(dtype)
+    if project is not None and term.rows > 2:
+        raise NotImplementedError(f"{term.name} projects {term.rows} rows; two at most")
 
     @wp.func
     def of_projection(y: y_type, r: rest_type, w: corners, compliance: dtype, multipliers: y_type, sweeps: int):
@@ -66,16 +82,16 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool):
             system += w[i] * wp.outer(weight(r, i), weight(r, i))
         mean = wp.trace(system) * dtype(wp.static(1.0 / term.rows))
         rows = y_type()
+        if wp.static(per_step):
+            compliance = spread(mean, compliance, sweeps)
         if wp.isfinite(compliance) and mean != dtype(0.0):
-            if wp.static(per_step):
-                compliance = spread(mean, compliance, sweeps)
             for m in range(M):
                 system[m, m] = system[m, m] + compliance
             gap = project(y, r) - y - compliance * multipliers
             if wp.static(term.rows == 1):
                 rows = gap / system[0, 0]
             else:
-                rows = wp.inverse(system) * gap
+                rows = pseudo_inverse2(system) * gap
         return rows, rows
 
     @wp.func
@@ -88,9 +104,9 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool):
                 direction += weight(r, i)[m] * g[m]
             total += w[i] * wp.dot(direction, direction)
         change = dtype(0.0)
+        if wp.static(per_step):
+            compliance = spread(total, compliance, sweeps)
         if wp.isfinite(compliance) and total != dtype(0.0):
-            if wp.static(per_step):
-                compliance = spread(total, compliance, sweeps)
             change = -(constraint(y, r) + compliance * multipliers) / (total + compliance)
         return change, g * change
 

@@ -31,12 +31,15 @@ class Term:
         vertices: K.
         rows: M.
         parameters: P.
-        rest_state: NumPy function (points (n, 3) [m], stencil (E, K)) → (E, P), the rest state of every element.
+        rest_state: NumPy function (points (n, 3) [m], stencil (E, K), …) → (E, P), the rest state of every element; further
+            arguments, by keyword, are what the material has beside its stiffness.
         weight: (rest, i) → (M,), the weights of vertex i in y; also ∂y/∂xᵢ.
         measure: (rest) → Aₑ.
         energy: (y, rest) → u.
         gradient: (y, rest) → ∂u/∂y (M, 3).
         hessian: (y, rest, policy) → ∂²u/∂y² (3M, 3M), y row by row, see :class:`HessianPolicy`.
+        slack: Whether there is a range about the rest shape without energy; ``rest_state`` then takes the ratios ``least`` and
+            ``most`` of its ends.
         project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or None.
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next two.
         constraint_gradient: (y, rest) → ∂C/∂y (M, 3).
@@ -53,6 +56,7 @@ class Term:
     energy: Any
     gradient: Any
     hessian: Any
+    slack: bool = False
     project: Any = None
     constraint: Any = None
     constraint_gradient: Any = None

@@ -14,6 +14,7 @@ import warp as wp
 import warpcloth as wc
 from warpcloth.model import DTYPES
 from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.terms import TERMS as KINDS
 
 # 35 vertices, 82 edges, 48 triangles, 62 hinges, 4 corners: all counts differ.
 MESH = wc.Mesh.grid(7, 5, pattern="alternating")
@@ -132,6 +133,29 @@ BAD_TERMS = {
     "length infinite": (lambda: wc.Spring(stiffness=1.0, rest_lengths=[1.0, np.inf]), "Spring.rest_lengths[1] is inf"),
     "stiffness None": (lambda: wc.Spring(stiffness=None), "Spring.stiffness is None, which is not numeric"),
     "stiffness a truth": (lambda: wc.Spring(stiffness=True), "Spring.stiffness is True, which is not numeric"),
+    "ratio of 1": (
+        lambda: wc.StVKMembrane(stiffness=1.0, poisson_ratio=1.0),
+        "StVKMembrane.poisson_ratio is 1.0; it must be above",
+    ),
+    "ratio of -1": (
+        lambda: wc.NeoHookeanMembrane(stiffness=1.0, poisson_ratio=-1.0),
+        "poisson_ratio is -1.0; it must be above",
+    ),
+    "ratio NaN": (lambda: wc.NeoHookeanMembrane(stiffness=1.0, poisson_ratio=np.nan), "poisson_ratio is nan"),
+    "too few ratios": (
+        lambda: wc.StVKMembrane(stiffness=1.0, poisson_ratio=[0.1, 0.2]),
+        "StVKMembrane.poisson_ratio has shape (2,)",
+    ),
+    "too few triangles": (lambda: wc.CorotatedMembrane(stiffness=[1.0, 2.0]), "CorotatedMembrane.stiffness has shape (2,)"),
+    "modulus below 0": (lambda: wc.CorotatedMembrane.from_material(-1.0, 1e-3), "CorotatedMembrane.youngs_modulus is -1.0"),
+    "thickness 0": (lambda: wc.StVKMembrane.from_material(1e6, 0.3, 0.0), "StVKMembrane.thickness is 0.0; it must be above 0"),
+    "mu 0": (lambda: wc.StVKMembrane.from_moduli(0.0, 1.0), "StVKMembrane.mu is 0.0; it must be above 0"),
+    "lam too low": (lambda: wc.StVKMembrane.from_moduli(1.0, -1.0), "StVKMembrane.poisson_ratio is -1.0"),
+    "no limit": (lambda: wc.StrainLimit(), "StrainLimit has neither least nor most"),
+    "least 0": (lambda: wc.SpringLimit(least=0.0), "SpringLimit.least is 0.0; it must be finite, above 0"),
+    "most infinite": (lambda: wc.StrainLimit(least=0.9, most=np.inf), "StrainLimit.most is inf; it must be finite, above 0"),
+    "least above most": (lambda: wc.StrainLimit(least=1.1, most=1.0), "StrainLimit.least is 1.1; it must be no more than most"),
+    "too few limits": (lambda: wc.SpringLimit(most=[1.0, 1.1]), "SpringLimit.most has shape (2,)"),
     "name a number": (lambda: wc.Spring(stiffness=1.0, name=5), "Spring.name is 5"),
 }
 
@@ -143,14 +167,16 @@ def test_bad_term_is_refused(term, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("kind", [wc.Spring, wc.QuadraticBending, wc.DihedralBending, wc.Attachment])
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 @pytest.mark.parametrize("stiffness", [-1.0, np.nan, [1.0, -1.0], "stiff"])
 def test_what_needs_no_mesh_is_refused_when_written(kind, stiffness):
     with pytest.raises(ValueError, match=rf"^{kind.__name__}.stiffness(\[1\])? is "):
         kind(stiffness=stiffness)
 
 
-@pytest.mark.parametrize("term", [wc.QuadraticBending(stiffness=1.0), wc.DihedralBending(stiffness=1.0)])
+@pytest.mark.parametrize(
+    "term", [wc.QuadraticBending(stiffness=1.0), wc.DihedralBending(stiffness=1.0), wc.StrainLimit(most=1.0)]
+)
 def test_a_term_without_elements_is_refused(term):
     with pytest.raises(ValueError, match="has no elements"):
         wc.Scene(wc.Mesh.chain(5), density=0.1, terms=[term]).build()

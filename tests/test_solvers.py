@@ -275,7 +275,7 @@ def test_steps_above_gershgorins_bound_warn(device):
     rest, motion = step_limits(scene.build(device=device))
     h = 0.5 * (rest + motion)
     scene = net("shear", duration=h, fps=1 / h)
-    with pytest.warns(UserWarning, match="in motion, hinges counted as at rest"):
+    with pytest.warns(UserWarning, match="in motion, hinges and membranes counted as at rest"):
         wc.Explicit(substeps=1).bind(scene.build(device=device))
 
 

@@ -35,10 +35,15 @@ def every_term():
         terms=[
             wc.Spring(name="warp", pairs=("structural", "shear"), stiffness=1e3 / 3),
             wc.Spring(name="weft", pairs=pairs[::-1], stiffness=np.linspace(1, 2, len(pairs)), rest_lengths=0.1),
+            wc.CorotatedMembrane(stiffness=1e3 / 7),
+            wc.StVKMembrane(stiffness=np.linspace(1, 2, len(sheet.triangles)), poisson_ratio=1 / 3),
+            wc.NeoHookeanMembrane(stiffness=100.0, poisson_ratio=np.linspace(-0.5, 0.9, len(sheet.triangles)), name="rubber"),
             wc.QuadraticBending(stiffness=1e-5),
             wc.DihedralBending(stiffness=np.full(len(sheet.hinges), 1e-6)),
             wc.Attachment(vertices="corners", stiffness=[1.0, 2.0, 3.0, 4.0], name="by selection"),
             wc.Attachment(vertices=[7, 3], stiffness=5.0, targets=sheet.points[[7, 3]] + 0.1),
+            wc.SpringLimit(pairs="structural", most=1.1),
+            wc.StrainLimit(least=np.linspace(0.8, 0.9, len(sheet.triangles)), most=1 + 1 / 30, stiffness=1e4),
         ],
         name="every term",
     )
@@ -177,6 +182,17 @@ def test_every_field_has_a_row():
     for term in TERMS.values():
         assert {f"terms.{field.name}" for field in fields(term)} <= known
     assert len({(row.name, row.place) for row in ATTRIBUTES}) == len(ATTRIBUTES)
+
+
+def test_a_limit_without_a_stiffness_is_hard(tmp_path):
+    limit = {
+        "warpcloth:density": ("Double", 0.1),
+        "warpcloth:terms:limit:type": ("Token", "StrainLimit"),
+        "warpcloth:terms:limit:most": ("Double", 1.05),
+    }
+    artist(tmp_path / "artist.usda", limit).Save()
+    (term,) = read_scene(tmp_path / "artist.usda").terms
+    assert (term.least, term.most, term.stiffness) == (None, 1.05, math.inf)
 
 
 # Stages that artists make.

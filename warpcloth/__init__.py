@@ -8,7 +8,17 @@ from .rotation import kabsch, polar, svd
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
 from .solvers import PBD, XPBD, Explicit, Newton
-from .terms import Attachment, DihedralBending, QuadraticBending, Spring
+from .terms import (
+    Attachment,
+    CorotatedMembrane,
+    DihedralBending,
+    NeoHookeanMembrane,
+    QuadraticBending,
+    Spring,
+    SpringLimit,
+    StrainLimit,
+    StVKMembrane,
+)
 
 __all__ = [
     "PBD",
@@ -16,16 +26,21 @@ __all__ = [
     "Animation",
     "Arap",
     "Attachment",
+    "CorotatedMembrane",
     "Deformation",
     "DihedralBending",
     "Equilibrium",
     "Explicit",
     "Mesh",
+    "NeoHookeanMembrane",
     "Newton",
     "Pins",
     "QuadraticBending",
     "Scene",
     "Spring",
+    "SpringLimit",
+    "StVKMembrane",
+    "StrainLimit",
     "deform",
     "equilibrium",
     "kabsch",

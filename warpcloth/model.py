@@ -65,6 +65,14 @@ class DeviceElements:
 
         return replace(self, **{name: put(getattr(self, name)) for name in ("stencil", "stiffness", "rest")})
 
+    def taut(self, points):
+        """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
+        if not self.term.slack:
+            return self
+        rest = self.term.rest_state(points, self.stencil.numpy() % len(points), least=1.0, most=1.0)
+        held = rest.astype(wp.dtype_to_numpy(self.stiffness.dtype))
+        return replace(self, rest=wp.array(held, dtype=self.rest.dtype, device=self.rest.device))
+
     @cached_property
     def incidences(self):
         """(offsets (N+1,), incidences (B·E·K,)): for each vertex K·element + corner, in order. Built when first asked for."""
@@ -201,6 +209,7 @@ class Model:
         stiffness = vary.take_stiffness(one, E)
         for copy, e in np.argwhere(~(stiffness >= 0.0))[:1]:
             raise ValueError(f"{one.label}.stiffness is {stiffness[copy, e]} in copy {copy}; it must be 0 or more")
+        rest_type = wp.types.vector(one.term.parameters, self.dtype)
         return DeviceElements(
             label=one.label,
             kind=one.kind,
@@ -208,7 +217,7 @@ class Model:
             per_copy=E,
             stencil=wp.array(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), dtype=wp.int32, device=self.device),
             stiffness=self._broadcast(one.label, stiffness, E),
-            rest=self._put(f"{one.label}: rest state", "", rest, wp.types.vector(one.term.parameters, self.dtype), "element"),
+            rest=self._put(f"{one.label}: rest state", "", rest, rest_type, "element", infinite=True),  # a limit may be none
             hard=bool(np.isinf(stiffness).any()),
         )
 

@@ -75,7 +75,7 @@ class Energy:
 
 
 class Hessian:
-    """∂²U/∂x² + scale·M in block compressed rows, pinned vertices replaced by the identity.
+    """∂²U/∂x² + scale·M in block compressed rows, pinned vertices replaced by the identity; or of the ``terms`` given.
 
     Attributes:
         offsets, columns: Block rows (N+1,) and the column of each block.
@@ -84,14 +84,12 @@ class Hessian:
         policy: (B,) int32, a :class:`HessianPolicy` for each copy.
     """
 
-    def __init__(self, model, policy=0, corrected=False):
-        self.model = model
+    def __init__(self, model, policy=0, corrected=False, terms=None):
+        self.model, self.terms = model, model.terms if terms is None else terms
         device = model.device
-        self.kernels = [
-            model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected) for elements in model.terms
-        ]
+        self.kernels = [model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected) for elements in self.terms]
         self.blocks = [
-            wp.zeros((elements.count, elements.term.vertices**2), dtype=model.mat33, device=device) for elements in model.terms
+            wp.zeros((elements.count, elements.term.vertices**2), dtype=model.mat33, device=device) for elements in self.terms
         ]
         self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=device)
         self._set_inertia = model.kernel(linear.set_inertia, model.dtype)
@@ -103,7 +101,7 @@ class Hessian:
         model, n = self.model, self.model.count
         fixed = model.inverse_mass.numpy() == 0.0
         keys, sources = [np.arange(n, dtype=np.int64) * (n + 1)], []
-        for elements in model.terms:
+        for elements in self.terms:
             stencil = elements.stencil.numpy().astype(np.int64)
             K = stencil.shape[1]
             rows, columns = np.repeat(stencil, K, axis=1).ravel(), np.tile(stencil, K).ravel()
@@ -132,7 +130,7 @@ class Hessian:
         model = self.model
         self.values.zero_()
         model.launch(self._set_inertia, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values])
-        for elements, kernel, blocks, gather in zip(model.terms, self.kernels, self.blocks, self.gathers, strict=True):
+        for elements, kernel, blocks, gather in zip(self.terms, self.kernels, self.blocks, self.gathers, strict=True):
             arguments = [*elements.arguments, x, correction, elements.per_copy, self.policy]
             model.launch(kernel, elements.count, arguments, [blocks])
             model.launch(self._add_blocks, len(self.values), [*gather, blocks.flatten()], [self.values])

@@ -1,5 +1,6 @@
 """What a scene writes: one small frozen record per energy, with units. The energies themselves are in ``kernels/terms``."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -8,7 +9,17 @@ import numpy as np
 
 from .checks import numeric, refuse, shown
 from .kernels.term import Term
-from .kernels.terms import ATTACHMENT, DIHEDRAL_BENDING, QUADRATIC_BENDING, SPRING
+from .kernels.terms import (
+    ATTACHMENT,
+    COROTATED_MEMBRANE,
+    DIHEDRAL_BENDING,
+    NEO_HOOKEAN_MEMBRANE,
+    QUADRATIC_BENDING,
+    SPRING,
+    SPRING_LIMIT,
+    STRAIN_LIMIT,
+    STVK_MEMBRANE,
+)
 
 
 @dataclass(frozen=True)
@@ -123,17 +134,102 @@ class Spring(Declared):
             refuse(f"{self.label}.rest_lengths", lengths, wrong, "must be finite, 0 or more")
 
     def stencil(self, mesh):
-        if isinstance(self.pairs, str):
-            return mesh.springs(self.pairs)
-        if isinstance(self.pairs, (tuple, list)) and self.pairs and all(isinstance(kind, str) for kind in self.pairs):
-            return np.unique(np.concatenate([mesh.springs(kind) for kind in self.pairs]), axis=0)
-        return own_stencil(self.label, "pairs", self.pairs, 2, len(mesh.points))
+        return pairs_on(mesh, self.label, self.pairs)
 
     def rest(self, mesh, positions, stencil):
         if self.rest_lengths is None:
             return super().rest(mesh, positions, stencil)
         lengths = self._of_elements("rest_lengths", len(stencil))
         return np.broadcast_to(lengths, len(stencil))[:, None].copy()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorotatedMembrane(Declared):
+    """A membrane of triangles without Poisson's effect, U = Σ ½kA‖F − R‖², R the polar rotation of F (Chao et al. 2010).
+
+    F (3×2) is the deformation gradient and A the rest area of a triangle. Linear in the stretch, and has a projection.
+
+    Attributes:
+        stiffness: k = Et = 2μ [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled.
+            One or (T,); ``math.inf`` for solvers that take hard constraints.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = COROTATED_MEMBRANE
+
+    @classmethod
+    def from_material(cls, youngs_modulus, thickness, **fields):
+        """Of a material with E [Pa] and ν = 0, ``thickness`` t [m] thick."""
+        return cls(stiffness=_product(cls, youngs_modulus, thickness), **fields)
+
+    def stencil(self, mesh):
+        return mesh.triangles
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Isotropic(Declared):
+    """What isotropic membranes in plane stress have: k = Et, and Poisson's ratio ν.
+
+    In these μ = k/(2(1 + ν)) and λ = kν/(1 − ν²). A stiffness that varies leaves ν as it is.
+    """
+
+    poisson_ratio: float | Sequence[float] | np.ndarray = 0.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        ratio = self._numeric("poisson_ratio")
+        refuse(f"{self.label}.poisson_ratio", ratio, ~((ratio > -1.0) & (ratio < 1.0)), "must be above -1 and below 1")
+
+    @classmethod
+    def from_material(cls, youngs_modulus, poisson_ratio, thickness, **fields):
+        """Of a material with E [Pa] and ν, ``thickness`` t [m] thick: μ = Et/(2(1 + ν)), λ = Eνt/(1 − ν²) [N/m]."""
+        return cls(stiffness=_product(cls, youngs_modulus, thickness), poisson_ratio=poisson_ratio, **fields)
+
+    @classmethod
+    def from_moduli(cls, mu, lam, **fields):
+        """Of Lamé's moduli of the membrane, μ above 0 and λ above −μ [N/m]: ν = λ/(λ + 2μ), k = 2μ(1 + ν)."""
+        mu, lam = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in (("mu", mu), ("lam", lam)))
+        refuse(f"{cls.__name__}.mu", mu, ~(mu > 0.0), "must be above 0")
+        ratio = lam / (lam + 2.0 * mu)
+        return cls(stiffness=2.0 * mu * (1.0 + ratio), poisson_ratio=ratio, **fields)
+
+    def stencil(self, mesh):
+        return mesh.triangles
+
+    def rest(self, mesh, positions, stencil):
+        return self.term.rest_state(mesh.points, stencil, poisson_ratio=self._of_elements("poisson_ratio", len(stencil)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StVKMembrane(_Isotropic):
+    """A St. Venant–Kirchhoff membrane of triangles, U = Σ A(μ‖E‖² + ½λ(tr E)²), E = ½(FᵀF − I) the Green strain.
+
+    F (3×2) is the deformation gradient and A the rest area of a triangle. It gives way under large pressure.
+
+    Attributes:
+        stiffness: k = Et [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled a
+            little. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
+        poisson_ratio: ν, above −1 and below 1, one or (T,).
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = STVK_MEMBRANE
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeoHookeanMembrane(_Isotropic):
+    """A stable Neo-Hookean membrane, U = Σ A(½μ(‖F‖² − 2) − μ(J − 1) + ½(λ + μ)(J − 1)²) (Smith, De Goes and Kim 2018).
+
+    F (3×2) is the deformation gradient, J = ‖f₁×f₂‖, and A the rest area of a triangle. It recovers from any deformation.
+
+    Attributes:
+        stiffness: k = Et [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled a
+            little. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
+        poisson_ratio: ν, above −1 and below 1, one or (T,).
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = NEO_HOOKEAN_MEMBRANE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,7 +299,100 @@ class Attachment(Declared):
         return targets
 
 
-TERMS = {cls.__name__: cls for cls in (Spring, QuadraticBending, DihedralBending, Attachment)}
+@dataclass(frozen=True, kw_only=True)
+class _Limit(Declared):
+    """What limits have: a stiffness that is infinite unless it is given, and a least and a most."""
+
+    stiffness: float | Sequence[float] | np.ndarray = math.inf
+    least: float | Sequence[float] | np.ndarray | None = None
+    most: float | Sequence[float] | np.ndarray | None = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        given = {name: self._numeric(name) for name in ("least", "most") if getattr(self, name) is not None}
+        if not given:
+            raise ValueError(f"{self.label} has neither least nor most; at least one of the two must be given")
+        for name, values in given.items():
+            refuse(f"{self.label}.{name}", values, ~((values > 0.0) & np.isfinite(values)), "must be finite, above 0")
+        if len(given) == 2 and len({values.shape for values in given.values() if values.ndim}) < 2:
+            least, most = np.broadcast_arrays(given["least"], given["most"])
+            refuse(f"{self.label}.least", least, ~(least <= most), "must be no more than most")
+
+    def rest(self, mesh, positions, stencil):
+        given = {name: self._of_elements(name, len(stencil)) for name in ("least", "most") if getattr(self, name) is not None}
+        return self.term.rest_state(mesh.points, stencil, **given)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringLimit(_Limit):
+    """Limits of the lengths of pairs, U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L] (Provot 1995).
+
+    Attributes:
+        least, most: σ_min, σ_max, ratios to the rest length L, one or (E,); at least one of the two.
+        pairs: Which vertices, as in :class:`Spring`.
+        stiffness: k [N/m], one or (E,): of the springs that pairs beyond their limits are; infinite for PBD, which takes
+            hard constraints, finite for solvers that need forces.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = SPRING_LIMIT
+
+    pairs: str | tuple | np.ndarray = "edges"
+
+    def stencil(self, mesh):
+        return pairs_on(mesh, self.label, self.pairs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StrainLimit(_Limit):
+    """Limits of the principal stretches of triangles, U = Σ ½kA‖F − p‖², p the nearest with σ_min ≤ σᵢ ≤ σ_max (Thomaszewski
+    et al. 2009).
+
+    Attributes:
+        least, most: σ_min, σ_max of the singular values of the deformation gradient F, one or (T,); at least one of the two.
+        stiffness: k [N/m], one or (T,), that of :class:`CorotatedMembrane` beyond the limits; infinite for PBD, which takes
+            hard constraints, finite for solvers that need forces.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = STRAIN_LIMIT
+
+    def stencil(self, mesh):
+        return mesh.triangles
+
+
+TERMS = {
+    cls.__name__: cls
+    for cls in (
+        Spring,
+        CorotatedMembrane,
+        StVKMembrane,
+        NeoHookeanMembrane,
+        QuadraticBending,
+        DihedralBending,
+        Attachment,
+        SpringLimit,
+        StrainLimit,
+    )
+}
+
+
+def _product(cls, youngs_modulus, thickness):
+    """Et [N/m]."""
+    given = {"youngs_modulus": youngs_modulus, "thickness": thickness}
+    modulus, t = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in given.items())
+    refuse(f"{cls.__name__}.youngs_modulus", modulus, ~(modulus >= 0.0), "must be 0 or more")
+    refuse(f"{cls.__name__}.thickness", t, ~(t > 0.0), "must be above 0")
+    return (modulus * t)[()]
+
+
+def pairs_on(mesh, label, pairs):
+    """The pairs of :class:`Spring` on a mesh, (E, 2) int32."""
+    if isinstance(pairs, str):
+        return mesh.springs(pairs)
+    if isinstance(pairs, (tuple, list)) and pairs and all(isinstance(kind, str) for kind in pairs):
+        return np.unique(np.concatenate([mesh.springs(kind) for kind in pairs]), axis=0)
+    return own_stencil(label, "pairs", pairs, 2, len(mesh.points))
 
 
 def own_stencil(label, parameter, indices, vertices, count):

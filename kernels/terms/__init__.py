@@ -1,8 +1,23 @@
 """The catalogue: the only list of the energies."""
 
 from .attachment import ATTACHMENT
+from .corotated_membrane import COROTATED_MEMBRANE
 from .dihedral_bending import DIHEDRAL_BENDING
+from .neo_hookean_membrane import NEO_HOOKEAN_MEMBRANE
 from .quadratic_bending import QUADRATIC_BENDING
 from .spring import SPRING
+from .spring_limit import SPRING_LIMIT
+from .strain_limit import STRAIN_LIMIT
+from .stvk_membrane import STVK_MEMBRANE
 
-CATALOGUE = (SPRING, QUADRATIC_BENDING, DIHEDRAL_BENDING, ATTACHMENT)
+CATALOGUE = (
+    SPRING,
+    COROTATED_MEMBRANE,
+    STVK_MEMBRANE,
+    NEO_HOOKEAN_MEMBRANE,
+    QUADRATIC_BENDING,
+    DIHEDRAL_BENDING,
+    ATTACHMENT,
+    SPRING_LIMIT,
+    STRAIN_LIMIT,
+)

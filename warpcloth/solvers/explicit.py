@@ -42,7 +42,8 @@ class Explicit(Step):
         """The solver on ``model``, all scratch allocated.
 
         Warns:
-            UserWarning: If the step is above the bound in motion, see :func:`step_limits`, which counts hinges as at rest.
+            UserWarning: If the step is above the bound in motion, see :func:`step_limits`, which counts hinges and
+                membranes as at rest.
 
         Raises:
             ValueError: If the step is above the limit and that is not allowed, or a stiffness is infinite.
@@ -69,18 +70,19 @@ class Explicit(Step):
         if h >= motion:
             warnings.warn(
                 f"dt is {h:.6g} s; below {rest:.6g} s it is stable about the rest shape, but only below {motion:.6g} s "
-                "in motion, hinges counted as at rest",
+                "in motion, hinges and membranes counted as at rest",
                 stacklevel=3,
             )
 
 
 def step_limits(model):
-    """The largest stable steps of symplectic Euler [s]: about the rest shape, and in motion, hinges counted as at rest.
+    """The largest stable steps of symplectic Euler [s]: about the rest shape, and in motion, see below.
 
     The first is 2/ω with ω² the largest eigenvalue of M⁻¹∂²U/∂x² at rest, by Lanczos iteration; the second 2/√G with
     Gershgorin's G = max over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is
     2·Σk/m, which no motion exceeds, and neither does one of quadratic bending. The Hessian of dihedral bending grows as the
-    cloth folds or is compressed, so for scenes with it the second is no bound there: it counts hinges as at rest.
+    cloth folds or is compressed and those of membranes as they stretch, so for scenes with these the second is no bound there:
+    it counts them as at rest. Limits, which at rest have no stiffness, are counted as reached, in both.
 
     Returns:
         (rest, motion); infinite where nothing is stiff.
@@ -92,14 +94,14 @@ def step_limits(model):
     from scipy.sparse.linalg import eigsh
 
     refuse_hard(model, "Explicit", _INSTEAD)
-    hessian = Hessian(model)
+    hessian = Hessian(model, terms=[elements.taut(model.scene.mesh.points) for elements in model.terms])
     rest_shape = np.tile(model.scene.mesh.points, (model.copies, 1))
     hessian.assemble(model.array(rest_shape, model.vec3), 0.0)
     inverse_mass = model.inverse_mass.numpy().astype(np.float64)
     root = diags(np.repeat(np.sqrt(inverse_mass), 3))
     matrix = (root @ hessian.matrix() @ root).tocsr()
     rows = np.zeros(model.count)
-    for elements, blocks in zip(model.terms, hessian.blocks, strict=True):
+    for elements, blocks in zip(hessian.terms, hessian.blocks, strict=True):
         K = elements.term.vertices
         sizes = np.abs(blocks.numpy().astype(np.float64))
         # √(‖·‖₁‖·‖∞) is no less than the spectral norm, equal to it along the axes and diagonals of a grid, and cheap.

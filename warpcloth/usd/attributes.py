@@ -69,6 +69,9 @@ ATTRIBUTES = (
     Attribute("terms.stiffness", "warpcloth:terms:<name>:stiffness", "cloth", (_T.Double, _T.DoubleArray)),
     Attribute("terms.pairs", "warpcloth:terms:<name>:pairs", "cloth", (_T.Token, _T.TokenArray, _T.Int2Array)),
     Attribute("terms.rest_lengths", "warpcloth:terms:<name>:restLengths", "cloth", (_T.Double, _T.DoubleArray)),
+    Attribute("terms.poisson_ratio", "warpcloth:terms:<name>:poissonRatio", "cloth", (_T.Double, _T.DoubleArray)),
+    Attribute("terms.least", "warpcloth:terms:<name>:least", "cloth", (_T.Double, _T.DoubleArray)),
+    Attribute("terms.most", "warpcloth:terms:<name>:most", "cloth", (_T.Double, _T.DoubleArray)),
     Attribute("terms.vertices", "warpcloth:terms:<name>:vertices", "cloth", (_T.String, _T.IntArray)),
     Attribute("terms.targets", "warpcloth:terms:<name>:targets", "cloth", (_T.Double3Array,)),
     # What the prim's own points and curves lose. Used while they agree with these: an artist's edit wins.

@@ -1,7 +1,7 @@
 """Whole scenes read from USD stages and written as such. What stands where is said in `attributes`."""
 
 import os
-from dataclasses import fields, replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -173,13 +173,13 @@ def _term(values, key):
     kind = given.pop("type", None)
     if kind not in TERMS:
         raise ValueError(f"{prefix}:type is {'not given' if kind is None else repr(kind)}, must be one of {', '.join(TERMS)}")
-    wrong = sorted(set(given) - {field.name for field in fields(TERMS[kind])})
+    known = {field.name: field for field in fields(TERMS[kind])}
+    wrong = sorted(set(given) - set(known))
     if wrong:
         raise ValueError(f"{prefix} has {wrong[0]}, which a {kind} has not; it must have none")
-    if "stiffness" not in given:
+    if "stiffness" not in given and known["stiffness"].default is MISSING:
         raise ValueError(f"{prefix}:stiffness is not given, must be a number or one for each element")
-    if np.ndim(given["stiffness"]) == 0:
-        given["stiffness"] = float(given["stiffness"])
+    given = {name: float(value) if isinstance(value, np.number) else value for name, value in given.items()}
     # A term without a name of its own is called by its kind.
     given["name"] = given.get("name", "" if key == kind else key) or None
     return TERMS[kind](**given)

@@ -1,0 +1,191 @@
+"""What energies of a triangle's deformation gradient share: F itself, and Hessians from its singular values.
+
+Stencil: a triangle (x₀, x₁, x₂). F (3×2) = [x₁ − x₀, x₂ − x₀] Dm⁻¹ with Dm the rest edges in the triangle's own tangent frame,
+the first along an axis; the rows of y are the columns of F. The first numbers of a rest state are Dm⁻¹, which is upper
+triangular: r₀ = Dm⁻¹₀₀, r₁ = Dm⁻¹₀₁, r₂ = Dm⁻¹₁₁ [1/m]. The measure is the rest area ½ det Dm [m²].
+
+An isotropic energy ψ(σ₁, σ₂) of the singular values of F = U diag(σ) Vᵀ, u₃ = u₁×u₂, has ∂ψ/∂F = Σ ψᵢ uᵢvᵢᵀ, and its Hessian
+the eigenmatrices (Smith, De Goes and Kim 2019, *Analytic eigensystems for isotropic distortion energies*; here of 3×2)
+
+    stretch     u₁v₁ᵀ and u₂v₂ᵀ, mixed by the 2×2 matrix ψᵢⱼ
+    twist       (u₂v₁ᵀ − u₁v₂ᵀ)/√2     (ψ₁ + ψ₂)/(σ₁ + σ₂)
+    flip        (u₂v₁ᵀ + u₁v₂ᵀ)/√2     (ψ₁ − ψ₂)/(σ₁ − σ₂)
+    out of the plane    u₃vᵢᵀ           ψᵢ/σᵢ
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .rotation import svd3x2
+from .term import HessianPolicy
+
+RAW = wp.constant(int(HessianPolicy.RAW))
+ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
+
+
+def inverse_edges(points, stencil):
+    """r₀, r₁, r₂ [1/m] of the triangles ``stencil`` (E, 3), (E, 3)."""
+    a, b = points[stencil[:, 1]] - points[stencil[:, 0]], points[stencil[:, 2]] - points[stencil[:, 0]]
+    length = np.linalg.norm(a, axis=1)
+    height = np.linalg.norm(np.cross(a, b), axis=1) / length
+    along = np.einsum("ij,ij->i", a, b) / length
+    return np.stack([1.0 / length, -along / (length * height), 1.0 / height], axis=1)
+
+
+def material_state(points, stencil, poisson_ratio):
+    """:func:`inverse_edges` and, of Poisson's ratio ν (one or E), μ/k = 1/(2(1 + ν)) and λ/k = ν/(1 − ν²), (E, 5)."""
+    nu = np.broadcast_to(poisson_ratio, len(stencil))
+    return np.column_stack([inverse_edges(points, stencil), 0.5 / (1.0 + nu), nu / (1.0 - nu**2)])
+
+
+@wp.func
+def weight(rest: Any, i: int):
+    w = wp.vector(length=2, dtype=rest.dtype)
+    if i == 0:
+        w[0] = -rest[0]
+        w[1] = -(rest[1] + rest[2])
+    elif i == 1:
+        w[0] = rest[0]
+        w[1] = rest[1]
+    else:
+        w[1] = rest[2]
+    return w
+
+
+@wp.func
+def measure(rest: Any):
+    return rest.dtype(0.5) / (rest[0] * rest[2])
+
+
+@wp.func
+def decompose(y: Any):
+    """U (3×2), σ and V (2×2) of F."""
+    return svd3x2(wp.transpose(y))
+
+
+@wp.func
+def dyad(u: Any, v: Any):
+    """u vᵀ as a vector, laid out as y row by row."""
+    a = wp.vector(length=6, dtype=u.dtype)
+    for m in range(2):
+        for row in range(3):
+            a[3 * m + row] = v[m] * u[row]
+    return a
+
+
+@wp.func
+def kept(value: Any, policy: int):
+    """An eigenvalue under a policy."""
+    if policy != RAW and value < type(value)(0.0):
+        if policy == ABSOLUTE:
+            value = -value
+        else:
+            value = type(value)(0.0)
+    return value
+
+
+@wp.func
+def kept2(B: Any, policy: int):
+    """A symmetric 2×2 matrix under a policy, without its eigenvectors."""
+    half = B.dtype(0.5)
+    mean = half * (B[0, 0] + B[1, 1])
+    difference = half * (B[0, 0] - B[1, 1])
+    radius = wp.sqrt(difference * difference + B[0, 1] * B[0, 1])
+    high = mean + radius
+    low = mean - radius
+    K = B
+    if policy != RAW and low < B.dtype(0.0):
+        # Of unlike signs the eigenvalues are apart.
+        if policy == ABSOLUTE:
+            K = -B
+            if high > B.dtype(0.0):
+                K = ((high + low) * B - B.dtype(2.0) * high * low * wp.identity(n=2, dtype=B.dtype)) / (high - low)
+        else:
+            K = B * B.dtype(0.0)
+            if high > B.dtype(0.0):
+                K = (high / (high - low)) * (B - low * wp.identity(n=2, dtype=B.dtype))
+    return K
+
+
+@wp.func
+def isotropic_hessian(U: Any, V: Any, stretch: Any, twist: Any, flip: Any, out1: Any, out2: Any, policy: int):
+    """∂²ψ/∂y² (6×6) of the 2×2 matrix and the four eigenvalues of the module's table."""
+    u1 = wp.vector(U[0, 0], U[1, 0], U[2, 0])
+    u2 = wp.vector(U[0, 1], U[1, 1], U[2, 1])
+    u3 = wp.cross(u1, u2)
+    v1 = wp.vector(V[0, 0], V[1, 0])
+    v2 = wp.vector(V[0, 1], V[1, 1])
+    B = kept2(stretch, policy)
+    half = U.dtype(0.5)
+    a = dyad(u1, v1)
+    b = dyad(u2, v2)
+    c = dyad(u2, v1)
+    d = dyad(u1, v2)
+    H = wp.outer(a, B[0, 0] * a + B[0, 1] * b) + wp.outer(b, B[0, 1] * a + B[1, 1] * b)
+    H += wp.outer((half * kept(twist, policy)) * (c - d), c - d) + wp.outer((half * kept(flip, policy)) * (c + d), c + d)
+    a = dyad(u3, v1)
+    b = dyad(u3, v2)
+    return H + wp.outer(kept(out1, policy) * a, a) + wp.outer(kept(out2, policy) * b, b)
+
+
+# --- the distance to the F whose singular values lie in a range, u = ½‖F − p‖² = ½Σ(σᵢ − cᵢ)², cᵢ = σᵢ clamped to it
+
+
+@wp.func
+def clamped(S: Any, least: Any, most: Any):
+    return wp.vector(wp.min(wp.max(S[0], least), most), wp.min(wp.max(S[1], least), most))
+
+
+@wp.func
+def range_energy(y: Any, least: Any, most: Any):
+    _U, S, _V = decompose(y)
+    excess = S - clamped(S, least, most)
+    return y.dtype(0.5) * wp.dot(excess, excess)
+
+
+@wp.func
+def range_gradient(y: Any, least: Any, most: Any):
+    """F − p, exactly 0 inside the range. What has no direction, σ = 0, takes that of U."""
+    U, S, V = decompose(y)
+    excess = S - clamped(S, least, most)
+    return wp.transpose(U * wp.diag(excess) * wp.transpose(V))
+
+
+@wp.func
+def secant(excess: Any, size: Any, target: Any):
+    """excess/size, and 1 of what is collapsed, size ≤ 1e-12 target; 0 where there is no excess."""
+    k = excess
+    if excess != type(excess)(0.0):
+        k = type(excess)(1.0)
+        if not (size <= target * type(excess)(1.0e-12)):
+            k = excess / size
+    return k
+
+
+@wp.func
+def tangent(size: Any, least: Any, most: Any):
+    """∂(σ − c)/∂σ: 1, and 0 inside the range."""
+    k = type(size)(1.0)
+    if size > least and size < most:
+        k = type(size)(0.0)
+    return k
+
+
+@wp.func
+def range_hessian(y: Any, least: Any, most: Any, policy: int):
+    """∂²u/∂y²; on the edge of the range that of outside. Only twist and the last two can be negative."""
+    U, S, V = decompose(y)
+    c = clamped(S, least, most)
+    excess = S - c
+    stretch = wp.matrix(shape=(2, 2), dtype=y.dtype)
+    stretch[0, 0] = tangent(S[0], least, most)
+    stretch[1, 1] = tangent(S[1], least, most)
+    flip = tangent(S[0], least, most)
+    if S[0] > S[1]:
+        flip = y.dtype(1.0) - (c[0] - c[1]) / (S[0] - S[1])
+    twist = secant(excess[0] + excess[1], S[0] + S[1], c[0] + c[1])
+    out1 = secant(excess[0], S[0], c[0])
+    out2 = secant(excess[1], S[1], c[1])
+    return isotropic_hessian(U, V, stretch, twist, flip, out1, out2, policy)

@@ -1,0 +1,55 @@
+"""Corotated membrane: U = Σ ½kA‖F − R‖², k = 2μ = Et in N/m, Poisson's ratio 0 (Sorkine and Alexa 2007; Chao et al. 2010, *A
+simple geometric model for elastic deformation*).
+
+F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, R the nearest matrix with RᵀR = I, its polar factor;
+A is the rest area. Per area that is μΣ(σᵢ − 1)². A term ½λ(tr(RᵀF) − 2)² would bring Poisson's effect, and take the projection.
+
+A collapsed triangle keeps a force: where R is not unique it is the least rotation, see :mod:`..rotation`.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from ..membrane import inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
+from ..term import Term
+
+
+def rest_state(points, stencil):
+    """Inverse rest edges [1/m] of the triangles ``stencil`` (E, 3) as an array (E, 3)."""
+    return inverse_edges(points, stencil)
+
+
+@wp.func
+def energy(y: Any, rest: Any):
+    return range_energy(y, y.dtype(1.0), y.dtype(1.0))
+
+
+@wp.func
+def gradient(y: Any, rest: Any):
+    return range_gradient(y, y.dtype(1.0), y.dtype(1.0))
+
+
+@wp.func
+def hessian(y: Any, rest: Any, policy: int):
+    return range_hessian(y, y.dtype(1.0), y.dtype(1.0), policy)
+
+
+@wp.func
+def project(y: Any, rest: Any):
+    return y - gradient(y, rest)
+
+
+COROTATED_MEMBRANE = Term(
+    name="CorotatedMembrane",
+    vertices=3,
+    rows=2,
+    parameters=3,
+    rest_state=rest_state,
+    weight=weight,
+    measure=measure,
+    energy=energy,
+    gradient=gradient,
+    hessian=hessian,
+    project=project,
+)

@@ -1,0 +1,72 @@
+"""Spring limit: U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L], k in N/m (Provot 1995, *Deformation constraints in a
+mass-spring model*).
+
+Stencil (x₀, x₁), y = x₁ − x₀, l = ‖y‖, measure 1. Within the limits there is neither energy nor force; beyond them it is the
+spring whose length is the limit, see :mod:`.spring`, collapsed ones too. An infinite k makes it a hard constraint.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..term import Term
+from . import spring
+
+spring_energy, spring_gradient, spring_hessian, spring_project = spring.energy, spring.gradient, spring.hessian, spring.project
+
+
+def rest_state(points, stencil, least=-np.inf, most=np.inf):
+    """Least and most lengths [m] of the pairs ``stencil`` (E, 2), from σ_min and σ_max (one or E each), as an array (E, 2)."""
+    lengths = spring.rest_state(points, stencil)[:, 0]
+    ratios = np.stack([np.broadcast_to(least, len(lengths)), np.broadcast_to(most, len(lengths))], axis=1).astype(np.float64)
+    return np.multiply(ratios, lengths[:, None], out=ratios, where=np.isfinite(ratios))
+
+
+@wp.func
+def nearest_length(y: Any, rest: Any):
+    """c, as the rest state of a spring."""
+    c = wp.vector(length=1, dtype=rest.dtype)
+    c[0] = wp.min(wp.max(wp.length(y[0]), rest[0]), rest[1])
+    return c
+
+
+@wp.func
+def energy(y: Any, rest: Any):
+    return spring_energy(y, nearest_length(y, rest))
+
+
+@wp.func
+def gradient(y: Any, rest: Any):
+    return spring_gradient(y, nearest_length(y, rest))
+
+
+@wp.func
+def hessian(y: Any, rest: Any, policy: int):
+    """On a limit that of outside."""
+    h = spring_hessian(y, nearest_length(y, rest), policy)
+    length = wp.length(y[0])
+    if length > rest[0] and length < rest[1]:
+        h *= y.dtype(0.0)
+    return h
+
+
+@wp.func
+def project(y: Any, rest: Any):
+    return spring_project(y, nearest_length(y, rest))
+
+
+SPRING_LIMIT = Term(
+    name="SpringLimit",
+    vertices=2,
+    rows=1,
+    parameters=2,
+    rest_state=rest_state,
+    weight=spring.weight,
+    measure=spring.measure,
+    energy=energy,
+    gradient=gradient,
+    hessian=hessian,
+    slack=True,
+    project=project,
+)
