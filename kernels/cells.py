@@ -16,7 +16,10 @@ from .rotation import nearest_rotation
 
 @cache
 def set_moments(dtype):
-    """Kernel over cells: gᵢ = wᵢ(Xᵢ − X̄) of their members, with the centroid X̄ = Σ wᵢ Xᵢ / Σ wᵢ."""
+    """Kernel over cells: gᵢ = wᵢ(Xᵢ − X̄) of their members, with the centroid X̄ = Σ wᵢ Xᵢ / Σ wᵢ, the largest made 1 long.
+
+    Their size does not matter to a rotation, and squares of small ones would underflow.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -29,25 +32,35 @@ def set_moments(dtype):
         moments: wp.array(dtype=vec3),
     ):
         c = wp.tid()
-        # From the first member, so that nothing is lost far from the origin.
-        origin = X[members[offsets[c]]]
+        first, last = offsets[c], offsets[c + 1]
         total = dtype(0.0)
+        # From a member that counts, so that nothing is lost far from the origin.
+        origin = X[members[first]]
+        for k in range(first, last):
+            if total == dtype(0.0):
+                origin = X[members[k]]
+            total += weights[members[k]]
         centroid = vec3()
-        for k in range(offsets[c], offsets[c + 1]):
-            i = members[k]
-            total += weights[i]
-            centroid += weights[i] * (X[i] - origin)
-        centroid = centroid / total
-        for k in range(offsets[c], offsets[c + 1]):
-            i = members[k]
-            moments[k] = weights[i] * ((X[i] - origin) - centroid)
+        for k in range(first, last):
+            centroid += (weights[members[k]] / total) * (X[members[k]] - origin)
+        largest = dtype(0.0)
+        for k in range(first, last):
+            g = (weights[members[k]] / total) * ((X[members[k]] - origin) - centroid)
+            largest = wp.max(largest, wp.max(wp.abs(g)))
+            moments[k] = g
+        if largest > dtype(0.0):
+            for k in range(first, last):
+                moments[k] = moments[k] / largest
 
     return set_from_centroid
 
 
 @cache
 def fit_rotations(dtype):
-    """Kernel over cells: R_c = the rotation that maximises tr(RᵀS_c), S_c = Σᵢ (xᵢ − x_o) gᵢᵀ, x_o that of the first member."""
+    """Kernel over cells: R_c = the rotation with the largest tr(RᵀS_c), S_c = Σᵢ (xᵢ − x_o) gᵢᵀ.
+
+    x_o is that of the first member with a moment, for one without may be anywhere.
+    """
     vec3, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -60,10 +73,13 @@ def fit_rotations(dtype):
         rotations: wp.array(dtype=mat33),
     ):
         c = wp.tid()
-        first = offsets[c]
-        origin = x[members[first]]
+        first, last = offsets[c], offsets[c + 1]
+        o = first
+        while o < last - 1 and wp.length_sq(moments[o]) == dtype(0.0):
+            o += 1
+        origin = x[members[o]]
         S = mat33()
-        for k in range(first + 1, offsets[c + 1]):
+        for k in range(first, last):
             S += wp.outer(x[members[k]] - origin, moments[k])
         rotations[c] = nearest_rotation(S)
 

@@ -97,4 +97,4 @@ def launch(factory, function, A, out):
     block = BLOCK if A.device.is_cuda else 1
     kernel = factory(function, A.dtype, tuple(array.dtype for array in out), block)
     threads = -(-len(A) // block) * block
-    wp.launch(kernel, threads, inputs=[A], outputs=out, device=A.device, block_dim=max(block, 1))
+    wp.launch(kernel, threads, inputs=[A], outputs=out, device=A.device, block_dim=block)

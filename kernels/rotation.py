@@ -50,14 +50,18 @@ def smallest(x: wp.float64):  # noqa: F811 - likewise
 
 @wp.func
 def unit(c: Any, s: Any, least: Any, c_else: Any, s_else: Any):
-    """(c, s) made a unit vector; where it is not longer than ``least`` the other one, and (1, 0) where that is 0 too."""
+    """(c, s) made a unit vector; where it is not longer than ``least`` the other one, and (1, 0) where that is below ε² too.
+
+    So that no square underflows of what is made longer.
+    """
     length = wp.sqrt(c * c + s * s)
     if length <= least:
         c = c_else
         s = s_else
         length = wp.sqrt(c * c + s * s)
-        if length == type(c)(0.0):
+        if length <= epsilon(c) * epsilon(c):
             c = type(c)(1.0)
+            s = type(c)(0.0)
             length = type(c)(1.0)
     inverse = type(c)(1.0) / length
     return inverse * c, inverse * s
@@ -90,7 +94,7 @@ def complement(n: Any):
 
 @wp.func
 def separated_eigenvector(C: Any):
-    """Unit eigenvector of a symmetric 3×3 C of about unit size, for the eigenvalue farthest from the others.
+    """Unit eigenvector of a symmetric 3×3 C, none of it large, for the eigenvalue farthest from the others.
 
     Returns:
         It, and 1 where that eigenvalue is the largest, −1 where it is the smallest.
@@ -258,7 +262,7 @@ def polar3(A: Any):
     """R, P of a 3×3 A = R P: the nearest rotation, and P symmetric; its least eigenvalue has the sign of det A."""
     R = nearest_rotation(A)
     P = wp.transpose(R) * A
-    return R, A.dtype(0.5) * (P + wp.transpose(P))
+    return R, A.dtype(0.5) * P + A.dtype(0.5) * wp.transpose(P)
 
 
 @wp.func
@@ -344,7 +348,7 @@ def polar2(A: Any):
     """R, P of a 2×2 A = R P: the nearest rotation, and P symmetric; its lesser eigenvalue has the sign of det A."""
     R = nearest_rotation2(A)
     P = wp.transpose(R) * A
-    return R, A.dtype(0.5) * (P + wp.transpose(P))
+    return R, A.dtype(0.5) * P + A.dtype(0.5) * wp.transpose(P)
 
 
 @wp.func
@@ -387,4 +391,4 @@ def polar3x2(A: Any):
     U, _S, V = svd3x2(A)
     R = U * wp.transpose(V)
     P = wp.transpose(R) * A
-    return R, A.dtype(0.5) * (P + wp.transpose(P))
+    return R, A.dtype(0.5) * P + A.dtype(0.5) * wp.transpose(P)

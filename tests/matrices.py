@@ -47,9 +47,18 @@ CLASSES = {
     "rotation": rotations,
     "half turn": half_turns,
     "reflected rotation": lambda rng, n: -rotations(rng, n),
+    "nearly −e₀e₀ᵀ": lambda rng, n: _turned_round(rng, n),
     "small integers": lambda rng, n: rng.integers(-2, 3, size=(n, 3, 3)).astype(np.float64),
     "zero": lambda rng, n: np.zeros((n, 3, 3)),
 }
+
+
+def _turned_round(rng, n):
+    """What turns the first axis round, and parts far below rounding, down to where squares underflow, in either precision."""
+    A = rng.normal(size=(n, 3, 3)) * 10.0 ** rng.uniform(-45, -6, size=(n, 3, 3))
+    A[::2] = np.sign(A[::2]) * np.abs(A[::2]) ** 3.5
+    A[:, 0, 0] = -1.0
+    return A
 
 
 def _equal(rng, n):

@@ -5,6 +5,7 @@ import re
 import warnings
 from functools import cache
 
+import matrices
 import numpy as np
 import pytest
 import trimesh
@@ -504,3 +505,33 @@ def test_scipy_solves_where_cholespy_is_missing(device, monkeypatch):
     monkeypatch.setattr(linear.importlib.util, "find_spec", lambda name: None)
     at = wp.get_device(device)
     assert type(linear.constant_factor(csr_matrix(np.eye(3)), at, wp.float64)) is linear.LUFactor
+
+
+def test_intrinsic_weights_do_not_ask_how_triangles_run():
+    """Those of a mesh with every second triangle turned over are the same; where nothing can be oriented they are refused."""
+    mesh, handles, _ = load("irregular")
+    mixed = mesh.triangles.copy()
+    mixed[::2] = mixed[::2, ::-1]
+    one, other = (bend(wc.Mesh(mesh.points, t), handles, weights="intrinsic").laplacian for t in (mesh.triangles, mixed))
+    assert abs(one - other).max() < 1e-12
+    fan = wc.Mesh([[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+    with pytest.raises(ValueError, match=r"needs a manifold that can be oriented, and at edge \[0, 1\]"):
+        wc.Arap(fan, [0], weights="intrinsic")
+    wc.Arap(fan, [0]).solve([[0, 0, 0]])
+
+
+def test_an_energy_below_zero_is_said():
+    """An obtuse triangle by itself: its long side pushes, and nothing holds it."""
+    obtuse = wc.Mesh([[0, 0, 0], [1, 0, 0], [0.5, 0.1, 0]], [[0, 1, 2]])
+    with pytest.warns(UserWarning, match="negative weights"):
+        arap = wc.Arap(obtuse, [0])
+    with pytest.warns(UserWarning, match=r"the energy ends at -.* m², below 0: negative weights pull the mesh apart"):
+        arap.solve([[0, 0, 0]])
+    calm = wc.Arap(obtuse, [0], energy="spokes_and_rims").solve([[0, 0, 0]])
+    assert np.abs(calm.points - obtuse.points).max() < 1e-12
+
+
+def test_thin_right_angles_have_no_negative_weights(device):
+    """Cotangents of 1e6 are rounded by 1e-10."""
+    thin = wc.Mesh.grid(5, 5).points * [1.0, 1.0, 1e-6] @ matrices.rotations(np.random.default_rng(0), 1)[0].T
+    assert not len(wc.Arap(wc.Mesh(thin, wc.Mesh.grid(5, 5).triangles), "all", device=device).negative_edges)

@@ -170,6 +170,16 @@ def test_nan_in_gives_nan_out(dtype, shape, bad, device):
 
 
 @PRECISIONS
+def test_polar_decomposition_does_not_overflow(dtype, device):
+    largest = np.finfo(dtype).max
+    for rows, columns in ((3, 3), (3, 2), (2, 2)):
+        A = np.zeros((rows, columns), dtype)
+        A[0, 0], A[1, 1] = 0.9 * largest, 1.0
+        R, P = wc.polar(A)
+        assert np.array_equal(R, np.eye(rows, columns)) and np.abs(P[0, 0] / A[0, 0] - 1.0) < BOUND[dtype]
+
+
+@PRECISIONS
 def test_the_ends_of_the_range(dtype, device):
     """Numbers so small that they have few digits, or so large that their squares overflow: no more is lost."""
     limits = np.finfo(dtype)
@@ -289,12 +299,32 @@ def test_kabsch_where_the_rotation_is_not_unique(device):
     turn = matrices.rotations(rng, 1)[0]
     assert np.abs(wc.kabsch(flat, flat @ turn.T) - turn).max() < 1e-14
     assert determinant(wc.kabsch(P, P * [1.0, 1.0, -1.0])[None], 1) < 1e-14
+    for bad in (np.nan, np.inf):  # a set of one point says nothing of its rotation, but must not hide it
+        assert (
+            np.isnan(wc.kabsch([[bad, 0, 0]], [[0.0, 0, 0]])).all() and np.isnan(wc.kabsch([[0.0, 0, 0]], [[bad, 0, 0]])).all()
+        )
+    assert np.isnan(wc.kabsch([[1.0, 0, 0]], [[0.0, 0, 0]], weights=[np.nan])).all()
     broken = P.copy()
     broken[3, 1] = np.nan
     R = wc.kabsch(P, np.stack([P, broken]))
     assert np.isnan(R[1]).all() and np.isfinite(R[0]).all()
     R = wc.kabsch(P, broken, neighbours=[[0, 1, 2], [1, 2, 3]])
     assert np.isnan(R[1]).all() and np.isfinite(R[0]).all()
+
+
+def test_kabsch_does_without_points_of_weight_0_and_without_a_scale(precision, device):
+    """What has no weight may be anywhere, first of all; squares of what is small or large are not taken."""
+    rng = np.random.default_rng(15)
+    turn = matrices.rotations(rng, 1)
+    P = points(rng, 6).astype(precision)
+    bound = 40.0 * np.finfo(precision).eps
+    far = np.concatenate([[[1e8, 1e8, -1e8]], P]).astype(precision)
+    Q = np.concatenate([[[0.0, 0.0, 0.0]], P.astype(np.float64) @ turn[0].T]).astype(precision)
+    assert angle(wc.kabsch(far, Q, weights=[0, 1, 1, 1, 1, 1, 1])[None], turn)[0] < bound
+    for scale in (1e-22, 1e-30, 1e20, 1e30) if precision is np.float32 else (1e-170, 1e-250, 1e160, 1e250):
+        X, Y = ((a * precision(scale)).astype(precision) for a in (P, Q[1:]))
+        for w in (None, np.full(6, 1e-30), np.full(6, 1e30)):
+            assert angle(wc.kabsch(X, Y, weights=w)[None], turn)[0] < bound
 
 
 def test_kabsch_of_warp_arrays(device):
@@ -325,6 +355,10 @@ _P = np.eye(3)
         ({"weights": [1, 1]}, r"weights has shape \(2,\); it must be \(3,\) or"),
         ({"weights": [1, -1, 1]}, r"weights\[1\] is -1.0; it must be 0 or more"),
         ({"weights": [0, 0, 0]}, "weights of a set of points are all 0"),
+        ({"weights": [0, 0, 1], "neighbours": [[1, 2], [0, 1]]}, "weights of a set of points are all 0"),
+        ({"P": _P.astype(np.float32), "Q": _P.astype(np.float32), "weights": [1e-50] * 3}, "are all 0 in float32"),
+        ({"neighbours": {5: "a"}}, r"neighbours\[0\] is 5; it must be"),
+        ({"P": [[1, 2], [3]]}, "P has shape"),
         ({"weights": "even"}, "weights is 'even', which is not numeric"),
         ({"neighbours": [[0, 1], []]}, r"neighbours\[1\] is \[\]; it must be an array \(C, k\) of indices or C lists"),
         ({"neighbours": [[0, 1], [2, 3]]}, r"neighbours\[1\] has 3; it must be an index of the 3 points"),

@@ -17,7 +17,7 @@ from .operators import CHUNKS
 from .rotation import kabsch
 from .selection import distinct_vertices
 
-# Cotangents are numbers near 1, so that a weight below this is one of rounding.
+# A weight below this share of the largest is one of rounding.
 _ROUNDING = 1e-12
 
 
@@ -57,7 +57,8 @@ class Arap:
     - "cotangent": ½(cot α + cot β) of the angles opposite the edge; negative where α + β > 180°.
     - "clamped": the same, negative ones 0. Gives up linear precision: of a flat mesh L x = 0 no longer holds inside.
     - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges take the place of those of the mesh (Fisher
-      et al. 2007); negative at most on the boundary. Needs libigl: ``pip install 'warpcloth[intrinsic]'``.
+      et al. 2007); negative at most on the boundary. Of manifolds that can be oriented. Needs libigl:
+      ``pip install 'warpcloth[intrinsic]'``.
     - "uniform": 1 for each edge; the only ones for an edge mesh.
 
     "spokes_and_rims" takes "cotangent" alone.
@@ -108,11 +109,12 @@ class Arap:
         self.handles = distinct_vertices("handles", handles, mesh)
         if not len(self.handles):
             raise ValueError(f"handles is {shown(handles)}, which names no vertex; at least one is needed")
+        self.handles.setflags(write=False)
         n = len(mesh.points)
         f = n - len(self.handles)
 
         pairs, w = _edge_weights(mesh, weights)
-        self.negative_edges = pairs[w < -_ROUNDING]
+        self.negative_edges = pairs[w < -_ROUNDING * np.abs(w).max(initial=0.0)]
         if len(self.negative_edges) and not rims:
             others = "" if weights == "intrinsic" else 'weights = "intrinsic" do inside the mesh, '
             warnings.warn(
@@ -160,8 +162,8 @@ class Arap:
             tolerance: It has converged when an iteration lowers the energy by no more than this share of it, or than edges
                 strained by this much have, or by what rounding makes of it; 0 to make all iterations.
             initial: Points to start from (n, 3) [m], where those of handles do not count. Default: the rest shape, each
-                part of the mesh moved rigidly to where its handles fit their targets best, so that a rigid motion of all
-                handles is followed exactly.
+                part of the mesh moved rigidly to where its handles fit their targets best. A rigid motion of all handles is
+                then followed exactly, where the energy is not negative.
 
         Returns:
             Deformed: Points, rotations, energies.
@@ -172,8 +174,9 @@ class Arap:
         whole("iterations", iterations, 0)
         number("tolerance", tolerance, least=0.0)
         targets = _points("positions", positions, len(self.handles), lambda k: f" of handle {self.handles[k]}")
-        origin, f = targets.mean(axis=0), len(self._start.host)
+        f = len(self._start.host)
         with np.errstate(over="ignore", invalid="ignore"):  # the energy shows it
+            origin = targets.mean(axis=0)
             held = (targets - origin) / self._unit
             if initial is None:
                 x = self.carry(self._rest, self._rest[self.handles], held)
@@ -190,6 +193,12 @@ class Arap:
             energies.append(self._fit(len(energies)))
             fall = energies[-2] - energies[-1]
             converged = tolerance > 0.0 and fall <= max(tolerance * abs(energies[-1]), least)
+        if energies[-1] < -least:
+            warnings.warn(
+                f"the energy ends at {energies[-1]:.3g} m², below 0: negative weights pull the mesh apart; use "
+                'energy = "spokes_and_rims", or weights = "clamped"',
+                stacklevel=2,
+            )
         points = self._x.read()[self._place] * self._unit + origin
         points[self.handles] = targets
         rotations = self._rotations.read()[self._place].astype(np.float64)
@@ -331,7 +340,15 @@ def _edge_weights(mesh, weights):
             raise ImportError('weights = "intrinsic" needs libigl: pip install "warpcloth[intrinsic]"')
         import igl
 
-        matrix = igl.intrinsic_delaunay_cotmatrix(np.array(mesh.points), mesh.triangles.astype(np.int64))[0]
+        triangles = igl.bfs_orient(mesh.triangles.astype(np.int64))[0]  # which its flips rely on
+        sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+        sides, counts = np.unique(sides, axis=0, return_counts=True)
+        for side in sides[counts > 1][:1]:
+            raise ValueError(
+                'weights is "intrinsic", which needs a manifold that can be oriented, and at edge '
+                f"{np.sort(side).tolist()} two triangles run the same way, or three meet; the other weights do without"
+            )
+        matrix = igl.intrinsic_delaunay_cotmatrix(np.array(mesh.points), triangles)[0]
     else:
         opposite = mesh.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
         matrix = coo_matrix((_half_cotangents(mesh).ravel(), np.sort(opposite, axis=1).T), shape=(n, n))

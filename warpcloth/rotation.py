@@ -91,8 +91,6 @@ def kabsch(P, Q, weights=None, neighbours=None):
     if w.ndim == 0 or w.shape[-1] != n:
         raise ValueError(f"weights has shape {w.shape}; it must be {(n,)} or (…, {n})")
     refuse("weights", w, w < 0.0, "must be 0 or more")
-    if (w == 0.0).all(axis=-1).any():
-        raise ValueError("weights of a set of points are all 0; one of them must be above")
     shapes = rest.batch[:-1], turned.batch[:-1], w.shape[:-1]
     try:
         leading = np.broadcast_shapes(*shapes)
@@ -103,8 +101,13 @@ def kabsch(P, Q, weights=None, neighbours=None):
     offsets = np.concatenate([[0], np.cumsum(np.tile(sizes, count))])
     members = (members + n * np.arange(count)[:, None]).ravel()
     device, vec3, mat33 = rest.device, wp.types.vector(3, rest.scalar), wp.types.matrix((3, 3), rest.scalar)
+    with np.errstate(over="ignore"):
+        w = np.broadcast_to(w, (*leading, n)).reshape(-1).astype(wp.dtype_to_numpy(rest.scalar))
+    starts = offsets[:-1]
+    if len(starts) and not (np.add.reduceat(w[members], starts) != 0.0).all():
+        raise ValueError(f"weights of a set of points are all 0 in {rest.scalar.__name__}; one of them must be above")
     offsets, members = (wp.array(part.astype(np.int32), dtype=wp.int32, device=device) for part in (offsets, members))
-    w = wp.array(np.broadcast_to(w, (*leading, n)).reshape(-1), dtype=rest.scalar, device=device)
+    w = wp.array(w, dtype=rest.scalar, device=device)
     X, x = (batch.spread((*leading, n)) for batch in (rest, turned))
     moments = wp.empty(len(members), dtype=vec3, device=device)
     R = wp.empty(len(offsets) - 1, dtype=mat33, device=device)
@@ -118,8 +121,8 @@ def _sets(neighbours, n):
     if neighbours is None:
         return np.array([n]), np.arange(n)
     rule = f"it must be an array (C, k) of indices or C lists of them, of the {n} points, none of them empty"
-    given = _on_host(neighbours)
     try:
+        given = list(_on_host(neighbours))
         sets = [np.asarray(members) for members in given]
     except (TypeError, ValueError):
         raise ValueError(f"neighbours is {shown(neighbours)}; {rule}") from None
@@ -160,7 +163,10 @@ class _Batch:
         inner = getattr(A.dtype, "_shape_", ()) if self.warp else ()
         self.typed = len(inner) == len(shapes[0])  # items, not numbers
         if not self.warp:
-            A = np.asarray(A)
+            try:
+                A = np.asarray(A)
+            except ValueError:  # rows of different lengths
+                A = np.asarray(None)
             A = A.astype(np.float64) if A.dtype.kind in "iu" else A
         scalar = _TYPES.get(A.dtype) if not self.warp else A.dtype._wp_scalar_type_ if self.typed else A.dtype
         shape, split = (*A.shape, *inner), -len(shapes[0])
