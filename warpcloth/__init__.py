@@ -7,10 +7,11 @@ from .mesh import Mesh
 from .rotation import kabsch, polar, svd
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
-from .solvers import PBD, XPBD, Explicit, Newton
+from .solvers import ADMM, PBD, XPBD, Explicit, Newton, ProjectiveDynamics
 from .terms import Attachment, DihedralBending, QuadraticBending, Spring
 
 __all__ = [
+    "ADMM",
     "PBD",
     "XPBD",
     "Animation",
@@ -23,6 +24,7 @@ __all__ = [
     "Mesh",
     "Newton",
     "Pins",
+    "ProjectiveDynamics",
     "QuadraticBending",
     "Scene",
     "Spring",
