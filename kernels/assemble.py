@@ -171,3 +171,32 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
                 out[e, K * i + j] = block
 
     return blocks_of_elements
+
+
+@cache
+def constant_blocks(term: Term, dtype):
+    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ wᵢ·wⱼ [N/m], the matrix kAGᵀG of the weights, in double precision."""
+    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    weight, measure = term.weight, term.measure
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def blocks_of_weights(
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        out: wp.array2d(dtype=wp.float64),
+    ):
+        e = wp.tid()
+        r = rest[e]
+        scale = wp.float64(stiffness[e]) * wp.float64(measure(r))
+        for i in range(K):
+            wi = weight(r, i)
+            for j in range(K):
+                wj = weight(r, j)
+                total = wp.float64(0.0)
+                for m in range(M):
+                    total += wp.float64(wi[m]) * wp.float64(wj[m])
+                out[e, K * i + j] = scale * total
+
+    return blocks_of_weights

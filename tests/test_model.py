@@ -14,6 +14,7 @@ import warp as wp
 import warpcloth as wc
 from warpcloth.model import DTYPES
 from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS as KINDS
 
 # 35 vertices, 82 edges, 48 triangles, 62 hinges, 4 corners: all counts differ.
@@ -335,7 +336,7 @@ def test_what_float32_holds_is_built(fields):
     scene(**fields).build()
 
 
-@pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1), wc.PBD(substeps=1), wc.XPBD(substeps=1)])
+@pytest.mark.parametrize("solver", [record(substeps=1) for record in SOLVERS.values()], ids=SOLVERS)
 @pytest.mark.parametrize(("given", "shown"), [(scene(), "a Scene"), (None, "None"), (3, "3")])
 def test_a_solver_binds_a_model(solver, given, shown):
     with pytest.raises(ValueError, match=rf"^model is {shown}; bind takes a model, which scene.build\(\) makes$"):
@@ -709,7 +710,7 @@ def probed(tmp_path, solver, declared, device):
 ALL_HOMES = ["attachment", "dihedral_bending", "quadratic_bending", "spring"]
 ALL_NAMES = ["Attachment", "DihedralBending", "QuadraticBending", "Spring"]
 BUILDS = {
-    **{f"{solver} of springs": (solver, "springs", ["spring"], ["Spring"]) for solver in ("Explicit", "Newton", "PBD", "XPBD")},
+    **{f"{each.__name__} of springs": (each.__name__, "springs", ["spring"], ["Spring"]) for each in SOLVERS.values()},
     "PBD of all, to show that the probe sees them": ("PBD", "all", ALL_HOMES, ALL_NAMES),
 }
 

@@ -30,6 +30,11 @@ SOLVERS = {
     "xpbd": wc.XPBD(substeps=1, iterations=4),
     "xpbd sequential": wc.XPBD(substeps=1, iterations=4, sweep="sequential", form="scalar"),
     "xpbd averaged by constraint": wc.XPBD(substeps=1, iterations=4, sweep="constraint-averaged"),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=1, iterations=8),
+    "projective dynamics plain": wc.ProjectiveDynamics(substeps=1, iterations=4, acceleration="none"),
+    "projective dynamics chebyshev": wc.ProjectiveDynamics(substeps=1, iterations=16, acceleration="chebyshev"),
+    "projective dynamics l-bfgs": wc.ProjectiveDynamics(substeps=1, iterations=8, acceleration="l-bfgs"),
+    "admm": wc.ADMM(substeps=1, iterations=4),
 }
 PAIR = wc.Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), edges=[[0, 1]])
 
@@ -47,14 +52,16 @@ def oscillator(omega, h):
     )
 
 
-def square(n=6, **scene):
-    """A small cloth with springs and both kinds of bending, 0.1 kg/m²."""
+def square(n=6, solver=None, **scene):
+    """A small cloth with springs and both kinds of bending, or what of them ``solver`` takes, 0.1 kg/m²."""
     mesh = wc.Mesh.grid(n, n, pattern="alternating")
     terms = [
         wc.Spring(pairs=("structural", "shear"), stiffness=100.0),
         wc.QuadraticBending(stiffness=1e-4),
         wc.DihedralBending(stiffness=1e-4),
     ]
+    if isinstance(solver, (wc.ProjectiveDynamics, wc.ADMM)):  # the angle of a hinge is no distance
+        terms.pop()
     return wc.Scene(mesh, density=0.1, terms=terms, **scene)
 
 
@@ -86,7 +93,7 @@ def test_oscillator_keeps_its_invariant(method, omega_h, device):
 @pytest.mark.parametrize("name", SOLVERS)
 def test_free_fall(name, dtype, device):
     """y_n = −g h² n(n+1)/2 for every method, and no strain."""
-    scene = square(fps=600.0)
+    scene = square(solver=SOLVERS[name], fps=600.0)
     stepper = SOLVERS[name].bind(scene.build(device=device, dtype=dtype))
     start, steps = scene.mesh.points, 300
     for _ in range(steps):
@@ -104,7 +111,7 @@ def test_momentum_is_conserved(name, device):
     """Inner forces cancel: P is kept; symplectic Euler keeps L too, implicit Euler and PBD lose it in x_new − x_old."""
     angular, implicit = name == "explicit", name.startswith("newton")
     rng = np.random.default_rng(1)
-    scene = square(gravity=(0.0, 0.0, 0.0), fps=600.0, duration=1.0, velocities=rng.normal(size=(36, 3)))
+    scene = square(solver=SOLVERS[name], gravity=(0.0, 0.0, 0.0), fps=600.0, duration=1.0, velocities=rng.normal(size=(36, 3)))
     stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
     mass = scene.vertex_masses[:, None]
 
@@ -308,6 +315,16 @@ def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
         (lambda: wc.XPBD(substeps=1, sweep="vertex-averaged"), "sweep is 'vertex-averaged'; it must be one of 'coloured'"),
         (lambda: wc.XPBD(substeps=1, form="row"), "form is 'row'"),
         (lambda: wc.XPBD(substeps=1, relaxation=-1.0), "relaxation is -1.0"),
+        (lambda: wc.ProjectiveDynamics(), "exactly one of dt and substeps"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, tolerance=0.0), "tolerance is 0.0"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, acceleration="lbfgs"), "acceleration is 'lbfgs'; it must be one of 'none'"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, window=0), "window is 0"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, rho=0.0), "rho is 0.0"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, rho=1.0), "rho is 1; it must be below 1"),
+        (lambda: wc.ADMM(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.ADMM(substeps=1, tolerance=-1.0), "tolerance is -1.0"),
+        (lambda: wc.ADMM(substeps=1, weight=0.0), "weight is 0.0"),
     ],
 )
 def test_options_are_checked(make, message):
@@ -323,7 +340,8 @@ def test_a_frame_is_a_whole_number_of_steps(device):
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_step_allocates_nothing(name, device):
     """Of arrays of Warp; what scipy allocates to factorise on the host is outside the tracker's sight."""
-    stepper = SOLVERS[name].bind(square(fps=600.0, pins="corners").build(device=device, dtype="float64"))
+    solver = SOLVERS[name]
+    stepper = solver.bind(square(solver=solver, fps=600.0, pins="corners").build(device=device, dtype="float64"))
     stepper.step()
     with wp.ScopedMemoryTracker("steps", print=False) as tracker:
         assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1, "the tracker sees an allocation"
@@ -345,7 +363,8 @@ def allocations(tracker, work):
 @pytest.mark.parametrize("name", SOLVERS)
 def test_the_same_run_gives_the_same_bits(name, dtype, device):
     def run():
-        return wc.simulate(square(fps=600.0, pins="corners"), SOLVERS[name], device=device, dtype=dtype, frames=10).points
+        scene = square(solver=SOLVERS[name], fps=600.0, pins="corners")
+        return wc.simulate(scene, SOLVERS[name], device=device, dtype=dtype, frames=10).points
 
     assert np.array_equal(run(), run())
 
@@ -355,7 +374,7 @@ def test_copies_run_as_if_alone(name, device):
     """Every reduction is per copy: copies of different stiffness and gravity do not notice one another."""
     stiffness, gravity = [50.0, 100.0, 200.0], [[0, -9.81, 0], [0, -1.6, 0], [3.0, 0, 0]]
     vary = {"Spring.stiffness": stiffness, "gravity": gravity}
-    solver, base = SOLVERS[name], square(fps=600.0, pins="corners")
+    solver, base = SOLVERS[name], square(solver=SOLVERS[name], fps=600.0, pins="corners")
     batch = wc.simulate(base, solver, device=device, dtype="float64", frames=10, copies=3, vary=vary).points
     for copy in range(3):
         terms = [wc.Spring(pairs=("structural", "shear"), stiffness=stiffness[copy]), *base.terms[1:]]
@@ -375,7 +394,8 @@ def test_moving_pins_follow_their_keyframes(device):
         pins=wc.Pins([0], keyframes),
         duration=1.0,
     )
-    for solver in (wc.Newton(substeps=4), wc.Explicit(substeps=4), wc.PBD(substeps=4), wc.XPBD(substeps=4)):
+    for record in (wc.Newton, wc.Explicit, wc.PBD, wc.XPBD, wc.ProjectiveDynamics, wc.ADMM):
+        solver = record(substeps=4)
         stepper = solver.bind(scene.build(device=device, dtype="float64"))
         seen = []
         for _ in range(12):

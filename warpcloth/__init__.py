@@ -7,7 +7,7 @@ from .mesh import Mesh
 from .rotation import kabsch, polar, svd
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
-from .solvers import PBD, XPBD, Explicit, Newton
+from .solvers import ADMM, PBD, XPBD, Explicit, Newton, ProjectiveDynamics
 from .terms import (
     Attachment,
     CorotatedMembrane,
@@ -21,6 +21,7 @@ from .terms import (
 )
 
 __all__ = [
+    "ADMM",
     "PBD",
     "XPBD",
     "Animation",
@@ -35,6 +36,7 @@ __all__ = [
     "NeoHookeanMembrane",
     "Newton",
     "Pins",
+    "ProjectiveDynamics",
     "QuadraticBending",
     "Scene",
     "Spring",

@@ -209,6 +209,40 @@ class LUFactor:
         left.write(self.factors.solve(right.read().astype(np.float64)))
 
 
+class CopyFactors:
+    """Solves A x = b for each copy with a constant scalar matrix, factorised once for all copies that have the same.
+
+    Args:
+        model: The :class:`warpcloth.model.Model`.
+        matrices: A of each copy, scipy matrices (n, n) of one pattern.
+
+    Raises:
+        ValueError: If a matrix is not finite or not positive definite.
+    """
+
+    def __init__(self, model, matrices):
+        self.per_copy, found = model.per_copy, {}
+        self.factors = []
+        for matrix in matrices:
+            key = matrix.data.tobytes()
+            if key not in found:
+                found[key] = constant_factor(matrix, model.device, model.dtype)
+            self.factors.append(found[key])
+        self._parts = {}
+
+    def solve(self, b, x):
+        """x = A⁻¹ b, both (N,) vectors; a call of the host. NaN in b is NaN in x of that copy."""
+        for factor, right, left in zip(self.factors, self._of_copies(b), self._of_copies(x), strict=True):
+            factor.solve(right, left)
+
+    def _of_copies(self, array):
+        """The parts of an array that belong to the copies, made when the array is first seen."""
+        if array.ptr not in self._parts:
+            n = self.per_copy
+            self._parts[array.ptr] = [array[first : first + n] for first in range(0, len(array), n)]
+        return self._parts[array.ptr]
+
+
 _INDEFINITE = "the matrix is not positive definite, so it has no Cholesky factors"
 
 

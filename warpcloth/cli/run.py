@@ -16,8 +16,8 @@ _EXPLICIT_MARGIN = 1.1
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
-Where neither dt nor substeps is given: newton, pbd and xpbd take the substeps that come nearest to 1/240 s; explicit the fewest
-that are 10 % below the limit about the rest shape and below the bound for motion (exact for springs; hinges count as at rest).
+Where neither dt nor substeps is given: explicit takes the fewest substeps that are 10 % below the limit about the rest shape
+and below the bound for motion (exact for springs; hinges count as at rest), all others those that come nearest to 1/240 s.
 """
 
 

@@ -1,10 +1,19 @@
 """One file a method: options, the equation and its source, the bound solver."""
 
+from .admm import ADMM
 from .explicit import Explicit
 from .newton import Newton
 from .pbd import PBD
+from .projective_dynamics import ProjectiveDynamics
 from .xpbd import XPBD
 
-SOLVERS = {"explicit": Explicit, "newton": Newton, "pbd": PBD, "xpbd": XPBD}
+SOLVERS = {
+    "explicit": Explicit,
+    "newton": Newton,
+    "projective-dynamics": ProjectiveDynamics,
+    "admm": ADMM,
+    "pbd": PBD,
+    "xpbd": XPBD,
+}
 
-__all__ = ["PBD", "SOLVERS", "XPBD", "Explicit", "Newton"]
+__all__ = ["ADMM", "PBD", "SOLVERS", "XPBD", "Explicit", "Newton", "ProjectiveDynamics"]

@@ -126,3 +126,17 @@ def refuse_hard(model, solver, instead):
     for elements in model.terms:
         if elements.hard:
             raise ValueError(f"{solver} cannot take {elements.label} with infinite stiffness; {instead}")
+
+
+def refuse_without_projection(model, solver):
+    """Refuses terms whose energy is no squared distance to a set, for a solver that lives on that.
+
+    Raises:
+        ValueError: Naming the term, the solver and what would work.
+    """
+    for elements in model.terms:
+        if elements.term.project is None:
+            others = "Newton or Explicit" if elements.term.constraint is None else "Newton, Explicit, PBD or XPBD"
+            raise ValueError(
+                f"{solver} cannot take {elements.label}, whose energy is no squared distance to a set; {others} can"
+            )

@@ -1,0 +1,186 @@
+"""Factories of the kernels that quasi-Newton iterations with a constant matrix A need: histories, their products, candidates.
+
+With w = A⁻¹∇φ(d) the plain step is d − w. Slot j of a history of m pairs holds sⱼ, a step of d, the change yⱼ of ∇φ that it
+made, and zⱼ = A⁻¹yⱼ, which is the change of w, so that no acceleration needs a solve of its own.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .assemble import types
+
+
+@cache
+def plain_step(dtype):
+    """Kernel over vertices: out = d − w in copies that still iterate, d in the rest; out may be d."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def step(
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        d: wp.array(dtype=vec3),
+        w: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if active[i // per_copy] == 1:
+            out[i] = d[i] - w[i]
+        else:
+            out[i] = d[i]
+
+    return step
+
+
+@cache
+def note_change(dtype):
+    """Kernel over vertices: y and z of the slot are what ∇φ and w have changed by; their values of now are kept."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def note(
+        slot: wp.array(dtype=wp.int32),
+        gradient: wp.array(dtype=vec3),
+        w: wp.array(dtype=vec3),
+        # in and out
+        last_gradient: wp.array(dtype=vec3),
+        last_w: wp.array(dtype=vec3),
+        # out
+        y: wp.array2d(dtype=vec3),
+        z: wp.array2d(dtype=vec3),
+    ):
+        i = wp.tid()
+        y[slot[0], i] = gradient[i] - last_gradient[i]
+        z[slot[0], i] = w[i] - last_w[i]
+        last_gradient[i] = gradient[i]
+        last_w[i] = w[i]
+
+    return note
+
+
+@cache
+def partial_products(dtype):
+    """Kernel over (copies, chunks, 4m): sⱼ·∇φ, zⱼ·∇φ, sⱼ·y and zⱼ·y, m of each, with the y of the slot."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def multiply(
+        slot: wp.array(dtype=wp.int32),
+        gradient: wp.array(dtype=vec3),
+        s: wp.array2d(dtype=vec3),
+        y: wp.array2d(dtype=vec3),
+        z: wp.array2d(dtype=vec3),
+        per_copy: int,
+        # out
+        out: wp.array3d(dtype=wp.float64),
+    ):
+        copy, chunk, row = wp.tid()
+        m = s.shape[0]
+        j, kind = row % m, row // m
+        a = s[j]
+        if kind % 2 == 1:
+            a = z[j]
+        b = gradient
+        if kind >= 2:
+            b = y[slot[0]]
+        total = wp.float64(0.0)
+        for i in range(copy * per_copy + chunk, (copy + 1) * per_copy, out.shape[1]):
+            total += wp.float64(wp.dot(a[i], b[i]))
+        out[copy, chunk, row] = total
+
+    return multiply
+
+
+@cache
+def finish_products():
+    """Kernel over (copies, 4m): out = the sum over chunks."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_chunks(partial: wp.array3d(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
+        copy, row = wp.tid()
+        total = wp.float64(0.0)
+        for chunk in range(partial.shape[1]):
+            total += partial[copy, chunk, row]
+        out[copy, row] = total
+
+    return add_chunks
+
+
+@cache
+def combine(dtype):
+    """Kernel over vertices: out = d − c₀ w + Σⱼ aⱼ sⱼ + bⱼ zⱼ with the coefficients (c₀, a, b) of the copy, (B, 1 + 2m).
+
+    A coefficient of 0 leaves out what it would multiply, whatever that slot holds.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def combine_histories(
+        coefficients: wp.array2d(dtype=wp.float64),
+        per_copy: int,
+        d: wp.array(dtype=vec3),
+        w: wp.array(dtype=vec3),
+        s: wp.array2d(dtype=vec3),
+        z: wp.array2d(dtype=vec3),
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        m = s.shape[0]
+        total = vec3()
+        if coefficients[copy, 0] != wp.float64(0.0):
+            total -= dtype(coefficients[copy, 0]) * w[i]
+        for j in range(m):
+            if coefficients[copy, 1 + j] != wp.float64(0.0):
+                total += dtype(coefficients[copy, 1 + j]) * s[j, i]
+            if coefficients[copy, 1 + m + j] != wp.float64(0.0):
+                total += dtype(coefficients[copy, 1 + m + j]) * z[j, i]
+        out[i] = d[i] + total
+
+    return combine_histories
+
+
+@cache
+def choose(dtype):
+    """Kernel over vertices: d becomes the accelerated candidate where its φ is no more than the plain one's, else that.
+
+    A φ that is NaN is never chosen. The step is s of the slot.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def choose_candidate(
+        slot: wp.array(dtype=wp.int32),
+        per_copy: int,
+        plain: wp.array(dtype=vec3),
+        accelerated: wp.array(dtype=vec3),
+        plain_energy: wp.array(dtype=wp.float64),
+        energy: wp.array(dtype=wp.float64),
+        # in and out
+        d: wp.array(dtype=vec3),
+        # out
+        s: wp.array2d(dtype=vec3),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        chosen = plain[i]
+        if energy[copy] <= plain_energy[copy]:
+            chosen = accelerated[i]
+        s[slot[0], i] = chosen - d[i]
+        d[i] = chosen
+
+    return choose_candidate
+
+
+@cache
+def next_slot():
+    """Kernel of one thread: slot[0] = (slot[0] + 1) mod m."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance(slot: wp.array(dtype=wp.int32), m: int):
+        slot[0] = (slot[0] + 1) % m
+
+    return advance

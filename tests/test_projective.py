@@ -1,0 +1,401 @@
+"""Projective dynamics and ADMM: the minimiser they share with Newton, rates, accelerations, residuals, what is refused."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from test_projection import swinging
+
+import warpcloth as wc
+from warpcloth.acceleration import LBFGS, Anderson, Chebyshev
+from warpcloth.kernels.terms import SPRING
+from warpcloth.linear import CopyFactors
+from warpcloth.operators import Energy, Gradient, Hessian, Sums, constant_matrices
+from warpcloth.solvers.projective_dynamics import ACCELERATIONS
+from warpcloth.status import Result
+
+EPS = np.finfo(np.float64).eps
+METHODS = {
+    **{name: wc.ProjectiveDynamics(substeps=1, acceleration=name) for name in ACCELERATIONS},
+    "admm": wc.ADMM(substeps=1),
+    "admm, light": wc.ADMM(substeps=1, weight=0.1),
+}
+
+
+def after_one_step(declared, solver, device, dtype="float64", **build):
+    """x after a step [m], and the stepper."""
+    stepper = solver.bind(declared.build(device=device, dtype=dtype, **build))
+    stepper.step()
+    return stepper.state.x.numpy().astype(np.float64), stepper
+
+
+def newton_step(declared, device):
+    return after_one_step(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)[0]
+
+
+def objective(declared, x, device):
+    """1/(2h²)‖x − x̃‖²_M + U(x) [J] for a step of a frame."""
+    model = declared.build(device=device, dtype="float64")
+    U, h = wp.zeros(1, dtype=wp.float64, device=device), 1 / declared.fps
+    Energy(model, Sums(model)).add(model.array(x, model.vec3), U)
+    predicted = declared.positions + h * declared.velocities + h**2 * declared.gravity
+    moved = np.where(model.inverse_mass.numpy()[:, None] > 0.0, x - predicted, 0.0)
+    return 0.5 / h**2 * float((declared.vertex_masses[:, None] * moved**2).sum()) + float(U.numpy()[0])
+
+
+# --- the matrix
+
+
+def test_matrix_is_the_hessian_of_fixed_projections(device):
+    """Of quadratic terms alone M/h² + Σ k A GᵀG is the Hessian of the objective, three times over; pins are the identity."""
+    mesh = wc.Mesh.grid(6, 5, pattern="alternating")
+    terms = [wc.QuadraticBending(stiffness=0.3), wc.Attachment(vertices=[7, 9], stiffness=[2.0, 5.0])]
+    declared = wc.Scene(mesh, density=0.1, terms=terms, pins=[0, 12])
+    model = declared.build(device=device, dtype="float64", copies=2, vary={"density": [0.1, 0.4]})
+    hessian = Hessian(model)
+    hessian.assemble(model.positions, 50.0)
+    for matrix, expected in zip(constant_matrices(model, 50.0), hessian.matrices(), strict=True):
+        assert np.abs(np.kron(matrix.toarray(), np.eye(3)) - expected.toarray()).max() < 1e-12
+
+
+def test_equal_copies_share_their_factors(device):
+    declared = swinging(8)
+    for vary, count in (({}, 1), ({"Spring.stiffness": [1e3, 1e3, 2e3]}, 2)):
+        model = declared.build(device=device, copies=3, vary=vary)
+        factors = CopyFactors(model, constant_matrices(model, 1.0))
+        assert len({id(each) for each in factors.factors}) == count
+
+
+# --- the minimiser
+
+CONVERGED = {"none": 20_000, "chebyshev": 3_000, "anderson": 1_500, "l-bfgs": 2_000, "admm": 20_000, "admm, light": 3_000}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_fixed_point_is_implicit_euler(name, device):
+    """All energies are squared distances here, so that every method ends where Newton does."""
+    declared = swinging(8)
+    newton = newton_step(declared, device)
+    for dtype, bound in (("float64", 1e-8), ("float32", 1e-4)):
+        solver = replace(METHODS[name], iterations=CONVERGED[name], tolerance=1e-11)
+        x, stepper = after_one_step(declared, solver, device, dtype)
+        print(name, dtype, "from Newton", np.abs(x - newton).max(), "residual", stepper.residual, stepper.iterations)
+        assert np.abs(x - newton).max() < bound
+    few, stepper = after_one_step(declared, replace(METHODS[name], iterations=5), device)
+    assert np.abs(few - newton).max() > 1e-3, "a few iterations are not enough to say anything"
+    assert stepper.results == [Result.ITERATIONS_USED_UP] and stepper.residual[0] > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "iterations"), [("none", 60_000), ("anderson", 2_000), ("l-bfgs", 3_000), ("admm", 60_000)])
+def test_the_fixed_point_of_a_finer_cloth(name, iterations, device):
+    declared = swinging(16)
+    solver = replace(METHODS[name], iterations=iterations, tolerance=1e-11)
+    x, stepper = after_one_step(declared, solver, device)
+    gap = np.abs(x - newton_step(declared, device)).max()
+    print(name, gap, stepper.iterations)
+    assert gap < 1e-8
+
+
+@pytest.mark.parametrize("across", [False, True], ids=["along", "across"])
+@pytest.mark.parametrize("pull", [0.2, 3.0])
+def test_rate_on_one_spring(pull, across, device):
+    """One end fixed: the error across shrinks by k(L/l)/(m/h² + k) an iteration; along it is gone after one."""
+    k, m, h = 100.0, 0.05, 1 / 60
+    mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), edges=[[0, 1]])
+    # x̃ lies beyond the minimiser on the same ray, or a little beside it.
+    start = np.array([[0.0, 0.0, 0.0], [1.0 + pull, 1e-6 * across, 0.0]])
+    gravity = (0.0, -1e-4 if across else 0.0, 0.0)
+    scene = wc.Scene(mesh, masses=[m, m], positions=start, terms=[wc.Spring(stiffness=k)], pins=[0], gravity=gravity)
+    predicted = start[1] + h**2 * np.array(gravity)
+    ray = predicted / np.linalg.norm(predicted)
+    length = (m / h**2 * np.linalg.norm(predicted) + k) / (m / h**2 + k)
+    exact = length * ray
+
+    solver = wc.ProjectiveDynamics(substeps=1, iterations=1, tolerance=1e-300, acceleration="none")
+    if not across:
+        x, _ = after_one_step(scene, solver, device)
+        assert np.abs(x[1] - exact).max() < 8 * EPS * length
+        return
+    normal, stepper = np.array([-ray[1], ray[0], 0.0]), solver.bind(scene.build(device=device, dtype="float64"))
+    stepper._start()
+    stepper.correction.assign(np.array([np.zeros(3), exact - predicted + 1e-6 * normal]))
+    stepper._launch_gradient()
+    stepper._active.write(1)
+    errors = [1e-6]
+    for _ in range(6):
+        stepper._factors.solve(stepper._gradient, stepper._w)
+        stepper._move()
+        errors.append((stepper.correction.numpy()[1] - (exact - predicted)) @ normal)
+    rate, found = (k / length) / (m / h**2 + k), np.array(errors[1:]) / errors[:-1]
+    print(found, rate)
+    assert np.abs(found / rate - 1.0).max() < 1e-6
+
+
+def test_the_objective_never_rises(device):
+    declared = swinging(8)
+    h = 1 / declared.fps
+    predicted = declared.positions + h * declared.velocities + h**2 * declared.gravity
+    predicted[declared.pins.vertices] = declared.positions[declared.pins.vertices]
+    counts = [1, 2, 3, 5, 10, 20, 50, 100, 200, 500]
+    plain = [objective(declared, predicted, device)]
+    for name in ACCELERATIONS:
+        values = []
+        for iterations in counts:
+            solver = replace(METHODS[name], iterations=iterations, tolerance=1e-300)
+            values.append(objective(declared, after_one_step(declared, solver, device)[0], device))
+        values = np.array(values)
+        if name == "none":
+            plain = np.array([*plain, *values])
+            assert (np.diff(plain) < 0.0).all()
+        else:
+            print(name, (values - plain[1:]) / plain[1:])
+            assert (values <= plain[1:] * (1 + 8 * EPS)).all() and values[-1] < plain[-1]
+            assert (np.diff(values) <= 8 * EPS * values[:-1]).all()
+
+
+def test_a_bad_proposal_is_dropped(device):
+    """With coefficients that lead nowhere every step is the plain one, to the bit."""
+    declared = swinging(8)
+    plain, _ = after_one_step(declared, replace(METHODS["none"], iterations=30), device)
+
+    def nonsense(iteration, products, accepted):
+        assert iteration == 0 or not accepted.any()
+        wrong = np.full((len(products), 1 + 2 * products.shape[2]), [1e3, np.nan][iteration % 2])
+        wrong[:, 1:] *= iteration > 0
+        return wrong
+
+    stepper = replace(METHODS["anderson"], iterations=30).bind(declared.build(device=device, dtype="float64"))
+    stepper._history.method.propose = nonsense
+    stepper.step()
+    assert np.array_equal(stepper.state.x.numpy(), plain)
+
+
+def test_accelerations_pay(device):
+    """After as many iterations as plain ones are cheap: the error of 200 is that of more than 2000 plain ones."""
+    declared = swinging(8)
+    newton = newton_step(declared, device)
+    errors = {
+        name: np.abs(after_one_step(declared, replace(METHODS[name], iterations=count), device)[0] - newton).max()
+        for name, count in (("none", 2000), ("chebyshev", 200), ("anderson", 200), ("l-bfgs", 200))
+    }
+    print(errors)
+    assert max(errors[name] for name in ACCELERATIONS[1:]) < errors["none"]
+
+
+def textbook(name, H, A, b, window, rho, count):
+    """Iterates of ½dᵀHd − bᵀd from 0 as the papers write them."""
+    iterates, omega = [np.zeros(len(b))], 1.0
+    for k in range(count):
+        d, gradients = iterates[-1], [H @ each - b for each in iterates]
+        steps = [each - np.linalg.solve(A, g) for each, g in zip(iterates, gradients, strict=True)]  # G(d)
+        first = max(0, k - window)
+        if name == "chebyshev":
+            omega = 1.0 if k < 10 else 2 / (2 - rho**2) if k == 10 else 4 / (4 - rho**2 * omega)
+            new = omega * (steps[-1] - iterates[max(k - 1, 0)]) + iterates[max(k - 1, 0)]
+        elif name == "anderson":
+            F, root = [G - each for G, each in zip(steps, iterates, strict=True)], np.linalg.cholesky(A).T
+            new = steps[-1]
+            if k:
+                changes = np.stack([F[j + 1] - F[j] for j in range(first, k)], axis=1)
+                theta = np.linalg.lstsq(root @ changes, root @ F[-1])[0]
+                new = new - np.stack([steps[j + 1] - steps[j] for j in range(first, k)], axis=1) @ theta
+        else:
+            pairs = [(iterates[j + 1] - iterates[j], gradients[j + 1] - gradients[j]) for j in range(first, k)]
+            q, alphas = gradients[-1], []
+            for s, y in reversed(pairs):
+                alphas.append(s @ q / (s @ y))
+                q = q - alphas[-1] * y
+            r = np.linalg.solve(A, q)
+            for (s, y), alpha in zip(pairs, reversed(alphas), strict=True):
+                r = r + s * (alpha - y @ r / (s @ y))
+            new = d - r
+        iterates.append(new)
+    return np.array(iterates)
+
+
+@pytest.mark.parametrize("method", [Chebyshev(1, 0.9), Anderson(1, 3, EPS), LBFGS(1, 3, EPS)], ids=ACCELERATIONS[1:])
+def test_proposals_are_those_of_the_papers(method, request):
+    """Coefficients of a history give the iterates of the textbook, on a quadratic objective below its matrix."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(12, 12))
+    H = root @ root.T + np.eye(12)
+    A, b = H + np.diag(rng.uniform(1.0, 20.0, size=12)), rng.normal(size=12)
+    m, count = method.window, 14 if isinstance(method, Chebyshev) else 7
+    s, y, z = np.zeros((3, m, 12))
+    d, found, last = np.zeros(12), [np.zeros(12)], None
+    method.start()
+    for k in range(count):
+        gradient = H @ d - b
+        w = np.linalg.solve(A, gradient)
+        slot = k % m
+        if k:
+            y[slot], z[slot] = gradient - last[0], w - last[1]
+        last = gradient, w
+        products = np.stack([s @ gradient, z @ gradient, s @ y[slot], z @ y[slot]])[None]
+        (c,) = method.propose(k, products, np.array([True]))
+        new = d - c[0] * w + c[1 : 1 + m] @ s + c[1 + m :] @ z
+        s[(k + 1) % m] = new - d
+        d = new
+        found.append(d)
+    name = request.node.callspec.id
+    expected = textbook(name, H, A, b, m, 0.9, count)
+    assert np.abs(np.array(found) - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_step_starts_afresh(name, device):
+    """From the same state the same bits, whatever step came before; 7 iterations end within a window of 5."""
+    declared = swinging(8)
+    stepper = replace(METHODS[name], iterations=7).bind(declared.build(device=device, dtype="float64"))
+    found = []
+    for _ in range(2):
+        stepper.state.x.assign(declared.positions)
+        stepper.state.v.assign(declared.velocities)
+        stepper.step()
+        found.append(stepper.state.x.numpy().copy())
+    assert np.array_equal(*found)
+
+
+# --- ADMM
+
+
+@wp.func
+def scaled_weight(rest: Any, i: int):
+    w = wp.vector(length=1, dtype=rest.dtype)
+    w[0] = rest.dtype(8.0) * rest.dtype(2 * i - 1)
+    return w
+
+
+@pytest.mark.parametrize("name", ["none", "anderson", "admm", "admm, light"])
+def test_units_of_the_local_coordinate_do_not_matter(name, device):
+    """D times c and W over c: the same iterates, here with c = 8, which is exact in binary, to the bit."""
+    c = 8.0
+    declared = swinging(8)
+    declared = replace(declared, terms=declared.terms[:1])
+    solver = replace(METHODS[name], iterations=30)
+    expected, _ = after_one_step(declared, solver, device)
+    model = declared.build(device=device, dtype="float64")
+    (springs,) = model.terms
+    term = replace(SPRING, name="ScaledSpring", weight=scaled_weight)
+    rest = wp.array(c * springs.rest.numpy(), dtype=springs.rest.dtype, device=model.device)
+    stiffness = wp.array(springs.stiffness.numpy() / c**2, dtype=wp.float64, device=model.device)
+    model.terms = (replace(springs, term=term, rest=rest, stiffness=stiffness),)
+    stepper = solver.bind(model)
+    stepper.step()
+    assert np.array_equal(stepper.state.x.numpy(), expected)
+
+
+def test_residuals_of_admm(device):
+    """The forces of y − z and of what z moved by, the largest of any vertex that moves; both end at 0."""
+    declared = swinging(8)
+    solver = wc.ADMM(substeps=1, iterations=7)
+    before, last = (replace(solver, iterations=count).bind(declared.build(device=device, dtype="float64")) for count in (6, 7))
+    before.step()
+    last.step()
+    model = last.model
+    primal, dual = np.zeros((model.count, 3)), np.zeros((model.count, 3))
+    (springs, hinges), x = model.terms, last.state.x.numpy()
+    for elements, mine, old in zip((springs, hinges), last._locals, before._locals, strict=True):
+        stencil, rest, k = elements.stencil.numpy(), elements.rest.numpy(), elements.stiffness.numpy()
+        if elements is springs:
+            G = np.tile([-1.0, 1.0], (len(stencil), 1))
+        else:
+            G, k = rest[:, :4], k * rest[:, 4]
+        y = np.einsum("ei,eic->ec", G, x[stencil])
+        z, z_before = mine[0].numpy().reshape(-1, 3), old[0].numpy().reshape(-1, 3)
+        for sums, rows in ((primal, y - z), (dual, z - z_before)):
+            np.add.at(sums, stencil, (k[:, None] * G)[:, :, None] * rows[:, None])
+    for found, forces in ((last.primal, primal), (last.dual, dual)):
+        expected = np.linalg.norm(model.inverse_mass.numpy()[:, None] * forces, axis=1).max() / 9.81
+        assert found[0] == pytest.approx(expected, rel=1e-9) and expected > 1e-3
+    assert last.residual[0] == max(last.primal[0], last.dual[0]) and last.results == [Result.ITERATIONS_USED_UP]
+    _, stepper = after_one_step(declared, wc.ADMM(substeps=1, iterations=20_000, tolerance=1e-6), device)
+    assert max(stepper.primal[0], stepper.dual[0]) <= 1e-6 and stepper.results == [Result.CONVERGED]
+
+
+# --- residual, copies, status
+
+
+def test_residual_is_that_of_newton(device):
+    """‖(x − x̃)/h² + ∇U/m‖ over g, the largest of any vertex that moves."""
+    declared = swinging(8)
+    x, stepper = after_one_step(declared, wc.ProjectiveDynamics(substeps=1, iterations=10), device)
+    model = declared.build(device=device, dtype="float64")
+    gradient = model.vectors()
+    Gradient(model).add(stepper.state.x, gradient)
+    h, w = stepper.h, model.inverse_mass.numpy()[:, None]
+    predicted = declared.positions + h * declared.velocities + h**2 * declared.gravity
+    forces = np.where(w > 0.0, (x - predicted) / h**2 + w * gradient.numpy(), 0.0)
+    expected = np.linalg.norm(forces, axis=1).max() / 9.81
+    assert stepper.residual[0] == pytest.approx(expected, rel=1e-9) and expected > 0.1
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_copies_converge_as_if_alone(name, device):
+    """Copies of other stiffness need other numbers of iterations; none goes on when it is done, or notices the rest."""
+    declared, stiffness = swinging(8), [30.0, 1e3, 100.0]
+    solver = replace(METHODS[name], iterations=400, tolerance=1e-3)
+    x, together = after_one_step(declared, solver, device, copies=3, vary={"Spring.stiffness": stiffness})
+    alone, counts = [], []
+    for copy, k in enumerate(stiffness):
+        one = replace(declared, terms=[replace(declared.terms[0], stiffness=k), *declared.terms[1:]])
+        points, stepper = after_one_step(one, solver, device)
+        alone.append(points)
+        counts.append(stepper.iterations)
+        assert stepper.results[0] is together.results[copy] and stepper.residual[0] == together.residual[copy]
+    assert np.array_equal(x.reshape(3, -1, 3), alone)
+    assert len(set(counts)) > 1 and together.iterations == max(counts)
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered")
+@pytest.mark.parametrize("name", METHODS)
+def test_what_is_not_finite_has_diverged(name, device):
+    """And no other copy with it."""
+    declared = swinging(8)
+    velocities = np.tile(declared.velocities, (2, 1, 1))
+    velocities[1, 40] = 1e200
+    x, stepper = after_one_step(declared, METHODS[name], device, copies=2, vary={"velocities": velocities})
+    good, _ = after_one_step(declared, METHODS[name], device)
+    assert stepper.results == [Result.ITERATIONS_USED_UP, Result.DIVERGED]
+    assert not np.isfinite(stepper.residual[1]) and np.array_equal(x[:64], good)
+    wrong = replace(declared, velocities=velocities[1])
+    status = wc.simulate(wrong, METHODS[name], device=device, dtype="float64", frames=3).status
+    assert not status.ok and "diverged in frame 1" in status.message
+
+
+def test_status_of_a_run_that_used_up_its_iterations(device):
+    status = wc.simulate(swinging(8), wc.ProjectiveDynamics(substeps=1, iterations=3), device=device, frames=2).status
+    assert status.ok and status.result is Result.ITERATIONS_USED_UP
+    assert status.message == f"iterations used up, in a step or more; largest residual {status.residual:.2g}"
+    easy = replace(swinging(8), terms=[wc.QuadraticBending(stiffness=1e-5)])
+    status = wc.simulate(easy, wc.ProjectiveDynamics(substeps=1), device=device, dtype="float64", frames=2).status
+    assert status.result is Result.CONVERGED
+
+
+@pytest.mark.parametrize("solver", [wc.ProjectiveDynamics(substeps=1), wc.ADMM(substeps=1)])
+def test_what_is_no_squared_distance_is_refused(solver, device):
+    mesh = wc.Mesh.grid(4, 4)
+    name = type(solver).__name__
+    folded = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0), wc.DihedralBending(stiffness=1.0)])
+    with pytest.raises(
+        ValueError,
+        match=f"{name} cannot take DihedralBending, whose .* distance to a set; Newton, Explicit, PBD or XPBD",
+    ):
+        solver.bind(folded.build(device=device))
+    hard = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=np.inf)])
+    with pytest.raises(ValueError, match=f"{name} cannot take Spring with infinite stiffness; PBD"):
+        solver.bind(hard.build(device=device))
+
+
+@pytest.mark.parametrize("solver", [wc.ProjectiveDynamics, wc.ADMM])
+def test_no_stiffness_and_no_terms(solver, device):
+    """Then x̃ is the answer, in no iteration."""
+    mesh = wc.Mesh.grid(3, 3)
+    for terms in ([], [wc.Spring(stiffness=0.0)]):
+        scene = wc.Scene(mesh, density=0.1, terms=terms)
+        x, stepper = after_one_step(scene, solver(substeps=1), device)
+        assert stepper.iterations == 0 and stepper.results == [Result.CONVERGED]
+        assert np.abs(x - mesh.points - [0.0, -9.81 / 3600, 0.0]).max() < 8 * EPS

@@ -1,0 +1,132 @@
+"""Accelerations of d ← d − A⁻¹∇φ(d), as coefficients of the steps taken before.
+
+Each proposes d − c₀w + Σⱼ aⱼsⱼ + bⱼzⱼ, w = A⁻¹∇φ, from the products of a history of m pairs: steps sⱼ, changes yⱼ of ∇φ and
+zⱼ = A⁻¹yⱼ. All numbers here are on the host, in double precision, with a row for each copy.
+"""
+
+import numpy as np
+
+
+class Chebyshev:
+    """The Chebyshev semi-iterative method (Wang 2015): d ← ω(d − w − d₋₁) + d₋₁ with ω → 2/(1 + √(1 − ρ²)).
+
+    ω is 1 in the first ten iterations, then 2/(2 − ρ²), then 4/(4 − ρ²ω), and the same anew in a copy whose proposal was turned
+    down, but for the ten.
+
+    Args:
+        copies: B.
+        rho: ρ in (0, 1), the assumed factor of the error in a plain iteration.
+    """
+
+    DELAY = 10
+
+    def __init__(self, copies, rho):
+        self.window, self.rho2 = 1, rho**2
+        self.omega, self.count = np.ones(copies), np.zeros(copies, dtype=int)
+
+    def start(self):
+        """Before the first iteration of a step."""
+        self.omega[:], self.count[:] = 1.0, 0
+
+    def propose(self, iteration, products, accepted):
+        """Coefficients (B, 1 + 2m) of (c₀, a, b).
+
+        Args:
+            iteration: From 0.
+            products: sⱼ·∇φ, zⱼ·∇φ, sⱼ·y, zⱼ·y, y the newest, (B, 4, m).
+            accepted: Which copies took the proposal before, (B,).
+        """
+        self.count = np.where(accepted, self.count + 1, self.DELAY)
+        later = np.where(self.omega > 1.0, 4.0 / (4.0 - self.rho2 * self.omega), 2.0 / (2.0 - self.rho2))
+        self.omega = np.where(self.count > self.DELAY, later, 1.0)
+        return np.stack([self.omega, self.omega - 1.0, np.zeros_like(self.omega)], axis=1)
+
+
+def _dot(a, b):
+    """Σⱼ aⱼbⱼ of each copy, (B, m) both; added in order, so that a copy has the same bits however many there are."""
+    total = np.zeros(len(a))
+    for j in range(a.shape[1]):
+        total = total + a[:, j] * b[:, j]
+    return total
+
+
+def _times(A, b):
+    """A b of each copy, (B, m, m) and (B, m), as :func:`_dot`."""
+    return np.stack([_dot(row, b) for row in A.transpose(1, 0, 2)], axis=1)
+
+
+class _History:
+    """The products of the last m pairs: sᵢ·yⱼ for j no older than i, and zᵢ·yⱼ = yᵢᵀA⁻¹yⱼ for all.
+
+    Args:
+        copies: B.
+        window: m.
+        epsilon: Rounding of the products, relative.
+    """
+
+    def __init__(self, copies, window, epsilon):
+        self.window, self.epsilon = window, epsilon
+        self.sy, self.zy = (np.zeros((copies, window, window)) for _ in range(2))
+
+    def start(self):
+        """Before the first iteration of a step."""
+
+    def propose(self, iteration, products, accepted):
+        """As :meth:`Chebyshev.propose`."""
+        B, _, m = products.shape
+        proposal = np.zeros((B, 1 + 2 * m))
+        proposal[:, 0] = 1.0
+        if iteration == 0:
+            return proposal
+        newest = iteration % m
+        self.sy[:, :, newest] = products[:, 2]
+        self.zy[:, :, newest] = self.zy[:, newest] = products[:, 3]
+        slots = [(newest - age) % m for age in range(min(iteration, m))]
+        with np.errstate(all="ignore"):  # of a copy that is not finite
+            a, b = self._coefficients(slots, products[:, 0, slots], products[:, 1, slots])
+        good = (np.isfinite(a) & np.isfinite(b)).all(axis=1)[:, None]
+        proposal[:, [1 + j for j in slots]] = np.where(good, a, 0.0)
+        proposal[:, [1 + m + j for j in slots]] = np.where(good, b, 0.0)
+        return proposal
+
+    def _coefficients(self, slots, s, z):
+        """a and b (B, pairs) of the pairs in ``slots``, the newest first, from their products s and z with ∇φ."""
+        raise NotImplementedError
+
+
+class Anderson(_History):
+    """Anderson acceleration (Peng et al. 2018): d − w − Σθⱼ(sⱼ − zⱼ) with the θ that minimises ‖w − Σθⱼzⱼ‖ in the norm of A.
+
+    In that norm zᵢᵀAzⱼ = zᵢ·yⱼ and zᵢᵀAw = zᵢ·∇φ. Directions that are linear combinations of others are left out.
+    """
+
+    def _coefficients(self, slots, s, z):
+        gram = self.zy[:, slots][:, :, slots]
+        scale = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
+        scale = np.where(scale > 0.0, scale, 1.0)
+        gram = gram / (scale[:, :, None] * scale[:, None])
+        finite = np.isfinite(gram).all(axis=(1, 2))
+        values, vectors = np.linalg.eigh(np.where(finite[:, None, None], gram, 0.0))
+        kept = values > len(slots) * self.epsilon * values[:, -1:]
+        inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+        theta = _times(vectors, inverse * _times(vectors.transpose(0, 2, 1), z / scale)) / scale
+        return -theta, theta
+
+
+class LBFGS(_History):
+    """L-BFGS with A for the first Hessian (Liu et al. 2017), both loops on products alone; pairs with sᵀy ≤ 0 are left out."""
+
+    def _coefficients(self, slots, s, z):
+        sy, zy = self.sy[:, slots][:, :, slots], self.zy[:, slots][:, :, slots]
+        along = np.diagonal(sy, axis1=1, axis2=2)
+        good = along > self.epsilon * np.diagonal(zy, axis1=1, axis2=2)
+        rho = np.where(good, 1.0 / np.where(good, along, 1.0), 0.0)
+        alpha, beta = np.zeros_like(s), np.zeros_like(s)
+        pairs = range(len(slots))
+        for i in pairs:  # the newest first: j < i is newer
+            alpha[:, i] = rho[:, i] * (s[:, i] - _dot(alpha[:, :i], sy[:, i, :i]))
+        curved = z - _times(zy, alpha)
+        for i in reversed(pairs):
+            older = _dot((alpha - beta)[:, i + 1 :], sy[:, i + 1 :, i])
+            beta[:, i] = rho[:, i] * (curved[:, i] + older)
+        return beta - alpha, alpha

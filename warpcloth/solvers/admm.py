@@ -1,0 +1,159 @@
+"""ADMM: implicit Euler split into the elements and the vertices, which meet by multipliers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..capture import Mirror, Segment
+from ..checks import number, whole
+from ..kernels import project as kernels
+from ..kernels.accelerate import plain_step
+from ..kernels.minimise import add_inertia
+from ..linear import CopyFactors
+from ..operators import Sums, constant_matrices
+from ..status import Result
+from .solver import Step, Stepper, refuse_hard, refuse_without_projection
+
+
+@dataclass(frozen=True)
+class ADMM(Step):
+    """The alternating direction method of multipliers on 1/(2h²)‖x − x̃‖²_M + Σ U(z), z = Dx, from x = x̃, z = Dx̃, u = 0
+    (Narain et al. 2016, Overby et al. 2017).
+
+    D gives the local coordinates y of all elements, W² = r k A weighs them. In turn z = argmin U(z) + ½‖W(Dx − z + u)‖², which
+    for U = ½kA‖z − p(z)‖² is (p(v) + r v)/(1 + r) with v = Dx + u; u += Dx − z; and
+    (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once. The fixed point is that of
+    :class:`warpcloth.ProjectiveDynamics` and the x(t+h) of :class:`warpcloth.Newton`. Only WD counts: iterates stay the same
+    when D is scaled and W inversely.
+
+    Too large a weight stalls, too small a one oscillates. r = 1 takes about the iterations of plain projective dynamics; on
+    ``hanging`` in motion 0.03 to 0.1 took a tenth of them, 0.003 more again. Of few iterations a small weight makes cloth soft.
+
+    ``residual`` is the larger of the primal and the dual residual, and both are accelerations over gravity's (in m/s² without
+    any), the largest of any vertex: of the forces DᵀW²(Dx − z) and DᵀW²(z − z before) over the masses.
+
+    Attributes:
+        dt, substeps: See :class:`Step`.
+        iterations: The most iterations a step.
+        tolerance: Of both residuals.
+        weight: r = W²/(kA) > 0.
+
+    Raises:
+        ValueError: If an option breaks a rule.
+    """
+
+    iterations: int = 20
+    tolerance: float = 1e-3
+    weight: float = 1.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        whole("iterations", self.iterations, 1)
+        number("tolerance", self.tolerance, above=0.0)
+        number("weight", self.weight, above=0.0)
+
+    def bind(self, model):
+        """The solver on ``model``, all scratch allocated.
+
+        Raises:
+            ValueError: If a term has infinite stiffness, or an energy that is no squared distance.
+        """
+        refuse_hard(model, "ADMM", "PBD and XPBD take hard constraints, or give a finite stiffness")
+        refuse_without_projection(model, "ADMM")
+        return ADMMStepper(self, model)
+
+
+class ADMMStepper(Stepper):
+    """:class:`ADMM` on a model.
+
+    Attributes:
+        correction: x − x̃ of the last step, (N,) [m].
+        primal, dual: Residuals at the end of the last step, (B,).
+        iterations: Iterations of the last step.
+    """
+
+    def __init__(self, options, model):
+        super().__init__(options, model)
+        self.s = 1.0 / self.h**2
+        self._factors = CopyFactors(model, constant_matrices(model, self.s, options.weight))
+        self._sums, cuda = Sums(model), model.device.is_cuda
+        self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
+        self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self._primal, self._dual = (Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device)) for _ in range(2))
+        self._active = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
+        self._locals = []  # of each term z, u, gap, change
+        for elements in model.terms:
+            kind = wp.types.matrix((elements.term.rows, 3), model.dtype)
+            self._locals.append([wp.zeros(elements.count, dtype=kind, device=model.device) for _ in range(4)])
+        sum_of = kernels.gather_splitting if cuda else kernels.scatter_splitting
+        self._kernels = [
+            [model.kernel(factory, elements.term, model.dtype) for factory in (kernels.start_splitting, kernels.split, sum_of)]
+            for elements in model.terms
+        ]
+        self._incidences = [elements.incidences if cuda else () for elements in model.terms]
+        self._add_inertia, self._plain_step = (model.kernel(factory, model.dtype) for factory in (add_inertia, plain_step))
+        gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
+        self._scale = np.where(gravity > 0.0, gravity, 1.0)
+        self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
+        self.iterations = 0
+        self._start = Segment(model.device, self._launch_start)
+        self._local = Segment(model.device, self._launch_local)
+        self._move = Segment(model.device, self._launch_move)
+        self._finish = Segment(model.device, lambda: self.launch_finish(self.correction))
+
+    def step(self):
+        self._start()
+        active = np.ones(self.model.copies, dtype=bool)
+        self.iterations = 0
+        while True:
+            self._local()
+            self.primal = np.where(active, self._primal.read() / self._scale, self.primal)
+            self.dual = np.where(active, self._dual.read() / self._scale, self.dual)
+            residual = np.maximum(self.primal, self.dual)  # keeps NaN
+            finite = np.isfinite(residual)
+            converged = finite & (residual <= self.options.tolerance)
+            active &= finite & ~converged
+            if not active.any() or self.iterations == self.options.iterations:
+                break
+            self._active.write(active)
+            self._factors.solve(self._force, self._w)
+            self._move()
+            self.iterations += 1
+        self._finish()
+        self.residual = np.maximum(self.residual, residual)
+        for copy, before in enumerate(self.results):
+            now = Result.CONVERGED if converged[copy] else Result.ITERATIONS_USED_UP if finite[copy] else Result.DIVERGED
+            self.results[copy] = before.worse(now)
+
+    # What the segments record.
+
+    def _launch_start(self):
+        self.launch_prediction()
+        self.correction.zero_()
+        for elements, (z, u, _gap, _change), (start, _split, _sum) in self._each():
+            self.model.launch(start, elements.count, [*elements.arguments, self.state.x], [z, u])
+
+    def _launch_local(self):
+        """z and u, and the forces that follow: of the gaps, of the changes, and what the matrix is to take away."""
+        model, ratio = self.model, self.options.weight
+        sums = [self._gaps, self._changes, self._force]
+        for array in sums:
+            array.zero_()
+        for i, (elements, (z, u, gap, change), (_start, split, sum_of)) in enumerate(self._each()):
+            given = [*elements.arguments, self.state.x, self.correction, ratio]
+            model.launch(split, elements.count, given, [z, u, gap, change])
+            dim = len(self._incidences[i][0]) - 1 if self._incidences[i] else elements.count
+            model.launch(sum_of, dim, [*self._incidences[i], *elements.arguments, ratio, u, gap, change], sums)
+        given = [model.mass, model.inverse_mass, model.gravity, model.per_copy, self.s, 0.0, self.correction]
+        model.launch(self._add_inertia, model.count, given, [self._force, self._work])
+        for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
+            self._sums.largest(model.inverse_mass, forces, largest.array)
+
+    def _launch_move(self):
+        model = self.model
+        given = [self._active.array, model.per_copy, self.correction, self._w]
+        model.launch(self._plain_step, model.count, given, [self.correction])
+
+    def _each(self):
+        return zip(self.model.terms, self._locals, self._kernels, strict=True)

@@ -1,0 +1,228 @@
+"""Projective dynamics: implicit Euler by projections of the elements and one constant matrix, factorised once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..acceleration import LBFGS, Anderson, Chebyshev
+from ..capture import Mirror, Segment
+from ..checks import choice, number, whole
+from ..kernels import accelerate as kernels
+from ..kernels.minimise import add_inertia
+from ..linear import CopyFactors
+from ..operators import CHUNKS, Energy, Gradient, Sums, constant_matrices
+from ..status import Result
+from .solver import Step, Stepper, refuse_hard, refuse_without_projection
+
+ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")
+
+
+@dataclass(frozen=True)
+class ProjectiveDynamics(Step):
+    """Implicit Euler by a local and a global step in turn (Liu et al. 2013, Bouaziz et al. 2014), from x = x̃.
+
+    For energies ½kA‖y − p(y)‖², y = Gx: with the projections p of all elements fixed, the objective of implicit Euler is least
+    where (M/h² + Σ k A GᵀG) x = (M/h²) x̃ + Σ k A Gᵀp. The matrix is constant and scalar and factorised once. As
+    ∂u/∂y = y − p(y), one iteration is d ← d − A⁻¹∇φ(d) in terms of d = x − x̃, so that rounding of the solve cures itself. The
+    objective φ never rises, and the fixed point is the x(t+h) of :class:`warpcloth.Newton`.
+
+    Motion across stiff elements is slow: of one spring with a fixed end, of length l and rest length L, what is wrong across
+    shrinks by k(L/l)/(m/h² + k) an iteration, what is wrong along is gone after one. Hence the accelerations; a proposal whose
+    φ is above that of the plain iteration from the same place is dropped for that.
+
+    Attributes:
+        dt, substeps: See :class:`Step`.
+        iterations: The most iterations a step.
+        tolerance: Of the residual, as for :class:`warpcloth.Newton`: the largest unbalanced acceleration of any vertex over
+            gravity's (without any, over the largest at x̃).
+        acceleration: ``"none"``; ``"chebyshev"`` (Wang 2015); ``"anderson"`` (Peng et al. 2018), in the norm of the matrix;
+            ``"l-bfgs"`` (Liu et al. 2017), with the matrix as first Hessian.
+        window: Steps that Anderson and L-BFGS remember.
+        rho: What Chebyshev takes for the factor of the error in a plain iteration, in (0, 1).
+
+    Raises:
+        ValueError: If an option breaks a rule.
+    """
+
+    iterations: int = 20
+    tolerance: float = 1e-3
+    acceleration: str = "anderson"
+    window: int = 5
+    rho: float = 0.999
+
+    def __post_init__(self):
+        super().__post_init__()
+        whole("iterations", self.iterations, 1)
+        number("tolerance", self.tolerance, above=0.0)
+        choice("acceleration", self.acceleration, ACCELERATIONS)
+        whole("window", self.window, 1)
+        number("rho", self.rho, above=0.0)
+        if not self.rho < 1.0:
+            raise ValueError(f"rho is {self.rho:g}; it must be below 1")
+
+    def bind(self, model):
+        """The solver on ``model``, all scratch allocated.
+
+        Raises:
+            ValueError: If a term has infinite stiffness, or an energy that is no squared distance.
+        """
+        refuse_hard(model, "ProjectiveDynamics", "PBD and XPBD take hard constraints, or give a finite stiffness")
+        refuse_without_projection(model, "ProjectiveDynamics")
+        return ProjectiveDynamicsStepper(self, model)
+
+
+class ProjectiveDynamicsStepper(Stepper):
+    """:class:`ProjectiveDynamics` on a model.
+
+    Attributes:
+        correction: x − x̃ of the last step, (N,) [m].
+        iterations: Iterations of the last step.
+    """
+
+    def __init__(self, options, model):
+        super().__init__(options, model)
+        self.s = 1.0 / self.h**2
+        self._factors = CopyFactors(model, constant_matrices(model, self.s))
+        self._sums, self._gradient_of = Sums(model), Gradient(model, corrected=True)
+        self.correction, self._gradient, self._w = (model.vectors() for _ in range(3))
+        self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self._acceleration = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))
+        self._active = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
+        self._add_inertia = model.kernel(add_inertia, model.dtype)
+        self._plain_step = model.kernel(kernels.plain_step, model.dtype)
+        self._history = None if options.acceleration == "none" else _Accelerator(self)
+        self._gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
+        self.iterations = 0
+        self._start = Segment(model.device, self._launch_start)
+        self._move = Segment(model.device, self._launch_move)
+        self._finish = Segment(model.device, lambda: self.launch_finish(self.correction))
+
+    def step(self):
+        self._start()
+        first = self._acceleration.read().copy()
+        scale = np.where(self._gravity > 0.0, self._gravity, np.where(first != 0.0, first, 1.0))
+        if self._history:
+            self._history.start()
+        self.iterations = 0
+        while True:
+            residual = self._acceleration.read() / scale
+            finite = np.isfinite(residual)
+            converged = finite & (residual <= self.options.tolerance)
+            active = finite & ~converged
+            if not active.any() or self.iterations == self.options.iterations:
+                break
+            self._active.write(active)
+            self._factors.solve(self._gradient, self._w)
+            if self._history:
+                self._history.propose(self.iterations, active)
+            self._move()
+            self.iterations += 1
+        self._finish()
+        self.residual = np.maximum(self.residual, residual)  # keeps NaN
+        for copy, before in enumerate(self.results):
+            now = Result.CONVERGED if converged[copy] else Result.ITERATIONS_USED_UP if finite[copy] else Result.DIVERGED
+            self.results[copy] = before.worse(now)
+
+    # What the segments record.
+
+    def _launch_start(self):
+        self.launch_prediction()
+        self.correction.zero_()
+        if self._history:
+            self._history.slot.zero_()
+        self._launch_gradient()
+
+    def _launch_move(self):
+        if self._history:
+            self._history.launch_move()
+        else:
+            self.launch_plain_step(self.correction)
+        self._launch_gradient()
+
+    def launch_plain_step(self, out):
+        """out = d − w."""
+        model = self.model
+        given = [self._active.array, model.per_copy, self.correction, self._w]
+        model.launch(self._plain_step, model.count, given, [out])
+
+    def _launch_gradient(self):
+        """∇φ at d, and the largest unbalanced acceleration."""
+        self._gradient.zero_()
+        self._gradient_of.add(self.state.x, self._gradient, self.correction)
+        self.launch_inertia(self.correction, self._gradient)
+        self._sums.largest(self.model.inverse_mass, self._gradient, self._acceleration.array)
+
+    def launch_inertia(self, d, gradient):
+        """gradient += s M d, 0 for pins; and s/2‖d‖²_M as a sum over vertices."""
+        model = self.model
+        given = [model.mass, model.inverse_mass, model.gravity, model.per_copy, self.s, 0.0, d]
+        model.launch(self._add_inertia, model.count, given, [gradient, self._work])
+
+
+class _Accelerator:
+    """The history of a stepper on the device, and the choice between the plain and the accelerated step."""
+
+    def __init__(self, stepper):
+        model, options = stepper.model, stepper.options
+        self.stepper, B, device = stepper, model.copies, model.device
+        epsilon = 10.0 * float(np.finfo(model.numpy_dtype).eps)
+        if options.acceleration == "chebyshev":
+            self.method = Chebyshev(B, options.rho)
+        else:
+            self.method = {"anderson": Anderson, "l-bfgs": LBFGS}[options.acceleration](B, options.window, epsilon)
+        m = self.method.window
+        self.s, self.y, self.z = (wp.zeros((m, model.count), dtype=model.vec3, device=device) for _ in range(3))
+        self.plain, self.accelerated, self.last_gradient, self.last_w, self.unused = (model.vectors() for _ in range(5))
+        self.slot = wp.zeros(1, dtype=wp.int32, device=device)
+        self.partial = wp.zeros((B, CHUNKS if device.is_cuda else 1, 4 * m), dtype=wp.float64, device=device)
+        self.products = Mirror(wp.zeros((B, 4 * m), dtype=wp.float64, device=device))
+        self.coefficients = Mirror(wp.zeros((B, 1 + 2 * m), dtype=wp.float64, device=device))
+        self.plain_energy, self.energy = (Mirror(wp.zeros(B, dtype=wp.float64, device=device)) for _ in range(2))
+        self.energy_of = Energy(model, stepper._sums, corrected=True)
+        names = ("note_change", "partial_products", "combine", "choose")
+        self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
+        self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in ("finish_products", "next_slot")}
+        self._note = Segment(device, self._launch_note)
+
+    def start(self):
+        """Before the first iteration of a step."""
+        self.method.start()
+
+    def propose(self, iteration, active):
+        """Sets the coefficients of the accelerated step of the copies that still iterate."""
+        self._note()
+        accepted = self.energy.read() <= self.plain_energy.read() if iteration else np.ones(len(active), dtype=bool)
+        products = self.products.read().reshape(len(active), 4, -1)
+        self.coefficients.write(np.where(active[:, None], self.method.propose(iteration, products, accepted), 0.0))
+
+    def _launch_note(self):
+        stepper, model = self.stepper, self.stepper.model
+        given = [self.slot, stepper._gradient, stepper._w]
+        self._launch("note_change", model.count, given, [self.last_gradient, self.last_w, self.y, self.z])
+        given = [self.slot, stepper._gradient, self.s, self.y, self.z, model.per_copy]
+        self._launch("partial_products", self.partial.shape, given, [self.partial])
+        self._launch("finish_products", self.products.array.shape, [self.partial], [self.products.array])
+
+    def launch_move(self):
+        """d = the better of the plain and the accelerated step."""
+        stepper, model = self.stepper, self.stepper.model
+        N, n, d = model.count, model.per_copy, stepper.correction
+        stepper.launch_plain_step(self.plain)
+        given = [self.coefficients.array, n, d, stepper._w, self.s, self.z]
+        self._launch("combine", N, given, [self.accelerated])
+        self._launch_energy(self.plain, self.plain_energy.array)
+        self._launch_energy(self.accelerated, self.energy.array)
+        self._launch("next_slot", 1, [self.slot, self.method.window], [])
+        given = [self.slot, n, self.plain, self.accelerated, self.plain_energy.array, self.energy.array]
+        self._launch("choose", N, given, [d, self.s])
+
+    def _launch_energy(self, d, out):
+        """out (B,) = φ(d)."""
+        stepper, model = self.stepper, self.stepper.model
+        stepper.launch_inertia(d, self.unused)
+        stepper._sums.sum(stepper._work, model.per_copy, out)
+        self.energy_of.add(stepper.state.x, out, d)
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.stepper.model.launch(self.kernels[name], dim, inputs, outputs)
