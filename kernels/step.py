@@ -1,6 +1,7 @@
 """Factories of the kernels that move vertices through time: symplectic update, predict, finish, pins.
 
-A pinned vertex has inverse mass 0. Fixed pins stay; moved ones take the place that their keyframes give at the end of the step.
+A pinned vertex has inverse mass 0. Fixed pins stay; moved ones take the place that their keyframes give. hₑ is the effective
+step of an implicit integrator, see :mod:`warpcloth.integrators`.
 """
 
 from functools import cache
@@ -46,31 +47,93 @@ def explicit_update(dtype, symplectic: bool):
 
 @cache
 def predict(dtype):
-    """Kernel over vertices: x += h v + h² g, the place x̃ that inertia and gravity alone lead to."""
+    """Kernel over vertices: v += hₑ g, x += hₑ v, the place x̃ that inertia and gravity alone lead to."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def predict_vertices(
         inverse_mass: wp.array(dtype=dtype),
-        v: wp.array(dtype=vec3),
         gravity: wp.array(dtype=vec3),
         per_copy: int,
-        h: dtype,
+        he: dtype,
         # in and out
         x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
     ):
         i = wp.tid()
         if inverse_mass[i] > dtype(0.0):
-            x[i] = x[i] + h * (v[i] + h * gravity[i // per_copy])
+            after = v[i] + he * gravity[i // per_copy]
+            v[i] = after
+            x[i] = x[i] + he * after
+
+    return predict_vertices
+
+
+@cache
+def start_bdf2(dtype):
+    """Kernel over vertices, the past of a motion of constant a₀ = g − ∇U/m: move = x₀ − x₋₁ = h v₀ − ½h²a₀, v₋₁ = v₀ − h a₀."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def start(
+        inverse_mass: wp.array(dtype=dtype),
+        gravity: wp.array(dtype=vec3),
+        per_copy: int,
+        h: dtype,
+        gradient: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        # out
+        move: wp.array(dtype=vec3),
+        v_before: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        w = inverse_mass[i]
+        if w > dtype(0.0):
+            change = h * (gravity[i // per_copy] - w * gradient[i])
+            move[i] = h * (v[i] - dtype(0.5) * change)
+            v_before[i] = v[i] - change
+
+    return start
+
+
+@cache
+def predict_bdf2(dtype):
+    """Kernel over vertices: v ← (4v₀ − v₋₁)/3 + hₑ g, move ← (x₀ − x₋₁)/3 + hₑ v, x += move, v₋₁ ← v₀.
+
+    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v; moves are kept in place of x₋₁, for they have the digits that large coordinates lose.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def predict_vertices(
+        inverse_mass: wp.array(dtype=dtype),
+        gravity: wp.array(dtype=vec3),
+        per_copy: int,
+        he: dtype,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        v_before: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] > dtype(0.0):
+            third = dtype(1.0) / dtype(3.0)
+            now = v[i]
+            after = now + third * (now - v_before[i]) + he * gravity[i // per_copy]
+            v_before[i] = now
+            v[i] = after
+            move[i] = third * move[i] + he * after
+            x[i] = x[i] + move[i]
 
     return predict_vertices
 
 
 @cache
 def move_pins(dtype):
-    """Kernel over (copies, pins): places the pinned vertices where the keyframes say they are at the end of this step.
+    """Kernel over (copies, pins): places the pinned vertices where the keyframes say they are h later.
 
-    Step counter k in whole steps, ``steps_per_frame`` of them to a keyframe; between keyframes linear, after the last at rest.
+    Step counter k in whole steps of this h, ``steps_per_frame`` of them to a keyframe; between keyframes linear, after the last at rest.
     x is set, v = (x − x before)/h.
     """
     vec3, _ = types(dtype)
@@ -116,9 +179,34 @@ def count_step():
 
 @cache
 def finish(dtype):
-    """Kernel over vertices, after a prediction and a correction d: x += d, v += h g + d/h.
+    """Kernel over vertices, after a prediction and a correction d: x += d, v += d/hₑ.
 
-    The same as v = (x − x before)/h, but d keeps the digits that large coordinates lose. Pins have d = 0 and keep their v.
+    Of Euler the same as v = (x − x before)/h, but d keeps the digits that large coordinates lose. Pins keep their x and v.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def finish_vertices(
+        inverse_mass: wp.array(dtype=dtype),
+        correction: wp.array(dtype=vec3),
+        he: dtype,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] > dtype(0.0):
+            x[i] = x[i] + correction[i]
+            v[i] = v[i] + correction[i] / he
+
+    return finish_vertices
+
+
+@cache
+def finish_midpoint(dtype):
+    """Kernel over vertices, after a prediction to the midpoint and a correction d: x₁ = 2(x̃ + d) − x₀, v₁ = 2(ṽ + d/hₑ) − v₀.
+
+    With ṽ = v₀ + hₑ g of the prediction: x += 2d + hₑ ṽ, v += 2d/hₑ + hₑ g. Pins keep their x and v.
     """
     vec3, _ = types(dtype)
 
@@ -128,14 +216,34 @@ def finish(dtype):
         gravity: wp.array(dtype=vec3),
         correction: wp.array(dtype=vec3),
         per_copy: int,
-        h: dtype,
+        he: dtype,
         # in and out
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
     ):
         i = wp.tid()
         if inverse_mass[i] > dtype(0.0):
-            x[i] = x[i] + correction[i]
-            v[i] = v[i] + h * gravity[i // per_copy] + correction[i] / h
+            twice = dtype(2.0) * correction[i]
+            x[i] = x[i] + (twice + he * v[i])
+            v[i] = v[i] + twice / he + he * gravity[i // per_copy]
 
     return finish_vertices
+
+
+@cache
+def note_move(dtype):
+    """Kernel over vertices, after a correction d: move += d, which makes it x₁ − x₀."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def note(
+        inverse_mass: wp.array(dtype=dtype),
+        correction: wp.array(dtype=vec3),
+        # in and out
+        move: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] > dtype(0.0):
+            move[i] = move[i] + correction[i]
+
+    return note

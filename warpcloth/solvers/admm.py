@@ -13,11 +13,11 @@ from ..kernels.minimise import add_inertia
 from ..linear import CopyFactors
 from ..operators import Sums, constant_matrices
 from ..status import Result
-from .solver import Step, Stepper, refuse_hard, refuse_without_projection
+from .solver import ImplicitStep, Stepper, refuse_hard, refuse_without_projection
 
 
 @dataclass(frozen=True)
-class ADMM(Step):
+class ADMM(ImplicitStep):
     """The alternating direction method of multipliers on 1/(2h²)‖x − x̃‖²_M + Σ U(z), z = Dx, from x = x̃, z = Dx̃, u = 0
     (Narain et al. 2016, Overby et al. 2017).
 
@@ -34,7 +34,7 @@ class ADMM(Step):
     any), the largest of any vertex: of the forces DᵀW²(Dx − z) and DᵀW²(z − z before) over the masses.
 
     Attributes:
-        dt, substeps: See :class:`Step`.
+        dt, substeps, integrator: See :class:`ImplicitStep`.
         iterations: The most iterations a step.
         tolerance: Of both residuals.
         weight: r = W²/(kA) > 0.
@@ -74,8 +74,8 @@ class ADMMStepper(Stepper):
     """
 
     def __init__(self, options, model):
-        super().__init__(options, model)
-        self.s = 1.0 / self.h**2
+        super().__init__(options, model, options.integrator)
+        self.s = 1.0 / self.he**2
         self._factors = CopyFactors(model, constant_matrices(model, self.s, options.weight))
         self._sums, cuda = Sums(model), model.device.is_cuda
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))

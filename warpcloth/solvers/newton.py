@@ -7,18 +7,18 @@ import numpy as np
 from ..capture import Segment
 from ..checks import choice, number, whole
 from ..minimise import LINEAR, POLICIES, Minimiser
-from .solver import Step, Stepper, refuse_hard
+from .solver import ImplicitStep, Stepper, refuse_hard
 
 
 @dataclass(frozen=True)
-class Newton(Step):
+class Newton(ImplicitStep):
     """Implicit Euler: x(t+h) minimises 1/(2h²)‖x − x̃‖²_M + U(x), x̃ = x + h v + h² g (Baraff and Witkin 1998).
 
     From a state in exact balance that is no minimum, such as a straight chain under pressure, it does not move.
     Multiplies the energy of an oscillation by 1/(1 + ω²h²) a step; conserves linear, not angular momentum.
 
     Attributes:
-        dt, substeps: See :class:`Step`.
+        dt, substeps, integrator: See :class:`ImplicitStep`.
         tolerance: Of the residual, the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, over gravity's (without any,
             over the largest at x̃). Where rounding leaves more than that, which in float32 it does in stiff cloth, a step ends
             when nothing is left to gain, and says so.
@@ -58,8 +58,8 @@ class NewtonStepper(Stepper):
     """:class:`Newton` on a model."""
 
     def __init__(self, options, model):
-        super().__init__(options, model)
-        self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.h**2)
+        super().__init__(options, model, options.integrator)
+        self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.he**2)
         self._predict = Segment(model.device, self.launch_prediction)
         self._finish = Segment(model.device, lambda: self.launch_finish(self.minimiser.correction))
 

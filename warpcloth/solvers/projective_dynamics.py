@@ -13,13 +13,13 @@ from ..kernels.minimise import add_inertia
 from ..linear import CopyFactors
 from ..operators import CHUNKS, Energy, Gradient, Sums, constant_matrices
 from ..status import Result
-from .solver import Step, Stepper, refuse_hard, refuse_without_projection
+from .solver import ImplicitStep, Stepper, refuse_hard, refuse_without_projection
 
 ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")
 
 
 @dataclass(frozen=True)
-class ProjectiveDynamics(Step):
+class ProjectiveDynamics(ImplicitStep):
     """Implicit Euler by a local and a global step in turn (Liu et al. 2013, Bouaziz et al. 2014), from x = x̃.
 
     For energies ½kA‖y − p(y)‖², y = Gx: with the projections p of all elements fixed, the objective of implicit Euler is least
@@ -32,7 +32,7 @@ class ProjectiveDynamics(Step):
     φ is above that of the plain iteration from the same place is dropped for that.
 
     Attributes:
-        dt, substeps: See :class:`Step`.
+        dt, substeps, integrator: See :class:`ImplicitStep`.
         iterations: The most iterations a step.
         tolerance: Of the residual, as for :class:`warpcloth.Newton`: the largest unbalanced acceleration of any vertex over
             gravity's (without any, over the largest at x̃).
@@ -81,8 +81,8 @@ class ProjectiveDynamicsStepper(Stepper):
     """
 
     def __init__(self, options, model):
-        super().__init__(options, model)
-        self.s = 1.0 / self.h**2
+        super().__init__(options, model, options.integrator)
+        self.s = 1.0 / self.he**2
         self._factors = CopyFactors(model, constant_matrices(model, self.s))
         self._sums, self._gradient_of = Sums(model), Gradient(model, corrected=True)
         self.correction, self._gradient, self._w = (model.vectors() for _ in range(3))

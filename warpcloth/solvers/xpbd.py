@@ -11,11 +11,11 @@ from ..kernels.project import add_momentum
 from ..operators import Gradient, Sums
 from ..status import Result
 from ..sweeps import Sweep, refuse_unprojectable
-from .solver import Step, Stepper, require_model
+from .solver import ImplicitStep, Stepper, refuse_hard, require_model
 
 
 @dataclass(frozen=True)
-class XPBD(Step):
+class XPBD(ImplicitStep):
     """Extended position based dynamics (Macklin et al. 2016, *XPBD*), from x = x̃ and λ = 0 in each step.
 
     With form ``"vector"`` the constraint of an element is p(y) − y, whose Jacobian is the constant G of weights:
@@ -35,7 +35,7 @@ class XPBD(Step):
     instead.
 
     Attributes:
-        dt, substeps: See :class:`Step`.
+        dt, substeps, integrator: See :class:`ImplicitStep`.
         iterations: Sweeps a step.
         sweep: Gauss–Seidel ``"coloured"``, or ``"sequential"``: elements in the order of the scene, by one thread, which on a
             GPU is for small scenes; or Jacobi ``"constraint-averaged"``: each Δλ over the most constraints at any of its
@@ -63,9 +63,13 @@ class XPBD(Step):
         """The solver on ``model``, all scratch allocated.
 
         Raises:
-            ValueError: If a term has nothing to project on.
+            ValueError: If a term has nothing to project on, or infinite stiffness with an integrator other than Euler.
         """
         require_model(model)
+        if self.integrator != "euler":
+            refuse_hard(
+                model, f"XPBD with integrator={self.integrator!r}", "integrator='euler' can, or give a finite stiffness"
+            )
         refuse_unprojectable(model, "XPBD")
         return XPBDStepper(self, model)
 
@@ -78,11 +82,11 @@ class XPBDStepper(Stepper):
     """
 
     def __init__(self, options, model):
-        super().__init__(options, model)
+        super().__init__(options, model, options.integrator)
         self.sweep = Sweep(
             model,
             self.state.x,
-            self.h,
+            self.he,
             options.sweep,
             options.relaxation,
             scalar=options.form == "scalar",
@@ -118,7 +122,7 @@ class XPBDStepper(Stepper):
         self.launch_finish(d)
 
     def _launch_momentum(self, sign):
-        given = [self.model.mass, self.sweep.correction, sign / self.h**2]
+        given = [self.model.mass, self.sweep.correction, sign / self.he**2]
         self.model.launch(self._add_momentum, self.model.count, given, [self._force])
 
     def step(self):

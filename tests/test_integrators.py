@@ -1,0 +1,180 @@
+"""Implicit Euler, midpoint and BDF2 in every solver that takes them: order, energy, momentum, pins, what is refused."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import warpcloth as wc
+from warpcloth.status import Result
+
+EPS = np.finfo(np.float64).eps
+INTEGRATORS = ("euler", "midpoint", "bdf2")
+# So far converged that the error is that of the step.
+SOLVERS = {
+    "newton": wc.Newton(substeps=1, tolerance=1e-11),
+    "newton factorised": wc.Newton(substeps=1, tolerance=1e-11, linear="factorised"),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=200),
+    "admm": wc.ADMM(substeps=1, tolerance=1e-10, iterations=4000, weight=1.0),
+    "xpbd": wc.XPBD(substeps=1, iterations=120),
+    "xpbd scalar": wc.XPBD(substeps=1, iterations=120, form="scalar"),
+}
+each_solver = pytest.mark.parametrize("name", SOLVERS)
+each_integrator = pytest.mark.parametrize("integrator", INTEGRATORS)
+
+
+def bound(scene, solver, device, dtype="float64", **options):
+    """``solver`` with other options, bound to ``scene``."""
+    return replace(solver, **options).bind(scene.build(device=device, dtype=dtype))
+
+
+def oscillator(omega, h, stretch=0.25, speed=0.5):
+    """A unit mass on a spring along x of rest length 1 from a pin: u = x − 1 obeys u″ = −ω²u."""
+    mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), edges=[[0, 1]])
+    return wc.Scene(
+        mesh,
+        masses=[1.0, 1.0],
+        positions=[[0.0, 0.0, 0.0], [1.0 + stretch, 0.0, 0.0]],
+        velocities=[[0.0, 0.0, 0.0], [speed, 0.0, 0.0]],
+        terms=[wc.Spring(stiffness=omega**2)],
+        pins=[0],
+        gravity=(0.0, 0.0, 0.0),
+        fps=1.0 / h,
+        duration=h,
+    )
+
+
+def swing(stepper, steps, omega):
+    """v + iωu of the start and after each step, (steps + 1,)."""
+    found = []
+    for step in range(steps + 1):
+        if step:
+            stepper.step()
+        found.append(stepper.state.v.numpy()[1, 0] + 1j * omega * (stepper.state.x.numpy()[1, 0] - 1.0))
+    return np.array(found)
+
+
+def slopes(steps, errors):
+    """d log error / d log h between neighbours."""
+    return np.diff(np.log(errors)) / np.diff(np.log(steps))
+
+
+@each_integrator
+@each_solver
+def test_order_on_an_oscillator(name, integrator, device):
+    """The error after a time falls like h for Euler and like h² for midpoint and BDF2."""
+    omega, end = 2.0, 1.0
+    steps, errors = end / np.array([20, 40, 80, 160]), []
+    for h in steps:
+        w = swing(bound(oscillator(omega, h), SOLVERS[name], device, integrator=integrator), round(end / h), omega)
+        errors.append(abs(w[-1] - w[0] * np.exp(1j * omega * end)))
+    print(name, integrator, errors, slopes(steps, errors))
+    assert slopes(steps, errors)[-1] == pytest.approx(1 if integrator == "euler" else 2, abs=0.15)
+
+
+@pytest.mark.parametrize("omega_h", [0.1, 1.0, 10.0])
+@each_integrator
+@each_solver
+def test_energy_of_an_oscillator(name, integrator, omega_h, device):
+    """With w = v + iωu, z = iωh: Euler w/(1 − z), midpoint w(1 + z/2)/(1 − z/2), which keeps |w|, BDF2 the roots of its law.
+
+    (3/2 − z)r² − 2r + 1/2 = 0, from w₋₁ = w₀(1 − z) + ½h²ω·(i a₀), a₀ = −ω²u₀.
+    """
+    h, steps = 0.1, 40
+    omega, z = omega_h / h, 1j * omega_h
+    scene = oscillator(omega, h, stretch=0.01, speed=0.02)  # so little that x̃ does not pass the pin
+    w = swing(bound(scene, SOLVERS[name], device, integrator=integrator), steps, omega)
+    n = np.arange(steps + 1)
+    if integrator == "bdf2":
+        before = w[0] * (1.0 - z) - 0.5j * h**2 * omega**2 * w[0].imag
+        r = (2.0 + np.array([1.0, -1.0]) * np.sqrt(1.0 + 2.0 * z)) / (3.0 - 2.0 * z)
+        parts = np.linalg.solve([[1.0, 1.0], 1.0 / r], [w[0], before])
+        exact = (parts[:, None] * r[:, None] ** n).sum(axis=0)
+        assert np.abs(r).max() < 1.0, "it dissipates"
+    else:
+        exact = w[0] * (1.0 / (1.0 - z) if integrator == "euler" else (1.0 + z / 2.0) / (1.0 - z / 2.0)) ** n
+    # Of a step is left at most 1e-10 of the first unbalanced acceleration or, of both residuals of ADMM, of 1 m/s², h times that.
+    tolerance = steps * 1e-10 * max(max(1.0, omega_h) * np.abs(exact).max(), 2.0 * h)
+    assert np.abs(w - exact).max() < tolerance
+    energy = np.abs(w) ** 2
+    if integrator == "midpoint":
+        assert np.abs(energy / energy[0] - 1.0).max() < 2.0 * tolerance / np.sqrt(energy[0])
+    elif integrator == "euler":
+        assert np.allclose(energy, energy[0] / (1.0 + omega_h**2) ** n, rtol=1e-8, atol=2.0 * tolerance * np.sqrt(energy[0]))
+
+
+def test_damping_of_bdf2_is_what_its_docstring_says():
+    omega_h = 0.05
+    r = (2.0 + np.sqrt(1.0 + 2.0j * omega_h)) / (3.0 - 2.0j * omega_h)
+    assert (1.0 - abs(r) ** 2) / omega_h**4 == pytest.approx(0.5, abs=0.01)
+
+
+FPS, FRAMES = 10.0, 4
+
+
+@cache
+def held():
+    """A net of 4 × 4 in tension, thrown, in gravity, whose pinned corners are moved with a kink at every frame."""
+    mesh = wc.Mesh.grid(4, 4)
+    corners = [0, 3, 12, 15]
+    rng = np.random.default_rng(0)
+    start = 1.2 * mesh.points
+    keyframes = start[corners] + np.concatenate([np.zeros((1, 4, 3)), 0.02 * rng.normal(size=(FRAMES, 4, 3))]).cumsum(axis=0)
+    return wc.Scene(
+        mesh,
+        masses=rng.uniform(0.5, 1.5, size=16),
+        positions=start,
+        velocities=0.3 * rng.normal(size=(16, 3)),
+        terms=[wc.Spring(pairs="structural", stiffness=30.0)],
+        pins=wc.Pins(corners, keyframes),
+        gravity=(0.0, -1.0, 0.5),
+        fps=FPS,
+        duration=FRAMES / FPS,
+    )
+
+
+@cache
+def true_end():
+    """x and v of the free vertices of :func:`held` in the end, (2, 12, 3), to 1e-11, frame by frame and without any of Warp."""
+    scene = held()
+    pins, pairs = scene.pins.vertices, scene.terms[0].stencil(scene.mesh)
+    free = np.setdiff1d(np.arange(16), pins)
+    lengths = np.linalg.norm(np.diff(scene.mesh.points[pairs], axis=1)[:, 0], axis=1)
+    state = np.stack([scene.positions[free], scene.velocities[free]])
+    for frame in range(FRAMES):
+        here, there = scene.pins.keyframes[frame : frame + 2]
+
+        def rate(t, y, here=here, there=there):
+            x, v = np.empty((16, 3)), y.reshape(2, -1, 3)[1]
+            x[free], x[pins] = y.reshape(2, -1, 3)[0], here + t * FPS * (there - here)
+            y = x[pairs[:, 1]] - x[pairs[:, 0]]
+            length = np.linalg.norm(y, axis=1)
+            pull = (30.0 * (1.0 - lengths / length))[:, None] * y
+            force = np.zeros((16, 3))
+            np.add.at(force, pairs[:, 0], pull)
+            np.add.at(force, pairs[:, 1], -pull)
+            return np.concatenate([v, force[free] / scene.vertex_masses[free, None] + scene.gravity]).ravel()
+
+        solution = solve_ivp(rate, (0.0, 1.0 / FPS), state.ravel(), method="DOP853", rtol=1e-12, atol=1e-13)
+        state = solution.y[:, -1].reshape(2, -1, 3)
+    return state
+
+
+@each_integrator
+@each_solver
+def test_order_on_a_net_whose_pins_move(name, integrator, device):
+    """Slopes 1 and 2 of x and v against an independent integration; pins at tₙ where midpoint wants tₙ + h/2 would cost an order."""
+    scene, substeps, errors = held(), [4, 8, 16], []
+    free = np.setdiff1d(np.arange(16), scene.pins.vertices)
+    for steps in substeps:
+        stepper = bound(scene, SOLVERS[name], device, integrator=integrator, substeps=steps)
+        for _ in range(FRAMES * steps):
+            stepper.step()
+        assert np.abs(stepper.state.x.numpy()[scene.pins.vertices] - scene.pins.keyframes[-1]).max() < 4 * EPS
+        ends = np.stack([stepper.state.x.numpy()[free], stepper.state.v.numpy()[free]])
+        errors.append(np.sqrt(((ends - true_end()) ** 2).mean(axis=(1, 2))))
+    found = np.log2(np.divide(errors[:-1], errors[1:]))
+    print(name, integrator, errors, found)
+    assert np.abs(found[-1] - (1 if integrator == "euler" else 2)).max() < 0.15
