@@ -133,8 +133,8 @@ def predict_bdf2(dtype):
 def move_pins(dtype):
     """Kernel over (copies, pins): places the pinned vertices where the keyframes say they are h later.
 
-    Step counter k in whole steps of this h, ``steps_per_frame`` of them to a keyframe; between keyframes linear, after the last at rest.
-    x is set, v = (x − x before)/h.
+    Counted in whole steps of this h, ``steps_per_frame`` of them to a keyframe; between keyframes linear, after the last at
+    rest. x is set, v = (x − x before)/h.
     """
     vec3, _ = types(dtype)
 

@@ -170,7 +170,10 @@ WRONG_USES = [
     ("info {}/needs.py", "needs.py needs a value for n; give it with -p n=…"),
     ("info {}/rigid.py -p n=3", "has no parameter 'n'; it takes none"),
     # options
-    ("run hanging -o {}/o.usdc -s speed=3", "Newton has no option 'speed'; allowed are dt, substeps, tolerance, iterations"),
+    (
+        "run hanging -o {}/o.usdc -s speed=3",
+        "Newton has no option 'speed'; allowed are dt, substeps, integrator, tolerance, iterations",
+    ),
     ("run hanging -o {}/o.usdc -s iterations=3.5", "iterations is '3.5'; it must be a whole number"),
     ("run hanging -o {}/o.usdc -s tolerance=0", "tolerance is 0.0; it must be a number above 0"),
     ("run hanging -o {}/o.usdc -s tolerance=inf", "tolerance is inf; it must be a number above 0"),

@@ -22,6 +22,8 @@ SOLVERS = {
     "explicit": wc.Explicit(substeps=1),
     "newton": wc.Newton(substeps=1, tolerance=1e-12),
     "newton factorised": wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"),
+    "newton midpoint": wc.Newton(substeps=1, tolerance=1e-12, integrator="midpoint"),
+    "newton bdf2": wc.Newton(substeps=1, tolerance=1e-12, integrator="bdf2"),
     "pbd": wc.PBD(substeps=1, iterations=4),
     "pbd sequential": wc.PBD(substeps=1, iterations=4, sweep="sequential", stiffness="per-step"),
     "pbd averaged by vertex": wc.PBD(substeps=1, iterations=4, sweep="vertex-averaged"),
@@ -92,14 +94,15 @@ def test_oscillator_keeps_its_invariant(method, omega_h, device):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("name", SOLVERS)
 def test_free_fall(name, dtype, device):
-    """y_n = −g h² n(n+1)/2 for every method, and no strain."""
+    """y_n = −g h² n(n+1)/2 for every method of first order, −½g(nh)² for those of second, and no strain."""
     scene = square(solver=SOLVERS[name], fps=600.0)
     stepper = SOLVERS[name].bind(scene.build(device=device, dtype=dtype))
     start, steps = scene.mesh.points, 300
     for _ in range(steps):
         stepper.step()
     drop = stepper.state.x.numpy() - start
-    exact = -9.81 * stepper.h**2 * steps * (steps + 1) / 2
+    second = getattr(SOLVERS[name], "integrator", "euler") != "euler"
+    exact = -9.81 * stepper.h**2 * steps * (steps + (0 if second else 1)) / 2
     # Every step rounds x to ε·|x|, |x| up to the larger of size and drop, and v to ε·|v|, which h carries into x each step.
     eps = np.finfo(dtype).eps
     tolerance = 2 * steps * eps * (1.0 + abs(exact))
@@ -108,8 +111,8 @@ def test_free_fall(name, dtype, device):
 
 @pytest.mark.parametrize("name", [name for name in SOLVERS if "vertex" not in name])  # averaging by vertex keeps neither
 def test_momentum_is_conserved(name, device):
-    """Inner forces cancel: P is kept; symplectic Euler keeps L too, implicit Euler and PBD lose it in x_new − x_old."""
-    angular, implicit = name == "explicit", name.startswith("newton")
+    """Inner forces cancel: P is kept; symplectic Euler and midpoint keep L too, the others lose it in x_new − x_old."""
+    angular, implicit = name in ("explicit", "newton midpoint"), name.startswith("newton")
     rng = np.random.default_rng(1)
     scene = square(solver=SOLVERS[name], gravity=(0.0, 0.0, 0.0), fps=600.0, duration=1.0, velocities=rng.normal(size=(36, 3)))
     stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
@@ -301,6 +304,7 @@ def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
         (lambda: wc.Newton(dt=float("nan")), "dt is nan"),
         (lambda: wc.Newton(substeps=0), "substeps is 0"),
         (lambda: wc.Newton(substeps=1.5), "substeps is 1.5"),
+        (lambda: wc.Newton(substeps=1, integrator="trapezoid"), "integrator is 'trapezoid'; it must be one of 'euler'"),
         (lambda: wc.Newton(substeps=1, hessian="psd"), "hessian is 'psd'; it must be one of"),
         (lambda: wc.Newton(substeps=1, linear="lu"), "linear is 'lu'"),
         (lambda: wc.Newton(substeps=1, tolerance=0.0), "tolerance is 0.0"),
@@ -394,8 +398,9 @@ def test_moving_pins_follow_their_keyframes(device):
         pins=wc.Pins([0], keyframes),
         duration=1.0,
     )
-    for record in (wc.Newton, wc.Explicit, wc.PBD, wc.XPBD, wc.ProjectiveDynamics, wc.ADMM):
-        solver = record(substeps=4)
+    solvers = [record(substeps=4) for record in (wc.Newton, wc.Explicit, wc.PBD, wc.XPBD, wc.ProjectiveDynamics, wc.ADMM)]
+    solvers += [wc.Newton(substeps=4, integrator=integrator) for integrator in ("midpoint", "bdf2")]
+    for solver in solvers:
         stepper = solver.bind(scene.build(device=device, dtype="float64"))
         seen = []
         for _ in range(12):

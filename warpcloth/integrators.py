@@ -47,7 +47,7 @@ class Euler:
 
 
 class Midpoint(Euler):
-    """Euler by h/2, the minimiser being xₘ; then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Of second order. Pins of xₘ are those of t + h/2."""
+    """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Of second order. Pins of xₘ are those of t + h/2."""
 
     part = 0.5
 
@@ -64,8 +64,8 @@ class Midpoint(Euler):
 class BDF2(Euler):
     """hₑ = 2h/3, x̃ = (4x₀ − x₋₁)/3 + hₑ(4v₀ − v₋₁)/3 + hₑ² g; the minimiser is x₁, v₁ = (4v₀ − v₋₁)/3 + hₑ(a₁ + g).
 
-    Of second order. It starts as if from a motion of constant a₀ = −∇U(x₀)/m + g, x₋₁ = x₀ − h v₀ + ½h²a₀, v₋₁ = v₀ − h a₀, which
-    keeps the order and one hₑ for all steps.
+    Of second order. It starts as if from a motion of constant a₀ = −∇U(x₀)/m + g: x₋₁ = x₀ − h v₀ + ½h²a₀, v₋₁ = v₀ − h a₀.
+    That keeps the order, and one hₑ for all steps.
     """
 
     part = 2.0 / 3.0
