@@ -60,6 +60,14 @@ def measure(rest: Any):
 
 
 @wp.func
+def green_strain(y: Any):
+    """E₀₀, E₁₁, E₀₁ of E = ½(FᵀF − I)."""
+    half = y.dtype(0.5)
+    one = y.dtype(1.0)
+    return wp.vector(half * (wp.dot(y[0], y[0]) - one), half * (wp.dot(y[1], y[1]) - one), half * wp.dot(y[0], y[1]))
+
+
+@wp.func
 def decompose(y: Any):
     """U (3×2), σ and V (2×2) of F."""
     return svd3x2(wp.transpose(y))

@@ -19,6 +19,25 @@ class HessianPolicy(IntEnum):
 
 
 @dataclass(frozen=True)
+class Dissipation:
+    """The dissipation D = Σ (Aβ/2hₑ)‖s(y) − s̃‖² of a step as an energy whose rest state s̃ is set where the step begins.
+
+    s is the term's own invariant and s̃ = sₙ of the last state, or sₙ + (sₙ − sₙ₋₁)/3 of the last two, so that (s − s̃)/hₑ is
+    its rate as the integrator has it. Where u = ½‖s − s̄‖² with the same s, D merges with it: of a stiffness k + β/hₑ the
+    rest state is s̄ + share·(s̃ − s̄), share = (β/hₑ)/(k + β/hₑ); with share 1 it is that of D alone.
+
+    Attributes:
+        rest: (y, y one state before, rest state of the term, share) → rest state of ``term``.
+        merges: Whether D merges with the energy; else it is one beside it.
+        term: The :class:`Term` of the sum, or of D alone where it does not merge; None for the term itself.
+    """
+
+    rest: Any
+    merges: bool = True
+    term: Any = None
+
+
+@dataclass(frozen=True)
 class Term:
     """An energy U = Σₑ kₑ Aₑ u(yₑ) over stencils of ``vertices`` = K vertices.
 
@@ -44,6 +63,7 @@ class Term:
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next two.
         constraint_gradient: (y, rest) → ∂C/∂y (M, 3).
         constraint_hessian: (y, rest) → ∂²C/∂y² (3M, 3M).
+        dissipation: :class:`Dissipation`, or None for what cannot be damped.
     """
 
     name: str
@@ -61,3 +81,4 @@ class Term:
     constraint: Any = None
     constraint_gradient: Any = None
     constraint_hessian: Any = None
+    dissipation: Dissipation | None = None

@@ -13,11 +13,12 @@ import warp as wp
 import warpcloth as wc
 from warpcloth.kernels import assemble, project
 from warpcloth.kernels.term import HessianPolicy, Term
-from warpcloth.kernels.terms import CATALOGUE
+from warpcloth.kernels import terms as energies
 from warpcloth.model import DTYPES
 from warpcloth.operators import Energy, Gradient, Hessian, Sums
 
 RAW, CLAMP, ABSOLUTE = HessianPolicy
+CATALOGUE = (*energies.CATALOGUE, *energies.DISSIPATIONS)
 SCALES = (1.0, 0.1, 0.01, 0.001)
 # A few roundings in a row: no sum here has more than a dozen addends that matter.
 FEW = 16
@@ -507,6 +508,7 @@ SETS = {
     "CorotatedMembrane": lambda rest, random: isometries(len(rest), random),
     "StrainLimit": lambda rest, random: stretched(isometries(len(rest), random), *rest[:, 3:].T, random),
     "QuadraticBending": lambda rest, random: np.zeros((len(rest), 1, 3)),
+    "DampedQuadraticBending": lambda rest, random: rest[:, 5:, None] * unit(random.normal(size=(len(rest), 1, 3))),
     "Attachment": lambda rest, random: rest[:, None],
 }
 
@@ -971,7 +973,8 @@ def test_edges_stay_finite(term, edge, scale, dtype, device):
     assert all(np.isfinite(values).all() for values in results)
     for policy in (CLAMP, ABSOLUTE):
         hessian = elements.hessian(policy).astype(np.float64)
-        assert (np.linalg.eigvalsh(hessian)[:, 0] >= -FEW * eps(dtype) * norms(hessian)).all()
+        lost = eps(dtype) * norms(hessian) + np.finfo(dtype).tiny
+        assert (np.linalg.eigvalsh(hessian)[:, 0] >= -FEW * lost).all()
 
 
 @on_edges
@@ -1059,7 +1062,7 @@ def row_sums(model):
     return rows
 
 
-@every_term
+@pytest.mark.parametrize("term", **named(energies.CATALOGUE))
 @every_dtype
 def test_numbering_of_the_mesh_is_no_matter(term, dtype, device):
     random = np.random.default_rng(7)
@@ -1079,7 +1082,7 @@ def test_numbering_of_the_mesh_is_no_matter(term, dtype, device):
     assert (np.linalg.norm(gradient, axis=1) > 100 * error).any()
 
 
-@every_term
+@pytest.mark.parametrize("term", **named(energies.CATALOGUE))
 @every_dtype
 def test_gathering_is_scattering(term, dtype, device):
     """The sum over the stencils of a vertex, the way of a GPU, is the sum over stencils; and each run gives the same bits."""

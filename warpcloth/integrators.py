@@ -5,8 +5,8 @@ minimiser is taken for (Hairer and Wanner 1996, *Solving ordinary differential e
 correction d = x − x̃, velocities follow from d/hₑ = hₑ a with a = −∇U/m at the minimiser.
 """
 
+from .damping import Forces
 from .kernels import step as kernels
-from .operators import Gradient
 
 
 class Euler:
@@ -17,9 +17,11 @@ class Euler:
 
     Attributes:
         he: hₑ [s].
+        move: x₀ − x₋₁ (N,) [m] of those that know two states, else None.
     """
 
     part = 1.0  # hₑ/h
+    move = None
 
     def __init__(self, stepper):
         self.stepper, self.he = stepper, self.part * stepper.h
@@ -64,7 +66,7 @@ class Midpoint(Euler):
 class BDF2(Euler):
     """hₑ = 2h/3, x̃ = (4x₀ − x₋₁)/3 + hₑ(4v₀ − v₋₁)/3 + hₑ² g; the minimiser is x₁, v₁ = (4v₀ − v₋₁)/3 + hₑ(a₁ + g).
 
-    Of second order. It starts as if from a motion of constant a₀ = −∇U(x₀)/m + g: x₋₁ = x₀ − h v₀ + ½h²a₀, v₋₁ = v₀ − h a₀.
+    Of second order. It starts as if from a motion of constant a₀ = −∇(U + D)/m + g: x₋₁ = x₀ − h v₀ + ½h²a₀, v₋₁ = v₀ − h a₀.
     That keeps the order, and one hₑ for all steps.
     """
 
@@ -74,7 +76,7 @@ class BDF2(Euler):
         super().__init__(stepper)
         model = stepper.model
         self.move, self.v_before, gradient = (model.vectors() for _ in range(3))
-        Gradient(model).add(stepper.state.x, gradient)
+        Forces(model, stepper.h).add(*stepper.state, gradient)
         given = [self._gravity, self._n, stepper.h, gradient, stepper.state.v]
         self._launch(kernels.start_bdf2, given, [self.move, self.v_before])
 

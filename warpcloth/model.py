@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Mapping
+from copy import copy as shallow_copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +19,21 @@ DTYPES = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float6
 
 
 @dataclass(frozen=True, eq=False)
+class Origin:
+    """What the rest state of damped elements is set from, see :class:`warpcloth.kernels.term.Dissipation`.
+
+    Attributes:
+        term: The term that is damped.
+        rest: Its rest state (B·E,).
+        share: (B·E,).
+    """
+
+    term: Term
+    rest: wp.array
+    share: wp.array
+
+
+@dataclass(frozen=True, eq=False)
 class DeviceElements:
     """The elements of one term in all copies, on the device.
 
@@ -28,6 +44,8 @@ class DeviceElements:
         stiffness: (B·E,); of stride 0 where all elements share one value.
         rest: (B·E,) vectors of P.
         hard: Whether any stiffness is infinite.
+        damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
+        origin: :class:`Origin` of a rest state that is set in each step, or None.
     """
 
     label: str
@@ -38,6 +56,8 @@ class DeviceElements:
     stiffness: wp.array
     rest: wp.array
     hard: bool
+    damping: wp.array | None = None
+    origin: Origin | None = None
 
     @property
     def arguments(self):
@@ -63,7 +83,9 @@ class DeviceElements:
                 return array
             return wp.array(array.numpy()[order], dtype=array.dtype, device=array.device)
 
-        return replace(self, **{name: put(getattr(self, name)) for name in ("stencil", "stiffness", "rest")})
+        changed = {name: put(getattr(self, name)) for name in ("stencil", "stiffness", "rest")}
+        origin = self.origin and replace(self.origin, rest=put(self.origin.rest), share=put(self.origin.share))
+        return replace(self, **changed, origin=origin)
 
     def taut(self, points):
         """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
@@ -94,7 +116,7 @@ class Model:
         copies: B.
         vary: What differs between the copies, by name, each with B entries: ``"gravity"`` (B, 3), ``"density"`` (B,),
             ``"masses"`` (B, n), ``"positions"`` and ``"velocities"`` (B, n, 3), and of terms, by their name or class,
-            ``"Spring.stiffness"`` (B,) or (B, E).
+            ``"Spring.stiffness"`` and ``"Spring.damping"``, (B,) or (B, E).
 
     Attributes:
         positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
@@ -147,6 +169,12 @@ class Model:
             self.keyframes = self.array(places, self.vec3)
         self.terms = tuple(self._on_device(term, positions, vary) for term in scene.terms)
         vary.refuse_rest()
+
+    def with_terms(self, terms):
+        """This model with other :class:`DeviceElements`, all else shared."""
+        other = shallow_copy(self)
+        other.terms = tuple(terms)
+        return other
 
     def array(self, values, dtype):
         """``values`` on the model's device, in its precision."""
@@ -206,9 +234,14 @@ class Model:
         E = len(one.stencil)
         stencil = one.stencil[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
         rest = np.stack([copy.rest for copy in copies] * (self.copies // len(copies)))
-        stiffness = vary.take_stiffness(one, E)
+        stiffness = vary.take_of_elements("stiffness", one, E)
         for copy, e in np.argwhere(~(stiffness >= 0.0))[:1]:
             raise ValueError(f"{one.label}.stiffness is {stiffness[copy, e]} in copy {copy}; it must be 0 or more")
+        damping = vary.take_of_elements("damping", one, E)
+        for copy, e in np.argwhere(~((damping >= 0.0) & np.isfinite(damping)))[:1]:
+            raise ValueError(f"{one.label}.damping is {damping[copy, e]} in copy {copy}; it must be finite, 0 or more")
+        if damping.any() and one.term.dissipation is None:
+            raise ValueError(f"{one.label} cannot be damped; leave its damping out of vary")
         rest_type = wp.types.vector(one.term.parameters, self.dtype)
         return DeviceElements(
             label=one.label,
@@ -216,17 +249,18 @@ class Model:
             term=one.term,
             per_copy=E,
             stencil=wp.array(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), dtype=wp.int32, device=self.device),
-            stiffness=self._broadcast(one.label, stiffness, E),
+            stiffness=self._broadcast(f"{one.label}.stiffness", stiffness, E),
             rest=self._put(f"{one.label}: rest state", "", rest, rest_type, "element", infinite=True),  # a limit may be none
             hard=bool(np.isinf(stiffness).any()),
+            damping=self._broadcast(f"{one.label}.damping", damping, E) if damping.any() else None,
         )
 
-    def _broadcast(self, label, stiffness, E):
+    def _broadcast(self, name, values, E):
         """(B, 1) or (B, E) values as an array (B·E,), of stride 0 where all are one value."""
-        name, each = f"{label}.stiffness", "element" if stiffness.shape[1] > 1 else None
-        if (stiffness != stiffness[0, 0]).any() or len(stiffness) * stiffness.shape[1] == self.copies * E:
-            return self._put(name, "", np.broadcast_to(stiffness, (self.copies, E)), self.dtype, each, infinite=True)
-        return self._repeat(self._put(name, "", stiffness[:1, :1], self.dtype, None, infinite=True), self.copies * E)
+        each = "element" if values.shape[1] > 1 else None
+        if (values != values[0, 0]).any() or len(values) * values.shape[1] == self.copies * E:
+            return self._put(name, "", np.broadcast_to(values, (self.copies, E)), self.dtype, each, infinite=True)
+        return self._repeat(self._put(name, "", values[:1, :1], self.dtype, None, infinite=True), self.copies * E)
 
     def constant(self, value, count):
         """An array (count,) of one value, of stride 0."""
@@ -250,7 +284,7 @@ class Model:
             {
                 "term": elements.label + (f" {count + 1}" if count else ""),
                 "elements": elements.count,
-                "bytes": sum(_bytes(array) for array in elements.arguments),
+                "bytes": sum(_bytes(array) for array in (*elements.arguments, elements.damping) if array is not None),
             }
             for elements, count in zip(self.terms, before, strict=True)
         ]
@@ -288,9 +322,9 @@ class _Varied:
         self.taken.add(name)
         return array(f"vary[{name!r}]", self.values[name], (self.copies, *np.shape(default))).copy()
 
-    def take_stiffness(self, elements, E):
-        """Stiffness of a term as (B, 1) or (B, E)."""
-        for name in (f"{elements.label}.stiffness", f"{elements.kind}.stiffness"):
+    def take_of_elements(self, field, elements, E):
+        """Stiffness or damping of a term as (B, 1) or (B, E)."""
+        for name in (f"{elements.label}.{field}", f"{elements.kind}.{field}"):
             if name in self.values:
                 self.taken.add(name)
                 rule = f"({self.copies},) or ({self.copies}, {E})"
@@ -298,12 +332,12 @@ class _Varied:
                 if values.shape not in ((self.copies,), (self.copies, E)):
                     raise ValueError(f"vary[{name!r}] has shape {values.shape}; it must be {rule}")
                 return values.reshape(self.copies, -1)
-        return np.repeat(np.atleast_1d(elements.stiffness)[None], self.copies, axis=0)
+        return np.repeat(np.atleast_1d(getattr(elements, field))[None], self.copies, axis=0)
 
     def refuse_rest(self):
         rest = sorted(set(self.values) - self.taken, key=str)
         if rest:
             raise ValueError(
                 f"vary[{rest[0]!r}] names nothing in this scene; allowed are gravity, density or masses, positions, "
-                "velocities and <term>.stiffness"
+                "velocities, <term>.stiffness and <term>.damping"
             )

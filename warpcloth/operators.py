@@ -42,19 +42,19 @@ class Sums:
 
 
 class Gradient:
-    """∂U/∂x of all terms [N]."""
+    """∂U/∂x of all terms [N]; or of the ``terms`` given."""
 
-    def __init__(self, model, corrected=False):
-        self.model = model
+    def __init__(self, model, corrected=False, terms=None):
+        self.model, self.terms = model, model.terms if terms is None else terms
         cuda = model.device.is_cuda
         factory = assemble.gather_gradient if cuda else assemble.scatter_gradient
-        self.kernels = [model.kernel(factory, elements.term, model.dtype, corrected) for elements in model.terms]
+        self.kernels = [model.kernel(factory, elements.term, model.dtype, corrected) for elements in self.terms]
         # Gathering needs to know which stencils a vertex belongs to; scattering does not, and then nothing is built.
-        self.incidences = [elements.incidences if cuda else () for elements in model.terms]
+        self.incidences = [elements.incidences if cuda else () for elements in self.terms]
 
     def add(self, x, out, correction=None):
         """out += ∂U/∂x at x, or at x + correction of operators built ``corrected``."""
-        for elements, kernel, incidences in zip(self.model.terms, self.kernels, self.incidences, strict=True):
+        for elements, kernel, incidences in zip(self.terms, self.kernels, self.incidences, strict=True):
             dim = len(incidences[0]) - 1 if incidences else elements.count
             self.model.launch(kernel, dim, [*incidences, *elements.arguments, x, correction], [out])
 

@@ -7,6 +7,7 @@ their order is no matter and they run at once; between colours, and between term
 import numpy as np
 import warp as wp
 
+from .damping import refuse_apart
 from .kernels import project as kernels
 
 # By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
@@ -45,6 +46,7 @@ def refuse_unprojectable(model, solver):
     Raises:
         ValueError: Naming the term, the solver and what would work.
     """
+    refuse_apart(model, solver)
     for elements in model.terms:
         if elements.term.project is None and elements.term.constraint is None:
             raise ValueError(

@@ -33,6 +33,7 @@ class Elements:
         stencil: Vertices of each element, (E, K) int32.
         stiffness: One value or (E,) [unit of the term].
         rest: Rest state (E, P).
+        damping: One value or (E,) [that times s].
     """
 
     label: str
@@ -41,6 +42,7 @@ class Elements:
     stencil: np.ndarray
     stiffness: np.ndarray
     rest: np.ndarray
+    damping: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +102,10 @@ class Declared:
         if len(stencil) == 0:
             raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
         stiffness = self._of_elements("stiffness", len(stencil))
-        return Elements(self.label, type(self).__name__, self.term, stencil, stiffness, self.rest(mesh, positions, stencil))
+        damped = getattr(self, "damping", None) is not None
+        damping = self._of_elements("damping", len(stencil)) if damped else np.zeros(())
+        rest = self.rest(mesh, positions, stencil)
+        return Elements(self.label, type(self).__name__, self.term, stencil, stiffness, rest, damping)
 
     def rest(self, mesh, positions, stencil):
         """Rest state (E, P) of the elements, from the rest shape of the mesh."""
@@ -108,7 +113,20 @@ class Declared:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spring(Declared):
+class _Damped(Declared):
+    """What terms have that can be damped: β, of a dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖² a step, s the term's own invariant."""
+
+    damping: float | Sequence[float] | np.ndarray | None = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.damping is not None:
+            damping = self._numeric("damping")
+            refuse(f"{self.label}.damping", damping, ~((damping >= 0.0) & np.isfinite(damping)), "must be finite, 0 or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spring(_Damped):
     """Springs, U = Σ ½k(l − L)² (Provot 1995).
 
     Attributes:
@@ -118,6 +136,7 @@ class Spring(Declared):
             lexicographic order; or own pairs (E, 2), as given.
         stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
         rest_lengths: L [m], one or (E,), if not those of the mesh.
+        damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.
         name: To tell two terms of one kind apart.
     """
 
@@ -144,7 +163,7 @@ class Spring(Declared):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorotatedMembrane(Declared):
+class CorotatedMembrane(_Damped):
     """A membrane of triangles without Poisson's effect, U = Σ ½kA‖F − R‖², R the polar rotation of F (Chao et al. 2010).
 
     F (3×2) is the deformation gradient and A the rest area of a triangle. Linear in the stretch, and has a projection.
@@ -152,6 +171,7 @@ class CorotatedMembrane(Declared):
     Attributes:
         stiffness: k = Et = 2μ [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled.
             One or (T,); ``math.inf`` for solvers that take hard constraints.
+        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
         name: To tell two terms of one kind apart.
     """
 
@@ -167,7 +187,7 @@ class CorotatedMembrane(Declared):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Isotropic(Declared):
+class _Isotropic(_Damped):
     """What isotropic membranes in plane stress have: k = Et, and Poisson's ratio ν.
 
     In these μ = k/(2(1 + ν)) and λ = kν/(1 − ν²). A stiffness that varies leaves ν as it is.
@@ -210,6 +230,7 @@ class StVKMembrane(_Isotropic):
         stiffness: k = Et [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled a
             little. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
+        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
         name: To tell two terms of one kind apart.
     """
 
@@ -226,6 +247,7 @@ class NeoHookeanMembrane(_Isotropic):
         stiffness: k = Et [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled a
             little. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
+        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
         name: To tell two terms of one kind apart.
     """
 
@@ -233,13 +255,14 @@ class NeoHookeanMembrane(_Isotropic):
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuadraticBending(Declared):
+class QuadraticBending(_Damped):
     """Quadratic bending of a sheet that is flat at rest, U = Σ ½D‖y‖²/(A₁+A₂) (Bergou et al. 2006). Linear forces.
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh. A grid with one diagonal a
             cell is 3 times as stiff where it curves along its diagonals, as stiff where it folds about them or curves along
             its rows, and 0.75 times 15° off the rows away from them; one with alternating diagonals is 1 to 1.5 times.
+        damping: β [N·m·s], of the rate of ‖y‖, which for a small angle θ is |e|·|θ|.
         name: To tell two terms of one kind apart.
     """
 
@@ -250,11 +273,12 @@ class QuadraticBending(Declared):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DihedralBending(Declared):
+class DihedralBending(_Damped):
     """Bending by the angle between neighbouring triangles, U = Σ ½D|e|²/(A₁+A₂)(θ−θ̄)² (Grinspun et al. 2003).
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated as in :class:`QuadraticBending`.
+        damping: β [N·m·s], of the rate of θ.
         name: To tell two terms of one kind apart.
     """
 
@@ -265,13 +289,14 @@ class DihedralBending(Declared):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attachment(Declared):
+class Attachment(_Damped):
     """Vertices held by springs of no length, U = Σ ½k‖x − target‖²: a pin that gives way.
 
     Attributes:
         vertices: Indices (E,), or a selection such as ``"corners"``.
         stiffness: k [N/m], one or (E,).
         targets: Places (E, 3) [m], if not where the vertices start.
+        damping: β [N·s/m], one or (E,): a force −βv. Unlike that of other terms it acts in rigid motion too.
         name: To tell two terms of one kind apart.
     """
 

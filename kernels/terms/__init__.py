@@ -3,8 +3,9 @@
 from .attachment import ATTACHMENT
 from .corotated_membrane import COROTATED_MEMBRANE
 from .dihedral_bending import DIHEDRAL_BENDING
+from .membrane_damping import MEMBRANE_DAMPING
 from .neo_hookean_membrane import NEO_HOOKEAN_MEMBRANE
-from .quadratic_bending import QUADRATIC_BENDING
+from .quadratic_bending import DAMPED_QUADRATIC_BENDING, QUADRATIC_BENDING
 from .spring import SPRING
 from .spring_limit import SPRING_LIMIT
 from .strain_limit import STRAIN_LIMIT
@@ -21,3 +22,5 @@ CATALOGUE = (
     SPRING_LIMIT,
     STRAIN_LIMIT,
 )
+# What damping makes of those whose sum with it is another energy, or that it stands beside.
+DISSIPATIONS = (DAMPED_QUADRATIC_BENDING, MEMBRANE_DAMPING)

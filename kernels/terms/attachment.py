@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from ..term import Term
+from ..term import Dissipation, Term
 
 
 def rest_state(points, stencil):
@@ -50,6 +50,13 @@ def hessian(y: Any, rest: Any, policy: int):
     return wp.identity(n=3, dtype=y.dtype)
 
 
+@wp.func
+def damped_rest(y: Any, before: Any, rest: Any, share: Any):
+    """With s = y itself: the place that it holds on to does not turn with it."""
+    s = y[0] + (y[0] - before[0]) / y.dtype(3.0)
+    return rest + share * (s - rest)
+
+
 ATTACHMENT = Term(
     name="Attachment",
     vertices=1,
@@ -62,4 +69,5 @@ ATTACHMENT = Term(
     gradient=gradient,
     hessian=hessian,
     project=project,
+    dissipation=Dissipation(rest=damped_rest),
 )

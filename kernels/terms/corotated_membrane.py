@@ -13,6 +13,7 @@ import warp as wp
 
 from ..membrane import inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
 from ..term import Term
+from .membrane_damping import DISSIPATION
 
 
 def rest_state(points, stencil):
@@ -52,4 +53,5 @@ COROTATED_MEMBRANE = Term(
     gradient=gradient,
     hessian=hessian,
     project=project,
+    dissipation=DISSIPATION,
 )

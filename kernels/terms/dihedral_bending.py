@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..term import HessianPolicy, Term
+from ..term import Dissipation, HessianPolicy, Term
 
 RAW = wp.constant(int(HessianPolicy.RAW))
 CLAMP = wp.constant(int(HessianPolicy.CLAMP))
@@ -70,6 +70,16 @@ def undefined(y: Any):
 
 
 @wp.func
+def wrap(angle: Any):
+    """Into (−π, π], from within (−3π, 3π)."""
+    if angle > type(angle)(wp.pi):
+        angle -= type(angle)(2.0 * wp.pi)
+    if angle <= -type(angle)(wp.pi):
+        angle += type(angle)(2.0 * wp.pi)
+    return angle
+
+
+@wp.func
 def constraint(y: Any, rest: Any):
     c = wp.ddot(y, y * y.dtype(0.0))  # 0, and NaN where y is
     if not undefined(y):
@@ -78,11 +88,7 @@ def constraint(y: Any, rest: Any):
         n2 = wp.cross(y[2], y[0])
         n1 /= wp.length(n1)
         n2 /= wp.length(n2)
-        c = wp.atan2(wp.dot(wp.cross(n1, n2), y[0]) / wp.length(y[0]), wp.dot(n1, n2)) - rest[0]
-        if c > rest.dtype(wp.pi):
-            c -= rest.dtype(2.0 * wp.pi)
-        if c <= -rest.dtype(wp.pi):
-            c += rest.dtype(2.0 * wp.pi)
+        c = wrap(wp.atan2(wp.dot(wp.cross(n1, n2), y[0]) / wp.length(y[0]), wp.dot(n1, n2)) - rest[0])
     return c
 
 
@@ -189,6 +195,14 @@ def hessian(y: Any, rest: Any, policy: int):
     return wp.outer(g, g) + curvature(y, constraint(y, rest), policy)
 
 
+@wp.func
+def damped_rest(y: Any, before: Any, rest: Any, share: Any):
+    c = constraint(y, rest)
+    r = rest
+    r[0] = wrap(rest[0] + share * wrap(c + wrap(c - constraint(before, rest)) / y.dtype(3.0)))
+    return r
+
+
 DIHEDRAL_BENDING = Term(
     name="DihedralBending",
     vertices=4,
@@ -203,4 +217,5 @@ DIHEDRAL_BENDING = Term(
     constraint=constraint,
     constraint_gradient=constraint_gradient,
     constraint_hessian=constraint_hessian,
+    dissipation=Dissipation(rest=damped_rest),
 )

@@ -16,6 +16,7 @@ import warp as wp
 from ..membrane import decompose, isotropic_hessian, material_state, measure, weight
 from ..rotation import epsilon
 from ..term import Term
+from .membrane_damping import DISSIPATION
 
 
 def rest_state(points, stencil, poisson_ratio=0.0):
@@ -94,4 +95,5 @@ NEO_HOOKEAN_MEMBRANE = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
+    dissipation=DISSIPATION,
 )

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..term import Term
+from ..term import Dissipation, Term
+from . import spring
 
 
 def rest_state(points, stencil):
@@ -66,6 +67,68 @@ def project(y: Any, rest: Any):
     return y * y.dtype(0.0)
 
 
+# Damped, with s = ‖y‖: the energy ½(‖y‖ − s̄)² of a spring of length s̄, the last number of the rest state.
+
+spring_energy, spring_gradient, spring_hessian, spring_project = spring.energy, spring.gradient, spring.hessian, spring.project
+damped_length = spring.damped_length
+
+
+@wp.func
+def length_of(rest: Any):
+    """s̄ as the rest state of a spring."""
+    s = wp.vector(length=1, dtype=rest.dtype)
+    s[0] = rest[5]
+    return s
+
+
+@wp.func
+def damped_energy(y: Any, rest: Any):
+    return spring_energy(y, length_of(rest))
+
+
+@wp.func
+def damped_gradient(y: Any, rest: Any):
+    return spring_gradient(y, length_of(rest))
+
+
+@wp.func
+def damped_hessian(y: Any, rest: Any, policy: int):
+    return spring_hessian(y, length_of(rest), policy)
+
+
+@wp.func
+def damped_project(y: Any, rest: Any):
+    return spring_project(y, length_of(rest))
+
+
+@wp.func
+def damped_rest(y: Any, before: Any, rest: Any, share: Any):
+    r = wp.vector(length=6, dtype=rest.dtype)
+    for i in range(5):
+        r[i] = rest[i]
+    r[5] = damped_length(wp.length(y[0]), wp.length(before[0]), rest.dtype(0.0), share)
+    return r
+
+
+def damped_rest_state(points, stencil):
+    """:func:`rest_state` and s̄ [m], 0 (E, 6)."""
+    return np.column_stack([rest_state(points, stencil), np.zeros(len(stencil))])
+
+
+DAMPED_QUADRATIC_BENDING = Term(
+    name="DampedQuadraticBending",
+    vertices=4,
+    rows=1,
+    parameters=6,
+    rest_state=damped_rest_state,
+    weight=weight,
+    measure=measure,
+    energy=damped_energy,
+    gradient=damped_gradient,
+    hessian=damped_hessian,
+    project=damped_project,
+)
+
 QUADRATIC_BENDING = Term(
     name="QuadraticBending",
     vertices=4,
@@ -78,4 +141,5 @@ QUADRATIC_BENDING = Term(
     gradient=gradient,
     hessian=hessian,
     project=project,
+    dissipation=Dissipation(rest=damped_rest, term=DAMPED_QUADRATIC_BENDING),
 )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..term import HessianPolicy, Term
+from ..term import Dissipation, HessianPolicy, Term
 
 CLAMP = wp.constant(int(HessianPolicy.CLAMP))
 ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
@@ -105,6 +105,20 @@ def constraint_hessian(y: Any, rest: Any):
     return h
 
 
+@wp.func
+def damped_length(length: Any, before: Any, rest_length: Any, share: Any):
+    """L + share·(s̃ − L) of :class:`..term.Dissipation` for s = l; no less than 0, which is of no length."""
+    s = length + (length - before) / type(length)(3.0)
+    return wp.max(rest_length + share * (s - rest_length), type(length)(0.0))
+
+
+@wp.func
+def damped_rest(y: Any, before: Any, rest: Any, share: Any):
+    r = rest
+    r[0] = damped_length(wp.length(y[0]), wp.length(before[0]), rest[0], share)
+    return r
+
+
 SPRING = Term(
     name="Spring",
     vertices=2,
@@ -120,4 +134,5 @@ SPRING = Term(
     constraint=constraint,
     constraint_gradient=constraint_gradient,
     constraint_hessian=constraint_hessian,
+    dissipation=Dissipation(rest=damped_rest),
 )

@@ -11,21 +11,14 @@ from typing import Any
 
 import warp as wp
 
-from ..membrane import decompose, isotropic_hessian, material_state, measure, weight
+from ..membrane import decompose, green_strain, isotropic_hessian, material_state, measure, weight
 from ..term import Term
+from .membrane_damping import DISSIPATION
 
 
 def rest_state(points, stencil, poisson_ratio=0.0):
     """Inverse rest edges [1/m] of the triangles ``stencil`` (E, 3), μ/k and λ/k [1] of ν (one or E), as an array (E, 5)."""
     return material_state(points, stencil, poisson_ratio)
-
-
-@wp.func
-def green_strain(y: Any):
-    """E₀₀, E₁₁, E₀₁."""
-    half = y.dtype(0.5)
-    one = y.dtype(1.0)
-    return wp.vector(half * (wp.dot(y[0], y[0]) - one), half * (wp.dot(y[1], y[1]) - one), half * wp.dot(y[0], y[1]))
 
 
 @wp.func
@@ -77,4 +70,5 @@ STVK_MEMBRANE = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
+    dissipation=DISSIPATION,
 )

@@ -75,6 +75,7 @@ class ADMMStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model, options.integrator)
+        model = self.model
         self.s = 1.0 / self.he**2
         self._factors = CopyFactors(model, constant_matrices(model, self.s, options.weight))
         self._sums, cuda = Sums(model), model.device.is_cuda

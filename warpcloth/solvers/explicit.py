@@ -7,8 +7,9 @@ import numpy as np
 
 from ..capture import Segment
 from ..checks import choice
+from ..damping import Forces, Past, dissipations
 from ..kernels import step as kernels
-from ..operators import Gradient, Hessian
+from ..operators import Hessian
 from .solver import Step, Stepper, refuse_hard
 
 _INSTEAD = "PBD and XPBD take hard constraints, or give a finite stiffness"
@@ -78,11 +79,12 @@ class Explicit(Step):
 def step_limits(model):
     """The largest stable steps of symplectic Euler [s]: about the rest shape, and in motion, see below.
 
-    The first is 2/ω with ω² the largest eigenvalue of M⁻¹∂²U/∂x² at rest, by Lanczos iteration; the second 2/√G with
-    Gershgorin's G = max over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is
-    2·Σk/m, which no motion exceeds, and neither does one of quadratic bending. The Hessian of dihedral bending grows as the
-    cloth folds or is compressed and those of membranes as they stretch, so for scenes with these the second is no bound there:
-    it counts them as at rest. Limits, which at rest have no stiffness, are counted as reached, in both.
+    The first is the h at which the largest eigenvalue of M⁻¹(h²K + 2hC) is 4, K = ∂²U/∂x² and C that of the damping at rest,
+    by Lanczos iteration; without damping that is 2/ω. The second takes for the eigenvalues Gershgorin's bounds, max over
+    vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is 2·Σk/m, which no motion exceeds,
+    and neither does one of quadratic bending. The Hessian of dihedral bending grows as the cloth folds or is compressed and
+    those of membranes as they stretch, so for scenes with these the second is no bound there: it counts them as at rest.
+    Limits, which at rest have no stiffness, are counted as reached, in both.
 
     Returns:
         (rest, motion); infinite where nothing is stiff.
@@ -90,16 +92,38 @@ def step_limits(model):
     Raises:
         ValueError: If a stiffness is infinite.
     """
-    from scipy.sparse import diags
-    from scipy.sparse.linalg import eigsh
-
     refuse_hard(model, "Explicit", _INSTEAD)
-    hessian = Hessian(model, terms=[elements.taut(model.scene.mesh.points) for elements in model.terms])
-    rest_shape = np.tile(model.scene.mesh.points, (model.copies, 1))
-    hessian.assemble(model.array(rest_shape, model.vec3), 0.0)
+    rest_shape = model.array(np.tile(model.scene.mesh.points, (model.copies, 1)), model.vec3)
+    taut = [elements.taut(model.scene.mesh.points) for elements in model.terms]
+    K, k = _over_mass(model, taut, rest_shape)
+    damping = dissipations(model, 1.0)  # of stiffness β, and at rest the Hessian is that of a linear damper
+    if not damping:
+        return float(_root(_largest(K)[0], 0.0)), float(_root(k, 0.0).min(initial=np.inf))
+    Past(model, damping).launch(rest_shape)
+    C, c = _over_mass(model, damping, rest_shape)
+    h = _root(*(_largest(matrix)[0] for matrix in (K, C)))
+    for _ in range(20):  # the first is too small, all others, by Rayleigh's principle, too large and falling
+        _value, u = _largest(h * h * K + 2.0 * h * C)
+        before, h = h, _root(u @ K @ u, u @ C @ u)
+        if abs(h - before) <= 1e-6 * h:
+            break
+    return float(h), float(_root(k, c).min(initial=np.inf))
+
+
+def _root(k, c):
+    """The h ≥ 0 with h² k + 2 h c = 4, infinite where both are 0."""
+    with np.errstate(divide="ignore"):
+        return np.divide(4.0, c + np.sqrt(c * c + 4.0 * np.maximum(k, 0.0)))
+
+
+def _over_mass(model, terms, x):
+    """M^-½ ∂²U/∂x² M^-½ of ``terms`` at x as a scipy matrix (3N, 3N), and Gershgorin's bound of each row (N,) [1/s²]."""
+    from scipy.sparse import diags
+
+    hessian = Hessian(model, terms=terms)
+    hessian.assemble(x, 0.0)
     inverse_mass = model.inverse_mass.numpy().astype(np.float64)
     root = diags(np.repeat(np.sqrt(inverse_mass), 3))
-    matrix = (root @ hessian.matrix() @ root).tocsr()
     rows = np.zeros(model.count)
     for elements, blocks in zip(hessian.terms, hessian.blocks, strict=True):
         K = elements.term.vertices
@@ -107,18 +131,24 @@ def step_limits(model):
         # √(‖·‖₁‖·‖∞) is no less than the spectral norm, equal to it along the axes and diagonals of a grid, and cheap.
         norms = np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)).reshape(-1, K, K).sum(axis=2)
         np.add.at(rows, elements.stencil.numpy(), norms)
-    bound = float((rows * inverse_mass).max(initial=0.0))
-    if bound == 0.0:
-        return np.inf, np.inf
+    return (root @ hessian.matrix() @ root).tocsr(), rows * inverse_mass
+
+
+def _largest(matrix):
+    """The largest eigenvalue of a symmetric matrix, and its vector."""
+    from scipy.sparse.linalg import eigsh
+
+    if matrix.shape[0] <= 30:
+        values, vectors = np.linalg.eigh(matrix.toarray())
+        return float(values[-1]), vectors[:, -1]
     start = np.random.default_rng(0).normal(size=matrix.shape[0])
-    if matrix.shape[0] > 30:
-        # The upper eigenvalues of a large net lie close together: 1e-4 takes 35 s at 512² vertices, 1e-2 a second, and the
-        # limit that it gives is 0.2 % too large.
-        tolerance = 1e-4 if matrix.shape[0] < 50_000 else 1e-2
-        largest = float(eigsh(matrix, k=1, which="LA", v0=start, return_eigenvectors=False, tol=tolerance)[0])
-    else:
-        largest = float(np.linalg.eigvalsh(matrix.toarray())[-1])
-    return (2.0 / np.sqrt(largest) if largest > 0.0 else np.inf), 2.0 / np.sqrt(bound)
+    if not matrix.count_nonzero():
+        return 0.0, start
+    # The upper eigenvalues of a large net lie close together: 1e-4 takes 35 s at 512² vertices, 1e-2 a second, and the
+    # limit that it gives is 0.2 % too large.
+    tolerance = 1e-4 if matrix.shape[0] < 50_000 else 1e-2
+    values, vectors = eigsh(matrix, k=1, which="LA", v0=start, tol=tolerance)
+    return float(values[0]), vectors[:, 0]
 
 
 class ExplicitStepper(Stepper):
@@ -127,13 +157,13 @@ class ExplicitStepper(Stepper):
     def __init__(self, options, model):
         super().__init__(options, model)
         self.gradient = model.vectors()
-        self._gradient_of = Gradient(model)
+        self._forces = Forces(model, self.h)
         self._update = model.kernel(kernels.explicit_update, model.dtype, options.scheme == "symplectic")
         self._step = Segment(model.device, self._launch_step)
 
     def _launch_step(self):
         model, (x, v) = self.model, self.state
-        self._gradient_of.add(x, self.gradient)
+        self._forces.add(x, v, self.gradient)
         given = [model.inverse_mass, model.gravity, model.per_copy, self.h]
         model.launch(self._update, model.count, given, [self.gradient, x, v])
         self.launch_pins()

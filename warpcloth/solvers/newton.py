@@ -59,6 +59,7 @@ class NewtonStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model, options.integrator)
+        model = self.model
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.he**2)
         self._predict = Segment(model.device, self.launch_prediction)
         self._finish = Segment(model.device, lambda: self.launch_finish(self.minimiser.correction))

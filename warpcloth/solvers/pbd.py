@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from ..capture import Segment
 from ..checks import choice, number, whole
+from ..damping import Past
 from ..sweeps import SWEEPS, Sweep, refuse_unprojectable
 from .solver import Step, Stepper, require_model
 
@@ -73,8 +74,10 @@ class PBDStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model)
+        model = self.model
         spread = options.iterations if options.stiffness == "per-step" else None
         self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)
+        self.past = Past(model, self.sweep.elements)
         self._start = Segment(model.device, self._launch_start)
         self._sweep = Segment(model.device, self.sweep.launch)
         self._finish = Segment(model.device, lambda: self.launch_finish(self.sweep.correction))

@@ -82,6 +82,7 @@ class ProjectiveDynamicsStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model, options.integrator)
+        model = self.model
         self.s = 1.0 / self.he**2
         self._factors = CopyFactors(model, constant_matrices(model, self.s))
         self._sums, self._gradient_of = Sums(model), Gradient(model, corrected=True)

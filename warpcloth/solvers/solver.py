@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..checks import choice, number, shown, whole
+from ..damping import Past, damped_terms, refuse_apart
 from ..integrators import INTEGRATORS
 from ..kernels import step as kernels
 from ..model import Model
@@ -83,6 +84,8 @@ class Stepper:
     Attributes:
         state: :class:`State`.
         h: Step [s].
+        model: The model, its terms damped as a step has it.
+        past: What they know of the state before, see :class:`warpcloth.damping.Past`.
         integrator: What leads to x̃ and away from the minimiser, see :mod:`warpcloth.integrators`.
         he: Its hₑ [s].
         steps_per_frame: Steps a frame.
@@ -101,6 +104,8 @@ class Stepper:
         self.count = wp.zeros(1, dtype=wp.int32, device=model.device) if model.pins is not None else None
         self.integrator = INTEGRATORS[integrator](self)
         self.he = self.integrator.he
+        self.model = model.with_terms(damped_terms(model, self.he))
+        self.past = Past(model, self.model.terms)
 
     def launch_pins(self, parts=1):
         """Moves the pins that have keyframes on by h/``parts``, which must be the same in all calls."""
@@ -115,6 +120,7 @@ class Stepper:
 
     def launch_prediction(self):
         """x = x̃, and the pins where they are then."""
+        self.past.launch(self.state.x, self.integrator.move)
         self.integrator.launch_prediction()
 
     def launch_finish(self, correction):
@@ -155,6 +161,7 @@ def refuse_without_projection(model, solver):
     Raises:
         ValueError: Naming the term, the solver and what would work.
     """
+    refuse_apart(model, solver)
     for elements in model.terms:
         if elements.term.project is None:
             others = "Newton or Explicit" if elements.term.constraint is None else "Newton, Explicit, PBD or XPBD"

@@ -7,6 +7,7 @@ import warp as wp
 
 from ..capture import Mirror, Segment
 from ..checks import choice, number, whole
+from ..damping import Past
 from ..kernels.project import add_momentum
 from ..operators import Gradient, Sums
 from ..status import Result
@@ -83,6 +84,7 @@ class XPBDStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model, options.integrator)
+        model = self.model
         self.sweep = Sweep(
             model,
             self.state.x,
@@ -92,8 +94,10 @@ class XPBDStepper(Stepper):
             scalar=options.form == "scalar",
             multipliers=True,
         )
+        self.past = Past(model, self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
-        self._gradient = None if any(elements.hard for elements in model.terms) else Gradient(model, corrected=True)
+        soft = not any(elements.hard for elements in model.terms)
+        self._gradient = Gradient(model, corrected=True, terms=self.sweep.elements) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
         acceleration = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
         self._acceleration = Mirror(acceleration)

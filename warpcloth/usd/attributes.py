@@ -67,6 +67,7 @@ ATTRIBUTES = (
     # Only where <name> is not the name of the term; empty where it has none.
     Attribute("terms.name", "warpcloth:terms:<name>:name", "cloth", (_T.String,)),
     Attribute("terms.stiffness", "warpcloth:terms:<name>:stiffness", "cloth", (_T.Double, _T.DoubleArray)),
+    Attribute("terms.damping", "warpcloth:terms:<name>:damping", "cloth", (_T.Double, _T.DoubleArray)),
     Attribute("terms.pairs", "warpcloth:terms:<name>:pairs", "cloth", (_T.Token, _T.TokenArray, _T.Int2Array)),
     Attribute("terms.rest_lengths", "warpcloth:terms:<name>:restLengths", "cloth", (_T.Double, _T.DoubleArray)),
     Attribute("terms.poisson_ratio", "warpcloth:terms:<name>:poissonRatio", "cloth", (_T.Double, _T.DoubleArray)),
