@@ -12,8 +12,8 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.kernels import assemble, project
-from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.kernels import terms as energies
+from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.model import DTYPES
 from warpcloth.operators import Energy, Gradient, Hessian, Sums
 
