@@ -7,7 +7,7 @@ import warp as wp
 
 from ..capture import Mirror, Segment
 from ..checks import number, whole
-from ..kernels import project as kernels
+from ..kernels import splitting as kernels
 from ..kernels.accelerate import plain_step
 from ..kernels.minimise import add_inertia
 from ..linear import CopyFactors
