@@ -300,3 +300,16 @@ def new_direction(dtype):
             p[i] = z[i] + dtype(ratio[copy]) * p[i]
 
     return turn
+
+
+@cache
+def scale(dtype):
+    """Kernel over vertices: out = sᵢ aᵢ."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scale_vertices(s: wp.array(dtype=dtype), a: wp.array(dtype=vec3), out: wp.array(dtype=vec3)):
+        i = wp.tid()
+        out[i] = s[i] * a[i]
+
+    return scale_vertices

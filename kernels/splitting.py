@@ -1,11 +1,133 @@
 """Factories of the kernels of ADMM: implicit Euler split into elements, with copies z of their y, and vertices."""
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from .assemble import local_coordinate, types
-from .term import Term
+from .rotation import epsilon
+from .term import HessianPolicy, Term
+
+CLAMP = wp.constant(int(HessianPolicy.CLAMP))
+# The most Newton steps of a local problem, and the most halvings of each.
+STEPS = 30
+
+
+@wp.func
+def solve_definite(H: Any, b: Any, n: int):
+    """H⁻¹ b of a symmetric positive definite H by Cholesky; n, its size, is unknown to the compiler, or it would unroll."""
+    L = H
+    x = b
+    for j in range(n):
+        s = L[j, j]
+        for k in range(j):
+            s -= L[j, k] * L[j, k]
+        s = wp.sqrt(s)
+        L[j, j] = s
+        for i in range(j + 1, n):
+            t = L[i, j]
+            for k in range(j):
+                t -= L[i, k] * L[j, k]
+            L[i, j] = t / s
+    for i in range(n):
+        t = x[i]
+        for k in range(i):
+            t -= L[i, k] * x[k]
+        x[i] = t / L[i, i]
+    for step in range(n):
+        i = n - 1 - step
+        t = x[i]
+        for k in range(i + 1, n):
+            t -= L[k, i] * x[k]
+        x[i] = t / L[i, i]
+    return x
+
+
+@cache
+def local_minimiser(term: Term, dtype):
+    """The device function (v, z, rest, r) → argmin u(z) + ½r‖v − z‖², r > 0, from a guess z.
+
+    In closed form (p(v) + r v)/(1 + r) of a term that projects; else by Newton's method with the semi-definite Hessian of
+    the term and a line search.
+    """
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    flat = wp.types.vector(3 * term.rows, dtype)
+    size = wp.constant(3 * term.rows)
+    project, u, gradient, hessian = term.project, term.energy, term.gradient, term.hessian
+
+    @wp.func
+    def closed(v: y_type, z: y_type, rest: rest_type, r: dtype, steps: int):
+        return v + (project(v, rest) - v) / (dtype(1.0) + r)
+
+    @wp.func
+    def value(v: y_type, z: y_type, rest: rest_type, r: dtype):
+        return u(z, rest) + dtype(0.5) * r * wp.ddot(v - z, v - z)
+
+    @wp.func
+    def newton(v: y_type, z: y_type, rest: rest_type, r: dtype, steps: int):
+        n = steps - steps + size
+        now = value(v, z, rest, r)
+        other = value(v, v, rest, r)
+        if not (now <= other):
+            z = v
+            now = other
+        for _step in range(steps):
+            g = gradient(z, rest) + r * (z - v)
+            right = flat()
+            for i in range(n):
+                right[i] = -g[i // 3, i % 3]
+            H = hessian(z, rest, CLAMP)
+            for i in range(n):
+                H[i, i] = H[i, i] + r
+            p = solve_definite(H, right, n)
+            slope = -wp.dot(right, p)
+            if not (wp.dot(p, p) > dtype(64.0) * epsilon(r) * epsilon(r) * wp.ddot(z, z)):
+                return z
+            direction = y_type()
+            for i in range(n):
+                direction[i // 3, i % 3] = p[i]
+            t = dtype(1.0)
+            halvings = steps - steps
+            searching = halvings == 0
+            while searching:
+                after = value(v, z + t * direction, rest, r)
+                # Near the minimum u resolves no decrease, and the step is right to rounding without one.
+                if after <= now + dtype(1.0e-4) * t * slope + dtype(4.0) * epsilon(r) * wp.abs(now):
+                    z = z + t * direction
+                    now = after
+                    searching = False
+                else:
+                    t = dtype(0.5) * t
+                    halvings += 1
+                    if halvings > steps:
+                        return z
+        return z
+
+    return closed if project is not None else newton
+
+
+@cache
+def stiffness_scale(term: Term, dtype):
+    """Kernel over elements: out = ‖∂²u/∂y²‖, which says how stiff an energy is to y, whatever both are measured in."""
+    vec3, _ = types(dtype)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, hessian = local_coordinate(term, dtype, False), term.hessian
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scale(
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        x: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=dtype),
+    ):
+        e = wp.tid()
+        h = hessian(y_of(stencil, e, rest[e], x, x), rest[e], CLAMP)
+        out[e] = wp.sqrt(wp.ddot(h, h))
+
+    return scale
 
 
 @cache
@@ -34,13 +156,13 @@ def start_splitting(term: Term, dtype):
 
 @cache
 def split(term: Term, dtype):
-    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², then u += y − z, with W² = r k A.
+    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², then u += y − z, with W² = r s k A.
 
-    For u(y) = ½‖y − p(y)‖² that is z = (p(v) + r v)/(1 + r), v = y + u. gap = W²(y − z), change = W²(z − z before) [N].
+    gap = W²(y − z), change = W²(z − z before) [N].
     """
     vec3, _ = types(dtype)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    y_of, measure, project = local_coordinate(term, dtype, True), term.measure, term.project
+    y_of, measure, minimise = local_coordinate(term, dtype, True), term.measure, local_minimiser(term, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def split_elements(
@@ -50,6 +172,8 @@ def split(term: Term, dtype):
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         ratio: dtype,
+        scale: wp.array(dtype=dtype),
+        steps: int,
         # in and out
         z: wp.array(dtype=y_type),
         u: wp.array(dtype=y_type),
@@ -59,10 +183,10 @@ def split(term: Term, dtype):
     ):
         e = wp.tid()
         r = rest[e]
-        w2 = ratio * stiffness[e] * measure(r)
+        w2 = ratio * scale[e] * stiffness[e] * measure(r)
         y = y_of(stencil, e, r, x, d)
         v = y + u[e]
-        after = v + (project(v, r) - v) / (dtype(1.0) + ratio)
+        after = minimise(v, z[e], r, ratio * scale[e], steps)
         gap[e] = w2 * (y - after)
         change[e] = w2 * (after - z[e])
         z[e] = after
@@ -85,6 +209,7 @@ def scatter_splitting(term: Term, dtype):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         ratio: dtype,
+        scale: wp.array(dtype=dtype),
         u: wp.array(dtype=y_type),
         gap: wp.array(dtype=y_type),
         change: wp.array(dtype=y_type),
@@ -95,7 +220,7 @@ def scatter_splitting(term: Term, dtype):
     ):
         e = wp.tid()
         r = rest[e]
-        pull = gap[e] + (ratio * stiffness[e] * measure(r)) * u[e]
+        pull = gap[e] + (ratio * scale[e] * stiffness[e] * measure(r)) * u[e]
         for i in range(K):
             w = weight(r, i)
             a = vec3()
@@ -128,6 +253,7 @@ def gather_splitting(term: Term, dtype):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         ratio: dtype,
+        scale: wp.array(dtype=dtype),
         u: wp.array(dtype=y_type),
         gap: wp.array(dtype=y_type),
         change: wp.array(dtype=y_type),
@@ -144,7 +270,7 @@ def gather_splitting(term: Term, dtype):
             e = incidences[n] // K
             r = rest[e]
             w = weight(r, incidences[n] - e * K)
-            pull = gap[e] + (ratio * stiffness[e] * measure(r)) * u[e]
+            pull = gap[e] + (ratio * scale[e] * stiffness[e] * measure(r)) * u[e]
             for m in range(M):
                 a += w[m] * gap[e][m]
                 b += w[m] * change[e][m]

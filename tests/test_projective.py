@@ -9,6 +9,7 @@ import warp as wp
 from test_projection import swinging
 
 import warpcloth as wc
+from warpcloth import linear
 from warpcloth.acceleration import LBFGS, Anderson, Chebyshev
 from warpcloth.kernels.terms import SPRING
 from warpcloth.linear import CopyFactors
@@ -19,6 +20,8 @@ from warpcloth.status import Result
 EPS = np.finfo(np.float64).eps
 METHODS = {
     **{name: wc.ProjectiveDynamics(substeps=1, acceleration=name) for name in ACCELERATIONS},
+    "matrix-free": wc.ProjectiveDynamics(substeps=1, acceleration="chebyshev", linear="jacobi"),
+    "matrix-free l-bfgs": wc.ProjectiveDynamics(substeps=1, acceleration="l-bfgs", linear="jacobi"),
     "admm": wc.ADMM(substeps=1),
     "admm, light": wc.ADMM(substeps=1, weight=0.1),
 }
@@ -97,6 +100,7 @@ def test_equal_copies_share_their_factors(device):
 # --- the minimiser
 
 CONVERGED = {"none": 20_000, "chebyshev": 3_000, "anderson": 1_500, "l-bfgs": 2_000, "admm": 20_000, "admm, light": 3_000}
+CONVERGED |= {"matrix-free": 20_000, "matrix-free l-bfgs": 3_000}
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -112,17 +116,6 @@ def test_the_fixed_point_is_implicit_euler(name, device):
     few, stepper = after_one_step(declared, replace(METHODS[name], iterations=5), device)
     assert np.abs(few - newton).max() > 1e-3, "a few iterations are not enough to say anything"
     assert stepper.results == [Result.ITERATIONS_USED_UP] and stepper.residual[0] > 1e-3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "iterations"), [("none", 60_000), ("anderson", 2_000), ("l-bfgs", 3_000), ("admm", 60_000)])
-def test_the_fixed_point_of_a_finer_cloth(name, iterations, device):
-    declared = swinging(16)
-    solver = replace(METHODS[name], iterations=iterations, tolerance=1e-11)
-    x, stepper = after_one_step(declared, solver, device)
-    gap = np.abs(x - newton_step(declared, device)).max()
-    print(name, gap, stepper.iterations)
-    assert gap < 1e-8
 
 
 @pytest.mark.parametrize("across", [False, True], ids=["along", "across"])
@@ -152,7 +145,7 @@ def test_rate_on_one_spring(pull, across, device):
     stepper._active.write(1)
     errors = [1e-6]
     for _ in range(6):
-        stepper._factors.solve(stepper._gradient, stepper._w)
+        stepper._linear.solve(stepper._gradient, stepper._w)
         stepper._move()
         errors.append((stepper.correction.numpy()[1] - (exact - predicted)) @ normal)
     rate, found = (k / length) / (m / h**2 + k), np.array(errors[1:]) / errors[:-1]
@@ -401,19 +394,94 @@ def test_status_of_a_run_that_used_up_its_iterations(device):
     assert status.result is Result.CONVERGED
 
 
-@pytest.mark.parametrize("solver", [wc.ProjectiveDynamics(substeps=1), wc.ADMM(substeps=1)])
-def test_what_is_no_squared_distance_is_refused(solver, device):
+def test_what_is_no_squared_distance_is_refused(device):
     mesh = wc.Mesh.grid(4, 4)
-    name = type(solver).__name__
     folded = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0), wc.DihedralBending(stiffness=1.0)])
-    with pytest.raises(
-        ValueError,
-        match=f"{name} cannot take DihedralBending, whose .* distance to a set; Newton, Explicit, PBD or XPBD",
-    ):
-        solver.bind(folded.build(device=device))
-    hard = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=np.inf)])
-    with pytest.raises(ValueError, match=f"{name} cannot take Spring with infinite stiffness; PBD"):
+    message = "ProjectiveDynamics cannot take DihedralBending, whose .* distance to a set; ADMM, Newton, Explicit, PBD or XPBD"
+    with pytest.raises(ValueError, match=message):
+        wc.ProjectiveDynamics(substeps=1).bind(folded.build(device=device))
+
+
+@pytest.mark.parametrize("solver", [wc.ProjectiveDynamics(substeps=1), wc.ADMM(substeps=1)])
+def test_infinite_stiffness_is_refused(solver, device):
+    hard = wc.Scene(wc.Mesh.grid(4, 4), density=0.1, terms=[wc.Spring(stiffness=np.inf)])
+    with pytest.raises(ValueError, match=f"{type(solver).__name__} cannot take Spring with infinite stiffness; PBD"):
         solver.bind(hard.build(device=device))
+
+
+def test_one_factorisation_serves_all_steps(monkeypatch, device):
+    """One matrix for ten steps of any integrator; another, built when a solver is bound to other weights or pins."""
+    built = []
+    factor = linear.constant_factor
+    monkeypatch.setattr(linear, "constant_factor", lambda *given: built.append(1) or factor(*given))
+    declared = swinging(8)
+    for count, integrator in enumerate(("euler", "midpoint", "bdf2"), 1):
+        for solver in (wc.ProjectiveDynamics(substeps=1, integrator=integrator), wc.ADMM(substeps=1, integrator=integrator)):
+            stepper = solver.bind(declared.build(device=device))
+            for _ in range(10):
+                stepper.step()
+        assert len(built) == 2 * count
+    wc.ProjectiveDynamics(substeps=1, linear="jacobi").bind(declared.build(device=device)).step()
+    assert len(built) == 6
+
+
+LOCAL = {
+    "StVKMembrane": [wc.StVKMembrane(stiffness=30.0, poisson_ratio=0.3)],
+    "NeoHookeanMembrane": [wc.NeoHookeanMembrane(stiffness=30.0, poisson_ratio=0.3)],
+    "DihedralBending": [wc.Spring(stiffness=30.0), wc.DihedralBending(stiffness=1e-3)],
+    "damped": [wc.NeoHookeanMembrane(stiffness=30.0, poisson_ratio=0.3, damping=0.3)],
+}
+
+
+@pytest.mark.parametrize("name", LOCAL)
+def test_admm_solves_local_problems_by_newton(name, device):
+    """Energies that are no squared distance: after three steps of a thrown cloth ADMM is where Newton is."""
+    mesh = wc.Mesh.grid(5, 5, pattern="alternating")
+    scene = wc.Scene(
+        mesh,
+        density=1.0,
+        positions=1.05 * mesh.points,
+        velocities=0.3 * np.random.default_rng(0).normal(size=(25, 3)),
+        terms=LOCAL[name],
+        pins="corners",
+        fps=120.0,
+    )
+    weight = 1.0 if name == "DihedralBending" else 0.1  # an angle is concave beyond its inflection: a small weight oscillates
+    for dtype, bound in (("float64", 1e-8), ("float32", 1e-4)):
+        ends = []
+        for solver in (
+            wc.Newton(substeps=1, tolerance=1e-11),
+            wc.ADMM(substeps=1, tolerance=1e-11, iterations=1000, weight=weight),
+        ):
+            stepper = solver.bind(scene.build(device=device, dtype=dtype))
+            for _ in range(3):
+                stepper.step()
+            ends.append(stepper.state.x.numpy())
+        assert np.abs(ends[1] - ends[0]).max() < bound
+        assert dtype == "float32" or stepper.results == [Result.CONVERGED]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_admm_takes_a_crushed_membrane(dtype, device):
+    """From all vertices but the pins on a line, and in one place: no NaN, and the cloth comes back to its size."""
+    mesh = wc.Mesh.grid(5, 5, pattern="alternating")
+    for scale in ([1.0, 0.0, 0.0], [0.0, 0.0, 0.0]):
+        noise = 1e-3 * np.random.default_rng(0).normal(size=mesh.points.shape)
+        scene = wc.Scene(
+            mesh,
+            density=1.0,
+            positions=scale * mesh.points + noise,
+            terms=[wc.NeoHookeanMembrane(stiffness=30.0, poisson_ratio=0.3)],
+            gravity=(0.0, 0.0, 0.0),
+            fps=60.0,
+        )
+        stepper = wc.ADMM(substeps=4, iterations=30).bind(scene.build(device=device, dtype=dtype))
+        for _ in range(240):
+            stepper.step()
+        points = stepper.state.x.numpy()
+        assert np.isfinite(points).all()
+        lengths = np.linalg.norm(np.diff(points[mesh.edges], axis=1)[:, 0], axis=1) / mesh.edge_lengths
+        assert 0.5 < np.median(lengths) < 1.5
 
 
 @pytest.mark.parametrize("solver", [wc.ProjectiveDynamics, wc.ADMM])

@@ -15,7 +15,7 @@ class Chebyshev:
 
     Args:
         copies: B.
-        rho: ρ in (0, 1), the assumed factor of the error in a plain iteration.
+        rho: ρ in [0, 1), the assumed factor of the error in a plain iteration, one or (B,).
     """
 
     DELAY = 10

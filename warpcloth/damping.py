@@ -48,7 +48,7 @@ def _dissipation(model, elements, he, stiffness):
     both = stiffness + viscous
     share = np.divide(viscous, both, out=np.zeros(count), where=both > 0.0)
     term = dissipation.term or elements.term
-    return replace(
+    damped = replace(
         elements,
         term=term,
         stiffness=_put(model, both),
@@ -56,6 +56,8 @@ def _dissipation(model, elements, he, stiffness):
         damping=None,
         origin=Origin(elements.term, elements.rest, _put(model, share)),
     )
+    Past(model, [damped]).launch(model.positions)  # for those who ask for weights and measures before the first step
+    return damped
 
 
 def _put(model, values):

@@ -243,6 +243,23 @@ class CopyFactors:
         return self._parts[array.ptr]
 
 
+class DiagonalScaling:
+    """x = D⁻¹ b, the step of a Jacobi iteration; runs on the device and may be captured.
+
+    Args:
+        model: The :class:`warpcloth.model.Model`.
+        diagonal: D of each copy, (B, n), above 0.
+    """
+
+    def __init__(self, model, diagonal):
+        self.model, self._inverse = model, model.array(1.0 / diagonal.ravel(), model.dtype)
+        self._scale = model.kernel(linear.scale, model.dtype)
+
+    def solve(self, b, x):
+        """x = D⁻¹ b, both (N,) vectors."""
+        self.model.launch(self._scale, self.model.count, [self._inverse, b], [x])
+
+
 _INDEFINITE = "the matrix is not positive definite, so it has no Cholesky factors"
 
 

@@ -1,6 +1,6 @@
 """ADMM: implicit Euler split into the elements and the vertices, which meet by multipliers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -13,7 +13,7 @@ from ..kernels.minimise import add_inertia
 from ..linear import CopyFactors
 from ..operators import Sums, constant_matrices
 from ..status import Result
-from .solver import ImplicitStep, Stepper, refuse_hard, refuse_without_projection
+from .solver import ImplicitStep, Stepper, refuse_hard
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,15 @@ class ADMM(ImplicitStep):
     (Narain et al. 2016, Overby et al. 2017).
 
     D gives the local coordinates y of all elements, W² = r k A weighs them. In turn z = argmin U(z) + ½‖W(Dx − z + u)‖², which
-    for U = ½kA‖z − p(z)‖² is (p(v) + r v)/(1 + r) with v = Dx + u; u += Dx − z; and
+    for U = ½kA‖z − p(z)‖² is (p(v) + r v)/(1 + r) with v = Dx + u, and for other energies is found by Newton's method with a
+    line search, W² being r s k A with the curvature s = ‖∂²u/∂y²‖ at rest; u += Dx − z; and
     (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once. The fixed point is that of
     :class:`warpcloth.ProjectiveDynamics` and the x(t+h) of :class:`warpcloth.Newton`. Only WD counts: iterates stay the same
     when D is scaled and W inversely.
 
     Too large a weight stalls, too small a one oscillates. r = 1 takes about the iterations of plain projective dynamics; on
     ``hanging`` in motion 0.03 to 0.1 took a tenth of them, 0.003 more again. Of few iterations a small weight makes cloth soft.
+    Energies that are concave somewhere, hinges above all, need not converge with a small one.
 
     ``residual`` is the larger of the primal and the dual residual, and both are accelerations over gravity's (in m/s² without
     any), the largest of any vertex: of the forces DᵀW²(Dx − z) and DᵀW²(z − z before) over the masses.
@@ -57,10 +59,9 @@ class ADMM(ImplicitStep):
         """The solver on ``model``, all scratch allocated.
 
         Raises:
-            ValueError: If a term has infinite stiffness, or an energy that is no squared distance.
+            ValueError: If a term has infinite stiffness.
         """
         refuse_hard(model, "ADMM", "PBD and XPBD take hard constraints, or give a finite stiffness")
-        refuse_without_projection(model, "ADMM")
         return ADMMStepper(self, model)
 
 
@@ -77,7 +78,9 @@ class ADMMStepper(Stepper):
         super().__init__(options, model, options.integrator)
         model = self.model
         self.s = 1.0 / self.he**2
-        self._factors = CopyFactors(model, constant_matrices(model, self.s, options.weight))
+        self._scales = [self._scale_of(elements) for elements in model.terms]
+        weighed = model.with_terms(map(_weighed, model.terms, self._scales))
+        self._factors = CopyFactors(model, constant_matrices(weighed, self.s, options.weight))
         self._sums, cuda = Sums(model), model.device.is_cuda
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
         self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
@@ -127,6 +130,17 @@ class ADMMStepper(Stepper):
             now = Result.CONVERGED if converged[copy] else Result.ITERATIONS_USED_UP if finite[copy] else Result.DIVERGED
             self.results[copy] = before.worse(now)
 
+    def _scale_of(self, elements):
+        """What r counts in, for each element: 1 of a squared distance, else the curvature of its energy at rest."""
+        model = self.model
+        if elements.term.project is not None:
+            return model.constant(1.0, elements.count)
+        scale = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
+        rest_shape = model.array(np.tile(model.scene.mesh.points, (model.copies, 1)), model.vec3)
+        kernel = model.kernel(kernels.stiffness_scale, elements.term, model.dtype)
+        model.launch(kernel, elements.count, [*elements.arguments, rest_shape], [scale])
+        return scale
+
     # What the segments record.
 
     def _launch_start(self):
@@ -142,10 +156,11 @@ class ADMMStepper(Stepper):
         for array in sums:
             array.zero_()
         for i, (elements, (z, u, gap, change), (_start, split, sum_of)) in enumerate(self._each()):
-            given = [*elements.arguments, self.state.x, self.correction, ratio]
+            scale = self._scales[i]
+            given = [*elements.arguments, self.state.x, self.correction, ratio, scale, kernels.STEPS]
             model.launch(split, elements.count, given, [z, u, gap, change])
             dim = len(self._incidences[i][0]) - 1 if self._incidences[i] else elements.count
-            model.launch(sum_of, dim, [*self._incidences[i], *elements.arguments, ratio, u, gap, change], sums)
+            model.launch(sum_of, dim, [*self._incidences[i], *elements.arguments, ratio, scale, u, gap, change], sums)
         given = [model.mass, model.inverse_mass, model.gravity, model.per_copy, self.s, 0.0, self.correction]
         model.launch(self._add_inertia, model.count, given, [self._force, self._work])
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
@@ -158,3 +173,9 @@ class ADMMStepper(Stepper):
 
     def _each(self):
         return zip(self.model.terms, self._locals, self._kernels, strict=True)
+
+
+def _weighed(elements, scale):
+    """The elements with s k for k."""
+    stiffness = elements.stiffness.numpy() * scale.numpy()
+    return replace(elements, stiffness=wp.array(stiffness, dtype=elements.stiffness.dtype, device=elements.stiffness.device))

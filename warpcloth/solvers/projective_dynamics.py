@@ -10,7 +10,7 @@ from ..capture import Mirror, Segment
 from ..checks import choice, number, whole
 from ..kernels import accelerate as kernels
 from ..kernels.minimise import add_inertia
-from ..linear import CopyFactors
+from ..linear import CopyFactors, DiagonalScaling
 from ..operators import CHUNKS, Energy, Gradient, Sums, constant_matrices
 from ..status import Result
 from .solver import ImplicitStep, Stepper, refuse_hard, refuse_without_projection
@@ -29,7 +29,8 @@ class ProjectiveDynamics(ImplicitStep):
 
     Motion across stiff elements is slow: of one spring with a fixed end, of length l and rest length L, what is wrong across
     shrinks by k(L/l)/(m/h² + k) an iteration, what is wrong along is gone after one. Hence the accelerations; a proposal whose
-    φ is above that of the plain iteration from the same place is dropped for that.
+    φ is above that of the plain iteration from the same place is dropped for that. Chebyshev needs a bound of that factor and
+    takes 1 − min m/(h²D), D the row sums of |A|.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
@@ -39,7 +40,9 @@ class ProjectiveDynamics(ImplicitStep):
         acceleration: ``"none"``; ``"chebyshev"`` (Wang 2015); ``"anderson"`` (Peng et al. 2018), in the norm of the matrix;
             ``"l-bfgs"`` (Liu et al. 2017), with the matrix as first Hessian.
         window: Steps that Anderson and L-BFGS remember.
-        rho: What Chebyshev takes for the factor of the error in a plain iteration, in (0, 1).
+        linear: ``"factorised"``, or ``"jacobi"``: without the matrix, its row sums Dᵢ = Σⱼ|Aᵢⱼ| stand in for it, above which
+            it never is, so that φ falls as well, only slower (Wang 2015 for Chebyshev). An iteration then moves nothing further
+            than to the next vertices, and until it has converged linear momentum is not kept.
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -49,7 +52,7 @@ class ProjectiveDynamics(ImplicitStep):
     tolerance: float = 1e-3
     acceleration: str = "anderson"
     window: int = 5
-    rho: float = 0.999
+    linear: str = "factorised"
 
     def __post_init__(self):
         super().__post_init__()
@@ -57,9 +60,7 @@ class ProjectiveDynamics(ImplicitStep):
         number("tolerance", self.tolerance, above=0.0)
         choice("acceleration", self.acceleration, ACCELERATIONS)
         whole("window", self.window, 1)
-        number("rho", self.rho, above=0.0)
-        if not self.rho < 1.0:
-            raise ValueError(f"rho is {self.rho:g}; it must be below 1")
+        choice("linear", self.linear, ("factorised", "jacobi"))
 
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
@@ -84,7 +85,9 @@ class ProjectiveDynamicsStepper(Stepper):
         super().__init__(options, model, options.integrator)
         model = self.model
         self.s = 1.0 / self.he**2
-        self._factors = CopyFactors(model, constant_matrices(model, self.s))
+        matrices = constant_matrices(model, self.s)
+        self._sizes = np.stack([np.asarray(abs(matrix).sum(axis=1)).ravel() for matrix in matrices])
+        self._linear = CopyFactors(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
         self._sums, self._gradient_of = Sums(model), Gradient(model, corrected=True)
         self.correction, self._gradient, self._w = (model.vectors() for _ in range(3))
         self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
@@ -114,7 +117,7 @@ class ProjectiveDynamicsStepper(Stepper):
             if not active.any() or self.iterations == self.options.iterations:
                 break
             self._active.write(active)
-            self._factors.solve(self._gradient, self._w)
+            self._linear.solve(self._gradient, self._w)
             if self._history:
                 self._history.propose(self.iterations, active)
             self._move()
@@ -124,6 +127,15 @@ class ProjectiveDynamicsStepper(Stepper):
         for copy, before in enumerate(self.results):
             now = Result.CONVERGED if converged[copy] else Result.ITERATIONS_USED_UP if finite[copy] else Result.DIVERGED
             self.results[copy] = before.worse(now)
+
+    def slowest(self):
+        """A bound (B,) of the factor by which any part of the error shrinks in a plain iteration, 1 − min s mᵢ/Σⱼ|Aᵢⱼ|.
+
+        For A is at most its row sums, and the Hessian, where nothing is compressed, at least s M.
+        """
+        mass, free = (array.numpy().reshape(self._sizes.shape) for array in (self.model.mass, self.model.inverse_mass))
+        part = np.where(free > 0.0, self.s * mass.astype(np.float64) / self._sizes, 1.0)
+        return 1.0 - part.min(axis=1)
 
     # What the segments record.
 
@@ -169,7 +181,7 @@ class _Accelerator:
         self.stepper, B, device = stepper, model.copies, model.device
         epsilon = 10.0 * float(np.finfo(model.numpy_dtype).eps)
         if options.acceleration == "chebyshev":
-            self.method = Chebyshev(B, options.rho)
+            self.method = Chebyshev(B, stepper.slowest())
         else:
             self.method = {"anderson": Anderson, "l-bfgs": LBFGS}[options.acceleration](B, options.window, epsilon)
         m = self.method.window

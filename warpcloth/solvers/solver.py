@@ -164,7 +164,7 @@ def refuse_without_projection(model, solver):
     refuse_apart(model, solver)
     for elements in model.terms:
         if elements.term.project is None:
-            others = "Newton or Explicit" if elements.term.constraint is None else "Newton, Explicit, PBD or XPBD"
+            others = "ADMM, Newton or Explicit" if elements.term.constraint is None else "ADMM, Newton, Explicit, PBD or XPBD"
             raise ValueError(
                 f"{solver} cannot take {elements.label}, whose energy is no squared distance to a set; {others} can"
             )
