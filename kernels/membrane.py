@@ -40,6 +40,16 @@ def material_state(points, stencil, poisson_ratio):
     return np.column_stack([inverse_edges(points, stencil), 0.5 / (1.0 + nu), nu / (1.0 - nu**2)])
 
 
+def edge_reach(points, stencil, stretch):
+    """``reach`` of triangles (E, 3) of stretches up to ``stretch`` (E,): their edges, each with a third of Σ kL² = 2A."""
+    pairs = stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    sides = points[pairs[:, 1]] - points[pairs[:, 0]]
+    squares = np.einsum("ij,ij->i", sides, sides)
+    normals = np.cross(sides[::3], sides[1::3])
+    areas = 0.5 * np.linalg.norm(normals, axis=1)
+    return pairs, np.repeat(stretch, 3) * np.sqrt(squares), np.repeat(2.0 / 3.0 * areas, 3) / squares
+
+
 @wp.func
 def weight(rest: Any, i: int):
     w = wp.vector(length=2, dtype=rest.dtype)

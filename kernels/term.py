@@ -59,6 +59,9 @@ class Term:
         hessian: (y, rest, policy) → ∂²u/∂y² (3M, 3M), y row by row, see :class:`HessianPolicy`.
         slack: Whether there is a range about the rest shape without energy; ``rest_state`` then takes the ratios ``least`` and
             ``most`` of its ends.
+        reach: NumPy function (points (n, 3) [m], stencil (E, K), rest (E, P)) → (pairs (E·m, 2), lengths (E·m,) [m], factors
+            (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it does
+            not), and how stiff a spring between them would be, kₑ = 1; or None.
         project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or None.
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next two.
         constraint_gradient: (y, rest) → ∂C/∂y (M, 3).
@@ -77,6 +80,7 @@ class Term:
     gradient: Any
     hessian: Any
     slack: bool = False
+    reach: Callable | None = None
     project: Any = None
     constraint: Any = None
     constraint_gradient: Any = None

@@ -67,6 +67,7 @@ class Sweep:
         scalar: Whether terms that have both are taken by their scalar constraint.
         multipliers: Whether λ adds up over the sweeps of a step (XPBD).
         spread: The number of sweeps that finite stiffness is spread over, or None.
+        correction: The d to move on, if not one of its own.
 
     Attributes:
         correction: d (N,) [m].
@@ -75,11 +76,11 @@ class Sweep:
         ranges: Of each term what one launch takes, as (first, count).
     """
 
-    def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None):
+    def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None, correction=None):
         self.model, self.x, self.h, self.relaxation = model, x, h, relaxation
         self.spread = spread or 1
         self.in_place, self.ordered = kind in ("coloured", "sequential"), kind == "sequential"
-        self.correction = model.vectors()
+        self.correction = model.vectors() if correction is None else correction
         self.elements, self.ranges = list(model.terms), [[(0, elements.count)] for elements in model.terms]
         if kind == "coloured":
             self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True) if model.terms else ((), ())

@@ -9,9 +9,10 @@ A collapsed triangle keeps a force: where R is not unique it is the least rotati
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from ..membrane import inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
+from ..membrane import edge_reach, inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
 from ..term import Term
 from .membrane_damping import DISSIPATION
 
@@ -19,6 +20,11 @@ from .membrane_damping import DISSIPATION
 def rest_state(points, stencil):
     """Inverse rest edges [1/m] of the triangles ``stencil`` (E, 3) as an array (E, 3)."""
     return inverse_edges(points, stencil)
+
+
+def reach(points, stencil, rest):
+    """The edges, no longer than at rest."""
+    return edge_reach(points, stencil, np.ones(len(stencil)))
 
 
 @wp.func
@@ -52,6 +58,7 @@ COROTATED_MEMBRANE = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
+    reach=reach,
     project=project,
     dissipation=DISSIPATION,
 )

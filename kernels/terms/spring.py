@@ -22,6 +22,11 @@ def rest_state(points, stencil):
     return np.linalg.norm(points[stencil[:, 1]] - points[stencil[:, 0]], axis=1)[:, None]
 
 
+def reach(points, stencil, rest):
+    """The pairs themselves, no longer than L."""
+    return stencil, rest[:, -1], np.ones(len(stencil))
+
+
 @wp.func
 def weight(rest: Any, i: int):
     w = wp.vector(length=1, dtype=rest.dtype)
@@ -130,6 +135,7 @@ SPRING = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
+    reach=reach,
     project=project,
     constraint=constraint,
     constraint_gradient=constraint_gradient,

@@ -68,5 +68,6 @@ SPRING_LIMIT = Term(
     gradient=gradient,
     hessian=hessian,
     slack=True,
+    reach=spring.reach,
     project=project,
 )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..membrane import inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
+from ..membrane import edge_reach, inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
 from ..term import Term
 
 
@@ -19,6 +19,11 @@ def rest_state(points, stencil, least=-np.inf, most=np.inf):
     """Inverse rest edges [1/m] of the triangles ``stencil`` (E, 3), σ_min and σ_max (one or E each), as an array (E, 5)."""
     E = len(stencil)
     return np.column_stack([inverse_edges(points, stencil), np.broadcast_to(least, E), np.broadcast_to(most, E)])
+
+
+def reach(points, stencil, rest):
+    """The edges, no longer than σ_max times their length at rest."""
+    return edge_reach(points, stencil, rest[:, 4])
 
 
 @wp.func
@@ -53,5 +58,6 @@ STRAIN_LIMIT = Term(
     gradient=gradient,
     hessian=hessian,
     slack=True,
+    reach=reach,
     project=project,
 )

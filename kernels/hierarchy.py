@@ -1,0 +1,31 @@
+"""The way from a coarse level of the vertices to the next finer one."""
+
+from functools import cache
+
+import warp as wp
+
+from .assemble import types
+
+
+@cache
+def follow(dtype):
+    """Kernel over (copies, dropped vertices): d = Σ weight·d of the kept vertices that each follows."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def follow_kept(
+        dropped: wp.array(dtype=wp.int32),
+        offsets: wp.array(dtype=wp.int32),
+        parents: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=dtype),
+        per_copy: int,
+        # in and out
+        d: wp.array(dtype=vec3),
+    ):
+        copy, i = wp.tid()
+        total = vec3()
+        for n in range(offsets[i], offsets[i + 1]):
+            total += weights[n] * d[copy * per_copy + parents[n]]
+        d[copy * per_copy + dropped[i]] = total
+
+    return follow_kept
