@@ -253,6 +253,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(capfd):
     [
         ("newton", "substeps=4"),
         ("pbd", "substeps=4"),
+        ("hierarchical-pbd", "substeps=4"),
         ("xpbd", "substeps=4"),
         ("projective-dynamics", "substeps=4"),
         ("admm", "substeps=4"),

@@ -283,6 +283,7 @@ SOLVERS = {
     "explicit": wc.Explicit(substeps=256),
     "pbd": wc.PBD(substeps=4),
     "pbd plain": wc.PBD(substeps=4, sweep="jacobi", relaxation=0.25),
+    "hierarchical pbd": wc.HierarchicalPBD(substeps=4),
     "xpbd": wc.XPBD(substeps=16, iterations=4),
     "projective dynamics": wc.ProjectiveDynamics(substeps=4),
     "projective dynamics plain": wc.ProjectiveDynamics(substeps=4, acceleration="none"),

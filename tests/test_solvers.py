@@ -29,6 +29,7 @@ SOLVERS = {
     "pbd averaged by vertex": wc.PBD(substeps=1, iterations=4, sweep="vertex-averaged"),
     "pbd averaged by constraint": wc.PBD(substeps=1, iterations=4, sweep="constraint-averaged"),
     "pbd plain": wc.PBD(substeps=1, iterations=4, sweep="jacobi", relaxation=0.3),
+    "hierarchical pbd": wc.HierarchicalPBD(substeps=1, iterations=4),
     "xpbd": wc.XPBD(substeps=1, iterations=4),
     "xpbd sequential": wc.XPBD(substeps=1, iterations=4, sweep="sequential", form="scalar"),
     "xpbd averaged by constraint": wc.XPBD(substeps=1, iterations=4, sweep="constraint-averaged"),
@@ -317,6 +318,10 @@ def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
         (lambda: wc.PBD(substeps=1, relaxation=0.0), "relaxation is 0.0"),
         (lambda: wc.PBD(substeps=1, sweep="gauss"), "sweep is 'gauss'; it must be one of 'vertex-averaged'"),
         (lambda: wc.PBD(substeps=1, stiffness="1e3"), "stiffness is '1e3'"),
+        (lambda: wc.HierarchicalPBD(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.HierarchicalPBD(substeps=1, coarse_iterations=0), "coarse_iterations is 0"),
+        (lambda: wc.HierarchicalPBD(substeps=1, levels=-1), "levels is -1"),
+        (lambda: wc.HierarchicalPBD(substeps=1, relaxation=0.0), "relaxation is 0.0"),
         (lambda: wc.XPBD(substeps=1, iterations=0), "iterations is 0"),
         (lambda: wc.XPBD(substeps=1, sweep="vertex-averaged"), "sweep is 'vertex-averaged'; it must be one of 'coloured'"),
         (lambda: wc.XPBD(substeps=1, form="row"), "form is 'row'"),
@@ -399,7 +404,8 @@ def test_moving_pins_follow_their_keyframes(device):
         pins=wc.Pins([0], keyframes),
         duration=1.0,
     )
-    solvers = [record(substeps=4) for record in (wc.Newton, wc.Explicit, wc.PBD, wc.XPBD, wc.ProjectiveDynamics, wc.ADMM)]
+    solvers = [record(substeps=4) for record in (wc.Newton, wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD)]
+    solvers += [record(substeps=4) for record in (wc.ProjectiveDynamics, wc.ADMM)]
     solvers += [wc.Newton(substeps=4, integrator=integrator) for integrator in ("midpoint", "bdf2")]
     for solver in solvers:
         stepper = solver.bind(scene.build(device=device, dtype="float64"))

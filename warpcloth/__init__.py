@@ -7,7 +7,7 @@ from .mesh import Mesh
 from .rotation import kabsch, polar, svd
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
-from .solvers import ADMM, PBD, XPBD, Explicit, Newton, ProjectiveDynamics
+from .solvers import ADMM, PBD, XPBD, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
 from .terms import (
     Attachment,
     CorotatedMembrane,
@@ -32,6 +32,7 @@ __all__ = [
     "DihedralBending",
     "Equilibrium",
     "Explicit",
+    "HierarchicalPBD",
     "Mesh",
     "NeoHookeanMembrane",
     "Newton",

@@ -81,7 +81,7 @@ def levels(model, most=None):
     free = inverse[0] > 0.0
     mass = np.where(free, model.mass.numpy().reshape(inverse.shape), 0.0).astype(np.float64)
     groups, found = _finest(model, free), []
-    while any(map(len, groups)) and (most is None or len(found) < most):
+    while most is None or len(found) < most:
         links = Bounds(
             np.concatenate([each.pairs for each in groups]),
             np.concatenate([each.lengths for each in groups]),
@@ -93,9 +93,10 @@ def levels(model, most=None):
             np.add.at(copy_mass, parents, weights * np.repeat(copy_mass[dropped], np.diff(offsets)))
             copy_mass[dropped] = 0.0
         groups = tuple(_scaled(_coarser(each, kept, free), each, free) for each in groups)
-        moving = free & kept
-        level = np.divide(1.0, mass, out=np.zeros_like(mass), where=moving)
-        found.append(Level(groups, level, dropped, offsets, parents, weights))
+        if not any(map(len, groups)):
+            break
+        level = np.divide(1.0, mass, out=np.zeros_like(mass), where=free & kept)
+        found.append(Level(groups, level, *(each.astype(np.int32) for each in (dropped, offsets, parents)), weights))
     return found
 
 
@@ -182,7 +183,9 @@ def _followers(links, kept):
     first = np.searchsorted(dropped, np.arange(n))
     rows, entries = _spread(first[ends[:, 1]], count[ends[:, 1]])
     ways = Bounds(
-        np.stack([np.concatenate([dropped, ends[rows, 0]]), np.concatenate([near.pairs[:, 1], near.pairs[entries, 1]])], axis=1),
+        np.stack(
+            [np.concatenate([dropped, ends[rows, 0]]), np.concatenate([near.pairs[:, 1], near.pairs[entries, 1]])], axis=1
+        ),
         np.concatenate([near.lengths, lengths[rows] + near.lengths[entries]]),
         np.zeros((len(dropped) + len(rows), 0)),
     )

@@ -2,6 +2,7 @@
 
 from .admm import ADMM
 from .explicit import Explicit
+from .hierarchical_pbd import HierarchicalPBD
 from .newton import Newton
 from .pbd import PBD
 from .projective_dynamics import ProjectiveDynamics
@@ -13,7 +14,8 @@ SOLVERS = {
     "projective-dynamics": ProjectiveDynamics,
     "admm": ADMM,
     "pbd": PBD,
+    "hierarchical-pbd": HierarchicalPBD,
     "xpbd": XPBD,
 }
 
-__all__ = ["ADMM", "PBD", "SOLVERS", "XPBD", "Explicit", "Newton", "ProjectiveDynamics"]
+__all__ = ["ADMM", "PBD", "SOLVERS", "XPBD", "Explicit", "HierarchicalPBD", "Newton", "ProjectiveDynamics"]

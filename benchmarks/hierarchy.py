@@ -1,0 +1,94 @@
+"""How fast hierarchical PBD and plain PBD meet hard springs in one step: residual against time, for a list of states.
+
+    python benchmarks/hierarchy.py [--device cpu|cuda:0] [--n 256] [STATE …]
+
+The cloth is ``hanging`` with n² vertices and infinitely stiff springs, the step 1/240 s. Prints a line for each state and setup:
+ms of the step (least of three), RMS and largest |l/L − 1| of the springs after it, RMS of the stretch alone, max(l/L − 1, 0).
+Shear and structural springs both hard let a sheet fold along straight lines only, so that 0 is out of reach.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+import warpcloth as wc
+from warpcloth.scenes import hanging
+
+
+def hard(n):
+    """The hanging cloth with hard springs, without bending."""
+    declared = hanging.scene(n=n)
+    return replace(declared, terms=[replace(declared.terms[0], stiffness=np.inf)])
+
+
+def stretched(n, device):
+    """Hung straight down, half as long again, at rest."""
+    declared = hard(n)
+    return replace(declared, positions=declared.mesh.points[:, [0, 2, 1]] * [1.0, -1.5, 1.0])
+
+
+def fallen(solver):
+    """The state after 20 frames of a solver."""
+
+    def state(n, device):
+        declared = hard(n)
+        past = wc.simulate(declared if isinstance(solver, wc.PBD) else hanging.scene(n=n), solver, device=device, frames=20)
+        return replace(declared, positions=past.points[-1], velocities=past.velocities[-1])
+
+    return state
+
+
+STATES = {
+    "stretched": stretched,
+    "fallen-pbd": fallen(wc.PBD(substeps=4, iterations=20)),
+    "fallen-newton": fallen(wc.Newton(substeps=4)),  # near the constraints already; for n up to 64 or so
+}
+SETUPS = [wc.PBD(substeps=4, iterations=n) for n in (1, 5, 20, 80, 320, 1280)]
+SETUPS += [wc.HierarchicalPBD(substeps=4, iterations=n, coarse_iterations=m) for n, m in ((1, 1), (1, 5), (5, 5), (20, 5))]
+SETUPS += [wc.HierarchicalPBD(substeps=4, iterations=n, coarse_iterations=20) for n in (5, 20, 80)]
+
+
+def measure(scene, options, device):
+    """Time of a step and what it leaves."""
+    stepper = options.bind(scene.build(device=device))
+    start = [wp.clone(array) for array in stepper.state]
+    times = []
+    for _ in range(3):
+        for array, first in zip(stepper.state, start, strict=True):
+            wp.copy(array, first)
+        wp.synchronize()
+        began = time.perf_counter()
+        stepper.step()
+        wp.synchronize()
+        times.append(time.perf_counter() - began)
+    pairs, points = scene.terms[0].stencil(scene.mesh), stepper.state.x.numpy().astype(np.float64)
+    now, rest = (np.linalg.norm(p[pairs[:, 1]] - p[pairs[:, 0]], axis=1) for p in (points, scene.mesh.points))
+    strain = now / rest - 1.0
+    return {
+        "ms": round(1e3 * min(times), 2),
+        "rms": float(f"{np.sqrt(np.mean(strain**2)):.3g}"),
+        "rms_stretch": float(f"{np.sqrt(np.mean(np.maximum(strain, 0.0) ** 2)):.3g}"),
+        "largest": float(f"{np.abs(strain).max():.3g}"),
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("states", nargs="*", choices=[[], *STATES], help="stretched and fallen-pbd if none")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--n", type=int, default=256)
+    options = parser.parse_args()
+    for name in options.states or ["stretched", "fallen-pbd"]:
+        scene = STATES[name](options.n, options.device)
+        for setup in SETUPS:
+            sweeps = {"iterations": setup.iterations, "coarse": getattr(setup, "coarse_iterations", None)}
+            row = {"state": name, "solver": type(setup).__name__, **sweeps, **measure(scene, setup, options.device)}
+            print(json.dumps(row), flush=True)
+
+
+if __name__ == "__main__":
+    main()
