@@ -2,7 +2,7 @@
 
     python benchmarks/hierarchy.py [--device cpu|cuda:0] [--n 256] [STATE …]
 
-The cloth is ``hanging`` with n² vertices and infinitely stiff springs, the step 1/240 s. Prints a line for each state and setup:
+The cloth is ``hanging`` with n² vertices and hard springs, the step 1/240 s. Prints a line for each state and setup:
 ms of the step (least of three), RMS and largest |l/L − 1| of the springs after it, RMS of the stretch alone, max(l/L − 1, 0).
 Shear and structural springs both hard let a sheet fold along straight lines only, so that 0 is out of reach.
 """

@@ -27,7 +27,7 @@ class HierarchicalPBD(Step):
     is as stiff as the way in series, times what keeps Σ kL² of the finer one; cloth of infinite stiffness has hard ones.
     A vertex of a level has the mass of what follows it, Mⱼ = mⱼ + Σ wᵢⱼ mᵢ, so that linear momentum is kept; angular is not.
 
-    What it costs: soft cloth comes out stiffer than by PBD, as all sweeps add up, and what follows its level is rough by itself,
+    What it costs: soft cloth comes out stiffer than by PBD, as all sweeps add up, and what follows its level is rough by it,
     most near pins, which the last sweeps must smooth. Levels pay where much is stretched over many vertices; where x̃ is near
     the constraints already, PBD alone leaves less. Repeating the levels in a step did no better in the same time.
 

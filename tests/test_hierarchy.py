@@ -1,0 +1,223 @@
+"""The levels of hierarchical PBD on meshes of all kinds, and what they change in a step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+import warpcloth as wc
+from warpcloth.hierarchy import levels
+from warpcloth.scenes import chain
+
+EPS = np.finfo(np.float64).eps
+RNG = np.random.default_rng(0)
+
+
+def edges_alone(points, edges, **scene):
+    """A net of hard springs on edges, masses from 1 to 2 kg."""
+    n = len(points)
+    scene = {"terms": [wc.Spring(stiffness=np.inf)], "masses": np.linspace(1.0, 2.0, n), **scene}
+    return wc.Scene(wc.Mesh(np.asarray(points, dtype=float), edges=edges), **scene)
+
+
+def line(n, x=0.0):
+    return np.stack([np.full(n, x), -np.arange(n, dtype=float), np.zeros(n)], axis=1)
+
+
+def links(n, first=0):
+    return np.stack([np.arange(n - 1), np.arange(1, n)], axis=1) + first
+
+
+def scattered():
+    """Points with springs to all within a radius: any valence, and no order of the vertices."""
+    points = RNG.uniform(size=(200, 3)) * [1.0, 0.0, 1.0]
+    pairs = np.argwhere(np.triu(np.linalg.norm(points[:, None] - points[None], axis=-1) < 0.15, 1))
+    return edges_alone(points, pairs, pins=[0, 7, 50])
+
+
+GRID = wc.Mesh.grid(12, 9, pattern="alternating")
+HUB = np.vstack([line(1), RNG.normal(size=(40, 3))])
+SCENES = {
+    "grid": wc.Scene(GRID, density=0.1, terms=[wc.Spring(pairs=("structural", "shear"), stiffness=100.0)], pins="corners"),
+    "grid by an edge": wc.Scene(GRID, density=0.1, terms=[wc.Spring(stiffness=100.0)], pins="x < 0.01"),
+    "membrane": wc.Scene(GRID, density=0.1, terms=[wc.CorotatedMembrane(stiffness=50.0)], pins=[0]),
+    "limit of triangles": wc.Scene(GRID, density=0.1, terms=[wc.StrainLimit(most=1.1)], pins=[0]),
+    "scattered": scattered(),
+    "chain": edges_alone(line(30), links(30), pins=[0]),
+    "two chains": edges_alone(np.vstack([line(9), line(14, 5.0)]), np.vstack([links(9), links(14, 9)]), pins=[0]),
+    "isolated vertices": edges_alone(np.vstack([line(8), line(3, 5.0)]), links(8), pins=[0, 9]),
+    "two vertices": edges_alone(line(2), links(2), pins=[0]),
+    "two free vertices": edges_alone(line(2), links(2)),
+    "hub": edges_alone(HUB, [[0, i] for i in range(1, 41)], pins=[1]),
+    "springs twice": edges_alone(line(9), links(9), terms=[wc.Spring(stiffness=9.0), wc.Spring(stiffness=np.inf)], pins=[0]),
+    "no rest length": edges_alone(line(9), links(9), terms=[wc.Spring(stiffness=np.inf, rest_lengths=0.0)], pins=[0]),
+    "all pinned": edges_alone(line(6), links(6), pins=np.arange(6)),
+    "bending alone": wc.Scene(GRID, density=0.1, terms=[wc.QuadraticBending(stiffness=1e-4)], pins=[0]),
+    "no stiffness": edges_alone(line(6), links(6), terms=[wc.Spring(stiffness=0.0)]),
+    "no terms": edges_alone(line(6), links(6), terms=[]),
+}
+WITHOUT = ("two vertices", "two free vertices", "all pinned", "bending alone", "no stiffness", "no terms")
+
+
+def lengths_of(points, pairs):
+    return np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_levels_of_any_mesh(name):
+    """Each drops vertices linked to what it keeps, none of which are linked; weights are 1 in all; ways have their length."""
+    scene = SCENES[name]
+    model = scene.build(dtype="float64")
+    n, found = model.per_copy, levels(model)
+    free = model.inverse_mass.numpy() > 0.0
+    assert bool(found) == (name not in WITHOUT)
+    if not found:
+        return
+    given = [
+        elements.term.reach(scene.mesh.points, elements.stencil.numpy(), elements.rest.numpy()) for elements in model.terms
+    ]
+    pairs, lengths = (np.concatenate(each) for each in zip(*[each[:2] for each in given], strict=True))
+    first = np.lexsort((lengths, pairs.max(axis=1), pairs.min(axis=1)))
+    finest, unique = np.unique(np.sort(pairs, axis=1)[first], axis=0, return_index=True)
+    graph = coo_array((np.maximum(lengths[first][unique], 1e-300), finest.T), shape=(n, n))
+    shortest = dijkstra(graph, directed=False)
+    there, linked = np.ones(n, dtype=bool), finest
+    for level in found:
+        kept = there.copy()
+        kept[level.dropped] = False
+        assert free[level.dropped].all() and there[level.dropped].all(), "pins are kept, and nothing is dropped twice"
+        both = linked[kept[linked].all(axis=1)]
+        assert not free[both].all(axis=1).any(), "no two kept free vertices are linked"
+        assert (np.diff(level.offsets) > 0).all() and kept[level.parents].all()
+        sums = np.add.reduceat(level.weights, level.offsets[:-1])
+        assert np.abs(sums - 1.0).max() < 8 * EPS and (level.weights > 0.0).all()
+        bounds = [each for each in level.bounds if len(each)]
+        linked = np.concatenate([each.pairs for each in bounds])
+        assert kept[linked].all() and free[linked].any(axis=1).all()
+        ways, least = np.concatenate([each.lengths for each in bounds]), shortest[linked[:, 0], linked[:, 1]]
+        assert (ways >= least * (1.0 - 100 * EPS) - 1e-200).all()
+        assert (ways <= (8.0 if name == "hub" else 1.5) * least + 1e-200).all(), "detours stay small"
+        there = kept
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", SCENES)
+def test_steps_on_any_mesh_and_copies(name, dtype, device):
+    """Of a cloth stretched by a tenth: finite, no more stretched after; pins stay, and copies have the bits of one alone."""
+    scene = replace(SCENES[name], positions=1.1 * SCENES[name].mesh.points, gravity=(0.0, 0.0, 0.0))
+    solver = wc.HierarchicalPBD(substeps=1, iterations=5)
+    alone = wc.simulate(scene, solver, device=device, dtype=dtype, frames=3)
+    twice = wc.simulate(scene, solver, device=device, dtype=dtype, frames=3, copies=2)
+    assert alone.status.ok and np.isfinite(alone.points).all()
+    assert np.array_equal(twice.points[:, 0], alone.points) and np.array_equal(twice.points[:, 1], alone.points)
+    assert np.array_equal(alone.points[-1, scene.pins.vertices], alone.points[0, scene.pins.vertices])
+    edges = scene.mesh.edges
+    assert lengths_of(alone.points[1], edges).sum() <= lengths_of(alone.points[0], edges).sum() * (1.0 + 1e-6)
+
+
+def test_without_levels_it_is_pbd(device):
+    for scene, most in ((SCENES["grid"], 0), (SCENES["bending alone"], None)):
+        runs = [
+            wc.simulate(scene, solver, device=device, frames=5).points
+            for solver in (wc.HierarchicalPBD(substeps=2, levels=most), wc.PBD(substeps=2))
+        ]
+        assert np.array_equal(*runs)
+
+
+def crumpled(n):
+    """A chain of links of 1 m in random directions."""
+    steps = RNG.normal(size=(n - 1, 3))
+    return np.vstack([np.zeros(3), np.cumsum(steps / np.linalg.norm(steps, axis=1)[:, None], axis=0)])
+
+
+def folded(points):
+    """A flat grid folded along a line of its vertices and across another."""
+    x = points.copy()
+    right = points[:, 0] > points[6, 0]
+    x[right, 0], x[right, 1] = points[6, 0], points[right, 0] - points[6, 0]
+    return x
+
+
+def test_what_meets_the_constraints_is_left_alone(device):
+    """A bound is a way over finer ones, so that no state that meets those is beyond it, folded or straight."""
+    grid = SCENES["grid"]
+    hard = [wc.Spring(pairs=("structural", "shear"), stiffness=np.inf)]
+    rotation = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
+    states = {
+        "crumpled": replace(SCENES["chain"], positions=crumpled(30), pins=None),
+        "folded": replace(grid, terms=hard, positions=folded(grid.mesh.points), pins=None),
+        "turned": replace(SCENES["scattered"], positions=SCENES["scattered"].mesh.points @ rotation, pins=None),
+        "crushed": replace(grid, terms=[wc.SpringLimit(most=1.0)], positions=0.5 * grid.mesh.points),
+        "soft, below a hard limit": replace(
+            grid, terms=[wc.Spring(stiffness=0.0), wc.SpringLimit(most=1.1)], positions=1.09 * grid.mesh.points, pins=None
+        ),
+    }
+    for name, scene in states.items():
+        model = replace(scene, gravity=(0.0, 0.0, 0.0)).build(device=device, dtype="float64")
+        stepper = wc.HierarchicalPBD(substeps=1).bind(model)
+        assert stepper.levels
+        stepper.step()
+        # Ways of up to some 10 m are a sum of some ten links, each rounded to ε of the coordinates.
+        assert np.abs(stepper.state.x.numpy() - scene.positions).max() < 1000 * EPS, name
+
+
+def test_levels_are_as_stiff_as_the_cloth():
+    """A chain of half the vertices k/2, a square net of a quarter of them k: Σ kL² is kept; hard stays hard."""
+    found = levels(edges_alone(line(33), links(33), terms=[wc.Spring(stiffness=8.0)], pins=[0]).build(dtype="float64"))
+    for i, level in enumerate(found[:5]):
+        assert np.allclose(1.0 / level.bounds[0].compliance, 8.0 / 2 ** (i + 1), rtol=1e-12)
+        assert np.allclose(level.bounds[0].lengths, 2 ** (i + 1), rtol=1e-12)
+    mesh = wc.Mesh.grid(33, 33)
+    sheet = wc.Scene(mesh, density=0.1, terms=[wc.Spring(pairs=("structural", "shear"), stiffness=8.0)])
+    for level in levels(sheet.build(dtype="float64"))[:3]:
+        # The border has as many springs on every level, by which the sum is off by some links of each row.
+        assert np.allclose(1.0 / level.bounds[0].compliance, 8.0, rtol=0.3)
+    assert all((each.compliance == 0.0).all() for level in levels(SCENES["scattered"].build()) for each in level.bounds)
+
+
+def test_soft_and_hard_bounds_stay_apart():
+    """A soft spring and a hard limit on one pair: the hard bound has the length of the limit, not of the spring."""
+    scene = edges_alone(line(31), links(31), terms=[wc.Spring(stiffness=5.0), wc.SpringLimit(most=1.25)], pins=[0])
+    soft, hard = levels(scene.build(dtype="float64"))[0].bounds
+    assert np.allclose(soft.lengths, 2.0) and np.allclose(1.0 / soft.compliance, 2.5)
+    assert np.allclose(hard.lengths, 2.5) and (hard.compliance == 0.0).all()
+
+
+def test_a_level_has_the_mass_of_what_follows():
+    """Without pins all of it, of each copy; so that a move of the level conserves momentum in what follows too."""
+    masses = np.stack([np.linspace(1.0, 2.0, 30), np.linspace(3.0, 1.0, 30)])
+    scene = replace(SCENES["chain"], pins=None)
+    model = scene.build(dtype="float64", copies=2, vary={"masses": masses})
+    for level in levels(model):
+        inverse = level.inverse_mass
+        kept = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0.0)
+        assert np.allclose(kept.sum(axis=1), masses.sum(axis=1), rtol=100 * EPS)
+
+
+def test_copies_of_unlike_stiffness_are_as_alone(device):
+    """None in one copy, infinite in another."""
+    base = replace(SCENES["chain"], terms=[wc.Spring(stiffness=1.0)])
+    stiffness, solver = [0.0, 50.0, np.inf], wc.HierarchicalPBD(substeps=1, iterations=3)
+    kept = {"device": device, "dtype": "float64", "frames": 5}
+    model = base.build(dtype="float64", copies=3, vary={"Spring.stiffness": stiffness})
+    assert levels(model)
+    batch = wc.simulate(base, solver, copies=3, vary={"Spring.stiffness": stiffness}, **kept).points
+    for copy in range(3):
+        alone = replace(base, terms=[wc.Spring(stiffness=stiffness[copy])])
+        points = wc.simulate(alone, solver, **kept).points
+        assert np.abs(batch[:, copy] - points).max() < 1e-9
+
+
+def test_stretch_grows_with_resolution_only_without_levels(device):
+    """Information moves one link a sweep: 10 sweeps a step stretch a chain of 1 m with hard links the more the finer it is."""
+    stretch = {}
+    for solver in (wc.PBD, wc.HierarchicalPBD):
+        for n in (16, 64, 256):
+            hung = chain.scene(links=n, stiffness=np.inf)
+            animation = wc.simulate(hung, solver(substeps=1, iterations=10), device=device, dtype="float64", frames=60)
+            stretch[solver, n] = max(lengths_of(x, hung.mesh.edges).sum() for x in animation.points) - 1.0
+    print(stretch)
+    assert stretch[wc.PBD, 64] > 3.0 * stretch[wc.PBD, 16]
+    assert stretch[wc.HierarchicalPBD, 256] < 0.1 * stretch[wc.PBD, 256]
