@@ -711,6 +711,8 @@ ALL_HOMES = ["attachment", "dihedral_bending", "quadratic_bending", "spring"]
 ALL_NAMES = ["Attachment", "DihedralBending", "QuadraticBending", "Spring"]
 BUILDS = {
     **{f"{each.__name__} of springs": (each.__name__, "springs", ["spring"], ["Spring"]) for each in SOLVERS.values()},
+    # The levels are bounds, which are one-sided springs.
+    "HierarchicalPBD of springs": ("HierarchicalPBD", "springs", ["spring", "spring_limit"], ["Spring", "SpringLimit"]),
     "PBD of all, to show that the probe sees them": ("PBD", "all", ALL_HOMES, ALL_NAMES),
 }
 
