@@ -95,7 +95,7 @@ def test_levels_of_any_mesh(name):
         assert np.abs(sums - 1.0).max() < 8 * EPS and (level.weights > 0.0).all()
         bounds = [each for each in level.bounds if len(each)]
         linked = np.concatenate([each.pairs for each in bounds])
-        assert kept[linked].all() and free[linked].any(axis=1).all()
+        assert kept[linked].all() and free[linked].any(axis=1).all() and (linked[:, 0] != linked[:, 1]).all()
         ways, least = np.concatenate([each.lengths for each in bounds]), shortest[linked[:, 0], linked[:, 1]]
         assert (ways >= least * (1.0 - 100 * EPS) - 1e-200).all()
         assert (ways <= (8.0 if name == "hub" else 1.5) * least + 1e-200).all(), "detours stay small"
@@ -115,6 +115,18 @@ def test_steps_on_any_mesh_and_copies(name, dtype, device):
     assert np.array_equal(alone.points[-1, scene.pins.vertices], alone.points[0, scene.pins.vertices])
     edges = scene.mesh.edges
     assert lengths_of(alone.points[1], edges).sum() <= lengths_of(alone.points[0], edges).sum() * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize(("name", "most"), [("membrane", 1.0), ("limit of triangles", 1.1)])
+def test_reach_of_triangles(name, most):
+    """Their edges, σ_max times as long as at rest; springs that resist a uniform stretch ε by Aε², as ½kA‖F − I‖² does."""
+    scene = SCENES[name]
+    elements = scene.terms[0].elements(scene.mesh, scene.positions)
+    pairs, lengths, factors = elements.term.reach(scene.mesh.points, elements.stencil, elements.rest)
+    rest = lengths_of(scene.mesh.points, pairs)
+    assert np.allclose(lengths, most * rest, rtol=8 * EPS)
+    energy = 0.5 * (factors * rest**2).reshape(-1, 3).sum(axis=1)
+    assert np.allclose(energy, scene.mesh.triangle_areas, rtol=100 * EPS)
 
 
 def test_without_levels_it_is_pbd(device):
