@@ -6,7 +6,6 @@ there, so that every dropped vertex is linked to at least one kept one; pins are
 shortest way over up to two dropped ones, with its length: what meets all finer bounds meets it, on any mesh, however folded.
 """
 
-from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -282,18 +281,19 @@ def on_device(model, level):
         stiffness = np.broadcast_to(1.0 / bounds.compliance.T, (B, E))
     stencil = bounds.pairs[None] + (np.arange(B) * model.per_copy)[:, None, None]
     rest = np.tile(np.stack([np.zeros(E), bounds.lengths], axis=1), (B, 1))
-    view = copy(model)
-    view.inverse_mass = model.array(level.inverse_mass.ravel(), model.dtype)
-    view.terms = (
-        DeviceElements(
-            label="bounds",
-            kind="bounds",
-            term=SPRING_LIMIT,
-            per_copy=E,
-            stencil=wp.array(stencil.reshape(-1, 2).astype(np.int32), dtype=wp.int32, device=model.device),
-            stiffness=model.array(stiffness.ravel(), model.dtype),
-            rest=model.array(rest, wp.types.vector(2, model.dtype)),
-            hard=bool(np.isinf(stiffness).any()),
-        ),
+    view = model.with_terms(
+        [
+            DeviceElements(
+                label="bounds",
+                kind="bounds",
+                term=SPRING_LIMIT,
+                per_copy=E,
+                stencil=wp.array(stencil.reshape(-1, 2).astype(np.int32), dtype=wp.int32, device=model.device),
+                stiffness=model.array(stiffness.ravel(), model.dtype),
+                rest=model.array(rest, wp.types.vector(2, model.dtype)),
+                hard=bool(np.isinf(stiffness).any()),
+            ),
+        ]
     )
+    view.inverse_mass = model.array(level.inverse_mass.ravel(), model.dtype)
     return view

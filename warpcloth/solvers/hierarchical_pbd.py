@@ -6,6 +6,7 @@ import warp as wp
 
 from ..capture import Segment
 from ..checks import number, whole
+from ..damping import Past
 from ..hierarchy import levels, on_device
 from ..kernels.hierarchy import follow
 from ..sweeps import Sweep, refuse_unprojectable
@@ -23,8 +24,8 @@ class HierarchicalPBD(Step):
 
     The constraints of a level are one-sided: ‖xᵢ − xⱼ‖ ≤ L with L the length of the shortest way over finer bounds, so that
     what meets those is left alone, and the levels hinder neither folds nor shear of a net. Springs, limits with σ_max and
-    membranes bound; bending and attachments take part in the last sweeps alone, and without bounds the solver is PBD. A level
-    is as stiff as the way in series, times what keeps Σ kL² of the finer one; cloth of infinite stiffness has hard ones.
+    membranes bound; bending, attachments and damping take part in the last sweeps alone, and without bounds the solver is
+    PBD. A level is as stiff as the way in series, times what keeps Σ kL² of the finer one; where the cloth is hard, it is too.
     A vertex of a level has the mass of what follows it, Mⱼ = mⱼ + Σ wᵢⱼ mᵢ, so that linear momentum is kept; angular is not.
 
     What it costs: soft cloth comes out stiffer than by PBD, as all sweeps add up: a chain of 80 springs that its material
@@ -79,7 +80,8 @@ class HierarchicalPBDStepper(Stepper):
     def __init__(self, options, model):
         super().__init__(options, model)
         self.levels = levels(model, options.levels)
-        self.sweep = Sweep(model, self.state.x, self.h, "coloured", options.relaxation)
+        self.sweep = Sweep(self.model, self.state.x, self.h, "coloured", options.relaxation)
+        self.past = Past(model, self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
         self._start = Segment(model.device, self._launch_start)
         self._sweep = Segment(model.device, self.sweep.launch)
