@@ -41,6 +41,7 @@ SLOW = {
 DO_NOT = {
     wc.Explicit: "takes the forces of where the step begins and minimises nothing",
     wc.PBD: "projects onto constraints whose stiffness depends on iterations and step",
+    wc.HierarchicalPBD: "does the same, after levels of constraints that the scene does not have",
 }
 each_solver = pytest.mark.parametrize("name", [*TAKE_PART, *(pytest.param(name, marks=slow) for name in SLOW)])
 
