@@ -917,7 +917,8 @@ def kite_weight(apex, device, **options):
 def test_12_obtuse_triangles_give_negative_weights(device):
     """Two apexes of 100° give cot 100° = −.176; the sign turns at 90°.
 
-    Remedies: intrinsic Delaunay (Fisher et al. 2007), clamping, and spokes and rims, to which they do no harm (Chao et al. 2010).
+    Remedies: intrinsic Delaunay (Fisher et al. 2007), clamping,
+    and spokes and rims, which they leave unharmed (Chao et al. 2010).
     """
     with pytest.warns(UserWarning, match=r"negative weights: 1, the most negative -0\.176 of edge \[0, 1\].*intrinsic"):
         arap = wc.Arap(kite(100.0), [0, 2], device=device)
@@ -1042,7 +1043,7 @@ def test_14_substeps_instead_of_iterations(solver, substeps, iterations, stretch
 
 @pytest.mark.parametrize("solver", [wc.PBD, wc.XPBD])
 def test_14_stretch_grows_with_resolution(solver, device):
-    """20 sweeps from the pin down: more than fourfold for twice the links. Remedy: as many substeps as links, 0.13 % for all."""
+    """20 sweeps from the pin down: more than fourfold for twice the links. Remedy: a substep for each link, 0.13 % for all."""
     coarse_to_fine = [10, 20, 40, 80]
     fixed = [stretch_of_chain(solver, n, device, substeps=1, iterations=20) for n in coarse_to_fine]
     assert (np.divide(fixed[1:], fixed[:-1]) > 4.0).all()

@@ -184,6 +184,27 @@ def test_steps_above_gershgorins_bound_warn(device):
         wc.Explicit(substeps=1).bind(scene.build(device=device))
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_sheet_at_rest_stays_there(name, dtype, device):
+    """Its rest shape, one pinned vertex, no gravity: it does not move in a second, and does not spin about the pin."""
+    pin, solver = 14, SOLVERS[name]
+    scene = square(solver=solver, gravity=(0.0, 0.0, 0.0), fps=600.0, pins=[pin])
+    stepper = solver.bind(scene.build(device=device, dtype=dtype))
+    for _ in range(600):
+        stepper.step()
+    x, v = (array.numpy().astype(np.float64) for array in stepper.state)
+    arms, mass, eps = scene.mesh.points - scene.mesh.points[pin], scene.vertex_masses, np.finfo(dtype).eps
+    L = np.cross(arms, mass[:, None] * v).sum(axis=0)
+    inertia = np.einsum("n,nkk,ij->ij", mass, arms[:, :, None] * arms[:, None], np.eye(3))
+    inertia -= np.einsum("n,ni,nj->ij", mass, arms, arms)
+    # Forces are made of rounding, which moves a place of size 1 to and fro by a few ε, within a step of h; the whole, less.
+    # What keeps energy lets it walk.
+    walks = name in ("explicit", "newton midpoint")
+    assert np.abs(x - scene.mesh.points).max() < (2.0 * np.sqrt(600) if walks else 16.0) * eps
+    assert np.linalg.norm(np.linalg.solve(inertia, L)) < 0.1 * eps / stepper.h
+
+
 @pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1)])
 def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
     with pytest.raises(ValueError, match="cannot take Spring with infinite stiffness; PBD"):
