@@ -158,19 +158,33 @@ def test_02_a_line_search_keeps_newton_going_downhill(device):
     assert len(short) and (np.array(full) > values[short]).any(), "there was something to prevent"
 
 
-def test_02_a_collapsed_spring_has_no_direction(device):
-    """l → 0: 1 − L/l → −∞, and y/l is nothing. Every policy steps on with finite numbers."""
-    for length in (0.0, 1e-300, 1e-14, 1e-6):
-        for policy in ("clamp", "absolute", "adaptive"):
-            declared = wc.Scene(
-                PAIR,
-                masses=[0.01, 0.01],
-                positions=[[0.0, 0.0, 0.0], [length, 0.0, 0.0]],
-                terms=[wc.Spring(stiffness=100.0)],
-                pins=[0],
-            )
-            x, stepper = after_one_step(declared, wc.Newton(substeps=1, hessian=policy), "float64", device)
-            assert np.isfinite(x).all() and stepper.results[0] is Result.CONVERGED
+COLLAPSED = [
+    *(wc.Newton(substeps=1, hessian=policy) for policy in ("clamp", "absolute", "adaptive")),
+    wc.Explicit(substeps=1),
+    wc.PBD(substeps=1),
+    *(wc.XPBD(substeps=1, form=form) for form in ("vector", "scalar")),
+    wc.ProjectiveDynamics(substeps=1),
+    wc.ADMM(substeps=1),
+]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("solver", COLLAPSED, ids=repr)
+def test_02_a_collapsed_spring_has_no_direction(solver, dtype, device):
+    """l → 0: 1 − L/l → −∞, and y/l is nothing. Below 1e-12 L it stays where it is; at 1e-6 L it is pushed out again."""
+    for length in (0.0, 1e-20, 1e-13, 1e-6):
+        declared = wc.Scene(
+            PAIR,
+            masses=[1.0, 1.0],
+            positions=[[0.0, 0.0, 0.0], [length, 0.0, 0.0]],
+            terms=[wc.Spring(stiffness=100.0)],
+            pins=[0],
+            gravity=(0.0, 0.0, 0.0),
+        )
+        x, stepper = after_one_step(declared, solver, dtype, device)
+        assert np.isfinite(x).all() and stepper.results[0] is not Result.DIVERGED
+        # Multipliers of ADMM throw it over to the other side, where U has a minimum too.
+        assert (abs(x[1, 0]) > 1e-3) == (length > 1e-12) and (x[1, 0] >= 0.0 or isinstance(solver, wc.ADMM))
 
 
 # --- 3. PBD: stiffness depends on iterations and step; XPBD's is mgα.
@@ -679,6 +693,8 @@ def test_08_rounding_of_a_fall_for_ten_seconds(name, device):
 
 # --- 9. Locking: an irregular net cannot bend without straining or wrinkling.
 
+REGULAR = ("equilateral", "diagonal", "alternating")
+
 
 def rolled(points, radius, degrees=0.0):
     """Rolled up along the direction at an angle to x, (n, 3): an isometry of the plane y = 0."""
@@ -759,21 +775,28 @@ def hinge_angles(mesh, x):
     return np.arctan2(np.einsum("ij,ij->i", np.cross(n1, n2), e) / np.linalg.norm(e, axis=1), np.einsum("ij,ij->i", n1, n2))
 
 
-@pytest.mark.parametrize(("mesh", "least", "most"), [("regular", 0.0, 0.05), ("jittered", 0.25, 0.5)])
-def test_09_an_irregular_net_loses_its_strain_to_wrinkles(mesh, least, most, device):
-    """A sheet of springs alone, rolled up, settles without strain, for it has 3 coordinates a vertex and fewer lengths.
+@pytest.mark.parametrize("pattern", ["jittered", *REGULAR])
+def test_09_an_irregular_net_loses_its_strain_by_losing_curvature(pattern, device):
+    """A sheet of springs alone, rolled up and let go, damped by implicit Euler: how much of the imposed angles is left.
 
-    A regular one keeps its shape; a jittered one wrinkles by a third of the imposed angles.
+    It has 3 coordinates a vertex and fewer lengths, so that in the end nothing is strained. A regular net keeps its curvature
+    up to (κh)²; a jittered one trades it for wrinkles and slides on along them: 89 % are left after 1/6 s, 81 % after 1 s and
+    66 % after 5 s here, and 30 to 90 % with other jitters, curvatures and steps.
     """
-    mesh = wc.Mesh.grid(21, 21, pattern="alternating") if mesh == "regular" else jittered(21)
+    mesh, kappa = jittered(11) if pattern == "jittered" else wc.Mesh.grid(11, 11, pattern=pattern), 1.0
     assert len(mesh.edges) < 3 * len(mesh.points) - 6
-    start = rolled(mesh.points, 1.0)
+    start = rolled(mesh.points, 1.0 / kappa)
     declared = wc.Scene(mesh, density=0.1, positions=start, terms=[wc.Spring(stiffness=1e3)], gravity=(0.0, 0.0, 0.0))
-    x = wc.equilibrium(declared, tolerance=1e-6, device=device).points
-    before, after = (np.abs(pair_lengths(each, mesh.edges) / mesh.edge_lengths - 1.0).max() for each in (start, x))
-    assert after < 1e-6 * before
-    imposed, kept = hinge_angles(mesh, start), hinge_angles(mesh, x)
-    assert least <= np.linalg.norm(kept - imposed) / np.linalg.norm(imposed) < most
+    solver = wc.Newton(substeps=1, tolerance=1e-8, linear="factorised")
+    points = wc.simulate(replace(declared, duration=5.0), solver, device=device, dtype="float64").points
+    before, after = (np.abs(pair_lengths(x, mesh.edges) / mesh.edge_lengths - 1.0).max() for x in points[[0, -1]])
+    imposed = hinge_angles(mesh, start)
+    kept = np.array([hinge_angles(mesh, points[frame]) @ imposed for frame in (10, 60, 300)]) / (imposed @ imposed)
+    assert after < 0.02 * before
+    if pattern == "jittered":
+        assert (np.diff(kept, prepend=1.0) < -0.05).all() and kept[-1] < 0.75
+    else:
+        assert np.abs(kept - 1.0).max() < (kappa / 10) ** 2
 
 
 def test_09_stiff_threads_lock_an_irregular_net(device):
