@@ -664,7 +664,11 @@ def strain_of_fall(name, seconds, device):
     for _ in range(steps):
         stepper.step()
     x = stepper.state.x.numpy().astype(np.float64)
-    assert stepper.results[0] is not Result.DIVERGED and x[:, 1].max() < -0.9 * 9.81 / 2 * seconds**2
+    second = getattr(solver, "integrator", "euler") != "euler"
+    exact = -9.81 * stepper.h**2 * steps * (steps + (0 if second else 1)) / 2
+    # v is rounded to ε|v| in every step and h carries it into x.
+    assert np.abs(x[:, 1] - exact).max() < 2 * steps * np.finfo(np.float32).eps * (1.0 + abs(exact))
+    assert stepper.results[0] is not Result.DIVERGED
     return np.abs(pair_lengths(x, pairs) / pair_lengths(points, pairs) - 1.0).max(), steps
 
 
@@ -692,8 +696,6 @@ def test_08_rounding_of_a_fall_for_ten_seconds(name, device):
 
 
 # --- 9. Locking: an irregular net cannot bend without straining or wrinkling.
-
-REGULAR = ("equilateral", "diagonal", "alternating")
 
 
 def rolled(points, radius, degrees=0.0):
@@ -775,28 +777,43 @@ def hinge_angles(mesh, x):
     return np.arctan2(np.einsum("ij,ij->i", np.cross(n1, n2), e) / np.linalg.norm(e, axis=1), np.einsum("ij,ij->i", n1, n2))
 
 
-@pytest.mark.parametrize("pattern", ["jittered", *REGULAR])
-def test_09_an_irregular_net_loses_its_strain_by_losing_curvature(pattern, device):
-    """A sheet of springs alone, rolled up and let go, damped by implicit Euler: how much of the imposed angles is left.
+THREADS = ("structural", "shear")
 
-    It has 3 coordinates a vertex and fewer lengths, so that in the end nothing is strained. A regular net keeps its curvature
-    up to (κh)²; a jittered one trades it for wrinkles and slides on along them: 89 % are left after 1/6 s, 81 % after 1 s and
-    66 % after 5 s here, and 30 to 90 % with other jitters, curvatures and steps.
+
+@pytest.mark.parametrize(
+    ("pattern", "pairs", "degrees", "keeps"),
+    [
+        *(("equilateral", "edges", degrees, True) for degrees in (0.0, 17.0, 45.0)),
+        *(("diagonal", "edges", degrees, True) for degrees in (0.0, 17.0, 45.0)),
+        *(("alternating", pairs, 0.0, True) for pairs in ("edges", THREADS)),
+        *(("alternating", pairs, 45.0, False) for pairs in ("edges", THREADS)),
+        ("jittered", "edges", 0.0, False),
+    ],
+)
+def test_09_a_net_that_cannot_bend_without_strain_loses_its_curvature(pattern, pairs, degrees, keeps, device):
+    """Springs alone, rolled up and let go, damped by implicit Euler: the part of the imposed angles that is left.
+
+    Nets of three lengths keep it up to (κh)², and so does one with diagonals both ways along its rows. With more lengths than
+    coordinates (both diagonals in each cell) a net straightens and swings through. With fewer it ends without strain by
+    wrinkling and slides on along its wrinkles: the jittered one keeps 89, 81 and 66 % after 1/6, 1 and 5 s, others 30 to 90 %.
     """
     mesh, kappa = jittered(11) if pattern == "jittered" else wc.Mesh.grid(11, 11, pattern=pattern), 1.0
-    assert len(mesh.edges) < 3 * len(mesh.points) - 6
-    start = rolled(mesh.points, 1.0 / kappa)
-    declared = wc.Scene(mesh, density=0.1, positions=start, terms=[wc.Spring(stiffness=1e3)], gravity=(0.0, 0.0, 0.0))
+    springs = wc.Spring(pairs=pairs, stiffness=1e3)
+    ends = springs.stencil(mesh)
+    assert (len(ends) > 3 * len(mesh.points) - 6) == (pairs == THREADS)
+    start = rolled(mesh.points, 1.0 / kappa, degrees)
+    declared = wc.Scene(mesh, density=0.1, positions=start, terms=[springs], gravity=(0.0, 0.0, 0.0), duration=5.0)
     solver = wc.Newton(substeps=1, tolerance=1e-8, linear="factorised")
-    points = wc.simulate(replace(declared, duration=5.0), solver, device=device, dtype="float64").points
-    before, after = (np.abs(pair_lengths(x, mesh.edges) / mesh.edge_lengths - 1.0).max() for x in points[[0, -1]])
+    points = wc.simulate(declared, solver, device=device, dtype="float64").points
+    rest = pair_lengths(mesh.points, ends)
+    before, after = (np.abs(pair_lengths(x, ends) / rest - 1.0).max() for x in points[[0, -1]])
     imposed = hinge_angles(mesh, start)
     kept = np.array([hinge_angles(mesh, points[frame]) @ imposed for frame in (10, 60, 300)]) / (imposed @ imposed)
-    assert after < 0.02 * before
-    if pattern == "jittered":
-        assert (np.diff(kept, prepend=1.0) < -0.05).all() and kept[-1] < 0.75
-    else:
+    assert after < (0.2 if pairs == THREADS else 0.02) * before
+    if keeps:
         assert np.abs(kept - 1.0).max() < (kappa / 10) ** 2
+    else:
+        assert kept[0] < 0.97 and kept[-1] < (0.0 if pairs == THREADS else 0.75)
 
 
 def test_09_stiff_threads_lock_an_irregular_net(device):
