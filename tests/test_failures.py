@@ -452,7 +452,7 @@ def test_06_rate_on_one_spring(k, pull, across, device):
     for _ in range(6):
         if errors[-1] * rate < 1e-9:  # below, rounding of x is above 1e-6 of it
             break
-        stepper._factors.solve(stepper._gradient, stepper._w)
+        stepper._linear.solve(stepper._gradient, stepper._w)
         stepper._move()
         errors.append((stepper.correction.numpy()[1] - (exact - predicted)) @ normal)
     assert len(errors) > 1 and np.abs(np.array(errors[1:]) / errors[:-1] / rate - 1.0).max() < 1e-6
