@@ -1064,7 +1064,7 @@ def test_13_kabsch_where_the_rotation_is_not_unique():
     assert matrices.determinant(wc.kabsch(P, P * [1.0, 1.0, -1.0])[None], 1) < 1e-14
 
 
-# --- 14. Local solvers at high resolution: information moves one ring an iteration.
+# --- 14. Local solvers at high resolution: information moves one ring an iteration (levels of vertices: test_hierarchy).
 
 
 def stretch_of_chain(solver, links, device, **options):
