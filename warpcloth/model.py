@@ -15,6 +15,8 @@ from .kernels.term import Term
 from .precision import cast, refuse_coarse
 from .scene import refuse_far_pins
 
+_PINNED = 1e3  # what a pinned vertex of a cell counts, in masses of the rest of the cell: it does not move, so the cell must
+
 DTYPES = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
 
 
@@ -34,6 +36,31 @@ class Origin:
 
 
 @dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of elements: those from offsets[c] to offsets[c+1] are the vertices of cell c.
+
+    Attributes:
+        offsets: (B·C + 1,) int32.
+        per_copy: Cells of one copy, C.
+        shape: Rest place of each element about the centre of mass of its cell, (B·E,) vectors [m].
+    """
+
+    offsets: wp.array
+    per_copy: int
+    shape: wp.array
+
+    @property
+    def count(self):
+        """Cells of all copies, B·C."""
+        return len(self.offsets) - 1
+
+    @property
+    def sizes(self):
+        """Elements of each cell, (B·C,)."""
+        return np.diff(self.offsets.numpy())
+
+
+@dataclass(frozen=True, eq=False)
 class DeviceElements:
     """The elements of one term in all copies, on the device.
 
@@ -46,6 +73,7 @@ class DeviceElements:
         hard: Whether any stiffness is infinite.
         damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
         origin: :class:`Origin` of a rest state that is set in each step, or None.
+        cells: :class:`Cells` that the elements are the vertices of, or None.
     """
 
     label: str
@@ -58,11 +86,18 @@ class DeviceElements:
     hard: bool
     damping: wp.array | None = None
     origin: Origin | None = None
+    cells: Cells | None = None
 
     @property
     def arguments(self):
         """The arguments that every kernel over elements starts with."""
         return [self.stencil, self.stiffness, self.rest]
+
+    @property
+    def arrays(self):
+        """All arrays of the term."""
+        cells = [self.cells.offsets, self.cells.shape] if self.cells else []
+        return self.arguments + ([] if self.damping is None else [self.damping]) + cells
 
     @property
     def count(self):
@@ -75,17 +110,30 @@ class DeviceElements:
         array = wp.array(np.where(np.isinf(stiffness), 1.0, stiffness).astype(stiffness.dtype), device=self.stiffness.device)
         return replace(self, stiffness=array, hard=False)
 
+    @property
+    def constraints(self):
+        """Vertices (B·C, K) of each constraint, or of cells a list of arrays: elements, and cells as a whole."""
+        stencil = self.stencil.numpy()
+        return stencil if self.cells is None else np.split(stencil[:, 0], self.cells.offsets.numpy()[1:-1])
+
     def reordered(self, order):
-        """The same elements with those of index ``order`` (B·E,) in that order."""
+        """The same elements, or cells, with those of index ``order`` in that order."""
 
         def put(array):
             if 0 in array.strides:
                 return array
             return wp.array(array.numpy()[order], dtype=array.dtype, device=array.device)
 
+        cells = self.cells
+        if cells:
+            firsts, sizes = cells.offsets.numpy()[order], cells.sizes[order]
+            ends = np.cumsum(sizes)
+            order = np.arange(ends[-1]) + np.repeat(firsts - (ends - sizes), sizes)
+            offsets = wp.array(np.append(0, ends).astype(np.int32), dtype=wp.int32, device=self.stencil.device)
+            cells = replace(cells, offsets=offsets, shape=put(cells.shape))
         changed = {name: put(getattr(self, name)) for name in ("stencil", "stiffness", "rest")}
         origin = self.origin and replace(self.origin, rest=put(self.origin.rest), share=put(self.origin.share))
-        return replace(self, **changed, origin=origin)
+        return replace(self, **changed, origin=origin, cells=cells)
 
     def taut(self, points):
         """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
@@ -234,7 +282,7 @@ class Model:
         E = len(one.stencil)
         stencil = one.stencil[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
         rest = np.stack([copy.rest for copy in copies] * (self.copies // len(copies)))
-        stiffness = vary.take_of_elements("stiffness", one, E)
+        stiffness = vary.take_of_elements("stiffness", one, E if one.cells is None else len(one.cells) - 1)
         for copy, e in np.argwhere(~(stiffness >= 0.0))[:1]:
             raise ValueError(f"{one.label}.stiffness is {stiffness[copy, e]} in copy {copy}; it must be 0 or more")
         damping = vary.take_of_elements("damping", one, E)
@@ -243,6 +291,11 @@ class Model:
         if damping.any() and one.term.dissipation is None:
             raise ValueError(f"{one.label} cannot be damped; leave its damping out of vary")
         rest_type = wp.types.vector(one.term.parameters, self.dtype)
+        cells = None
+        if one.cells is not None:
+            cells, rest = self._cells(one)
+            if stiffness.shape[1] > 1:
+                stiffness = np.repeat(stiffness, np.diff(one.cells), axis=1)
         return DeviceElements(
             label=one.label,
             kind=one.kind,
@@ -253,7 +306,31 @@ class Model:
             rest=self._put(f"{one.label}: rest state", "", rest, rest_type, "element", infinite=True),  # a limit may be none
             hard=bool(np.isinf(stiffness).any()),
             damping=self._broadcast(f"{one.label}.damping", damping, E) if damping.any() else None,
+            cells=cells,
         )
+
+    def _cells(self, elements):
+        """:class:`Cells` of a term's :class:`warpcloth.terms.Elements`, and its rest state with the masses, (B, E, P)."""
+        vertices, firsts = elements.stencil[:, 0], elements.cells[:-1]
+        sizes = np.diff(elements.cells)
+        shape = (self.copies, self.per_copy)
+        mass, inverse = (array.numpy().astype(np.float64).reshape(shape) for array in (self.mass, self.inverse_mass))
+        weight = np.where(inverse > 0.0, mass, 0.0)[:, vertices]
+        body = np.repeat(np.add.reduceat(weight, firsts, axis=1), sizes, axis=1)
+        weight = np.where(inverse[:, vertices] > 0.0, weight, np.where(body > 0.0, _PINNED * body, 1.0))
+        points = np.broadcast_to(self.scene.mesh.points[vertices], (self.copies, len(vertices), 3))
+        points = points - np.repeat(points[:, firsts], sizes, axis=1)
+        total = np.add.reduceat(weight, firsts, axis=1)
+        centre = np.add.reduceat(weight[..., None] * points, firsts, axis=1) / total[..., None]
+        offsets = np.append((elements.cells[:-1] + np.arange(self.copies)[:, None] * len(vertices)).ravel(), weight.size)
+        cells = Cells(
+            wp.array(offsets.astype(np.int32), dtype=wp.int32, device=self.device),
+            len(sizes),
+            self._put(f"{elements.label}: shape", "m", points - np.repeat(centre, sizes, axis=1), self.vec3),
+        )
+        rest = np.zeros((*weight.shape, elements.term.parameters))
+        rest[..., -1] = weight
+        return cells, rest
 
     def _broadcast(self, name, values, E):
         """(B, 1) or (B, E) values as an array (B·E,), of stride 0 where all are one value."""
@@ -284,7 +361,7 @@ class Model:
             {
                 "term": elements.label + (f" {count + 1}" if count else ""),
                 "elements": elements.count,
-                "bytes": sum(_bytes(array) for array in (*elements.arguments, elements.damping) if array is not None),
+                "bytes": sum(_bytes(array) for array in elements.arrays),
             }
             for elements, count in zip(self.terms, before, strict=True)
         ]

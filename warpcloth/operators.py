@@ -3,10 +3,19 @@
 import numpy as np
 import warp as wp
 
-from .kernels import assemble, linear, reduce
+from .kernels import assemble, clusters, linear, reduce
 
 # Chunks of a sum per copy: one on the CPU, which runs them in turn; on a GPU enough for it to be busy.
 CHUNKS = 256
+
+
+def fit_cells(model, terms, x, correction):
+    """Sets the targets of cells at x, or x + correction if that is not None."""
+    for elements in terms:
+        if elements.cells:
+            kernel = model.kernel(clusters.fit_targets, model.dtype, correction is not None)
+            given = [elements.cells.offsets, elements.stencil, elements.cells.shape, x, correction]
+            model.launch(kernel, elements.cells.count, given, [elements.rest])
 
 
 class Sums:
@@ -54,6 +63,7 @@ class Gradient:
 
     def add(self, x, out, correction=None):
         """out += ∂U/∂x at x, or at x + correction of operators built ``corrected``."""
+        fit_cells(self.model, self.terms, x, correction)
         for elements, kernel, incidences in zip(self.terms, self.kernels, self.incidences, strict=True):
             dim = len(incidences[0]) - 1 if incidences else elements.count
             self.model.launch(kernel, dim, [*incidences, *elements.arguments, x, correction], [out])
@@ -69,6 +79,7 @@ class Energy:
 
     def add(self, x, out, correction=None):
         """out (B,) += U(x), or U(x + correction)."""
+        fit_cells(self.model, self.terms, x, correction)
         for elements, kernel, values in zip(self.terms, self.kernels, self.of_elements, strict=True):
             self.model.launch(kernel, elements.count, [*elements.arguments, x, correction], [values])
             self.sums.sum(values, elements.per_copy, out, accumulate=1)

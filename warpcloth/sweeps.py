@@ -9,23 +9,26 @@ import warp as wp
 
 from .damping import refuse_apart
 from .kernels import project as kernels
+from .kernels.clusters import correct_clusters
+from .operators import fit_cells
 
 # By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
 # the largest n of its vertices. Jacobi: the plain sum.
 SWEEPS = ("vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential")
 
 
-def colours(stencil, free):
+def colours(constraints, free):
     """Colours of elements, so that no two of one colour share a free vertex: (E,) int, from 0 without gaps.
 
     By Warp's maximum cardinality search: 8 colours for the structural and shear springs of a grid, which is the least, and 18
     for the hinges of an alternating one.
 
     Args:
-        stencil: (E, K).
+        constraints: Vertices of each, (E, K) or a list of E arrays.
         free: Which vertices move, (n,); pinned ones may be shared (the hinges of ``bunny`` then need 17 colours, not 20).
     """
-    elements, vertices = np.repeat(np.arange(len(stencil), dtype=np.int32), stencil.shape[1]), stencil.ravel()
+    sizes = [len(vertices) for vertices in constraints]
+    elements, vertices = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), np.concatenate(constraints)
     keep = free[vertices]
     order = np.argsort(vertices[keep], kind="stable")
     elements, vertices = elements[keep][order], vertices[keep][order]
@@ -34,7 +37,7 @@ def colours(stencil, free):
     before = np.arange(len(vertices)) - first
     place = np.arange(before.sum()) - np.repeat(np.cumsum(before) - before - first, before)
     pairs = np.stack([np.repeat(elements, before), elements[place]], axis=1)
-    found = wp.zeros(len(stencil), dtype=wp.int32, device="cpu")
+    found = wp.zeros(len(sizes), dtype=wp.int32, device="cpu")
     if len(pairs):
         wp.utils.graph_coloring_assign(wp.array(pairs, dtype=wp.int32, device="cpu"), found)
     return found.numpy()
@@ -81,7 +84,7 @@ class Sweep:
         self.spread = spread or 1
         self.in_place, self.ordered = kind in ("coloured", "sequential"), kind == "sequential"
         self.correction = model.vectors() if correction is None else correction
-        self.elements, self.ranges = list(model.terms), [[(0, elements.count)] for elements in model.terms]
+        self.elements, self.ranges = list(model.terms), [[(0, (elements.cells or elements).count)] for elements in model.terms]
         if kind == "coloured":
             self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True) if model.terms else ((), ())
         keys = []
@@ -94,7 +97,12 @@ class Sweep:
         ]
         more, cuda = (multipliers, spread is not None), model.device.is_cuda
         if self.in_place:
-            self._kernels = [model.kernel(kernels.correct_in_place, *key, *more) for key in keys]
+            self._kernels = [
+                model.kernel(correct_clusters, model.dtype, *more)
+                if elements.cells
+                else model.kernel(kernels.correct_in_place, *key, *more)
+                for elements, key in zip(model.terms, keys, strict=True)
+            ]
             return
         factory = kernels.gather_correction if cuda else kernels.scatter_correction
         self._kernels = [model.kernel(factory, *key, *more) for key in keys]
@@ -108,7 +116,8 @@ class Sweep:
         """The elements of all copies by colour, and the range of each colour."""
         model = self.model
         free = model.inverse_mass.numpy()[: model.per_copy] > 0.0
-        colour = np.tile(colours(elements.stencil.numpy()[: elements.per_copy], free), model.copies)
+        one = elements.constraints[: elements.cells.per_copy if elements.cells else elements.per_copy]
+        colour = np.tile(colours(one, free), model.copies)
         counts = np.bincount(colour)
         firsts = np.cumsum(counts) - counts
         return elements.reordered(np.argsort(colour, kind="stable")), list(zip(firsts.tolist(), counts.tolist(), strict=True))
@@ -129,6 +138,10 @@ class Sweep:
             return
         constraints[model.inverse_mass.numpy() == 0.0] = 1.0  # what does not move cannot overshoot
         largest = [constraints[elements.stencil.numpy()].max(axis=1) for elements in terms]
+        for i, elements in enumerate(terms):
+            if elements.cells:  # one factor for all of a cell
+                firsts = elements.cells.offsets.numpy()[:-1]
+                largest[i] = np.repeat(np.maximum.reduceat(largest[i], firsts), elements.cells.sizes)
         self._factors = [model.array(self.relaxation / each, model.dtype) for each in largest]
         self._scale = model.constant(1.0, model.count)
 
@@ -146,6 +159,7 @@ class Sweep:
             self._launch_in_place()
             return
         model = self.model
+        fit_cells(model, self.elements, self.x, self.correction)
         for i, elements in enumerate(self.elements):
             given = [*elements.arguments, model.inverse_mass, self.x, self.correction, self.h, self.spread, self._factors[i]]
             dim = len(self._incidences[i][0]) - 1 if self._incidences[i] else elements.count
@@ -157,7 +171,19 @@ class Sweep:
     def _launch_in_place(self):
         model = self.model
         for i, elements in enumerate(self.elements):
-            each = elements.per_copy if self.ordered else 1
+            cells = elements.cells
+            of_cells = [cells.offsets, cells.shape] if cells else []
+            each = (cells or elements).per_copy if self.ordered else 1
             for first, count in self.ranges[i]:
-                given = [*elements.arguments, model.inverse_mass, self.x, first, each, self.h, self.spread, self.relaxation]
+                given = [
+                    *of_cells,
+                    *elements.arguments,
+                    model.inverse_mass,
+                    self.x,
+                    first,
+                    each,
+                    self.h,
+                    self.spread,
+                    self.relaxation,
+                ]
                 model.launch(self._kernels[i], count // each, given, [self.multipliers[i], self.correction])

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -15,11 +15,13 @@ from .kernels.terms import (
     DIHEDRAL_BENDING,
     NEO_HOOKEAN_MEMBRANE,
     QUADRATIC_BENDING,
+    RIGID_CLUSTER,
     SPRING,
     SPRING_LIMIT,
     STRAIN_LIMIT,
     STVK_MEMBRANE,
 )
+from .selection import distinct_vertices
 
 
 @dataclass(frozen=True)
@@ -31,9 +33,10 @@ class Elements:
         kind: Class name of the term.
         term: The energy.
         stencil: Vertices of each element, (E, K) int32.
-        stiffness: One value or (E,) [unit of the term].
+        stiffness: One value or (E,), or (C,) of cells [unit of the term].
         rest: Rest state (E, P).
         damping: One value or (E,) [that times s].
+        cells: Of elements that belong to cells, E of them from cells[c] to cells[c+1] to cell c, (C+1,); else None.
     """
 
     label: str
@@ -43,6 +46,7 @@ class Elements:
     stiffness: np.ndarray
     rest: np.ndarray
     damping: np.ndarray
+    cells: np.ndarray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +85,9 @@ class Declared:
             )
         return values
 
+    def _stiffness(self, count):
+        return self._of_elements("stiffness", count)
+
     def stencil(self, mesh):
         """Vertices of each element on ``mesh``, (E, K) int32."""
         raise NotImplementedError  # every term below has its own
@@ -101,7 +108,7 @@ class Declared:
         stencil = self.stencil(mesh)
         if len(stencil) == 0:
             raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
-        stiffness = self._of_elements("stiffness", len(stencil))
+        stiffness = self._stiffness(len(stencil))
         damped = getattr(self, "damping", None) is not None
         damping = self._of_elements("damping", len(stencil)) if damped else np.zeros(())
         rest = self.rest(mesh, positions, stencil)
@@ -386,6 +393,68 @@ class StrainLimit(_Limit):
         return mesh.triangles
 
 
+@dataclass(frozen=True, kw_only=True)
+class RigidCluster(Declared):
+    """Bodies, U = Σ (κ/2)Σ mᵢ‖xᵢ − (c + R qᵢ)‖² over their vertices, c and R the best motion of their rest shape (Müller et al.
+    2005).
+
+    Bodies that share a vertex hang together there. The mass of a vertex in several bodies counts in each. A pinned vertex
+    counts as a thousand times all others of its body, so that the body turns about it. A body on a line keeps no
+    orientation about it.
+
+    Attributes:
+        vertices: Indices of the bodies, one after the other, (E,); or a list of an array for each body; or a selection such as
+            ``"x < 0.1"`` for one body.
+        sizes: Vertices of each body, (C,), where ``vertices`` is one array of several bodies; else found.
+        stiffness: κ [1/s²], one or (C,): the square of the frequency at which a vertex swings about its place; infinite for
+            solvers that take hard constraints.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = RIGID_CLUSTER
+
+    vertices: str | Sequence | np.ndarray = field(default=())
+    sizes: Sequence[int] | np.ndarray | None = None
+    stiffness: float | Sequence[float] | np.ndarray = math.inf
+
+    def __post_init__(self):
+        super().__post_init__()
+        if isinstance(self.vertices, str) or not len(self.vertices) or np.ndim(self.vertices[0]) == 0:
+            return
+        if self.sizes is not None:
+            raise ValueError(f"{self.label} has sizes and a list for each body; at most one of the two may be given")
+        bodies = [own_indices(f"{self.label}.vertices[{c}]", body) for c, body in enumerate(self.vertices)]
+        object.__setattr__(self, "vertices", np.concatenate(bodies))
+        object.__setattr__(self, "sizes", np.array([len(body) for body in bodies]))
+
+    def _bodies(self, mesh):
+        """Vertices of each body, a list of index arrays."""
+        if isinstance(self.vertices, str):
+            if self.sizes is not None:
+                raise ValueError(f"{self.label} has sizes and a selection, which is one body; leave sizes out")
+            return [mesh.select(self.vertices)]
+        vertices = own_indices(f"{self.label}.vertices", self.vertices)
+        sizes = np.array([len(vertices)]) if self.sizes is None else own_indices(f"{self.label}.sizes", self.sizes)
+        if sizes.sum() != len(vertices) or (sizes < 1).any():
+            raise ValueError(
+                f"{self.label}.sizes is {shown(sizes.tolist())}; it must be 1 or more each and {len(vertices)} in all"
+            )
+        return np.split(vertices, np.cumsum(sizes)[:-1])
+
+    def stencil(self, mesh):
+        bodies = [
+            distinct_vertices(f"{self.label}.vertices, body {c}", body, mesh) for c, body in enumerate(self._bodies(mesh))
+        ]
+        return np.concatenate(bodies)[:, None]
+
+    def _stiffness(self, count):
+        return self._of_elements("stiffness", 1 if self.sizes is None else len(self.sizes))
+
+    def elements(self, mesh, positions):
+        found = super().elements(mesh, positions)
+        return replace(found, cells=np.cumsum([0, *(len(body) for body in self._bodies(mesh))]))
+
+
 TERMS = {
     cls.__name__: cls
     for cls in (
@@ -398,8 +467,25 @@ TERMS = {
         Attachment,
         SpringLimit,
         StrainLimit,
+        RigidCluster,
     )
 }
+
+
+def own_indices(name, indices):
+    """Indices that a user gave as (E,) int32.
+
+    Raises:
+        ValueError: If they are no whole numbers in a row.
+    """
+    try:
+        found = np.asarray(indices)
+    except ValueError:  # rows of different lengths
+        found = np.asarray(None)
+    found = found.astype(np.int32) if found.size == 0 else found
+    if found.ndim != 1 or found.dtype.kind not in "iu":
+        raise ValueError(f"{name} is {shown(indices)}; it must be a list of whole numbers")
+    return found.astype(np.int32)
 
 
 def _product(cls, youngs_modulus, thickness):

@@ -1,0 +1,130 @@
+"""Factories of kernels over rigid clusters: where their vertices are to go, and Gauss–Seidel sweeps over whole clusters.
+
+A cluster c has the elements offsets[c] to offsets[c+1], one for each vertex, with rest places ``shape`` about its centre of
+mass and rest states (t, m), see :mod:`.terms.rigid_cluster`.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .assemble import types
+from .project import spread_compliance
+from .rotation import nearest_rotation
+
+
+@cache
+def fit(dtype, corrected: bool):
+    """The device function that sets t = c + R q − (x + d) of the elements first to last of a cluster, d = 0 if not ``corrected``.
+
+    All from the first vertex, so that nothing is lost far from the origin.
+    """
+    vec3, mat33 = types(dtype)
+    rest_type = wp.types.vector(4, dtype)
+
+    @wp.func
+    def from_first(stencil: wp.array2d(dtype=wp.int32), first: int, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
+        place = x[stencil[e, 0]] - x[stencil[first, 0]]
+        if wp.static(corrected):
+            place += d[stencil[e, 0]] - d[stencil[first, 0]]
+        return place
+
+    @wp.func
+    def fit_cluster(
+        first: int,
+        last: int,
+        stencil: wp.array2d(dtype=wp.int32),
+        rest: wp.array(dtype=rest_type),
+        shape: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+    ):
+        total = dtype(0.0)
+        for e in range(first, last):
+            total += rest[e][3]
+        centre = vec3()
+        for e in range(first, last):
+            centre += (rest[e][3] / total) * from_first(stencil, first, e, x, d)
+        S = mat33()
+        for e in range(first, last):
+            S += wp.outer((rest[e][3] / total) * (from_first(stencil, first, e, x, d) - centre), shape[e])
+        R = nearest_rotation(S)
+        for e in range(first, last):
+            t = centre + R * shape[e] - from_first(stencil, first, e, x, d)
+            rest[e] = rest_type(t[0], t[1], t[2], rest[e][3])
+
+    return fit_cluster
+
+
+@cache
+def fit_targets(dtype, corrected: bool):
+    """Kernel over clusters: the targets t of their elements at x, or with ``corrected`` at x + d."""
+    vec3, _ = types(dtype)
+    rest_type = wp.types.vector(4, dtype)
+    fit_cluster = fit(dtype, corrected)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def fit_all(
+        offsets: wp.array(dtype=wp.int32),
+        stencil: wp.array2d(dtype=wp.int32),
+        shape: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # in and out
+        rest: wp.array(dtype=rest_type),
+    ):
+        c = wp.tid()
+        fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
+
+    return fit_all
+
+
+@cache
+def correct_clusters(dtype, multipliers: bool, per_step: bool):
+    """Kernel of a Gauss–Seidel sweep: each cluster sees what those before it did, and all its vertices move at once.
+
+    Δxᵢ = (tᵢ − α̃λᵢ/mᵢ)/(1 + α̃), α̃ = 1/(κh²), λᵢ += mᵢΔxᵢ; as :func:`.project.correct_in_place` for clusters, of which a thread
+    takes ``each``.
+    """
+    vec3, _ = types(dtype)
+    rest_type, lambda_type = wp.types.vector(4, dtype), wp.types.matrix((1, 3), dtype)
+    fit_cluster, spread = fit(dtype, True), spread_compliance(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def correct(
+        offsets: wp.array(dtype=wp.int32),
+        shape: wp.array(dtype=vec3),
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        inverse_mass: wp.array(dtype=dtype),
+        x: wp.array(dtype=vec3),
+        first: int,
+        each: int,
+        h: dtype,
+        sweeps: int,
+        relaxation: dtype,
+        # in and out
+        lambdas: wp.array(dtype=lambda_type),
+        d: wp.array(dtype=vec3),
+    ):
+        start = first + wp.tid() * each
+        for c in range(start, start + each):
+            fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
+            for e in range(offsets[c], offsets[c + 1]):
+                v = stencil[e, 0]
+                compliance = dtype(1.0) / (stiffness[e] * h * h)
+                if wp.static(per_step):
+                    compliance = spread(dtype(1.0), compliance, sweeps)
+                if inverse_mass[v] > dtype(0.0) and wp.isfinite(compliance):
+                    t = vec3(rest[e][0], rest[e][1], rest[e][2])
+                    if wp.static(multipliers):
+                        t = t - (compliance * inverse_mass[v]) * lambdas[e][0]
+                    move = (relaxation / (dtype(1.0) + compliance)) * t
+                    d[v] = d[v] + move
+                    if wp.static(multipliers):
+                        after = lambdas[e]
+                        after[0] = after[0] + move / inverse_mass[v]
+                        lambdas[e] = after
+
+    return correct

@@ -1,0 +1,80 @@
+"""Rigid cluster: U = Σ_cells (κ/2) Σᵢ mᵢ‖xᵢ − (c + R qᵢ)‖², κ in 1/s² (Müller et al. 2005, *Meshless deformations based on
+shape matching*; Chao et al. 2010 for the energy).
+
+The only term of cells of variable size: c is the centre of mass of a cell's vertices and R the rotation nearest to
+Σ mᵢ(xᵢ − c)qᵢᵀ (Kabsch 1976), qᵢ the rest places about their own centre of mass. As c and R are the best there are,
+∂U/∂xᵢ = κmᵢ(xᵢ − c − R qᵢ), as if they stood still. So each vertex of each cell is an element of its own, (x₀), y = x₀, whose
+rest state is where it is to go, t = c + R q − x₀ [m], and mᵢ [kg]; the measure is mᵢ. t is set by :mod:`..clusters` wherever a
+gradient, an energy or a projection is asked for, and only good there.
+
+Its Hessian is at most κM, which is the one given here; what that counts too much is the motion of the cell as a whole.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..term import Term
+
+
+def rest_state(points, stencil, masses=1.0):
+    """t = 0 [m] and the masses (one or E) [kg] of the vertices ``stencil`` (E, 1), as an array (E, 4)."""
+    return np.column_stack([np.zeros((len(stencil), 3)), np.broadcast_to(masses, len(stencil))])
+
+
+@wp.func
+def weight(rest: Any, i: int):
+    w = wp.vector(length=1, dtype=rest.dtype)
+    w[0] = rest.dtype(1.0)
+    return w
+
+
+@wp.func
+def measure(rest: Any):
+    return rest[3]
+
+
+@wp.func
+def target(rest: Any):
+    """t as a matrix of the shape of y."""
+    t = wp.matrix(shape=(1, 3), dtype=rest.dtype)
+    for i in range(3):
+        t[0, i] = rest[i]
+    return t
+
+
+@wp.func
+def project(y: Any, rest: Any):
+    return y + target(rest)
+
+
+@wp.func
+def gradient(y: Any, rest: Any):
+    return -target(rest)
+
+
+@wp.func
+def energy(y: Any, rest: Any):
+    t = target(rest)
+    return y.dtype(0.5) * wp.ddot(t, t)
+
+
+@wp.func
+def hessian(y: Any, rest: Any, policy: int):
+    return wp.identity(n=3, dtype=y.dtype)
+
+
+RIGID_CLUSTER = Term(
+    name="RigidCluster",
+    vertices=1,
+    rows=1,
+    parameters=4,
+    rest_state=rest_state,
+    weight=weight,
+    measure=measure,
+    energy=energy,
+    gradient=gradient,
+    hessian=hessian,
+    project=project,
+)
