@@ -432,8 +432,11 @@ class RigidCluster(Declared):
         if isinstance(self.vertices, str):
             if self.sizes is not None:
                 raise ValueError(f"{self.label} has sizes and a selection, which is one body; leave sizes out")
-            return [mesh.select(self.vertices)]
+            found = mesh.select(self.vertices)
+            return [found] if len(found) else []
         vertices = own_indices(f"{self.label}.vertices", self.vertices)
+        if not len(vertices) and self.sizes is None:
+            return []
         sizes = np.array([len(vertices)]) if self.sizes is None else own_indices(f"{self.label}.sizes", self.sizes)
         if sizes.sum() != len(vertices) or (sizes < 1).any():
             raise ValueError(
@@ -445,7 +448,7 @@ class RigidCluster(Declared):
         bodies = [
             distinct_vertices(f"{self.label}.vertices, body {c}", body, mesh) for c, body in enumerate(self._bodies(mesh))
         ]
-        return np.concatenate(bodies)[:, None]
+        return np.concatenate([np.zeros(0, np.int32), *bodies])[:, None]
 
     def _stiffness(self, count):
         return self._of_elements("stiffness", 1 if self.sizes is None else len(self.sizes))

@@ -13,7 +13,7 @@ from ..kernels.minimise import add_inertia
 from ..linear import CopyFactors
 from ..operators import Sums, constant_matrices
 from ..status import Result
-from .solver import ImplicitStep, Stepper, refuse_hard
+from .solver import ImplicitStep, Stepper, refuse_cells, refuse_hard
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,9 @@ class ADMM(ImplicitStep):
         """The solver on ``model``, all scratch allocated.
 
         Raises:
-            ValueError: If a term has infinite stiffness.
+            ValueError: If a term has infinite stiffness, or cells.
         """
+        refuse_cells(model, "ADMM")
         refuse_hard(model, "ADMM", "PBD and XPBD take hard constraints, or give a finite stiffness")
         return ADMMStepper(self, model)
 

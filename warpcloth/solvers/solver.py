@@ -155,6 +155,21 @@ def refuse_hard(model, solver, instead):
             raise ValueError(f"{solver} cannot take {elements.label} with infinite stiffness; {instead}")
 
 
+def refuse_cells(model, solver):
+    """Refuses terms of cells, for a solver that takes elements one by one.
+
+    Raises:
+        ValueError: Naming the term, the solver and what would work; or as :func:`require_model`.
+    """
+    require_model(model)
+    for elements in model.terms:
+        if elements.cells:
+            raise ValueError(
+                f"{solver} cannot take {elements.label}, whose bodies are no elements by themselves; "
+                "PBD, XPBD, ProjectiveDynamics, Newton or Explicit can"
+            )
+
+
 def refuse_without_projection(model, solver):
     """Refuses terms whose energy is no squared distance to a set, for a solver that lives on that.
 
