@@ -15,7 +15,7 @@ from .rotation import nearest_rotation
 
 @cache
 def fit(dtype, corrected: bool):
-    """The device function that sets t = c + R q − (x + d) of the elements first to last of a cluster, d = 0 if not ``corrected``.
+    """The device function that sets t = c + R q − (x + d) of the elements first to last, where d is 0 if not ``corrected``.
 
     All from the first vertex, so that nothing is lost far from the origin.
     """

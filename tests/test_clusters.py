@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from test_solvers import allocations
 
 import warpcloth as wc
 from warpcloth.operators import Energy, Gradient, Sums
@@ -147,7 +148,7 @@ def test_a_compound_pendulum_has_its_period(device):
 
 @pytest.mark.parametrize(("substeps", "iterations"), [(1, 1), (4, 1), (1, 10)])
 def test_a_soft_body_hangs_as_deep_as_its_stiffness_says(substeps, iterations, device):
-    """XPBD, whatever step and iterations: a vertex below a pinned one, which counts 1000 m, comes to rest g/κ·(1 + 1/1000) lower.
+    """XPBD, whatever step and iterations: a vertex below a pinned one of weight 1000 comes to rest 1.001 g/κ lower.
 
     A single iteration leaves a thousandth of what it moves, gh².
     """
@@ -222,6 +223,14 @@ def test_copies_with_their_own_bodies(solver, device):
         terms = [replace(base.terms[0], stiffness=stiffness[copy]), base.terms[1]]
         alone = replace(base, terms=terms, masses=masses[copy], density=None)
         assert np.abs(batch[:, copy] - wc.simulate(alone, solver(substeps=2), **setup).points).max() < 1e-9
+
+
+@pytest.mark.parametrize("solver", [wc.PBD, wc.XPBD, wc.ProjectiveDynamics, wc.Explicit])
+def test_a_step_allocates_nothing(solver, device):
+    stepper = solver(substeps=1).bind(jelly(fps=240.0).build(device=device))
+    stepper.step()
+    with wp.ScopedMemoryTracker("steps", print=False) as tracker:
+        assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
 
 
 def test_two_cells_of_a_colour_share_no_vertex(device):
