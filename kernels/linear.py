@@ -1,9 +1,10 @@
-"""Factories of the kernels of a sparse system of 3×3 blocks: filling it, multiplying, conjugate gradients per copy.
+"""Factories of the kernels of a sparse system of 3×3 blocks: filling it, multiplying; of conjugate gradients per copy.
 
 The matrix is in block compressed rows (offsets, columns, values); every copy is a diagonal block of it, so that nothing here
 but the sums knows of copies. ``active[copy]`` is 1 while that copy still iterates.
 
-Kernels that always run together share a module: one of ten compiles faster than ten of one.
+Kernels that always run together share a module: one of ten compiles faster than ten of one. Those of conjugate gradients
+take unknowns that are vectors, with 3×3 blocks to precondition, or ``numbers``.
 """
 
 from functools import cache
@@ -138,22 +139,32 @@ def invert_diagonal(dtype):
     return invert_blocks
 
 
-@cache
-def start_iteration(dtype):
-    """Kernel over vertices: x = 0, r = b, z = P r, p = z."""
+def _unknowns(dtype, numbers):
+    """Type of an unknown, type of a diagonal block, name of the module."""
     vec3, mat33 = types(dtype)
+    name = f"warpcloth.conjugate_gradients.{dtype.__name__}"
+    return (dtype, dtype, f"{name}.numbers") if numbers else (vec3, mat33, name)
 
-    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
+
+@cache
+def start_iteration(dtype, numbers: bool = False):
+    """Kernel over unknowns: x = 0, r = b, z = P r, p = z."""
+    vector, block, module = _unknowns(dtype, numbers)
+
+    @wp.kernel(module=module, enable_backward=False)
     def start(
-        preconditioner: wp.array(dtype=mat33),
-        b: wp.array(dtype=vec3),
-        x: wp.array(dtype=vec3),
-        r: wp.array(dtype=vec3),
-        z: wp.array(dtype=vec3),
-        p: wp.array(dtype=vec3),
+        preconditioner: wp.array(dtype=block),
+        b: wp.array(dtype=vector),
+        x: wp.array(dtype=vector),
+        r: wp.array(dtype=vector),
+        z: wp.array(dtype=vector),
+        p: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        x[i] = vec3()
+        if wp.static(numbers):
+            x[i] = dtype(0.0)
+        else:
+            x[i] = vector()
         r[i] = b[i]
         z[i] = preconditioner[i] * b[i]
         p[i] = z[i]
@@ -163,19 +174,24 @@ def start_iteration(dtype):
 
 @cache
 def start_copies():
-    """Kernel over copies: every wanted copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0."""
+    """Kernel over copies: every wanted copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0.
+
+    size is ‖p‖² in the norm of the inverse preconditioner, in which the residuals of all iterations are orthogonal.
+    """
 
     @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def start(
         rz: wp.array(dtype=wp.float64),
         wanted: wp.array(dtype=wp.int32),
         first: wp.array(dtype=wp.float64),
+        size: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
         iteration: wp.array(dtype=wp.int32),
         proceed: wp.array(dtype=wp.int32),
     ):
         copy = wp.tid()
         first[copy] = rz[copy]
+        size[copy] = rz[copy]
         active[copy] = wp.where(rz[copy] > wp.float64(0.0), wanted[copy], 0)
         iteration[0] = 0
         proceed[0] = 1
@@ -184,35 +200,37 @@ def start_copies():
 
 
 @cache
-def advance(dtype):
-    """Kernel over vertices: x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy.
+def advance(dtype, numbers: bool = False):
+    """Kernel over unknowns: x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy.
 
     In a direction without positive curvature the first step of a copy is x = p, later ones leave x: a descent direction
-    either way (Steihaug 1983).
+    either way (Steihaug 1983). Of a matrix that is semi-definite by itself, with ``null`` above 0, x stays.
     """
-    vec3, mat33 = types(dtype)
+    vector, block, module = _unknowns(dtype, numbers)
 
-    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
-    def advance_vertices(
-        preconditioner: wp.array(dtype=mat33),
-        p: wp.array(dtype=vec3),
-        q: wp.array(dtype=vec3),
+    @wp.kernel(module=module, enable_backward=False)
+    def advance_unknowns(
+        preconditioner: wp.array(dtype=block),
+        p: wp.array(dtype=vector),
+        q: wp.array(dtype=vector),
         rz: wp.array(dtype=wp.float64),
         pq: wp.array(dtype=wp.float64),
+        size: wp.array(dtype=wp.float64),
+        null: wp.float64,
         active: wp.array(dtype=wp.int32),
         iteration: wp.array(dtype=wp.int32),
         per_copy: int,
         # in and out
-        x: wp.array(dtype=vec3),
-        r: wp.array(dtype=vec3),
+        x: wp.array(dtype=vector),
+        r: wp.array(dtype=vector),
         # out
-        z: wp.array(dtype=vec3),
+        z: wp.array(dtype=vector),
     ):
         i = wp.tid()
         copy = i // per_copy
         if active[copy] == 1:
-            if pq[copy] <= wp.float64(0.0):
-                if iteration[0] == 0:
+            if pq[copy] <= null * size[copy]:
+                if iteration[0] == 0 and null == wp.float64(0.0):
                     x[i] = p[i]
             else:
                 a = dtype(rz[copy] / pq[copy])
@@ -220,7 +238,7 @@ def advance(dtype):
                 r[i] = r[i] - a * q[i]
                 z[i] = preconditioner[i] * r[i]
 
-    return advance_vertices
+    return advance_unknowns
 
 
 @cache
@@ -233,8 +251,10 @@ def check_copies():
         pq: wp.array(dtype=wp.float64),
         first: wp.array(dtype=wp.float64),
         tolerance: wp.array(dtype=wp.float64),
+        null: wp.float64,
         # in and out
         rz: wp.array(dtype=wp.float64),
+        size: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
         negative: wp.array(dtype=wp.int32),
         # out
@@ -245,9 +265,10 @@ def check_copies():
         if active[copy] == 1:
             ratio[copy] = new_rz[copy] / rz[copy]
             rz[copy] = new_rz[copy]
-            if pq[copy] <= wp.float64(0.0):
+            if pq[copy] <= null * size[copy]:
                 negative[copy] = 1
                 active[copy] = 0
+            size[copy] = new_rz[copy] + ratio[copy] * ratio[copy] * size[copy]
             # Written so that NaN ends the iteration too; the caller sees it in the result.
             if not (new_rz[copy] > tolerance[copy] * tolerance[copy] * first[copy]):
                 active[copy] = 0
@@ -282,17 +303,17 @@ def limit_iterations():
 
 
 @cache
-def new_direction(dtype):
-    """Kernel over vertices: p = z + ratio p."""
-    vec3, _ = types(dtype)
+def new_direction(dtype, numbers: bool = False):
+    """Kernel over unknowns: p = z + ratio p."""
+    vector, _block, module = _unknowns(dtype, numbers)
 
-    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def turn(
-        z: wp.array(dtype=vec3),
+        z: wp.array(dtype=vector),
         ratio: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
         per_copy: int,
-        p: wp.array(dtype=vec3),
+        p: wp.array(dtype=vector),
     ):
         i = wp.tid()
         copy = i // per_copy

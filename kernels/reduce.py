@@ -42,6 +42,21 @@ def partial_dot(dtype):
 
 
 @cache
+def partial_product(dtype):
+    """Kernel over (copies, chunks): out[copy, chunk] = Σ a b of numbers."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def multiply_chunks(a: wp.array(dtype=dtype), b: wp.array(dtype=dtype), per_copy: int, out: wp.array2d(dtype=wp.float64)):
+        copy, chunk = wp.tid()
+        total = wp.float64(0.0)
+        for i in range(chunk, per_copy, out.shape[1]):
+            total += wp.float64(a[copy * per_copy + i]) * wp.float64(b[copy * per_copy + i])
+        out[copy, chunk] = total
+
+    return multiply_chunks
+
+
+@cache
 def finish_sum():
     """Kernel over copies: out[copy] = Σ partial[copy], and what out held too where ``accumulate`` is 1."""
 
@@ -81,6 +96,23 @@ def partial_largest(dtype):
         out[copy, chunk] = most
 
     return largest_of_chunks
+
+
+@cache
+def partial_largest_number():
+    """Kernel over (copies, chunks): out[copy, chunk] = max of numbers of 0 or more; NaN stays."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def largest_number_of_chunks(values: wp.array(dtype=wp.float64), per_copy: int, out: wp.array2d(dtype=wp.float64)):
+        copy, chunk = wp.tid()
+        most = wp.float64(0.0)
+        for i in range(chunk, per_copy, out.shape[1]):
+            value = values[copy * per_copy + i]
+            if most == most and not (value <= most):
+                most = value
+        out[copy, chunk] = most
+
+    return largest_number_of_chunks
 
 
 @cache

@@ -63,9 +63,12 @@ class Term:
             (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it does
             not), and how stiff a spring between them would be, kₑ = 1; or None.
         project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or None.
-        constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next two.
+        linear: Whether p does not depend on y, so that y − p is linear in the vertices.
+        constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next four.
         constraint_gradient: (y, rest) → ∂C/∂y (M, 3).
         constraint_hessian: (y, rest) → ∂²C/∂y² (3M, 3M).
+        stiffening: (y, rest, tension) → B (N, 3M), with BᵀB the positive half of tension·∂²C/∂y².
+        stiffening_rows: N.
         dissipation: :class:`Dissipation`, or None for what cannot be damped.
     """
 
@@ -82,7 +85,10 @@ class Term:
     slack: bool = False
     reach: Callable | None = None
     project: Any = None
+    linear: bool = False
     constraint: Any = None
     constraint_gradient: Any = None
     constraint_hessian: Any = None
+    stiffening: Any = None
+    stiffening_rows: int = 0
     dissipation: Dissipation | None = None

@@ -7,7 +7,7 @@ from .mesh import Mesh
 from .rotation import kabsch, polar, svd
 from .scene import Pins, Scene
 from .simulate import Animation, simulate
-from .solvers import ADMM, PBD, XPBD, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
+from .solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
 from .terms import (
     Attachment,
     CorotatedMembrane,
@@ -28,6 +28,7 @@ __all__ = [
     "Animation",
     "Arap",
     "Attachment",
+    "ConstrainedDynamics",
     "CorotatedMembrane",
     "Deformation",
     "DihedralBending",

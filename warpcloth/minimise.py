@@ -8,15 +8,14 @@ from .kernels import minimise as kernels
 from .kernels.linear import rounding
 from .kernels.term import HessianPolicy
 from .linear import ConjugateGradients, Factorised
-from .operators import Energy, Gradient, Hessian, Sums
+from .operators import Hessian, Sums
+from .search import Search
 from .status import Result
 
 # Roundings that a force takes: of the lengths, of the strain, of the products and of the sum over a vertex's elements.
 ROUNDINGS = 4.0
 # Of the energy that roundings lose at worst what they lose as a rule, adding up like a random walk.
 TYPICAL = 0.1
-# Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
-HALVINGS = 30
 
 POLICIES = {
     "adaptive": HessianPolicy.RAW,
@@ -48,59 +47,46 @@ class Minimiser:
     """
 
     def __init__(self, model, base, hessian, linear, s, load=0.0, linear_iterations=10_000):
-        self.model, self.base, self.s, self.load = model, base, s, load
+        self.model, self.base = model, base
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
-        self.gradient_of, self.energy_of = Gradient(model, corrected=True), Energy(model, self.sums, corrected=True)
+        self.search = Search(model, base, self.sums, s, load)
+        self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
         if linear == "cg":
             self.linear = ConjugateGradients(self.hessian, self.sums, linear_iterations)
         else:
             self.linear = Factorised(self.hessian)
-        self.correction, self.trial, self.gradient, self.direction, self.right = (model.vectors() for _ in range(5))
+        self.right = model.vectors()
         self.work, self.lost = (wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2))
 
         def per_copy(dtype):
             return wp.zeros(model.copies, dtype=dtype, device=model.device)
 
-        scalars = (per_copy(wp.float64) for _ in range(9))
-        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step, self.square = (next(scalars) for _ in range(6))
-        self.rounding, self.lost_energy, self.acceleration = scalars
-        self.active, self.searching = per_copy(wp.int32), per_copy(wp.int32)
+        self.square, self.rounding, self.lost_energy, self.acceleration = (per_copy(wp.float64) for _ in range(4))
+        self.active = per_copy(wp.int32)
         self._active, self._policy = Mirror(self.active), Mirror(self.hessian.policy)
-        read = (self.energy, self.square, self.rounding, self.lost_energy, self.step, self.slope)
+        search = self.search
+        read = (search.energy, self.square, self.rounding, self.lost_energy, search.step, search.slope)
         self._energy, self._square, self._rounding, self._lost, self._step, self._slope = (Mirror(array) for array in read)
         self._acceleration = Mirror(self.acceleration)
         self.edge = float(np.median(model.scene.mesh.edge_lengths))
-        self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
-        # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
-        # energy to 2ε/e, so that √ε covers strains down to √ε.
-        self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
-        self._find_kernels()
+        self.kernels = {"negate": model.kernel(kernels.negate, model.dtype), "rounding": model.kernel(rounding, model.dtype)}
         self._record()
         self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         self.residual, self.iterations = np.zeros(model.copies), 0
-
-    def _find_kernels(self):
-        model = self.model
-        self.kernels = {
-            name: model.kernel(getattr(kernels, name), model.dtype) for name in ("set_trial", "add_inertia", "negate")
-        }
-        self.kernels["rounding"] = model.kernel(rounding, model.dtype)
-        names = ("begin_search", "check_trial", "begin_trial", "end_trial")
-        self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in names}
 
     def _record(self):
         device = self.model.device
         self._start = Segment(device, self._launch_start)
         self._assemble = Segment(device, self._launch_assemble)
         self._solve = Segment(device, self._launch_solve) if self.linear.capturable else self._launch_solve
-        self._search = Segment(device, self._launch_search)
+        self._step_on = Segment(device, self._launch_search)
 
     def set_objective(self, s, load):
         """Another s and load; what was recorded holds the old ones and is recorded again."""
-        self.s, self.load = s, load
+        self.search.s, self.search.load = s, load
         self._record()
 
     def minimise(self, tolerance, iterations):
@@ -134,7 +120,7 @@ class Minimiser:
             if self.linear.capturable:
                 self.linear.tolerance.write(np.clip(self.residual / first, 1e-12, 0.1))
             self._find_direction()
-            self._search()
+            self._step_on()
             self.iterations += 1
             noisy = self._square.read() <= ROUNDINGS**2 * self._rounding.read()
             before, energy = energy, self._energy.read().copy()
@@ -170,27 +156,12 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        self.correction.zero_()
-        self.direction.zero_()
-        self.step.zero_()
-        self._launch_trial()
-        self._launch_accept()
-
-    def _launch_trial(self):
-        """trial = d + step·p with its φ, ∇φ and slope φ'."""
-        model = self.model
-        N, n = model.count, model.per_copy
-        self._launch("set_trial", N, [self.correction, self.direction, self.step, n], [self.trial, self.gradient])
-        self.gradient_of.add(self.base, self.gradient, self.trial)
-        given = [model.mass, model.inverse_mass, model.gravity, n, self.s, self.load, self.trial]
-        self._launch("add_inertia", N, given, [self.gradient, self.work])
-        self.sums.sum(self.work, n, self.trial_energy)
-        self.energy_of.add(self.base, self.trial_energy, self.trial)
-        self.sums.dot(self.gradient, self.direction, self.trial_slope)
+        self.search.launch_start()
+        self._launch_norms()
 
     def _launch_assemble(self):
-        self.hessian.assemble(self.base, self.s, self.correction)
-        self._launch("negate", self.model.count, [self.gradient], [self.right])
+        self.hessian.assemble(self.base, self.search.s, self.correction)
+        self._launch("negate", self.model.count, [self.search.gradient], [self.right])
         hessian, model = self.hessian, self.model
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
         self._launch("rounding", model.count, [*given, np.finfo(model.numpy_dtype).eps, self.edge], [self.work, self.lost])
@@ -198,27 +169,17 @@ class Minimiser:
             self.sums.sum(values, model.per_copy, total)
 
     def _launch_solve(self):
-        self.linear.solve(self.right, self.direction, self.active)
+        self.linear.solve(self.right, self.search.direction, self.active)
 
     def _launch_search(self):
-        self.sums.dot(self.gradient, self.direction, self.slope)
-        self._launch("begin_search", self.model.copies, [self.active], [self.step, self.searching, self.trials, self.proceed])
-        wp.capture_while(self.proceed, self._try_step)
-        wp.copy(self.correction, self.trial)
-        self._launch_accept()
+        self.search.launch(self.active)
+        self._launch_norms()
 
-    def _launch_accept(self):
-        """φ, ‖∇φ‖² and the largest unbalanced acceleration of the trial become those of d."""
-        wp.copy(self.energy, self.trial_energy)
-        self.sums.dot(self.gradient, self.gradient, self.square)
-        self.sums.largest(self.model.inverse_mass, self.gradient, self.acceleration)
-
-    def _try_step(self):
-        self._launch_trial()
-        self._launch("begin_trial", 1, [], [self.trials, HALVINGS, self.proceed])
-        given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
-        self._launch("check_trial", self.model.copies, given, [self.step, self.searching, self.proceed])
-        self._launch("end_trial", 1, [self.trials, HALVINGS], [self.proceed])
+    def _launch_norms(self):
+        """‖∇φ‖² and the largest unbalanced acceleration at d."""
+        gradient = self.search.gradient
+        self.sums.dot(gradient, gradient, self.square)
+        self.sums.largest(self.model.inverse_mass, gradient, self.acceleration)
 
     def _launch(self, name, dim, inputs, outputs):
         self.model.launch(self.kernels[name], dim, inputs, outputs)

@@ -50,6 +50,29 @@ class Sums:
         self.model.launch(self._finish, self.model.copies, [self.partial, accumulate], [out])
 
 
+class RowSums(Sums):
+    """The same of numbers that every copy has ``per_copy`` of, such as the rows of constraints."""
+
+    def __init__(self, model, per_copy):
+        self.model, self.per_copy = model, per_copy
+        chunks = CHUNKS if model.device.is_cuda else 1
+        self.partial = wp.zeros((model.copies, chunks), dtype=wp.float64, device=model.device)
+        self._finish = model.kernel(reduce.finish_sum)
+        self._dot = model.kernel(reduce.partial_product, model.dtype)
+        self._largest = model.kernel(reduce.partial_largest_number)
+        self._finish_largest = model.kernel(reduce.finish_largest)
+
+    def dot(self, a, b, out):
+        """out (B,) = Σ a b of each copy."""
+        self.model.launch(self._dot, self.partial.shape, [a, b, self.per_copy], [self.partial])
+        self._add_chunks(0, out)
+
+    def largest(self, values, out):
+        """out (B,) = max of each copy of double precision ``values`` of 0 or more."""
+        self.model.launch(self._largest, self.partial.shape, [values, self.per_copy], [self.partial])
+        self.model.launch(self._finish_largest, self.model.copies, [self.partial], [out])
+
+
 class Gradient:
     """∂U/∂x of all terms [N]; or of the ``terms`` given."""
 
@@ -93,9 +116,13 @@ class Hessian:
         diagonal: Place of each diagonal block (N,).
         values: The blocks [N/m].
         policy: (B,) int32, a :class:`HessianPolicy` for each copy.
+        count, per_copy, vector, block: Unknowns, those of a copy, the types of one and of a diagonal block.
     """
 
+    null = 0.0  # see ConjugateGradients
+
     def __init__(self, model, policy=0, corrected=False, terms=None):
+        self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
         self.model, self.terms = model, model.terms if terms is None else terms
         device = model.device
         self.kernels = [model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected) for elements in self.terms]
@@ -105,6 +132,7 @@ class Hessian:
         self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=device)
         self._set_inertia = model.kernel(linear.set_inertia, model.dtype)
         self._add_blocks = model.kernel(linear.add_blocks, model.dtype)
+        self._multiply = self._invert_diagonal = None
         self._find_pattern()
 
     def _find_pattern(self):
@@ -145,6 +173,19 @@ class Hessian:
             arguments = [*elements.arguments, x, correction, elements.per_copy, self.policy]
             model.launch(kernel, elements.count, arguments, [blocks])
             model.launch(self._add_blocks, len(self.values), [*gather, blocks.flatten()], [self.values])
+
+    def prepare(self):
+        """Finds the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""
+        self._multiply = self.model.kernel(linear.multiply, self.model.dtype)
+        self._invert_diagonal = self.model.kernel(linear.invert_diagonal, self.model.dtype)
+
+    def multiply(self, p, q):
+        """q = A p."""
+        self.model.launch(self._multiply, self.count, [self.offsets, self.columns, self.values, p], [q])
+
+    def invert_diagonal(self, out):
+        """out = the inverse diagonal blocks."""
+        self.model.launch(self._invert_diagonal, self.count, [self.diagonal, self.values], [out])
 
     def matrices(self):
         """The values of now on the host, for each copy a scipy matrix in block compressed rows (3n, 3n), double precision."""

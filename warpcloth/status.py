@@ -15,6 +15,7 @@ class Result(Enum):
     ITERATIONS_USED_UP = "iterations used up"
     STALLED = "no step lowers the energy"
     SADDLE = "in balance, but not where the energy is least"
+    CONTRADICTED = "constraints contradict one another"
     DIVERGED = "diverged"
 
     def worse(self, other):

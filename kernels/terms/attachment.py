@@ -69,5 +69,6 @@ ATTACHMENT = Term(
     gradient=gradient,
     hessian=hessian,
     project=project,
+    linear=True,
     dissipation=Dissipation(rest=damped_rest),
 )

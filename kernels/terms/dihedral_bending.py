@@ -132,16 +132,52 @@ def flatten(g: Any):
 
 
 @wp.func
+def positive_half(g: Any, h: Any, ratio: Any, scale: Any):
+    """w with w wᵀ the positive half of scale·(g hᵀ + h gᵀ); ratio is |h|/|g|, and g ⟂ h."""
+    u = flatten(g) * wp.sqrt(ratio)
+    v = flatten(h) / wp.sqrt(ratio)
+    return wp.sqrt(wp.abs(scale) * scale.dtype(0.5)) * (u + wp.sign(scale) * v)
+
+
+@wp.func
 def product(g: Any, h: Any, ratio: Any, scale: Any, policy: int):
     """scale·(g hᵀ + h gᵀ), or its positive half or absolute value; ratio is |h|/|g|, and g ⟂ h."""
+    if policy == CLAMP:
+        w = positive_half(g, h, ratio, scale)
+        return wp.outer(w, w)
     u = flatten(g) * wp.sqrt(ratio)
     v = flatten(h) / wp.sqrt(ratio)
     if policy == RAW:
         return scale * (wp.outer(u, v) + wp.outer(v, u))
-    if policy == CLAMP:
-        w = u + wp.sign(scale) * v
-        return wp.abs(scale) * scale.dtype(0.5) * wp.outer(w, w)
     return wp.abs(scale) * (wp.outer(u, u) + wp.outer(v, v))
+
+
+@wp.func
+def factors(y: Any, corner: int):
+    """Of one triangle the covectors g, h and g', h', |h'|/|g'| of ∂²θ = Σ g hᵀ + h gᵀ + g'h'ᵀ + h'g'ᵀ."""
+    e = y[0]
+    length = wp.length(e)
+    t = e / length
+    one = y.dtype(1.0)
+    normal = wp.cross(e, y[corner])
+    if corner == 2:
+        normal = -normal
+    height = wp.length(normal) / length
+    foot = wp.dot(y[corner], e) / (length * length)
+    n = normal / wp.length(normal)
+    m = (y[corner] - foot * e) / height
+    # Lengths of the covectors over the four vertices, so that the split does not depend on which is x₀.
+    apex = wp.sqrt(one + foot * foot + (one - foot) * (one - foot)) / height
+    edge = wp.sqrt(y.dtype(2.0)) / length
+    sigma = apex_covector(t / height, foot, corner) + edge_covector(m * (y.dtype(0.5) / length))
+    ratio = wp.sqrt(apex * apex + y.dtype(0.25) * edge * edge) / edge
+    return (
+        apex_covector(n / height, foot, corner),
+        apex_covector(m / height, foot, corner),
+        edge_covector(n / length),
+        sigma,
+        ratio,
+    )
 
 
 @wp.func
@@ -150,27 +186,22 @@ def curvature(y: Any, scale: Any, policy: int):
     h = wp.matrix(shape=(9, 9), dtype=y.dtype)
     if undefined(y):
         return h
-    e = y[0]
-    length = wp.length(e)
-    t = e / length
-    one = y.dtype(1.0)
-    half = y.dtype(0.5)
     for corner in range(1, 3):
-        normal = wp.cross(e, y[corner])
-        if corner == 2:
-            normal = -normal
-        height = wp.length(normal) / length
-        foot = wp.dot(y[corner], e) / (length * length)
-        n = normal / wp.length(normal)
-        m = (y[corner] - foot * e) / height
-        # Lengths of the covectors over the four vertices, so that the split does not depend on which is x₀.
-        apex = wp.sqrt(one + foot * foot + (one - foot) * (one - foot)) / height
-        edge = wp.sqrt(y.dtype(2.0)) / length
-        h += product(apex_covector(n / height, foot, corner), apex_covector(m / height, foot, corner), one, scale, policy)
-        sigma = apex_covector(t / height, foot, corner) + edge_covector(m * (half / length))
-        ratio = wp.sqrt(apex * apex + y.dtype(0.25) * edge * edge) / edge
-        h += product(edge_covector(n / length), sigma, ratio, scale, policy)
+        g, around, turn, sigma, ratio = factors(y, corner)
+        h += product(g, around, y.dtype(1.0), scale, policy)
+        h += product(turn, sigma, ratio, scale, policy)
     return h
+
+
+@wp.func
+def stiffening(y: Any, rest: Any, tension: Any):
+    rows = wp.matrix(shape=(4, 9), dtype=y.dtype)
+    if not undefined(y):
+        for corner in range(1, 3):
+            g, around, turn, sigma, ratio = factors(y, corner)
+            rows[2 * corner - 2] = positive_half(g, around, y.dtype(1.0), tension)
+            rows[2 * corner - 1] = positive_half(turn, sigma, ratio, tension)
+    return rows
 
 
 @wp.func
@@ -217,5 +248,7 @@ DIHEDRAL_BENDING = Term(
     constraint=constraint,
     constraint_gradient=constraint_gradient,
     constraint_hessian=constraint_hessian,
+    stiffening=stiffening,
+    stiffening_rows=4,
     dissipation=Dissipation(rest=damped_rest),
 )

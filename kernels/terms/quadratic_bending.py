@@ -141,5 +141,6 @@ QUADRATIC_BENDING = Term(
     gradient=gradient,
     hessian=hessian,
     project=project,
+    linear=True,
     dissipation=Dissipation(rest=damped_rest, term=DAMPED_QUADRATIC_BENDING),
 )

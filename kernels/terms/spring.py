@@ -111,6 +111,16 @@ def constraint_hessian(y: Any, rest: Any):
 
 
 @wp.func
+def stiffening(y: Any, rest: Any, tension: Any):
+    length = wp.length(y[0])
+    rows = wp.matrix(shape=(3, 3), dtype=y.dtype)
+    if tension > y.dtype(0.0) and not collapsed(length, rest[0]):
+        direction = y[0] / length
+        rows = wp.sqrt(tension / length) * (wp.identity(n=3, dtype=y.dtype) - wp.outer(direction, direction))
+    return rows
+
+
+@wp.func
 def damped_length(length: Any, before: Any, rest_length: Any, share: Any):
     """L + share·(s̃ − L) of :class:`..term.Dissipation` for s = l; no less than 0, which is of no length."""
     s = length + (length - before) / type(length)(3.0)
@@ -140,5 +150,7 @@ SPRING = Term(
     constraint=constraint,
     constraint_gradient=constraint_gradient,
     constraint_hessian=constraint_hessian,
+    stiffening=stiffening,
+    stiffening_rows=3,
     dissipation=Dissipation(rest=damped_rest),
 )

@@ -1,6 +1,7 @@
 """One file a method: options, the equation and its source, the bound solver."""
 
 from .admm import ADMM
+from .constrained_dynamics import ConstrainedDynamics
 from .explicit import Explicit
 from .hierarchical_pbd import HierarchicalPBD
 from .newton import Newton
@@ -16,6 +17,17 @@ SOLVERS = {
     "pbd": PBD,
     "hierarchical-pbd": HierarchicalPBD,
     "xpbd": XPBD,
+    "constrained-dynamics": ConstrainedDynamics,
 }
 
-__all__ = ["ADMM", "PBD", "SOLVERS", "XPBD", "Explicit", "HierarchicalPBD", "Newton", "ProjectiveDynamics"]
+__all__ = [
+    "ADMM",
+    "PBD",
+    "SOLVERS",
+    "XPBD",
+    "ConstrainedDynamics",
+    "Explicit",
+    "HierarchicalPBD",
+    "Newton",
+    "ProjectiveDynamics",
+]

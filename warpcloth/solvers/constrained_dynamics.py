@@ -1,0 +1,224 @@
+"""Constrained dynamics with dual variables: implicit Euler for positions and the multipliers of compliant constraints."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..capture import Mirror, Segment
+from ..checks import choice, number, whole
+from ..constraints import Constraints
+from ..damping import refuse_apart
+from ..kernels import constrain as kernels
+from ..linear import ConjugateGradients, FactorisedRows
+from ..operators import RowSums, Sums
+from ..search import Search
+from ..status import Result
+from .solver import ImplicitStep, Stepper, refuse_hard, require_model
+
+STABILISATIONS = ("none", "geometric-stiffness", "line-search")
+# The most iterations of one solve by conjugate gradients.
+LINEAR_ITERATIONS = 10_000
+
+
+@dataclass(frozen=True)
+class ConstrainedDynamics(ImplicitStep):
+    """Implicit Euler with compliant constraints and multipliers λ (Servin, Lacoursière and Melin 2006, *Interactive simulation
+    of elastic deformable materials*; Tournier et al. 2015, *Stable constrained dynamics*), from x = x̃ and λ = 0.
+
+    An energy ½kA·C² is a constraint C with compliance 1/(kA), 0 for infinite stiffness, and λ = −kAh²C. With J = ∂C/∂x and
+    α̃ = 1/(kAh²) each iteration solves
+
+        [M̃, −Jᵀ; J, α̃][Δx; Δλ] = −[M(x − x̃) − Jᵀλ; C(x) + α̃λ]
+
+    through (J M̃⁻¹Jᵀ + α̃)Δλ = −(C + α̃λ) + J M̃⁻¹(M(x − x̃) − Jᵀλ). Springs and hinges have the published scalar C; other
+    terms have the rows C = y − p(y) with p held in an iteration, which is the step of projective dynamics; limits have none
+    inside their range. The system stays well conditioned however stiff the constraints are, and the fixed point is the x(t+h) of
+    :class:`warpcloth.Newton`, for infinite stiffness the point of C = 0 that is nearest to x̃.
+
+    One iteration with M̃ = M is the method as published. It leaves out −λ∂²C, across which a spring in tension overshoots once
+    the tension is above about m l/h², so that more iterations need a safeguard. Geometric stiffness (Tournier et al. 2015)
+    takes the positive half of it into M̃; here exactly, as rows B of compliance 1 with BᵀB = [−λ∂²C]₊, which keep M diagonal and
+    linear momentum to rounding. A line search uses that Δx is a direction of descent of 1/(2h²)‖x − x̃‖²_M + U (Gauss and Newton).
+
+    Attributes:
+        dt, substeps, integrator: See :class:`ImplicitStep`.
+        iterations: The most iterations a step.
+        tolerance: Of the residual: the largest unbalanced acceleration of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), or the largest that
+            would close C + α̃λ = 0 of a single constraint in a step, over gravity's (without any, over the first).
+        stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
+        linear: ``"cg"``, or ``"factorised"`` on the host. Redundant constraints are no matter to both.
+
+    Raises:
+        ValueError: If an option breaks a rule.
+    """
+
+    iterations: int = 20
+    tolerance: float = 1e-3
+    stabilisation: str = "geometric-stiffness"
+    linear: str = "cg"
+
+    def __post_init__(self):
+        super().__post_init__()
+        whole("iterations", self.iterations, 1)
+        number("tolerance", self.tolerance, above=0.0)
+        choice("stabilisation", self.stabilisation, STABILISATIONS)
+        choice("linear", self.linear, ("cg", "factorised"))
+
+    def bind(self, model):
+        """The solver on ``model``, all scratch allocated.
+
+        Raises:
+            ValueError: If a term has no constraint, or infinite stiffness where that has no place.
+        """
+        require_model(model)
+        if self.integrator != "euler":
+            solver = f"ConstrainedDynamics with integrator={self.integrator!r}"
+            refuse_hard(model, solver, "integrator='euler' can, or give a finite stiffness")
+        if self.stabilisation == "line-search":
+            instead = "stabilisation='geometric-stiffness' can, or give a finite stiffness"
+            refuse_hard(model, "ConstrainedDynamics with stabilisation='line-search'", instead)
+        refuse_unconstrained(model)
+        return ConstrainedDynamicsStepper(self, model)
+
+
+def refuse_unconstrained(model):
+    """Refuses terms that have no constraint, and hard ones whose projection moves: λ would keep parts of earlier directions.
+
+    Raises:
+        ValueError: Naming the term, the solver and what would work.
+    """
+    refuse_apart(model, "ConstrainedDynamics")
+    for elements in model.terms:
+        term = elements.term
+        if term.constraint is None and term.project is None:
+            raise ValueError(
+                f"ConstrainedDynamics cannot take {elements.label}, whose energy is no square of a constraint; "
+                "Newton or Explicit can"
+            )
+        if elements.hard and term.constraint is None and not term.linear:
+            raise ValueError(
+                f"ConstrainedDynamics cannot take {elements.label} with infinite stiffness, as it has no scalar constraint; "
+                "PBD and XPBD can, or give a finite stiffness"
+            )
+
+
+class ConstrainedDynamicsStepper(Stepper):
+    """:class:`ConstrainedDynamics` on a model.
+
+    Attributes:
+        constraints: The :class:`warpcloth.constraints.Constraints`, with λ of the last step.
+        correction: x − x̃ of the last step, (N,) [m].
+        iterations: Iterations of the last step.
+    """
+
+    def __init__(self, options, model):
+        super().__init__(options, model, options.integrator)
+        model, device = self.model, self.model.device
+        self.constraints = Constraints(model, self.he, options.stabilisation == "geometric-stiffness")
+        self._sums, self._row_sums = Sums(model), RowSums(model, self.constraints.per_copy)
+        self._search = None
+        if options.stabilisation == "line-search":
+            self._search = Search(model, self.state.x, self._sums, 1.0 / self.he**2)
+            self.correction, self._direction, self._step = self._search.correction, self._search.direction, self._search.step
+        else:
+            self.correction, self._direction = model.vectors(), model.vectors()
+            self._step = wp.zeros(model.copies, dtype=wp.float64, device=device)
+        self._moves, self._mismatch = model.vectors(), model.vectors()
+        self._right, self._change = (wp.zeros(self.constraints.count, dtype=model.dtype, device=device) for _ in range(2))
+        if options.linear == "cg":
+            self._linear = ConjugateGradients(self.constraints, self._row_sums, LINEAR_ITERATIONS)
+        else:
+            self._linear = FactorisedRows(self.constraints)
+        self._ones = model.constant(1.0, model.count)
+
+        def per_copy(dtype):
+            return Mirror(wp.zeros(model.copies, dtype=dtype, device=device))
+
+        self._active, self._stepped = per_copy(wp.int32), Mirror(self._step)
+        self._unbalanced, self._open, self._rounding = (per_copy(wp.float64) for _ in range(3))
+        self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("mismatch", "negate_rows")}
+        self._advance = [model.kernel(kernels.advance, model.dtype, vectors) for vectors in (True, False)]
+        self._begin_step = model.kernel(kernels.begin_step)
+        self._gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
+        self.iterations = 0
+        self._start = Segment(device, self._launch_start)
+        self._solve = Segment(device, self._launch_solve) if self._linear.capturable else self._launch_solve
+        self._move = Segment(device, self._launch_move)
+        self._finish = Segment(device, lambda: self.launch_finish(self.correction))
+
+    def step(self):
+        self._start()
+        first, options = self._residual().copy(), self.options
+        scale = np.where(self._gravity > 0.0, self._gravity, np.where(first != 0.0, first, 1.0))
+        stuck = contradicted = np.zeros(len(scale), dtype=bool)
+        least = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
+        self.iterations = 0
+        while True:
+            residual = self._residual() / scale
+            finite = np.isfinite(residual)
+            converged = finite & (residual <= options.tolerance)
+            rounded = finite & (residual * scale * self.he**2 <= self._rounding.read())
+            active = finite & ~(converged | rounded | stuck)
+            if not active.any() or self.iterations == options.iterations:
+                break
+            self._active.write(active)
+            # A tenth of what the step is allowed.
+            self._linear.tolerance.write(np.clip(0.1 * options.tolerance / np.where(active, residual, 1.0), least, 0.1))
+            self._solve()
+            self._move()
+            contradicted = np.where(active, self._linear.negative.read() != 0, contradicted)
+            stuck = stuck | (active & (self._stepped.read() == 0.0))
+            self.iterations += 1
+        self._finish()
+        self.residual = np.maximum(self.residual, residual)  # keeps NaN
+        conditions = [~finite, converged, rounded, contradicted, stuck]
+        results = [Result.DIVERGED, Result.CONVERGED, Result.ROUNDED, Result.CONTRADICTED, Result.STALLED]
+        now = np.select(conditions, np.array(results, dtype=object), Result.ITERATIONS_USED_UP)
+        self.results = [before.worse(each) for before, each in zip(self.results, now, strict=True)]
+
+    def _residual(self):
+        """The larger of both accelerations [m/s²] of each copy (B,)."""
+        return np.maximum(self._unbalanced.read(), self._open.read()) / self.he**2
+
+    # What the segments record.
+
+    def _launch_start(self):
+        self.launch_prediction()
+        if self._search:
+            self._search.launch_start()
+        self.correction.zero_()
+        self.constraints.multipliers.zero_()
+        self._launch_linearise()
+
+    def _launch_linearise(self):
+        """J, both residuals and the right-hand side at d and λ."""
+        constraints, model = self.constraints, self.model
+        constraints.launch_linearise(self.state.x, self.correction)
+        constraints.launch_moves(constraints.multipliers, self._moves)
+        self._launch("mismatch", model.count, [self.correction, self._moves], [self._mismatch])
+        self._launch("negate_rows", constraints.count, [constraints.gap], [self._right])
+        constraints.launch_apply(self._mismatch, self._right)
+        self._sums.largest(self._ones, self._mismatch, self._unbalanced.array)
+        self._row_sums.largest(constraints.residual, self._open.array)
+        self._row_sums.largest(constraints.rounding, self._rounding.array)
+
+    def _launch_solve(self):
+        self._linear.solve(self._right, self._change, self._active.array)
+
+    def _launch_move(self):
+        """Δx = W JᵀΔλ − (x − x̃ − W Jᵀλ), and a step along Δx and Δλ."""
+        model, constraints = self.model, self.constraints
+        constraints.launch_moves(self._change, self._moves)
+        self._launch("mismatch", model.count, [self._moves, self._mismatch], [self._direction])
+        if self._search:
+            self._search.launch(self._active.array)
+        else:
+            model.launch(self._begin_step, model.copies, [self._active.array], [self._step])
+            model.launch(self._advance[0], model.count, [self._step, self._direction, model.per_copy], [self.correction])
+        given = [self._step, self._change, constraints.per_copy]
+        model.launch(self._advance[1], constraints.count, given, [constraints.multipliers])
+        self._launch_linearise()
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.model.launch(self._kernels[name], dim, inputs, outputs)
