@@ -256,6 +256,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(capfd):
         ("hierarchical-pbd", "substeps=4"),
         ("xpbd", "substeps=4"),
         ("projective-dynamics", "substeps=4"),
+        ("constrained-dynamics", "substeps=4"),
         ("admm", "substeps=4"),
         ("explicit", "by default the fewest stable ones, limits "),
     ],

@@ -233,7 +233,8 @@ def test_momentum_is_kept(name, solver, device):
 
 
 @pytest.mark.parametrize(
-    "solver", [wc.Newton, wc.PBD, wc.HierarchicalPBD, wc.XPBD, wc.ProjectiveDynamics, wc.ADMM, wc.Explicit]
+    "solver",
+    [wc.Newton, wc.PBD, wc.HierarchicalPBD, wc.XPBD, wc.ProjectiveDynamics, wc.ADMM, wc.ConstrainedDynamics, wc.Explicit],
 )
 def test_it_calms_a_cloth(solver, device):
     """The same motion with and without: springs end with lower rates of length, by far, and the centre does not move."""
@@ -286,7 +287,7 @@ def test_damped_steps_meet_at_one_minimiser(integrator, device):
 
 
 @pytest.mark.parametrize("name", [name for name in DAMPED if "Membrane" in name])
-@pytest.mark.parametrize("solver", [wc.PBD, wc.HierarchicalPBD, wc.XPBD, wc.ProjectiveDynamics])
+@pytest.mark.parametrize("solver", [wc.PBD, wc.HierarchicalPBD, wc.XPBD, wc.ProjectiveDynamics, wc.ConstrainedDynamics])
 def test_what_does_not_merge_is_refused(name, solver, device):
     with pytest.raises(ValueError, match=f"cannot take (the damping of )?{name}, .*; Newton"):
         solver(substeps=1).bind(crumpled(name).build(device=device))

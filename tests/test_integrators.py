@@ -16,6 +16,10 @@ SOLVERS = {
     "newton": wc.Newton(substeps=1, tolerance=1e-11),
     "newton factorised": wc.Newton(substeps=1, tolerance=1e-11, linear="factorised"),
     "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=200),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=1, tolerance=1e-11, iterations=200),
+    "constrained dynamics searching": wc.ConstrainedDynamics(
+        substeps=1, tolerance=1e-11, iterations=200, stabilisation="line-search", linear="factorised"
+    ),
     "admm": wc.ADMM(substeps=1, tolerance=1e-10, iterations=4000, weight=1.0),
     "xpbd": wc.XPBD(substeps=1, iterations=120),
     "xpbd scalar": wc.XPBD(substeps=1, iterations=120, form="scalar"),

@@ -271,6 +271,8 @@ SOLVERS = {
     "projective dynamics": wc.ProjectiveDynamics(substeps=4),
     "projective dynamics plain": wc.ProjectiveDynamics(substeps=4, acceleration="none"),
     "admm": wc.ADMM(substeps=4),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=4, iterations=4),
+    "constrained dynamics searching": wc.ConstrainedDynamics(substeps=4, iterations=4, stabilisation="line-search"),
 }
 # Hinges by their angle are no distance to a set.
 FOLDED = ("bar_twist", "bunny")

@@ -36,6 +36,10 @@ SOLVERS = {
     "projective dynamics chebyshev": wc.ProjectiveDynamics(substeps=1, iterations=16, acceleration="chebyshev"),
     "projective dynamics l-bfgs": wc.ProjectiveDynamics(substeps=1, iterations=8, acceleration="l-bfgs"),
     "projective dynamics matrix-free": wc.ProjectiveDynamics(substeps=1, iterations=8, linear="jacobi"),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=1, iterations=4),
+    "constrained dynamics factorised": wc.ConstrainedDynamics(substeps=1, iterations=4, linear="factorised"),
+    "constrained dynamics searching": wc.ConstrainedDynamics(substeps=1, iterations=4, stabilisation="line-search"),
+    "constrained dynamics once": wc.ConstrainedDynamics(substeps=1, iterations=1, stabilisation="none"),
     "admm": wc.ADMM(substeps=1, iterations=4),
 }
 PAIR = wc.Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), edges=[[0, 1]])
@@ -243,6 +247,10 @@ def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
         (lambda: wc.ProjectiveDynamics(substeps=1, acceleration="lbfgs"), "acceleration is 'lbfgs'; it must be one of 'none'"),
         (lambda: wc.ProjectiveDynamics(substeps=1, window=0), "window is 0"),
         (lambda: wc.ProjectiveDynamics(substeps=1, linear="cg"), "linear is 'cg'; it must be one of 'factorised', 'jacobi'"),
+        (lambda: wc.ConstrainedDynamics(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.ConstrainedDynamics(substeps=1, tolerance=0.0), "tolerance is 0.0"),
+        (lambda: wc.ConstrainedDynamics(substeps=1, stabilisation="on"), "stabilisation is 'on'; it must be one of 'none'"),
+        (lambda: wc.ConstrainedDynamics(substeps=1, linear="lu"), "linear is 'lu'"),
         (lambda: wc.ADMM(substeps=1, iterations=0), "iterations is 0"),
         (lambda: wc.ADMM(substeps=1, tolerance=-1.0), "tolerance is -1.0"),
         (lambda: wc.ADMM(substeps=1, weight=0.0), "weight is 0.0"),
@@ -316,7 +324,7 @@ def test_moving_pins_follow_their_keyframes(device):
         duration=1.0,
     )
     solvers = [record(substeps=4) for record in (wc.Newton, wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD)]
-    solvers += [record(substeps=4) for record in (wc.ProjectiveDynamics, wc.ADMM)]
+    solvers += [record(substeps=4) for record in (wc.ProjectiveDynamics, wc.ADMM, wc.ConstrainedDynamics)]
     solvers += [wc.Newton(substeps=4, integrator=integrator) for integrator in ("midpoint", "bdf2")]
     for solver in solvers:
         stepper = solver.bind(scene.build(device=device, dtype="float64"))

@@ -165,6 +165,8 @@ class FactorisedRows:
         self.tolerance = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))
         self.negative = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
         self._mirrors = {}
+        if matrix.count:
+            matrix.matrices()  # allocates what it needs
 
     def solve(self, b, x, wanted):
         """x = A⁻¹ b to the ``tolerance`` (B,) of each copy that is wanted, 0 for the rest and where A is not finite."""

@@ -33,19 +33,20 @@ class ConstrainedDynamics(ImplicitStep):
 
     through (J M̃⁻¹Jᵀ + α̃)Δλ = −(C + α̃λ) + J M̃⁻¹(M(x − x̃) − Jᵀλ). Springs and hinges have the published scalar C; other
     terms have the rows C = y − p(y) with p held in an iteration, which is the step of projective dynamics; limits have none
-    inside their range. The system stays well conditioned however stiff the constraints are, and the fixed point is the x(t+h) of
+    inside their range. No stiffness is too large for the system, and the fixed point is the x(t+h) of
     :class:`warpcloth.Newton`, for infinite stiffness the point of C = 0 that is nearest to x̃.
 
     One iteration with M̃ = M is the method as published. It leaves out −λ∂²C, across which a spring in tension overshoots once
     the tension is above about m l/h², so that more iterations need a safeguard. Geometric stiffness (Tournier et al. 2015)
-    takes the positive half of it into M̃; here exactly, as rows B of compliance 1 with BᵀB = [−λ∂²C]₊, which keep M diagonal and
-    linear momentum to rounding. A line search uses that Δx is a direction of descent of 1/(2h²)‖x − x̃‖²_M + U (Gauss and Newton).
+    takes the positive half of it into M̃; here exactly, as rows B of compliance 1 with BᵀB = [−λ∂²C]₊, which keep M diagonal
+    and linear momentum to rounding. A line search uses that Δx leads down 1/(2h²)‖x − x̃‖²_M + U (it is that of Gauss and
+    Newton).
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
         iterations: The most iterations a step.
-        tolerance: Of the residual: the largest unbalanced acceleration of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), or the largest that
-            would close C + α̃λ = 0 of a single constraint in a step, over gravity's (without any, over the first).
+        tolerance: Of the residual: the largest unbalanced acceleration of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), or the largest
+            that would close C + α̃λ = 0 of a single constraint in a step, over gravity's (without any, over the first).
         stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
         linear: ``"cg"``, or ``"factorised"`` on the host. Redundant constraints are no matter to both.
 
