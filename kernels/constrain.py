@@ -45,6 +45,8 @@ def first_row(e: int, per_copy: int, first: int, rows_per_copy: int, rows: int):
 def linearise(term: Term, dtype, scalar: bool, curved: bool):
     """Kernel over elements at x̃ + d: gap = C + α̃λ, the Jacobian, α̃ = 1/(kAh²), the inverse diagonal of J W Jᵀ + α̃.
 
+    α̃ is no less than ``least`` of the diagonal of J W Jᵀ, or redundant hard rows would leave λ undetermined; carried [m] is the
+    move of a vertex by which that holds them open, next to nothing but where they contradict one another.
     residual [m] is the move of a vertex that closes the gap by itself, rounding [m] what of that and of the force precision
     does not hold. Of a hard row without direction the residual is |C|.
     """
@@ -77,6 +79,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         h: dtype,
+        least: dtype,
         per_copy: int,
         first: int,
         rows_per_copy: int,
@@ -89,6 +92,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
         inverse: wp.array(dtype=dtype),
         residual: wp.array(dtype=wp.float64),
         rounding: wp.array(dtype=wp.float64),
+        carried: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
         s = first_row(e, per_copy, first, rows_per_copy, Q)
@@ -115,9 +119,6 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
                 more = stiffening(y, r, -held)
                 for n in range(N):
                     covectors[1 + n] = more[n]
-        lambdas[s] = held
-        gap[s] = c + alpha * held
-        compliance[s] = alpha
         for j in range(1, Q):
             lambdas[s + j] = dtype(0.0)
             gap[s + j] = dtype(0.0)
@@ -125,7 +126,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
         slopes[e] = covectors
         lost = dtype(0.0)
         for j in range(Q):
-            total = compliance[s + j]
+            total = dtype(0.0)
             most = dtype(0.0)
             for i in range(K):
                 w = weight(r, i)
@@ -135,8 +136,16 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
                 free = inverse_mass[stencil[e, i]]
                 total += free * wp.dot(direction, direction)
                 most = wp.max(most, free * wp.length(direction))
+            if j == 0:
+                excess = wp.max(least * total - alpha, dtype(0.0))
+                alpha += excess
+                lambdas[s] = held
+                gap[s] = c + alpha * held
+                compliance[s] = alpha
+            total += compliance[s + j]
             inverse[s + j] = wp.where(total == dtype(0.0), dtype(0.0), dtype(1.0) / total)
             if j == 0:
+                carried[s] = wp.float64(most * excess * wp.abs(held) * inverse[s])
                 left += wp.float64(most * wp.abs(gap[s]) * inverse[s])
                 lost = most * (steep * size_of(stencil, e, r, x, d) * inverse[s] + wp.abs(held))
         residual[s] = left
@@ -151,6 +160,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         h: dtype,
+        least: dtype,
         per_copy: int,
         first: int,
         rows_per_copy: int,
@@ -163,6 +173,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
         inverse: wp.array(dtype=dtype),
         residual: wp.array(dtype=wp.float64),
         rounding: wp.array(dtype=wp.float64),
+        carried: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
         s = first_row(e, per_copy, first, rows_per_copy, Q)
@@ -178,13 +189,15 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
             c = y_type()
         size = size_of(stencil, e, r, x, d)
         for m in range(M):
-            total = alpha
+            total = dtype(0.0)
             most = dtype(0.0)
             if active:
                 for i in range(K):
                     w = wp.abs(weight(r, i)[m])
                     total += inverse_mass[stencil[e, i]] * w * w
                     most = wp.max(most, inverse_mass[stencil[e, i]] * w)
+            excess = wp.max(least * total - alpha, dtype(0.0))
+            total += alpha + excess
             inverted = wp.where(total == dtype(0.0), dtype(0.0), dtype(1.0) / total)
             row = vec3()
             force = vec3()
@@ -193,10 +206,11 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
                 if not active:
                     lambdas[j] = dtype(0.0)
                 force[a] = lambdas[j]
-                row[a] = c[m, a] + alpha * force[a]
+                row[a] = c[m, a] + (alpha + excess) * force[a]
                 gap[j] = row[a]
-                compliance[j] = alpha
+                compliance[j] = alpha + excess
                 inverse[j] = inverted
+            carried[s + 3 * m] = wp.float64(most * excess * wp.length(force) * inverted)
             residual[s + 3 * m] = wp.float64(most * wp.length(row) * inverted)
             lost = most * (size * inverted + wp.length(force))
             rounding[s + 3 * m] = wp.float64(dtype(ROUNDINGS) * epsilon(lost) * lost)

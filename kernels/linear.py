@@ -174,24 +174,19 @@ def start_iteration(dtype, numbers: bool = False):
 
 @cache
 def start_copies():
-    """Kernel over copies: every wanted copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0.
-
-    size is ‖p‖² in the norm of the inverse preconditioner, in which the residuals of all iterations are orthogonal.
-    """
+    """Kernel over copies: every wanted copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0."""
 
     @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def start(
         rz: wp.array(dtype=wp.float64),
         wanted: wp.array(dtype=wp.int32),
         first: wp.array(dtype=wp.float64),
-        size: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
         iteration: wp.array(dtype=wp.int32),
         proceed: wp.array(dtype=wp.int32),
     ):
         copy = wp.tid()
         first[copy] = rz[copy]
-        size[copy] = rz[copy]
         active[copy] = wp.where(rz[copy] > wp.float64(0.0), wanted[copy], 0)
         iteration[0] = 0
         proceed[0] = 1
@@ -204,7 +199,7 @@ def advance(dtype, numbers: bool = False):
     """Kernel over unknowns: x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy.
 
     In a direction without positive curvature the first step of a copy is x = p, later ones leave x: a descent direction
-    either way (Steihaug 1983). Of a matrix that is semi-definite by itself, with ``null`` above 0, x stays.
+    either way (Steihaug 1983).
     """
     vector, block, module = _unknowns(dtype, numbers)
 
@@ -215,8 +210,6 @@ def advance(dtype, numbers: bool = False):
         q: wp.array(dtype=vector),
         rz: wp.array(dtype=wp.float64),
         pq: wp.array(dtype=wp.float64),
-        size: wp.array(dtype=wp.float64),
-        null: wp.float64,
         active: wp.array(dtype=wp.int32),
         iteration: wp.array(dtype=wp.int32),
         per_copy: int,
@@ -229,8 +222,8 @@ def advance(dtype, numbers: bool = False):
         i = wp.tid()
         copy = i // per_copy
         if active[copy] == 1:
-            if pq[copy] <= null * size[copy]:
-                if iteration[0] == 0 and null == wp.float64(0.0):
+            if pq[copy] <= wp.float64(0.0):
+                if iteration[0] == 0:
                     x[i] = p[i]
             else:
                 a = dtype(rz[copy] / pq[copy])
@@ -251,10 +244,8 @@ def check_copies():
         pq: wp.array(dtype=wp.float64),
         first: wp.array(dtype=wp.float64),
         tolerance: wp.array(dtype=wp.float64),
-        null: wp.float64,
         # in and out
         rz: wp.array(dtype=wp.float64),
-        size: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
         negative: wp.array(dtype=wp.int32),
         # out
@@ -265,10 +256,9 @@ def check_copies():
         if active[copy] == 1:
             ratio[copy] = new_rz[copy] / rz[copy]
             rz[copy] = new_rz[copy]
-            if pq[copy] <= null * size[copy]:
+            if pq[copy] <= wp.float64(0.0):
                 negative[copy] = 1
                 active[copy] = 0
-            size[copy] = new_rz[copy] + ratio[copy] * ratio[copy] * size[copy]
             # Written so that NaN ends the iteration too; the caller sees it in the result.
             if not (new_rz[copy] > tolerance[copy] * tolerance[copy] * first[copy]):
                 active[copy] = 0

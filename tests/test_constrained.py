@@ -1,4 +1,4 @@
-"""Constrained dynamics: the published step, the minimiser it shares with Newton, hard, redundant and contradicting constraints."""
+"""Constrained dynamics: the published step, the minimiser, hard constraints, redundant ones and those that contradict."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -295,12 +295,16 @@ def test_stiffness_from_1_to_1e12(dtype, linear, device):
     mesh = wc.Mesh.chain(7)
     terms = [wc.Spring(stiffness=k)]
     declared = wc.Scene(mesh, masses=np.full(7, 0.1), terms=terms, pins=[0], fps=5.0)
-    stepper, x = after(declared, constrained(linear=linear, tolerance=1e-5), device, dtype, steps=200)
+    tolerance = 1e-4 if dtype == "float32" else 1e-10
+    stepper, x = after(declared, constrained(linear=linear, tolerance=tolerance), device, dtype, steps=200)
     assert stepper.results[0] in (Result.CONVERGED, Result.ROUNDED)
     load = 9.81 * 0.1 * np.arange(6, 0, -1)
     rest = mesh.edge_lengths
-    eps = np.finfo(dtype).eps
-    assert np.allclose(strains(declared, x) * rest, load / k, rtol=1e-3 if dtype == "float32" else 1e-6, atol=8 * eps)
+    # What the step and the least compliance, 2ε^0.7 of the move by a load of six masses, leave open.
+    open_by = (tolerance + 12.0 * np.finfo(dtype).eps ** 0.7) * 9.81 * stepper.h**2
+    assert np.allclose(strains(declared, x) * rest, load / k, rtol=1e-4, atol=open_by)
+    pull = -stepper.constraints.multipliers.numpy().reshape(6, -1)[:, 0] / stepper.h**2
+    assert np.allclose(pull, load, rtol=10.0 * tolerance)
 
 
 @each_linear
@@ -321,17 +325,14 @@ def test_nothing_to_solve(linear, device):
 @each_linear
 @pytest.mark.parametrize("stiffness", [1e3, np.inf])
 def test_springs_without_direction(stiffness, linear, device):
-    """Springs of no length pull their ends together; collapsed ones have no direction, and hard ones then say so."""
+    """Springs of no length pull their ends together; a collapsed one has no direction, and a hard one then stays open."""
     zero = replace(tetrahedron(lengths=0.0, stiffness=stiffness, moved=0.0), gravity=(0.0, 0.0, 0.0))
     stepper, x = after(zero, constrained(linear=linear, iterations=1), device)
     assert np.isfinite(x).all()
-    chain = wc.Mesh.chain(3)
-    terms = [wc.Spring(stiffness=stiffness)]
-    start = np.array([[0.0, 0.0, 0.0], [0.0, -0.5, 0.0], [0.0, -0.5, 0.0]])
-    collapsed = wc.Scene(chain, masses=np.ones(3), positions=start, terms=terms, pins=[0])
+    collapsed = replace(hanging_mass(stiffness, 1.0, 0.0), positions=np.ones((2, 3)), pins=[])
     stepper, x = after(collapsed, constrained(linear=linear), device)
-    assert np.isfinite(x).all()
-    assert (stepper.results[0] is Result.CONVERGED) == np.isfinite(stiffness)
+    assert np.allclose(x, [1.0, 1.0 - 9.81 / 3600, 1.0])
+    assert stepper.results == [Result.CONVERGED if np.isfinite(stiffness) else Result.ITERATIONS_USED_UP]
 
 
 def test_what_is_not_finite_is_said(device):

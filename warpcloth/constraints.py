@@ -39,10 +39,10 @@ class TermRows:
         """Where its rows are: from ``first`` on in the ``per_copy`` of each copy."""
         self._first, self._where = first, [self.elements.per_copy, first, per_copy]
 
-    def launch_linearise(self, x, d, h, multipliers, gap, compliance, inverse, residual, rounding):
-        """Of x + d its part of what :func:`warpcloth.kernels.constrain.linearise` makes."""
-        model, out = self.model, [gap, compliance, inverse, residual, rounding]
-        given = [*self.elements.arguments, model.inverse_mass, x, d, h, *self._where]
+    def launch_linearise(self, x, d, h, least, multipliers, *out):
+        """Of x + d its part of what :func:`warpcloth.kernels.constrain.linearise` makes, in the order of that."""
+        model = self.model
+        given = [*self.elements.arguments, model.inverse_mass, x, d, h, least, *self._where]
         model.launch(self._linearise, self.elements.count, given, [multipliers, self._slopes, *out])
 
     def launch_apply(self, v, out):
@@ -89,7 +89,7 @@ class Constraints:
         count, per_copy: Rows of all copies and of one.
         multipliers: λ (count,) [kg m over the unit of the constraint].
         gap: C + α̃λ (count,).
-        residual, rounding: (count,) [m], see :func:`warpcloth.kernels.constrain.linearise`.
+        residual, rounding, carried: (count,) [m], see :func:`warpcloth.kernels.constrain.linearise`.
     """
 
     def __init__(self, model, h, curved):
@@ -106,18 +106,18 @@ class Constraints:
             return wp.zeros(self.count, dtype=dtype, device=model.device)
 
         self.multipliers, self.gap, self._compliance, self._inverse = (rows() for _ in range(4))
-        self.residual, self.rounding = rows(wp.float64), rows(wp.float64)
+        self.residual, self.rounding, self.carried = (rows(wp.float64) for _ in range(3))
         self._vectors = model.vectors()
         self._weigh, self._scale = (model.kernel(factory, model.dtype) for factory in (kernels.weigh, kernels.scale_rows))
         self.vector = self.block = model.dtype
-        # A direction in which A has less than this of its diagonal is one in which redundant rows agree or contradict.
-        self.null = float(np.finfo(model.numpy_dtype).eps) ** (2.0 / 3.0)
+        # Of redundant hard rows A would be singular, and what they share of λ undetermined.
+        self.least = float(np.finfo(model.numpy_dtype).eps) ** 0.7
 
     def launch_linearise(self, x, d):
         """All rows at x + d, with λ as it is."""
-        out = [self.multipliers, self.gap, self._compliance, self._inverse, self.residual, self.rounding]
+        out = [self.multipliers, self.gap, self._compliance, self._inverse, self.residual, self.rounding, self.carried]
         for part in self.parts:
-            part.launch_linearise(x, d, self.h, *out)
+            part.launch_linearise(x, d, self.h, self.least, *out)
 
     def launch_apply(self, v, out):
         """out += J v."""

@@ -13,12 +13,12 @@ class ConjugateGradients:
     """Solves A x = b for each copy by conjugate gradients with the inverse diagonal blocks as preconditioner.
 
     Runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) fell to its tolerance times the first, or at
-    a direction without positive curvature, pᵀAp ≤ ``null``·pᵀP⁻¹p: then x is a descent direction of ½xᵀAx − bᵀx all the same
-    and ``negative`` is 1 (Steihaug 1983). Of a singular A, which has ``null`` above 0, x stays in its range.
+    a direction without positive curvature: then x is a descent direction of ½xᵀAx − bᵀx all the same and ``negative`` is 1
+    (Steihaug 1983).
 
     Args:
-        matrix: A, such as :class:`warpcloth.operators.Hessian`: what it has of ``count``, ``per_copy``, ``vector``, ``block``
-            and ``null``, ``prepare``, ``multiply`` and ``invert_diagonal``.
+        matrix: A, such as :class:`warpcloth.operators.Hessian`: what it has of ``count``, ``per_copy``, ``vector`` and
+            ``block``, ``prepare``, ``multiply`` and ``invert_diagonal``.
         sums: :class:`warpcloth.operators.Sums` over its unknowns.
         iterations: The most iterations of one solve.
     """
@@ -39,7 +39,7 @@ class ConjugateGradients:
         def per_copy(dtype):
             return wp.zeros(model.copies, dtype=dtype, device=model.device)
 
-        self.rz, self.new_rz, self.pq, self.first, self.ratio, self.size = (per_copy(wp.float64) for _ in range(6))
+        self.rz, self.new_rz, self.pq, self.first, self.ratio = (per_copy(wp.float64) for _ in range(5))
         self.active, self.negative, self.tolerance = (
             per_copy(wp.int32),
             Mirror(per_copy(wp.int32)),
@@ -59,20 +59,19 @@ class ConjugateGradients:
         self._launch("start_iteration", N, [self.preconditioner, b], [x, self.r, self.z, self.p])
         self.sums.dot(self.r, self.z, self.rz)
         self.negative.array.zero_()
-        started = [self.first, self.size, self.active, self.iteration, self.proceed]
-        self._launch("start_copies", B, [self.rz, wanted], started)
+        self._launch("start_copies", B, [self.rz, wanted], [self.first, self.active, self.iteration, self.proceed])
         wp.capture_while(self.proceed, self._iterate, x=x)
 
     def _iterate(self, x):
-        N, B, n, null = self.matrix.count, self.model.copies, self.matrix.per_copy, self.matrix.null
+        N, B, n = self.matrix.count, self.model.copies, self.matrix.per_copy
         self.matrix.multiply(self.p, self.q)
         self.sums.dot(self.p, self.q, self.pq)
-        scalars = [self.rz, self.pq, self.size, null, self.active, self.iteration, n]
+        scalars = [self.rz, self.pq, self.active, self.iteration, n]
         self._launch("advance", N, [self.preconditioner, self.p, self.q, *scalars], [x, self.r, self.z])
         self.sums.dot(self.r, self.z, self.new_rz)
         self._launch("begin_check", 1, [], [self.iteration, self.proceed])
-        given = [self.new_rz, self.pq, self.first, self.tolerance.array, null]
-        changed = [self.rz, self.size, self.active, self.negative.array, self.ratio, self.proceed]
+        given = [self.new_rz, self.pq, self.first, self.tolerance.array]
+        changed = [self.rz, self.active, self.negative.array, self.ratio, self.proceed]
         self._launch("check_copies", B, given, changed)
         self._launch("limit_iterations", 1, [self.iteration, self.iterations], [self.proceed])
         self._launch("new_direction", N, [self.z, self.ratio, self.active, n], [self.p])
@@ -148,10 +147,7 @@ class Factorised:
 
 
 class FactorisedRows:
-    """Solves A x = b for A = J W Jᵀ + α̃ of constraint rows by a sparse factorisation on the host, singular or not.
-
-    Scaled to a unit diagonal and shifted by ``null`` A is definite; iterative refinement takes the shift out again, in the
-    range of A. ``negative`` is 1 for a copy whose b is not in that range (to a hundredth): its rows contradict one another.
+    """Solves A x = b for A = J W Jᵀ + α̃ of constraint rows by a sparse factorisation on the host, scaled to a unit diagonal.
 
     Args:
         matrix: The :class:`warpcloth.constraints.Constraints`.
@@ -160,23 +156,19 @@ class FactorisedRows:
     capturable = False
 
     def __init__(self, matrix):
-        self.matrix, model = matrix, matrix.model
-        self.model = model
-        self.tolerance = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))
-        self.negative = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
+        self.matrix, self.model = matrix, matrix.model
         self._mirrors = {}
         if matrix.count:
             matrix.matrices()  # allocates what it needs
 
     def solve(self, b, x, wanted):
-        """x = A⁻¹ b to the ``tolerance`` (B,) of each copy that is wanted, 0 for the rest and where A is not finite."""
-        from scipy.sparse import diags, identity
+        """x = A⁻¹ b of each copy that is wanted, NaN where A or b is not finite, 0 for the rest."""
+        from scipy.sparse import diags
         from scipy.sparse.linalg import splu
 
         right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
         sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
-        solution, negative = np.zeros_like(sides), np.zeros(self.model.copies, dtype=bool)
-        matrices, tolerance = self.matrix.matrices(), self.tolerance.read()
+        solution, matrices = np.zeros_like(sides), self.matrix.matrices()
         for copy in np.flatnonzero(wanted.read()):
             A, side = matrices[copy], sides[copy]
             if not (np.isfinite(A.data).all() and np.isfinite(side).all()):
@@ -184,20 +176,13 @@ class FactorisedRows:
                 continue
             diagonal = A.diagonal()
             scale = np.divide(1.0, np.sqrt(diagonal), out=np.zeros_like(diagonal), where=diagonal > 0.0)
-            A, side = (diags(scale) @ A @ diags(scale)).tocsc(), scale * side
+            A, side = diags(scale) @ A @ diags(scale) + diags((scale == 0.0).astype(float)), scale * side
             options = {"SymmetricMode": True, "Equil": False}
-            shifted = (A + 1e-10 * identity(len(side), format="csc")).tocsc()
-            factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-            found, rest = np.zeros_like(side), side
-            for _ in range(4):
-                found = found + factor.solve(rest)
-                rest = side - A @ found
-                if np.linalg.norm(rest) <= tolerance[copy] * np.linalg.norm(side):
-                    break
-            negative[copy] = np.linalg.norm(rest) > 1e-2 * np.linalg.norm(side)
+            factor = splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            found = factor.solve(side)
+            found += factor.solve(side - A @ found)  # redundant rows leave A hardly definite
             solution[copy] = scale * found
         left.write(solution.ravel())
-        self.negative.write(negative)
 
     def _mirror(self, array):
         """The mirror of an array, built when the array is first seen."""

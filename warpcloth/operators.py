@@ -119,8 +119,6 @@ class Hessian:
         count, per_copy, vector, block: Unknowns, those of a copy, the types of one and of a diagonal block.
     """
 
-    null = 0.0  # see ConjugateGradients
-
     def __init__(self, model, policy=0, corrected=False, terms=None):
         self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
         self.model, self.terms = model, model.terms if terms is None else terms
