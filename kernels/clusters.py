@@ -15,7 +15,7 @@ from .rotation import nearest_rotation
 
 @cache
 def fit(dtype, corrected: bool):
-    """The device function that sets t = c + R q − (x + d) of the elements first to last, where d is 0 if not ``corrected``.
+    """The device function that sets t = c + R q − (x + d) of the elements first to last, where d is 0 if not ``corrected``; R.
 
     All from the first vertex, so that nothing is lost far from the origin.
     """
@@ -52,6 +52,7 @@ def fit(dtype, corrected: bool):
         for e in range(first, last):
             t = centre + R * shape[e] - from_first(stencil, first, e, x, d)
             rest[e] = rest_type(t[0], t[1], t[2], rest[e][3])
+        return R
 
     return fit_cluster
 
@@ -74,7 +75,7 @@ def fit_targets(dtype, corrected: bool):
         rest: wp.array(dtype=rest_type),
     ):
         c = wp.tid()
-        fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
+        _R = fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
 
     return fit_all
 
@@ -110,7 +111,7 @@ def correct_clusters(dtype, multipliers: bool, per_step: bool):
     ):
         start = first + wp.tid() * each
         for c in range(start, start + each):
-            fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
+            _R = fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
             for e in range(offsets[c], offsets[c + 1]):
                 v = stencil[e, 0]
                 compliance = dtype(1.0) / (stiffness[e] * h * h)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from .cluster_rows import ClusterRows
 from .kernels import constrain as kernels
 
 
@@ -94,7 +95,9 @@ class Constraints:
 
     def __init__(self, model, h, curved):
         self.model, self.h = model, h
-        self.parts = [TermRows(model, elements, curved) for elements in model.terms]
+        self.parts = [
+            ClusterRows(model, elements) if elements.cells else TermRows(model, elements, curved) for elements in model.terms
+        ]
         self.per_copy = sum(part.count for part in self.parts)
         self.count = self.per_copy * model.copies
         first = 0

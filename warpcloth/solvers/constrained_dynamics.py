@@ -103,7 +103,7 @@ def refuse_unconstrained(model):
                 f"ConstrainedDynamics cannot take {elements.label}, whose energy is no square of a constraint; "
                 "Newton or Explicit can"
             )
-        if elements.hard and term.constraint is None and not term.linear:
+        if elements.hard and term.constraint is None and not (term.linear or elements.cells):
             raise ValueError(
                 f"ConstrainedDynamics cannot take {elements.label} with infinite stiffness, as it has no scalar constraint; "
                 "PBD and XPBD can, or give a finite stiffness"
