@@ -8,6 +8,7 @@ import warp as wp
 from test_solvers import allocations
 
 import warpcloth as wc
+from warpcloth.constraints import Constraints
 from warpcloth.operators import Energy, Gradient, Sums
 from warpcloth.scenes import mobile
 from warpcloth.solvers.explicit import step_limits
@@ -98,7 +99,41 @@ def test_one_sweep_makes_a_body_rigid(name, sweep, device):
     assert np.abs(np.cross(x, mass * (after - x)).sum(axis=0)).max() < 64 * EPS
 
 
-@pytest.mark.parametrize("solver", [wc.PBD(substeps=1), wc.XPBD(substeps=1, iterations=5)])
+@each_body
+def test_rows_are_what_no_rigid_motion_takes_up(name, device):
+    """J = (I − Q)√M at a turned rest shape: central differences of √m(x − c − R q), its transpose, its matrix and its rank."""
+    rest = np.array(BODIES[name])
+    c, s = np.cos(2.0), np.sin(2.0)
+    x = rest @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).T + [0.0, 0.0, 8.0]
+    scene = body(rest, positions=x, stiffness=50.0)
+    model = scene.build(device=device, dtype="float64")
+    constraints, still = Constraints(model, 1 / 60, False), model.vectors()
+
+    def gap(places):
+        constraints.launch_linearise(model.array(places, model.vec3), still)
+        return constraints.gap.numpy().copy()
+
+    rng = np.random.default_rng(0)
+    v, rows, delta = rng.normal(size=rest.shape), rng.normal(size=constraints.count), 1e-6
+    slope = (gap(x + delta * v) - gap(x - delta * v)) / (2.0 * delta)
+    assert np.abs(gap(x)).max() < 64 * EPS * 8.0
+    applied, pulled = wp.zeros(constraints.count, dtype=wp.float64, device=device), model.vectors()
+    constraints.launch_apply(model.array(v, model.vec3), applied)
+    assert np.abs(applied.numpy() - slope).max() < 1e-8  # ε/δ of places 10 m away
+    constraints.parts[0].launch_transpose(wp.array(rows, dtype=wp.float64, device=device), pulled)
+    assert (applied.numpy() * rows).sum() == pytest.approx((v * pulled.numpy()).sum(), rel=1e-12)
+    values, row, column = constraints.parts[0].entries()
+    J = np.zeros((constraints.count, rest.size))
+    np.add.at(J, (row, column), values)
+    assert np.abs(J @ v.ravel() - applied.numpy()).max() < 64 * EPS
+    assert np.linalg.matrix_rank(J, tol=1e-9) == rest.size - (6 if name in ("solid", "flat") else 5)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [wc.PBD(substeps=1), wc.XPBD(substeps=1, iterations=5), wc.ConstrainedDynamics(substeps=1, tolerance=1e-9)],
+    ids=["pbd", "xpbd", "constrained-dynamics"],
+)
 def test_two_bars_hinge_at_a_shared_vertex(solver, device):
     """Free in space and folding: both keep their lengths, the angle changes, linear momentum stays to rounding."""
     rest = np.array([[-1.0, 0, 0], [-0.5, 0, 0], [0, 0, 0], [0.5, 0, 0], [1.0, 0, 0]])
@@ -122,7 +157,7 @@ def test_two_bars_hinge_at_a_shared_vertex(solver, device):
     assert np.dot(a, b) > -0.5, "it has folded"
 
 
-def pendulum(substeps, **scene):
+def pendulum(**scene):
     """A rigid bar of three vertices that swings about its pinned first one from 0.05 rad."""
     rest, angle = np.array([[0.0, 0, 0], [0, -0.5, 0], [0, -1.0, 0]]), 0.05
     c, s = np.cos(angle), np.sin(angle)
@@ -130,14 +165,13 @@ def pendulum(substeps, **scene):
     return body(rest, masses=[0.0, 1.0, 2.0], positions=x, pins=[0], gravity=(0.0, -9.81, 0.0), **scene)
 
 
-def test_a_compound_pendulum_has_its_period(device):
+@pytest.mark.parametrize("solver", [wc.XPBD(substeps=1, iterations=4), wc.ConstrainedDynamics(substeps=1, tolerance=1e-9)])
+def test_a_compound_pendulum_has_its_period(solver, device):
     """ω = √(m g d/I), I = Σ m r²: the angle after 0.5 s tends to 0.05 cos ωt (a part of 0.05²/16 slower), at order 1."""
     omega = np.sqrt(9.81 * (1.0 * 0.5 + 2.0 * 1.0) / (1.0 * 0.25 + 2.0 * 1.0)) * (1.0 - 0.05**2 / 16)
     errors = []
     for substeps in (10, 20, 40):
-        stepper = wc.XPBD(substeps=substeps, iterations=4).bind(
-            pendulum(substeps, fps=20.0).build(device=device, dtype="float64")
-        )
+        stepper = replace(solver, substeps=substeps).bind(pendulum(fps=20.0).build(device=device, dtype="float64"))
         for _ in range(10 * substeps):
             stepper.step()
         x = stepper.state.x.numpy()[2]
@@ -181,6 +215,13 @@ SOFT = {
     "projective dynamics matrix-free": wc.ProjectiveDynamics(
         substeps=1, tolerance=1e-11, iterations=10_000, acceleration="none", linear="jacobi"
     ),
+    **{
+        f"constrained dynamics {safe} {linear}": wc.ConstrainedDynamics(
+            substeps=1, tolerance=1e-11, iterations=100, stabilisation=safe, linear=linear
+        )
+        for safe in ("geometric-stiffness", "line-search")
+        for linear in ("cg", "factorised")
+    },
     "xpbd": wc.XPBD(substeps=1, iterations=3000),
     "xpbd jacobi": wc.XPBD(substeps=1, iterations=10_000, sweep="constraint-averaged"),
 }
@@ -210,7 +251,9 @@ def test_soft_bodies_meet_at_one_minimiser(device):
         assert np.abs(x - ends["newton"]).max() < 1e-8, name
 
 
-@pytest.mark.parametrize("solver", [wc.PBD, wc.XPBD, wc.ProjectiveDynamics, wc.Newton, wc.Explicit, wc.HierarchicalPBD])
+@pytest.mark.parametrize(
+    "solver", [wc.PBD, wc.XPBD, wc.ConstrainedDynamics, wc.ProjectiveDynamics, wc.Newton, wc.Explicit, wc.HierarchicalPBD]
+)
 def test_copies_with_their_own_bodies(solver, device):
     """Three copies with other stiffness, gravity and masses are three runs, and the same run gives the same bits."""
     base, stiffness = jelly(fps=240.0), np.array([[2e3, 5e3], [1e2, 1e3], [7e3, 7e3]])
@@ -225,7 +268,7 @@ def test_copies_with_their_own_bodies(solver, device):
         assert np.abs(batch[:, copy] - wc.simulate(alone, solver(substeps=2), **setup).points).max() < 1e-9
 
 
-@pytest.mark.parametrize("solver", [wc.PBD, wc.XPBD, wc.ProjectiveDynamics, wc.Explicit])
+@pytest.mark.parametrize("solver", [wc.PBD, wc.XPBD, wc.ConstrainedDynamics, wc.ProjectiveDynamics, wc.Explicit])
 def test_a_step_allocates_nothing(solver, device):
     stepper = solver(substeps=1).bind(jelly(fps=240.0).build(device=device))
     stepper.step()
@@ -285,6 +328,17 @@ def test_a_level_mobile_stays_level(device):
         else:
             assert np.abs(points[[2, 5], 1] - points[[3, 6], 1]).max() < 1e-3
             assert np.abs(points[1:7] - rest[1:7]).max() < 1e-2
+
+
+def test_a_mobile_moves_alike_with_two_methods(device):
+    """XPBD and constrained dynamics of the same step end 1e-4 m apart after a second; as hard joints, they share no code."""
+    scene = mobile.scene(n=5)
+    ends = [
+        wc.simulate(scene, solver, device=device, dtype="float64", frames=60).points[-1]
+        for solver in (wc.XPBD(substeps=20, iterations=20), wc.ConstrainedDynamics(substeps=20))
+    ]
+    assert np.abs(ends[0][:7] - scene.mesh.points[:7]).max() > 0.1
+    assert np.abs(ends[1][:7] - ends[0][:7]).max() < 1e-4
 
 
 @pytest.mark.parametrize(

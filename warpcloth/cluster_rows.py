@@ -1,5 +1,7 @@
 """The constraint rows of rigid clusters, beside those of terms in :mod:`warpcloth.constraints`."""
 
+from itertools import pairwise
+
 import numpy as np
 import warp as wp
 
@@ -64,7 +66,7 @@ class ClusterRows:
         inertia, R = (array.numpy().astype(np.float64) for array in (self._inertia, self._rotations))
         stencil, offsets, found = self.elements.stencil.numpy()[:, 0], self.cells.offsets.numpy(), []
         per_copy, first, rows_per_copy = self._where
-        for cell, (start, stop) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
+        for cell, (start, stop) in enumerate(pairwise(offsets)):
             if not R[cell].any():
                 continue
             elements = np.arange(start, stop)

@@ -14,7 +14,7 @@ from ..linear import ConjugateGradients, FactorisedRows
 from ..operators import RowSums, Sums
 from ..search import Search
 from ..status import Result
-from .solver import ImplicitStep, Stepper, refuse_cells, refuse_hard
+from .solver import ImplicitStep, Stepper, refuse_hard, require_model
 
 STABILISATIONS = ("none", "geometric-stiffness", "line-search")
 # The most iterations of one solve by conjugate gradients.
@@ -78,7 +78,7 @@ class ConstrainedDynamics(ImplicitStep):
         Raises:
             ValueError: If a term has no constraint, or infinite stiffness where that has no place.
         """
-        refuse_cells(model, "ConstrainedDynamics")
+        require_model(model)
         if self.integrator != "euler":
             solver = f"ConstrainedDynamics with integrator={self.integrator!r}"
             refuse_hard(model, solver, "integrator='euler' can, or give a finite stiffness")
