@@ -223,6 +223,7 @@ SOFT = {
         for linear in ("cg", "factorised")
     },
     "xpbd": wc.XPBD(substeps=1, iterations=3000),
+    "xpbd sequential": wc.XPBD(substeps=1, iterations=3000, sweep="sequential"),
     "xpbd jacobi": wc.XPBD(substeps=1, iterations=10_000, sweep="constraint-averaged"),
 }
 
@@ -238,17 +239,41 @@ def jelly(**scene):
     return wc.Scene(mesh, density=1.0, terms=terms, velocities=velocities, pins=[0], **scene)
 
 
-def test_soft_bodies_meet_at_one_minimiser(device):
+@pytest.mark.parametrize("integrator", ["euler", "midpoint", "bdf2"])
+def test_soft_bodies_meet_at_one_minimiser(integrator, device):
     """After three steps all who minimise are where Newton is, to 1e-8 m; vector XPBD as its fixed point is implicit Euler."""
     ends = {}
     for name, solver in SOFT.items():
-        stepper = solver.bind(jelly().build(device=device, dtype="float64"))
+        stepper = replace(solver, integrator=integrator).bind(jelly().build(device=device, dtype="float64"))
         for _ in range(3):
             stepper.step()
         ends[name] = stepper.state.x.numpy()
         assert "xpbd" in name or stepper.results == [Result.CONVERGED], name
     for name, x in ends.items():
         assert np.abs(x - ends["newton"]).max() < 1e-8, name
+
+
+@pytest.mark.parametrize("iterations", [1, 5, 40])
+def test_pbd_per_step_moves_a_soft_body_alike(iterations, device):
+    """The part 1/(1 + α̃) of the way to its shape, α̃ = 1/(κh²), whatever the iterations, and its centre not at all."""
+    rest, kappa = np.array(BODIES["solid"]), 3000.0
+    x = rest + 0.2 * np.random.default_rng(1).normal(size=rest.shape)
+    scene = body(rest, positions=x, stiffness=kappa)
+    solver = wc.PBD(substeps=1, iterations=iterations, stiffness="per-step")
+    stepper = solver.bind(scene.build(device=device, dtype="float64"))
+    stepper.step()
+    part = 1.0 / (1.0 + 1.0 / (kappa * stepper.h**2))
+    expected = x + part * (best_fit(rest, x, scene.vertex_masses) - x)
+    assert np.abs(stepper.state.x.numpy() - expected).max() < 4 * iterations * 16 * EPS
+
+
+def test_a_soft_body_comes_to_rest_where_it_hangs(device):
+    """The rest shape: a vertex below a pinned one of weight 1000 hangs 1.001 g/κ lower."""
+    kappa = 2000.0
+    scene = body([[0.0, 0, 0], [0, -1.0, 0]], masses=[0.0, 3.0], stiffness=kappa, pins=[0], gravity=(0, -9.81, 0))
+    found = wc.equilibrium(scene, device=device)
+    assert found.status.result is Result.CONVERGED
+    assert -1.0 - found.points[1, 1] == pytest.approx(1.001 * 9.81 / kappa, rel=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -274,6 +299,24 @@ def test_a_step_allocates_nothing(solver, device):
     stepper.step()
     with wp.ScopedMemoryTracker("steps", print=False) as tracker:
         assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
+
+
+def test_bodies_by_selections_are_those_by_indices(device):
+    texts = ["x == 0", "corners", "index(5, 6, 9)"]
+    listed = [jelly().mesh.select(text) for text in texts]
+    for bodies in (texts, tuple(texts), np.array(texts)):
+        one, other = (
+            replace(jelly(), terms=[wc.RigidCluster(vertices=given, stiffness=[1.0, 2.0, 3.0])]).build(device=device).terms[0]
+            for given in (bodies, listed)
+        )
+        assert all(
+            np.array_equal(a.numpy(), b.numpy())
+            for a, b in (
+                (one.stencil, other.stencil),
+                (one.cells.offsets, other.cells.offsets),
+                (one.stiffness, other.stiffness),
+            )
+        )
 
 
 def test_two_cells_of_a_colour_share_no_vertex(device):
@@ -349,11 +392,15 @@ def test_a_mobile_moves_alike_with_two_methods(device):
         ({"vertices": [[0, 1], [1, 99]]}, "RigidCluster.vertices, body 1.* is 99; it must lie in 0 … 15"),
         ({"vertices": [[0, 1], [2, 2]]}, "RigidCluster.vertices, body 1 names vertex 2 twice"),
         ({"vertices": [[0, 1], [2.5]]}, r"RigidCluster.vertices\[1\] is \[2.5\]; it must be a list of whole numbers"),
-        ({"vertices": [[0, 1], "all"]}, r"RigidCluster.vertices\[1\] is 'all'"),
+        ({"vertices": [[0, 1], "all"]}, "RigidCluster.vertices has both selections and indices"),
+        ({"vertices": ["all", 3]}, "RigidCluster.vertices has both selections and indices"),
+        ({"vertices": 3}, "RigidCluster.vertices is 3; it must be a list of bodies or a selection"),
         ({"vertices": [0, 1, 2], "sizes": [2, 2]}, r"RigidCluster.sizes is \[2, 2\]; it must be 1 or more each and 3 in all"),
         ({"vertices": [[0, 1]], "sizes": [2]}, "RigidCluster has sizes and a list for each body"),
-        ({"vertices": "all", "sizes": [16]}, "RigidCluster has sizes and a selection"),
-        ({"vertices": "x > 9"}, "RigidCluster has no elements"),
+        ({"vertices": "all", "sizes": [16]}, "RigidCluster has sizes and selections"),
+        ({"vertices": "x > 9"}, "RigidCluster.vertices: 'x > 9' selects nothing"),
+        ({"vertices": ["all", "x > 9"]}, "RigidCluster.vertices: 'x > 9' selects nothing"),
+        ({"vertices": ["all", "z == 0"], "stiffness": [1.0, 2.0, 3.0]}, "RigidCluster.stiffness has shape"),
         ({"vertices": [[0, 1], [2, 3]], "stiffness": [1.0, 2.0, 3.0]}, "RigidCluster.stiffness has shape"),
         ({"vertices": [[0, 1]], "stiffness": -1.0}, "RigidCluster.stiffness is -1.0"),
     ],

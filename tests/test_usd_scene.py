@@ -51,6 +51,7 @@ def every_term():
             wc.RigidCluster(vertices=[[0, 1, 2], [2, 7]], stiffness=[1e3, 2e4]),
             wc.RigidCluster(vertices=[3, 4, 5], name="hard"),
             wc.RigidCluster(vertices="corners", stiffness=1e3, name="one body"),
+            wc.RigidCluster(vertices=["x == 0", "corners"], stiffness=[1e3, 2e3], name="by selections"),
             wc.StrainLimit(least=np.linspace(0.8, 0.9, len(sheet.triangles)), most=1 + 1 / 30, stiffness=1e4),
         ],
         name="every term",

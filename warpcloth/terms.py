@@ -400,11 +400,12 @@ class RigidCluster(Declared):
 
     Bodies that share a vertex hang together there. The mass of a vertex in several bodies counts in each. A pinned vertex
     counts as a thousand times all others of its body, so that the body turns about it. A body on a line keeps no
-    orientation about it.
+    orientation about it. Newton's method takes κM for the Hessian, which holds bodies back as a whole: a step of κh² above 1
+    takes more iterations, and ``equilibrium`` of bodies that move far may use up its own.
 
     Attributes:
         vertices: Indices of the bodies, one after the other, (E,); or a list of an array for each body; or a selection such as
-            ``"x < 0.1"`` for one body.
+            ``"x < 0.1"`` for one body, or a list of them.
         sizes: Vertices of each body, (C,), where ``vertices`` is one array of several bodies; else found.
         stiffness: κ [1/s²], one or (C,): the square of the frequency at which a vertex swings about its place; infinite for
             solvers that take hard constraints.
@@ -419,7 +420,14 @@ class RigidCluster(Declared):
 
     def __post_init__(self):
         super().__post_init__()
-        if isinstance(self.vertices, str) or not len(self.vertices) or np.ndim(self.vertices[0]) == 0:
+        if not isinstance(self.vertices, (str, Sequence)) and not (
+            isinstance(self.vertices, np.ndarray) and self.vertices.ndim
+        ):
+            raise ValueError(f"{self.label}.vertices is {shown(self.vertices)}; it must be a list of bodies or a selection")
+        texts = self._selections
+        if texts and self.sizes is not None:
+            raise ValueError(f"{self.label} has sizes and selections, which are one body each; leave sizes out")
+        if texts or not len(self.vertices) or np.ndim(self.vertices[0]) == 0:
             return
         if self.sizes is not None:
             raise ValueError(f"{self.label} has sizes and a list for each body; at most one of the two may be given")
@@ -427,13 +435,24 @@ class RigidCluster(Declared):
         object.__setattr__(self, "vertices", np.concatenate(bodies))
         object.__setattr__(self, "sizes", np.array([len(body) for body in bodies]))
 
+    @property
+    def _selections(self):
+        """The selection of each body, or () where bodies are given by indices."""
+        vertices = (self.vertices,) if isinstance(self.vertices, str) else self.vertices
+        texts = [isinstance(body, str) for body in vertices]
+        if any(texts) and not all(texts):
+            raise ValueError(
+                f"{self.label}.vertices has both selections and indices; all bodies must be given by one of the two"
+            )
+        return tuple(vertices) if any(texts) else ()
+
     def _bodies(self, mesh):
         """Vertices of each body, a list of index arrays."""
-        if isinstance(self.vertices, str):
-            if self.sizes is not None:
-                raise ValueError(f"{self.label} has sizes and a selection, which is one body; leave sizes out")
-            found = mesh.select(self.vertices)
-            return [found] if len(found) else []
+        if texts := self._selections:
+            bodies = [mesh.select(text) for text in texts]
+            for text in [text for text, body in zip(texts, bodies, strict=True) if not len(body)][:1]:
+                raise ValueError(f"{self.label}.vertices: {text!r} selects nothing; a body must have one vertex or more")
+            return bodies
         vertices = own_indices(f"{self.label}.vertices", self.vertices)
         if not len(vertices) and self.sizes is None:
             return []
@@ -451,7 +470,8 @@ class RigidCluster(Declared):
         return np.concatenate([np.zeros(0, np.int32), *bodies])[:, None]
 
     def _stiffness(self, count):
-        return self._of_elements("stiffness", 1 if self.sizes is None else len(self.sizes))
+        bodies = (len(self._selections) or 1) if self.sizes is None else len(self.sizes)
+        return self._of_elements("stiffness", bodies)
 
     def elements(self, mesh, positions):
         found = super().elements(mesh, positions)

@@ -73,7 +73,7 @@ ATTRIBUTES = (
     Attribute("terms.poisson_ratio", "warpcloth:terms:<name>:poissonRatio", "cloth", (_T.Double, _T.DoubleArray)),
     Attribute("terms.least", "warpcloth:terms:<name>:least", "cloth", (_T.Double, _T.DoubleArray)),
     Attribute("terms.most", "warpcloth:terms:<name>:most", "cloth", (_T.Double, _T.DoubleArray)),
-    Attribute("terms.vertices", "warpcloth:terms:<name>:vertices", "cloth", (_T.String, _T.IntArray)),
+    Attribute("terms.vertices", "warpcloth:terms:<name>:vertices", "cloth", (_T.String, _T.TokenArray, _T.IntArray)),
     Attribute("terms.sizes", "warpcloth:terms:<name>:sizes", "cloth", (_T.IntArray,)),
     Attribute("terms.targets", "warpcloth:terms:<name>:targets", "cloth", (_T.Double3Array,)),
     # What the prim's own points and curves lose. Used while they agree with these: an artist's edit wins.
