@@ -400,8 +400,8 @@ class RigidCluster(Declared):
 
     Bodies that share a vertex hang together there. The mass of a vertex in several bodies counts in each. A pinned vertex
     counts as a thousand times all others of its body, so that the body turns about it. A body on a line keeps no
-    orientation about it. Newton's method takes κM for the Hessian, which holds bodies back as a whole: a step of κh² above 1
-    takes more iterations, and ``equilibrium`` of bodies that move far may use up its own.
+    orientation about it. Newton's method takes κM for the Hessian, which holds bodies back as a whole: steps with κh² near 1
+    or above take more iterations, and ``equilibrium`` of bodies that move far may use up its own.
 
     Attributes:
         vertices: Indices of the bodies, one after the other, (E,); or a list of an array for each body; or a selection such as
