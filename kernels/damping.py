@@ -9,15 +9,17 @@ from .term import Term
 
 
 @cache
-def set_damped_rest(term: Term, dtype, two_states: bool):
-    """Kernel over elements: out[e], the rest state that :class:`..kernels.term.Dissipation` has of y at x and at x − move.
+def set_damped_rest(term: Term, dtype, bdf2: bool, midpoint: bool):
+    """Kernel over elements: out[e], the rest state that :class:`..kernels.term.Dissipation` has of s̃, s at x but for a change.
 
-    Without ``two_states`` the state before counts as the same, and move may be None.
+    With d = scale·move the change is 0 of Euler, where move may be None; (s(x) − s(x − d))/3 of BDF2 for the last move d; of
+    midpoint s(x) − ½(s(x + d) + s(x − d)) ≈ −½ddᵀ∂²s for d = hₑ v, without which s of the mean of two states would be
+    taken for the mean of s, which is of first order and brakes what turns.
     """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     out_type = wp.types.vector((term.dissipation.term or term).parameters, dtype)
-    y_of, rest_of = local_coordinate(term, dtype, False), term.dissipation.rest
+    y_of, change_of, rest_of = local_coordinate(term, dtype, False), term.dissipation.change, term.dissipation.rest
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_rest(
@@ -26,15 +28,20 @@ def set_damped_rest(term: Term, dtype, two_states: bool):
         share: wp.array(dtype=dtype),
         x: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
+        scale: dtype,
         # out
         out: wp.array(dtype=out_type),
     ):
         e = wp.tid()
         y = y_of(stencil, e, rest[e], x, x)
-        before = y
-        if wp.static(two_states):
-            before = y - y_of(stencil, e, rest[e], move, move)
-        out[e] = rest_of(y, before, rest[e], share[e])
+        change = change_of(y, y, rest[e])
+        if wp.static(bdf2):
+            d = scale * y_of(stencil, e, rest[e], move, move)
+            change = -change_of(y, y - d, rest[e]) / dtype(3.0)
+        if wp.static(midpoint):
+            d = scale * y_of(stencil, e, rest[e], move, move)
+            change = -dtype(0.5) * (change_of(y, y + d, rest[e]) + change_of(y, y - d, rest[e]))
+        out[e] = rest_of(y, change, rest[e], share[e])
 
     return set_rest
 

@@ -71,7 +71,10 @@ def predict(dtype):
 
 @cache
 def start_bdf2(dtype):
-    """Kernel over vertices, the past of a motion of constant a₀ = g − ∇U/m: move = x₀ − x₋₁ = h v₀ − ½h²a₀, v₋₁ = v₀ − h a₀."""
+    """Kernel over vertices, the past of a motion of constant a₀ = g − ∇U/m: move = x₀ − x₋₁ = h v₀ − ½h²a₀, v₋₁ = v₀ − h a₀.
+
+    a₀ of pins is 0.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -88,10 +91,11 @@ def start_bdf2(dtype):
     ):
         i = wp.tid()
         w = inverse_mass[i]
+        change = vec3()
         if w > dtype(0.0):
             change = h * (gravity[i // per_copy] - w * gradient[i])
-            move[i] = h * (v[i] - dtype(0.5) * change)
-            v_before[i] = v[i] - change
+        move[i] = h * (v[i] - dtype(0.5) * change)
+        v_before[i] = v[i] - change
 
     return start
 
@@ -232,18 +236,22 @@ def finish_midpoint(dtype):
 
 @cache
 def note_move(dtype):
-    """Kernel over vertices, after a correction d: move += d, which makes it x₁ − x₀."""
+    """Kernel over vertices, after a correction d: move += d, which makes it x₁ − x₀; of pins h v is that."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def note(
         inverse_mass: wp.array(dtype=dtype),
         correction: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        h: dtype,
         # in and out
         move: wp.array(dtype=vec3),
     ):
         i = wp.tid()
         if inverse_mass[i] > dtype(0.0):
             move[i] = move[i] + correction[i]
+        else:
+            move[i] = h * v[i]
 
     return note

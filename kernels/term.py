@@ -22,16 +22,19 @@ class HessianPolicy(IntEnum):
 class Dissipation:
     """The dissipation D = Σ (Aβ/2hₑ)‖s(y) − s̃‖² of a step as an energy whose rest state s̃ is set where the step begins.
 
-    s is the term's own invariant and s̃ = sₙ of the last state, or sₙ + (sₙ − sₙ₋₁)/3 of the last two, so that (s − s̃)/hₑ is
-    its rate as the integrator has it. Where u = ½‖s − s̄‖² with the same s, D merges with it: of a stiffness k + β/hₑ the
-    rest state is s̄ + share·(s̃ − s̄), share = (β/hₑ)/(k + β/hₑ); with share 1 it is that of D alone.
+    s is the term's own invariant and s̃ that of the last state but for a change that makes (s − s̃)/hₑ the rate of s as the
+    integrator has it, see :func:`warpcloth.kernels.damping.set_damped_rest`. Where u = ½‖s − s̄‖² with the same s, D merges with
+    it: of a stiffness k + β/hₑ the rest state is s̄ + share·(s̃ − s̄), share = (β/hₑ)/(k + β/hₑ); with share 1 it is that of D
+    alone.
 
     Attributes:
-        rest: (y, y one state before, rest state of the term, share) → rest state of ``term``.
+        change: (y, another y, rest state of the term) → s of the other − s of y.
+        rest: (y, s̃ − s of y, rest state of the term, share) → rest state of ``term``.
         merges: Whether D merges with the energy; else it is one beside it.
         term: The :class:`Term` of the sum, or of D alone where it does not merge; None for the term itself.
     """
 
+    change: Any
     rest: Any
     merges: bool = True
     term: Any = None

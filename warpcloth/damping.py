@@ -77,13 +77,13 @@ class Past:
         self.model = model
         self.terms = [elements for elements in terms if elements.origin]
 
-    def launch(self, x, move=None):
-        """For the state x (N,), or with ``move`` for the last two, x and x − move."""
+    def launch(self, x, move=None, scale=1.0, bdf2=False, midpoint=False):
+        """For the state x (N,), and what else :func:`warpcloth.kernels.damping.set_damped_rest` takes of an integrator."""
         model = self.model
         for elements in self.terms:
             origin = elements.origin
-            kernel = model.kernel(kernels.set_damped_rest, origin.term, model.dtype, move is not None)
-            given = [elements.stencil, origin.rest, origin.share, x, move]
+            kernel = model.kernel(kernels.set_damped_rest, origin.term, model.dtype, bdf2, midpoint)
+            given = [elements.stencil, origin.rest, origin.share, x, move, scale]
             model.launch(kernel, elements.count, given, [elements.rest])
 
 

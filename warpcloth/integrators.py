@@ -17,14 +17,16 @@ class Euler:
 
     Attributes:
         he: hₑ [s].
-        move: x₀ − x₋₁ (N,) [m] of those that know two states, else None.
     """
 
     part = 1.0  # hₑ/h
-    move = None
 
     def __init__(self, stepper):
         self.stepper, self.he = stepper, self.part * stepper.h
+
+    def launch_past(self, past):
+        """Where a step begins, what its damping needs: (s − s̃)/hₑ is the rate of s then."""
+        past.launch(self.stepper.state.x)
 
     def launch_prediction(self):
         """x = x̃, v = (x̃ − x₀)/hₑ; pins where they are then."""
@@ -53,6 +55,10 @@ class Midpoint(Euler):
 
     part = 0.5
 
+    def launch_past(self, past):
+        x, v = self.stepper.state
+        past.launch(x, v, self.he, midpoint=True)
+
     def launch_prediction(self):
         self._launch(kernels.predict, [self._gravity, self._n, self.he], list(self.stepper.state))
         self.stepper.launch_pins(parts=2)
@@ -67,7 +73,11 @@ class BDF2(Euler):
     """hₑ = 2h/3, x̃ = (4x₀ − x₋₁)/3 + hₑ(4v₀ − v₋₁)/3 + hₑ² g; the minimiser is x₁, v₁ = (4v₀ − v₋₁)/3 + hₑ(a₁ + g).
 
     Of second order. It starts as if from a motion of constant a₀ = −∇(U + D)/m + g: x₋₁ = x₀ − h v₀ + ½h²a₀, v₋₁ = v₀ − h a₀.
-    That keeps the order, and one hₑ for all steps.
+    That keeps the order, and one hₑ for all steps. Pins come from where their first keyframes lead back to.
+
+    Attributes:
+        move: x₀ − x₋₁ (N,) [m].
+        v_before: v₋₁ (N,) [m/s]; unused of pins.
     """
 
     part = 2.0 / 3.0
@@ -76,9 +86,13 @@ class BDF2(Euler):
         super().__init__(stepper)
         model = stepper.model
         self.move, self.v_before, gradient = (model.vectors() for _ in range(3))
-        Forces(model, stepper.h).add(*stepper.state, gradient)
-        given = [self._gravity, self._n, stepper.h, gradient, stepper.state.v]
+        v = _with_pins(model)
+        Forces(model, stepper.h).add(stepper.state.x, v, gradient)
+        given = [self._gravity, self._n, stepper.h, gradient, v]
         self._launch(kernels.start_bdf2, given, [self.move, self.v_before])
+
+    def launch_past(self, past):
+        past.launch(self.stepper.state.x, self.move, bdf2=True)
 
     def launch_prediction(self):
         given = [self._gravity, self._n, self.he]
@@ -87,7 +101,16 @@ class BDF2(Euler):
 
     def launch_finish(self, correction):
         super().launch_finish(correction)
-        self._launch(kernels.note_move, [correction], [self.move])
+        self._launch(kernels.note_move, [correction, self.stepper.state.v, self.stepper.h], [self.move])
+
+
+def _with_pins(model):
+    """Velocities at the start (N,) [m/s], of moved pins those towards their second keyframe."""
+    if model.pins is None or len(model.keyframes) < 2:
+        return model.velocities
+    v, places = model.velocities.numpy(), model.keyframes[:2].numpy()
+    v.reshape(model.copies, -1, 3)[:, model.pins.numpy()] = model.scene.fps * (places[1] - places[0])
+    return model.array(v, model.vec3)
 
 
 INTEGRATORS = {"euler": Euler, "midpoint": Midpoint, "bdf2": BDF2}

@@ -51,10 +51,14 @@ def hessian(y: Any, rest: Any, policy: int):
 
 
 @wp.func
-def damped_rest(y: Any, before: Any, rest: Any, share: Any):
-    """With s = y itself: the place that it holds on to does not turn with it."""
-    s = y[0] + (y[0] - before[0]) / y.dtype(3.0)
-    return rest + share * (s - rest)
+def change(y: Any, other: Any, rest: Any):
+    """Of s = y itself: the place that it holds on to does not turn with it."""
+    return other[0] - y[0]
+
+
+@wp.func
+def damped_rest(y: Any, change: Any, rest: Any, share: Any):
+    return rest + share * (y[0] + change - rest)
 
 
 ATTACHMENT = Term(
@@ -70,5 +74,5 @@ ATTACHMENT = Term(
     hessian=hessian,
     project=project,
     linear=True,
-    dissipation=Dissipation(rest=damped_rest),
+    dissipation=Dissipation(change=change, rest=damped_rest),
 )

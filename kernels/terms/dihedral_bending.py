@@ -227,10 +227,14 @@ def hessian(y: Any, rest: Any, policy: int):
 
 
 @wp.func
-def damped_rest(y: Any, before: Any, rest: Any, share: Any):
-    c = constraint(y, rest)
+def change(y: Any, other: Any, rest: Any):
+    return wrap(constraint(other, rest) - constraint(y, rest))
+
+
+@wp.func
+def damped_rest(y: Any, change: Any, rest: Any, share: Any):
     r = rest
-    r[0] = wrap(rest[0] + share * wrap(c + wrap(c - constraint(before, rest)) / y.dtype(3.0)))
+    r[0] = wrap(rest[0] + share * wrap(constraint(y, rest) + change))
     return r
 
 
@@ -250,5 +254,5 @@ DIHEDRAL_BENDING = Term(
     constraint_hessian=constraint_hessian,
     stiffening=stiffening,
     stiffening_rows=4,
-    dissipation=Dissipation(rest=damped_rest),
+    dissipation=Dissipation(change=change, rest=damped_rest),
 )

@@ -68,10 +68,14 @@ def hessian(y: Any, rest: Any, policy: int):
 
 
 @wp.func
-def damped_rest(y: Any, before: Any, rest: Any, share: Any):
+def strain_change(y: Any, other: Any, rest: Any):
+    return green_strain(other) - green_strain(y)
+
+
+@wp.func
+def damped_rest(y: Any, change: Any, rest: Any, share: Any):
     """Of any membrane, whose rest state begins with the inverse rest edges."""
-    E = green_strain(y)
-    E = E + (E - green_strain(before)) / y.dtype(3.0)
+    E = green_strain(y) + change
     r = wp.vector(length=6, dtype=rest.dtype)
     for i in range(3):
         r[i] = rest[i]
@@ -92,4 +96,4 @@ MEMBRANE_DAMPING = Term(
     hessian=hessian,
 )
 
-DISSIPATION = Dissipation(rest=damped_rest, merges=False, term=MEMBRANE_DAMPING)
+DISSIPATION = Dissipation(change=strain_change, rest=damped_rest, merges=False, term=MEMBRANE_DAMPING)

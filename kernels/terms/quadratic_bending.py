@@ -102,11 +102,11 @@ def damped_project(y: Any, rest: Any):
 
 
 @wp.func
-def damped_rest(y: Any, before: Any, rest: Any, share: Any):
+def damped_rest(y: Any, change: Any, rest: Any, share: Any):
     r = wp.vector(length=6, dtype=rest.dtype)
     for i in range(5):
         r[i] = rest[i]
-    r[5] = damped_length(wp.length(y[0]), wp.length(before[0]), rest.dtype(0.0), share)
+    r[5] = damped_length(y, change, rest.dtype(0.0), share)
     return r
 
 
@@ -142,5 +142,5 @@ QUADRATIC_BENDING = Term(
     hessian=hessian,
     project=project,
     linear=True,
-    dissipation=Dissipation(rest=damped_rest, term=DAMPED_QUADRATIC_BENDING),
+    dissipation=Dissipation(change=spring.change, rest=damped_rest, term=DAMPED_QUADRATIC_BENDING),
 )

@@ -121,16 +121,21 @@ def stiffening(y: Any, rest: Any, tension: Any):
 
 
 @wp.func
-def damped_length(length: Any, before: Any, rest_length: Any, share: Any):
-    """L + share·(s̃ − L) of :class:`..term.Dissipation` for s = l; no less than 0, which is of no length."""
-    s = length + (length - before) / type(length)(3.0)
-    return wp.max(rest_length + share * (s - rest_length), type(length)(0.0))
+def change(y: Any, other: Any, rest: Any):
+    return wp.length(other[0]) - wp.length(y[0])
 
 
 @wp.func
-def damped_rest(y: Any, before: Any, rest: Any, share: Any):
+def damped_length(y: Any, change: Any, rest_length: Any, share: Any):
+    """L + share·(s̃ − L) of :class:`..term.Dissipation` for s = l; no less than 0, which is of no length."""
+    s = wp.length(y[0]) + change
+    return wp.max(rest_length + share * (s - rest_length), y.dtype(0.0))
+
+
+@wp.func
+def damped_rest(y: Any, change: Any, rest: Any, share: Any):
     r = rest
-    r[0] = damped_length(wp.length(y[0]), wp.length(before[0]), rest[0], share)
+    r[0] = damped_length(y, change, rest[0], share)
     return r
 
 
@@ -152,5 +157,5 @@ SPRING = Term(
     constraint_hessian=constraint_hessian,
     stiffening=stiffening,
     stiffening_rows=3,
-    dissipation=Dissipation(rest=damped_rest),
+    dissipation=Dissipation(change=change, rest=damped_rest),
 )

@@ -120,7 +120,7 @@ class Stepper:
 
     def launch_prediction(self):
         """x = x̃, and the pins where they are then."""
-        self.past.launch(self.state.x, self.integrator.move)
+        self.integrator.launch_past(self.past)
         self.integrator.launch_prediction()
 
     def launch_finish(self, correction):
