@@ -40,12 +40,13 @@ def rotation(axis, angle):
 
 
 class Dissipation:
-    """D and ∂D/∂x of a step of he from the positions of a scene, at any x."""
+    """D and ∂D/∂x of a step of he from the positions of a scene, at any x; of another integrator by what it ``knows``."""
 
-    def __init__(self, scene, he, device):
+    def __init__(self, scene, he, device, move=None, **knows):
         self.model = scene.build(device=device, dtype="float64")
         terms = dissipations(self.model, he)
-        Past(self.model, terms).launch(self.model.positions)
+        move = None if move is None else self.model.array(move, self.model.vec3)
+        Past(self.model, terms).launch(self.model.positions, move, **knows)
         self.energy_of = Energy(self.model, Sums(self.model), terms=terms)
         self.gradient_of = Gradient(self.model, terms=terms)
 
@@ -101,6 +102,53 @@ def test_it_only_takes(name, device):
         D = Dissipation(scene, 1e-6, device)
         powers.append((-D.gradient(scene.positions + 1e-6 * v) * v).sum())
     assert max(powers) < 0.0
+
+
+def viscous(name, x, v, device):
+    """β ds/dt ∂s of a motion through x with v, by central differences."""
+    scene, delta = replace(crumpled(name), positions=x), 1e-5
+    D = Dissipation(scene, delta, device)
+    return 0.5 * (D.gradient(x + delta * v) - D.gradient(x - delta * v))
+
+
+@pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("midpoint", 2), ("bdf2", 2)])
+@each_term
+def test_the_rate_has_the_order_of_the_integrator(name, integrator, order, device):
+    """∂D/∂x at the end of a step along x + vt + at²/2, at its middle for midpoint, less β ds/dt ∂s there."""
+    scene, errors = crumpled(name), []
+    v, a = np.random.default_rng(7).normal(size=(2, *scene.positions.shape))
+
+    def at(t):
+        return scene.positions + t * v + 0.5 * t * t * a
+
+    for h in (4e-3, 2e-3, 1e-3):
+        if integrator == "euler":
+            x, rate, D = at(h), v + h * a, Dissipation(scene, h, device)
+        elif integrator == "bdf2":
+            x, rate, D = at(h), v + h * a, Dissipation(scene, 2.0 * h / 3.0, device, at(0.0) - at(-h), bdf2=True)
+        else:
+            x, rate = 0.5 * (at(0.0) + at(h)), v + 0.5 * h * a
+            D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, midpoint=True)
+        exact = viscous(name, x, rate, device)
+        errors.append(np.linalg.norm(D.gradient(x) - exact) / np.linalg.norm(exact))
+    if name == "Attachment" and errors[-1] < 1e-9:  # s is linear, and so exact: BDF2 of this motion and midpoint
+        assert integrator != "euler"
+        return
+    assert np.log2(errors[-2] / errors[-1]) == pytest.approx(order, abs=0.15)
+
+
+@pytest.mark.parametrize("name", INNER)
+def test_midpoint_brakes_a_turning_body_by_the_cube_of_the_step(name, device):
+    """(s(xₘ) − s̃)/hₑ of chords of a turning body, half as long as its step; s of the mean state less sₙ would leave O(h)."""
+    scene, forces = crumpled(name), []
+    for angle in (0.1, 0.05):
+        h, turn = angle, [rotation((1.0, 2.0, 3.0), part * angle) for part in (0.0, 1.0)]
+        x0, x1 = (scene.positions @ R.T for R in turn)
+        v = np.cross(np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0), x0)
+        D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, midpoint=True)
+        forces.append(np.abs(D.gradient(0.5 * (x0 + x1))).max())
+    assert forces[0] > 1e6 * EPS
+    assert np.log2(forces[0] / forces[1]) == pytest.approx(3.0, abs=0.2)
 
 
 @each_term
