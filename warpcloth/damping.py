@@ -37,7 +37,8 @@ def refuse_apart(model, solver):
     for elements in model.terms:
         if elements.damping is not None and not elements.term.dissipation.merges:
             raise ValueError(
-                f"{solver} cannot take the damping of {elements.label}, which no projection has in it; Newton or Explicit can"
+                f"{solver} cannot take the damping of {elements.label}, which no projection has in it; "
+                "ADMM, Newton or Explicit can"
             )
 
 

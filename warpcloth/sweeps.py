@@ -53,7 +53,8 @@ def refuse_unprojectable(model, solver):
     for elements in model.terms:
         if elements.term.project is None and elements.term.constraint is None:
             raise ValueError(
-                f"{solver} cannot project {elements.label}, whose energy is no distance to a constraint; Newton or Explicit can"
+                f"{solver} cannot project {elements.label}, whose energy is no distance to a constraint; "
+                "ADMM, Newton or Explicit can"
             )
 
 

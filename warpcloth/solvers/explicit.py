@@ -61,7 +61,8 @@ class Explicit(Step):
         allow = 'above_limit="allow" runs it all the same'
         if self.scheme == "forward":
             raise ValueError(
-                f"dt is {h:.6g} s; forward Euler is stable at no step (symplectic Euler up to {rest:.6g} s); {allow}"
+                f"dt is {h:.6g} s; forward Euler is stable at no step where nothing damps "
+                f"(symplectic Euler up to {rest:.6g} s); {allow}"
             )
         if h >= rest:
             raise ValueError(
