@@ -71,10 +71,7 @@ def predict(dtype):
 
 @cache
 def start_bdf2(dtype):
-    """Kernel over vertices, the past of a motion of constant a₀ = g − ∇U/m: move = x₀ − x₋₁ = h v₀ − ½h²a₀, v₋₁ = v₀ − h a₀.
-
-    a₀ of pins is 0.
-    """
+    """Kernel over vertices, the past of a motion of constant a₀ = g − ∇U/m: move = x₀ − x₋₁ = h v₀ − ½h²a₀, v₋₁ = v₀ − h a₀."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -91,11 +88,10 @@ def start_bdf2(dtype):
     ):
         i = wp.tid()
         w = inverse_mass[i]
-        change = vec3()
         if w > dtype(0.0):
             change = h * (gravity[i // per_copy] - w * gradient[i])
-        move[i] = h * (v[i] - dtype(0.5) * change)
-        v_before[i] = v[i] - change
+            move[i] = h * (v[i] - dtype(0.5) * change)
+            v_before[i] = v[i] - change
 
     return start
 

@@ -73,7 +73,8 @@ class BDF2(Euler):
     """hₑ = 2h/3, x̃ = (4x₀ − x₋₁)/3 + hₑ(4v₀ − v₋₁)/3 + hₑ² g; the minimiser is x₁, v₁ = (4v₀ − v₋₁)/3 + hₑ(a₁ + g).
 
     Of second order. It starts as if from a motion of constant a₀ = −∇(U + D)/m + g: x₋₁ = x₀ − h v₀ + ½h²a₀, v₋₁ = v₀ − h a₀.
-    That keeps the order, and one hₑ for all steps. Pins come from where their first keyframes lead back to.
+    That keeps the order, and one hₑ for all steps. Pins stand still before the start. Damping looks back over kinks of their
+    motion: right after one its force has half of the jump too much, which is just what (v₀ − v₋₁)/3 lacks.
 
     Attributes:
         move: x₀ − x₋₁ (N,) [m].
@@ -86,9 +87,8 @@ class BDF2(Euler):
         super().__init__(stepper)
         model = stepper.model
         self.move, self.v_before, gradient = (model.vectors() for _ in range(3))
-        v = _with_pins(model)
-        Forces(model, stepper.h).add(stepper.state.x, v, gradient)
-        given = [self._gravity, self._n, stepper.h, gradient, v]
+        Forces(model, stepper.h).add(*stepper.state, gradient)
+        given = [self._gravity, self._n, stepper.h, gradient, stepper.state.v]
         self._launch(kernels.start_bdf2, given, [self.move, self.v_before])
 
     def launch_past(self, past):
@@ -102,15 +102,6 @@ class BDF2(Euler):
     def launch_finish(self, correction):
         super().launch_finish(correction)
         self._launch(kernels.note_move, [correction, self.stepper.state.v, self.stepper.h], [self.move])
-
-
-def _with_pins(model):
-    """Velocities at the start (N,) [m/s], of moved pins those towards their second keyframe."""
-    if model.pins is None or len(model.keyframes) < 2:
-        return model.velocities
-    v, places = model.velocities.numpy(), model.keyframes[:2].numpy()
-    v.reshape(model.copies, -1, 3)[:, model.pins.numpy()] = model.scene.fps * (places[1] - places[0])
-    return model.array(v, model.vec3)
 
 
 INTEGRATORS = {"euler": Euler, "midpoint": Midpoint, "bdf2": BDF2}
