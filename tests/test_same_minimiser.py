@@ -28,6 +28,10 @@ TAKE_PART = {
     "projective dynamics l-bfgs": replace(PD, iterations=3_000, acceleration="l-bfgs"),
     "projective dynamics matrix-free": replace(PD, iterations=6_000, acceleration="l-bfgs", linear="jacobi"),
     "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=12_000, weight=0.1),
+    **{
+        f"constrained dynamics {linear}": wc.ConstrainedDynamics(substeps=1, tolerance=1e-12, iterations=200, linear=linear)
+        for linear in ("cg", "factorised")
+    },
     "xpbd coloured": wc.XPBD(substeps=1, iterations=30_000),
     "xpbd sequential": wc.XPBD(substeps=1, iterations=30_000, sweep="sequential"),
 }
@@ -79,7 +83,7 @@ def test_all_meet(name, device):
     short = replace(solver, iterations=min(solver.iterations, 400_000))
     x, _ = after_one_step(swinging(16), short, "float32", device)
     assert np.abs(x - newton_step(device)).max() < 1e-4
-    if not isinstance(solver, wc.Newton):
+    if not isinstance(solver, (wc.Newton, wc.ConstrainedDynamics)):  # which need fewer
         few, _ = after_one_step(swinging(16), replace(solver, iterations=50), "float64", device)
         assert np.abs(few - newton_step(device)).max() > 1e-4, "fifty iterations are not enough to say anything"
 
