@@ -24,7 +24,7 @@ TAKE_PART = {
         for policy in ("adaptive", "clamp", "absolute", "raw")
         for linear in ("cg", "factorised")
     },
-    "projective dynamics anderson": replace(PD, iterations=2_000, acceleration="anderson"),
+    "projective dynamics anderson": replace(PD, iterations=5_000, acceleration="anderson"),
     "projective dynamics l-bfgs": replace(PD, iterations=3_000, acceleration="l-bfgs"),
     "projective dynamics matrix-free": replace(PD, iterations=6_000, acceleration="l-bfgs", linear="jacobi"),
     "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=12_000, weight=0.1),

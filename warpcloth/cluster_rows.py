@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
+from .capture import Mirror
 from .kernels import cluster_rows as kernels
 
 
@@ -24,20 +25,21 @@ class ClusterRows:
         self.count = 3 * elements.per_copy
         names = ("linearise_clusters", "apply_cluster_rows", "pull_clusters", "gather_pulls")
         self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
-        self._inertia = model.array(np.stack([np.linalg.pinv(each, 1e-12, True) for each in self._inertias()]), model.mat33)
+        self._stencil, self._offsets = elements.stencil.numpy()[:, 0], self.cells.offsets.numpy()
+        self._mass = elements.rest.numpy()[:, 3].astype(np.float64)
+        self._places = self.cells.shape.numpy().astype(np.float64)
+        self._inverses = np.stack([np.linalg.pinv(each, 1e-12, True) for each in self._inertias()])
+        self._inertia = model.array(self._inverses, model.mat33)
         self._rotations = wp.zeros(self.cells.count, dtype=model.mat33, device=model.device)
+        self._turned = Mirror(self._rotations)
         self._incidences = elements.incidences  # now: made during a capture they would only be recorded
         self._pulls = wp.zeros(elements.count, dtype=model.vec3, device=model.device)
 
     def _inertias(self):
         """Σ m(q²I − qqᵀ) of each cell at rest, (C, 3, 3) [kg m²]."""
-        mass, q = self._at_rest()
+        mass, q = self._mass, self._places
         each = mass[:, None, None] * ((q**2).sum(axis=1)[:, None, None] * np.eye(3) - q[:, :, None] * q[:, None, :])
-        return np.add.reduceat(each, self.cells.offsets.numpy()[:-1], axis=0)
-
-    def _at_rest(self):
-        """Masses (E,) [kg] and places about the centres of mass (E, 3) [m]."""
-        return self.elements.rest.numpy()[:, 3].astype(np.float64), self.cells.shape.numpy().astype(np.float64)
+        return np.add.reduceat(each, self._offsets[:-1], axis=0)
 
     def place(self, first, per_copy):
         """Where its rows are: from ``first`` on in the ``per_copy`` of each copy."""
@@ -62,11 +64,9 @@ class ClusterRows:
 
     def entries(self):
         """J on the host: values, rows and columns."""
-        mass, q = self._at_rest()
-        inertia, R = (array.numpy().astype(np.float64) for array in (self._inertia, self._rotations))
-        stencil, offsets, found = self.elements.stencil.numpy()[:, 0], self.cells.offsets.numpy(), []
+        mass, q, R, found = self._mass, self._places, self._turned.read().astype(np.float64), []
         per_copy, first, rows_per_copy = self._where
-        for cell, (start, stop) in enumerate(pairwise(offsets)):
+        for cell, (start, stop) in enumerate(pairwise(self._offsets)):
             if not R[cell].any():
                 continue
             elements = np.arange(start, stop)
@@ -75,12 +75,12 @@ class ClusterRows:
             linear = np.kron(root[:, None], np.eye(3))  # (3E, 3)
             angular = (root[:, None, None] * turns).reshape(-1, 3, 3)
             moments = np.concatenate(list(angular), axis=1)  # Σ √m r × v, (3, 3E)
-            world = R[cell] @ inertia[cell] @ R[cell].T
+            world = R[cell] @ self._inverses[cell] @ R[cell].T
             Q = linear @ linear.T / mass[elements].sum() + moments.T @ world @ moments
             block = (np.eye(len(Q)) - Q) * np.repeat(root, 3)
             copy, e = np.divmod(elements, per_copy)
             rows = ((copy * rows_per_copy + first + 3 * e)[:, None] + np.arange(3)).ravel()
-            columns = (3 * stencil[elements][:, None] + np.arange(3)).ravel()
+            columns = (3 * self._stencil[elements][:, None] + np.arange(3)).ravel()
             found.append((block.ravel(), np.repeat(rows, len(columns)), np.tile(columns, len(rows))))
         if not found:
             return np.zeros(0), np.zeros(0, dtype=int), np.zeros(0, dtype=int)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from .capture import Mirror
 from .cluster_rows import ClusterRows
 from .kernels import constrain as kernels
 
@@ -63,7 +64,7 @@ class TermRows:
         elements, Q = self.elements, self.rows
         stencil = elements.stencil.numpy().astype(np.int64)
         E, K = stencil.shape
-        blocks = wp.zeros((E, Q * K), dtype=wp.vec3d, device=self.model.device)
+        blocks = Mirror(wp.zeros((E, Q * K), dtype=wp.vec3d, device=self.model.device))
         copy, e = np.divmod(np.arange(E), elements.per_copy)
         rows = copy * self._where[2] + self._first + e * Q
         rows = np.broadcast_to(rows[:, None, None, None] + np.arange(Q)[None, None, :, None], (E, K, Q, 3))
@@ -73,8 +74,8 @@ class TermRows:
     def entries(self):
         """J on the host: values, rows and columns."""
         blocks, kernel, rows, columns = self._in_full
-        self.model.launch(kernel, self.elements.count, [self.elements.rest, self._slopes], [blocks])
-        return blocks.numpy().ravel(), rows, columns
+        self.model.launch(kernel, self.elements.count, [self.elements.rest, self._slopes], [blocks.array])
+        return blocks.read().ravel(), rows, columns
 
 
 class Constraints:
@@ -149,6 +150,11 @@ class Constraints:
         """out = the inverse diagonal, 0 where that is 0."""
         wp.copy(out, self._inverse)
 
+    @cached_property
+    def _on_host(self):
+        """The inverse masses of coordinates, and the mirror of the compliances."""
+        return np.repeat(self.model.inverse_mass.numpy().astype(np.float64), 3), Mirror(self._compliance)
+
     def matrices(self):
         """A of each copy on the host, scipy matrices in double precision."""
         from scipy.sparse import csr_matrix, diags
@@ -156,8 +162,8 @@ class Constraints:
         n, R, copies = 3 * self.model.per_copy, self.per_copy, self.model.copies
         values, rows, columns = (np.concatenate(each) for each in zip(*(part.entries() for part in self.parts), strict=True))
         J = csr_matrix((values, (rows, columns)), shape=(self.count, copies * n))
-        w = np.repeat(self.model.inverse_mass.numpy().astype(np.float64), 3)
-        compliance = self._compliance.numpy().astype(np.float64)
+        w, compliance = self._on_host
+        compliance = compliance.read().astype(np.float64)
         found = []
         for copy in range(copies):
             own = J[copy * R : (copy + 1) * R, copy * n : (copy + 1) * n]
