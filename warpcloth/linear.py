@@ -151,13 +151,14 @@ class FactorisedRows:
 
     Args:
         matrix: The :class:`warpcloth.constraints.Constraints`.
+        arrays: b, x and wanted, as they will be given to :meth:`solve`, which then allocates nothing.
     """
 
     capturable = False
 
-    def __init__(self, matrix):
+    def __init__(self, matrix, arrays):
         self.matrix, self.model = matrix, matrix.model
-        self._mirrors = {}
+        self._mirrors = {array.ptr: Mirror(array) for array in arrays}
         if matrix.count:
             matrix.matrices()  # allocates what it needs
 
@@ -166,7 +167,7 @@ class FactorisedRows:
         from scipy.sparse import diags
         from scipy.sparse.linalg import splu
 
-        right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
+        right, left, wanted = (self._mirrors[array.ptr] for array in (b, x, wanted))
         sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
         solution, matrices = np.zeros_like(sides), self.matrix.matrices()
         for copy in np.flatnonzero(wanted.read()):
@@ -183,12 +184,6 @@ class FactorisedRows:
             found += factor.solve(side - A @ found)  # redundant rows leave A hardly definite
             solution[copy] = scale * found
         left.write(solution.ravel())
-
-    def _mirror(self, array):
-        """The mirror of an array, built when the array is first seen."""
-        if array.ptr not in self._mirrors:
-            self._mirrors[array.ptr] = Mirror(array)
-        return self._mirrors[array.ptr]
 
 
 def constant_factor(matrix, device, dtype):

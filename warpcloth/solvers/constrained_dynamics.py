@@ -133,16 +133,16 @@ class ConstrainedDynamicsStepper(Stepper):
             self._step = wp.zeros(model.copies, dtype=wp.float64, device=device)
         self._moves, self._mismatch = model.vectors(), model.vectors()
         self._right, self._change = (wp.zeros(self.constraints.count, dtype=model.dtype, device=device) for _ in range(2))
-        if options.linear == "cg":
-            self._linear = ConjugateGradients(self.constraints, self._row_sums, LINEAR_ITERATIONS)
-        else:
-            self._linear = FactorisedRows(self.constraints)
         self._ones = model.constant(1.0, model.count)
 
         def per_copy(dtype):
             return Mirror(wp.zeros(model.copies, dtype=dtype, device=device))
 
         self._active, self._stepped = per_copy(wp.int32), Mirror(self._step)
+        if options.linear == "cg":
+            self._linear = ConjugateGradients(self.constraints, self._row_sums, LINEAR_ITERATIONS)
+        else:
+            self._linear = FactorisedRows(self.constraints, (self._right, self._change, self._active.array))
         self._unbalanced, self._open, self._rounding, self._carried = (per_copy(wp.float64) for _ in range(4))
         self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("mismatch", "negate_rows")}
         self._advance = [model.kernel(kernels.advance, model.dtype, vectors) for vectors in (True, False)]
