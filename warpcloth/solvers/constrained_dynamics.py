@@ -178,7 +178,8 @@ class ConstrainedDynamicsStepper(Stepper):
             self.iterations += 1
         self._finish()
         carried = self._carried.read() / (scale * self.he**2)
-        contradicted = finite & (carried > max(options.tolerance, CARRIED))
+        resolved = self._carried.read() > self._rounding.read()  # places and lengths contradict one another by rounding too
+        contradicted = finite & resolved & (carried > max(options.tolerance, CARRIED))
         residual = np.where(contradicted, np.maximum(residual, carried), residual)
         self.residual = np.maximum(self.residual, residual)  # keeps NaN
         conditions = [~finite, contradicted, converged, rounded, stuck]
