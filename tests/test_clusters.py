@@ -336,6 +336,21 @@ def test_two_cells_of_a_colour_share_no_vertex(device):
         assert len(np.unique(used)) == len(used)
 
 
+@pytest.mark.parametrize("linear", ["cg", "factorised"])
+def test_a_body_without_stiffness_is_not_there(linear, device):
+    """One iteration with it is the iteration without, where springs alone pull."""
+    declared, rng = body(BODIES["solid"], stiffness=0.0), np.random.default_rng(0)
+    spring = wc.Spring(pairs=[[0, 1], [0, 4]], stiffness=1e3, rest_lengths=0.7)
+    velocities = rng.normal(size=declared.mesh.points.shape)
+    found = []
+    for terms in ([spring], [spring, *declared.terms]):
+        model = replace(declared, terms=terms, velocities=velocities).build(device=device, dtype="float64")
+        stepper = wc.ConstrainedDynamics(substeps=1, iterations=1, tolerance=1e-12, linear=linear).bind(model)
+        stepper.step()
+        found.append(stepper.state.x.numpy())
+    assert np.abs(found[1] - found[0]).max() < (1e-9 if linear == "cg" else 8 * EPS)
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_degenerate_bodies(dtype, device):
     """One vertex, coincident ones, all pinned, one in another: nothing that is not finite, and the rest moves on."""

@@ -284,6 +284,20 @@ def test_contradicting_constraints_are_reported(linear, device):
 
 
 @each_linear
+def test_rows_of_every_kind_contradict(linear, device):
+    """A hard body between pins that are too far apart, and a vertex hung hard from two places: nothing else is hard."""
+    chain = wc.Mesh([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]], edges=[[0, 1], [1, 2]])
+    given = {"masses": np.ones(3), "fps": 60.0}
+    hung = [wc.Attachment(vertices=[0], targets=[[place, 0.0, 0.0]], stiffness=np.inf, name=str(place)) for place in (0.0, 0.5)]
+    for declared in (
+        wc.Scene(chain, positions=1.3 * chain.points, terms=[wc.RigidCluster(vertices=[0, 1, 2])], pins=[0, 2], **given),
+        wc.Scene(chain, terms=hung, **given),
+    ):
+        stepper, _ = after(declared, constrained(linear=linear), device)
+        assert stepper.results == [Result.CONTRADICTED] and stepper.residual[0] > 1.0
+
+
+@each_linear
 def test_rounding_is_no_contradiction(linear, device):
     """A turned body with three pins, and a turned net with four: in float32 their shapes contradict the pins by some ε.
 
