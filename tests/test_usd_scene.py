@@ -492,6 +492,12 @@ def test_two_physics_scenes_are_refused(tmp_path):
         ("scene.usdz", [SPRING], ValueError, "must end with one of .usd, .usda, .usdc"),
         ("nowhere/scene.usda", [SPRING], FileNotFoundError, "the folder .* does not exist"),
         ("scene.usda", [], ValueError, "scene.terms is empty; a scene in a stage must have one or more"),
+        (
+            "scene.usda",
+            [wc.RigidCluster(vertices=[])],
+            ValueError,
+            "RigidCluster has no elements on this mesh .*; leave it out",
+        ),
     ],
 )
 def test_bad_writes_are_refused(tmp_path, name, terms, error, message):

@@ -258,7 +258,8 @@ def write_scene(scene, path):
 
     Raises:
         FileNotFoundError: The folder does not exist.
-        ValueError: The path has another ending or is the stage that the scene was read from, or the scene has no terms.
+        ValueError: The path has another ending or is the stage that the scene was read from, or the scene has no terms or
+            one that does not fit its mesh.
         OSError: The file could not be written.
     """
     path = Path(os.path.abspath(followed(path)))
@@ -270,6 +271,8 @@ def write_scene(scene, path):
         raise ValueError(f"path = {path}: is the stage that the scene was read from, which must not be changed")
     if not scene.terms:
         raise ValueError("scene.terms is empty; a scene in a stage must have one or more")
+    for term in scene.terms:
+        term.elements(scene.mesh, scene.positions)  # or reading would refuse what was written
     up_axis = scene.stage.up_axis if scene.stage else "Z" if np.argmax(np.abs(scene.gravity)) == 2 else "Y"
     pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
     layer, target, _ = scene_layer(scene.mesh, pins, up_axis, "Cloth")
