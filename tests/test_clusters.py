@@ -1,5 +1,6 @@
 """Rigid clusters: the energy of their shape, what a projection keeps, bodies that hang together, the mobile."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -425,9 +426,13 @@ def test_bad_bodies_are_refused(fields, message):
         wc.Scene(wc.Mesh.grid(4, 4), density=1.0, terms=[wc.RigidCluster(**fields)]).build()
 
 
-def test_who_cannot_take_bodies_says_who_can(device):
-    model = body(BODIES["solid"]).build(device=device)
-    with pytest.raises(ValueError, match=r"ADMM cannot take RigidCluster, .*; PBD, XPBD, .* can"):
-        wc.ADMM(substeps=1).bind(model)
-    with pytest.raises(ValueError, match="Newton cannot take RigidCluster with infinite stiffness; PBD"):
-        wc.Newton(substeps=1).bind(model)
+@pytest.mark.parametrize(("solver", "stiffness"), [(wc.ADMM, 1.0), (wc.Newton, np.inf), (wc.ProjectiveDynamics, np.inf)])
+def test_who_cannot_take_bodies_says_who_can(solver, stiffness, device):
+    """All that are named can."""
+    model = body(BODIES["solid"], stiffness=stiffness).build(device=device)
+    with pytest.raises(ValueError, match=f"{solver.__name__} cannot take RigidCluster.*; PBD, ") as refused:
+        solver(substeps=1).bind(model)
+    others = set(re.findall(r"\w+", str(refused.value).partition("; ")[2])) & set(wc.__all__)
+    assert {"PBD", "HierarchicalPBD", "XPBD"} <= others
+    for name in others:
+        getattr(wc, name)(substeps=1).bind(model)

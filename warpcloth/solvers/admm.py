@@ -62,7 +62,7 @@ class ADMM(ImplicitStep):
             ValueError: If a term has infinite stiffness, or cells.
         """
         refuse_cells(model, "ADMM")
-        refuse_hard(model, "ADMM", "PBD and XPBD take hard constraints, or give a finite stiffness")
+        refuse_hard(model, "ADMM")
         return ADMMStepper(self, model)
 
 

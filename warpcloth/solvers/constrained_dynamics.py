@@ -106,7 +106,7 @@ def refuse_unconstrained(model):
         if elements.hard and term.constraint is None and not (term.linear or elements.cells):
             raise ValueError(
                 f"ConstrainedDynamics cannot take {elements.label} with infinite stiffness, as it has no scalar constraint; "
-                "PBD and XPBD can, or give a finite stiffness"
+                "PBD, HierarchicalPBD and XPBD can, or give a finite stiffness"
             )
 
 

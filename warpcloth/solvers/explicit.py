@@ -12,8 +12,6 @@ from ..kernels import step as kernels
 from ..operators import Hessian
 from .solver import Step, Stepper, refuse_hard
 
-_INSTEAD = "PBD and XPBD take hard constraints, or give a finite stiffness"
-
 
 @dataclass(frozen=True)
 class Explicit(Step):
@@ -49,7 +47,7 @@ class Explicit(Step):
         Raises:
             ValueError: If the step is above the limit and that is not allowed, or a stiffness is infinite.
         """
-        refuse_hard(model, "Explicit", _INSTEAD)
+        refuse_hard(model, "Explicit")
         stepper = ExplicitStepper(self, model)
         if self.above_limit == "refuse":
             self._refuse_unstable(model, stepper.h)
@@ -93,7 +91,7 @@ def step_limits(model):
     Raises:
         ValueError: If a stiffness is infinite.
     """
-    refuse_hard(model, "Explicit", _INSTEAD)
+    refuse_hard(model, "Explicit")
     rest_shape = model.array(np.tile(model.scene.mesh.points, (model.copies, 1)), model.vec3)
     taut = [elements.taut(model.scene.mesh.points) for elements in model.terms]
     K, k = _over_mass(model, taut, rest_shape)

@@ -50,7 +50,7 @@ class Newton(ImplicitStep):
         Raises:
             ValueError: If a term has infinite stiffness.
         """
-        refuse_hard(model, "Newton", "PBD and XPBD take hard constraints, or give a finite stiffness")
+        refuse_hard(model, "Newton")
         return NewtonStepper(self, model)
 
 

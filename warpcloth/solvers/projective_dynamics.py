@@ -68,7 +68,7 @@ class ProjectiveDynamics(ImplicitStep):
         Raises:
             ValueError: If a term has infinite stiffness, or an energy that is no squared distance.
         """
-        refuse_hard(model, "ProjectiveDynamics", "PBD and XPBD take hard constraints, or give a finite stiffness")
+        refuse_hard(model, "ProjectiveDynamics")
         refuse_without_projection(model, "ProjectiveDynamics")
         return ProjectiveDynamicsStepper(self, model)
 

@@ -143,7 +143,7 @@ def require_model(model):
         raise ValueError(f"model is {given}; bind takes a model, which scene.build() makes")
 
 
-def refuse_hard(model, solver, instead):
+def refuse_hard(model, solver, instead="PBD, HierarchicalPBD and XPBD take hard constraints, or give a finite stiffness"):
     """Refuses infinite stiffness for a solver that needs forces.
 
     Raises:
@@ -166,7 +166,7 @@ def refuse_cells(model, solver):
         if elements.cells:
             raise ValueError(
                 f"{solver} cannot take {elements.label}, whose bodies are no elements by themselves; "
-                "PBD, XPBD, ProjectiveDynamics, Newton or Explicit can"
+                "PBD, HierarchicalPBD, XPBD, ConstrainedDynamics, ProjectiveDynamics, Newton or Explicit can"
             )
 
 
