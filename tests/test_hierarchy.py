@@ -234,3 +234,15 @@ def test_stretch_grows_with_resolution_only_without_levels(device):
     print(stretch)
     assert stretch[wc.PBD, 64] > 3.0 * stretch[wc.PBD, 16]
     assert stretch[wc.HierarchicalPBD, 256] < 0.1 * stretch[wc.PBD, 256]
+
+
+def test_no_bound_of_a_mixed_net_is_shorter_than_the_way():
+    """Vertices that are linked to kept ones by hard springs alone have no soft ways, and the reverse."""
+    mesh = wc.Mesh.grid(9, 9)
+    pairs = mesh.springs("structural")
+    stiffness = np.where(np.random.default_rng(0).random(len(pairs)) < 0.5, 1e3, np.inf)
+    terms = [wc.Spring(pairs=pairs, stiffness=stiffness)]
+    for level in levels(wc.Scene(mesh, density=0.2, terms=terms, pins=[0]).build(dtype="float64")):
+        for bounds in level.bounds:
+            ends = mesh.points[bounds.pairs]
+            assert (bounds.lengths >= np.abs(ends[:, 1] - ends[:, 0]).sum(axis=1) * (1.0 - 100 * EPS)).all()
