@@ -54,7 +54,9 @@ class ConstrainedDynamics(ImplicitStep):
 
     Redundant constraints are no matter to either: no α̃ is below ε^0.7 of the diagonal of J W Jᵀ, so that of several λ the least
     is found, and hard constraints stay open by that part of the move that they cause in a step (1e-11, in float32 1e-5).
-    Those that contradict one another meet half-way, and the status says so, with what they stay open by as residual.
+    Those that contradict one another meet half-way, and the status says so, with what they stay open by as residual. A
+    constraint between pins alone has nothing to move and is left out. A hard spring without length has no direction, and need
+    not converge; XPBD takes it.
 
     Raises:
         ValueError: If an option breaks a rule.
