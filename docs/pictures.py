@@ -13,7 +13,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import ListedColormap, Normalize
 
 import warpcloth as wc
-from warpcloth.scenes import bar_twist, bunny, cantilever, hanging
+from warpcloth.scenes import bar_twist, bunny, cantilever, hanging, mobile
 
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent / "tests"))
@@ -144,7 +144,31 @@ def picture_deformation(frames=(0, 16, 32, 48), most=150.0):
     save(figure, "deformation.png")
 
 
+def picture_mobile(moments=(0.0, 1.0, 2.0, 3.0)):
+    """The mobile side by side at some moments [s]: strings and bars black, cloths in one colour."""
+    scene = mobile.scene(n=13, push=0.8)
+    animation = wc.simulate(scene, wc.ConstrainedDynamics(substeps=4), frames=round(moments[-1] * scene.fps))
+    assert animation.status.ok, animation.status
+    bodies, strings = scene.terms[:2]
+    bars = [bodies.vertices[:3][[1, 0, 2]], bodies.vertices[3:6][[1, 0, 2]]]
+    figure, axes = plt.subplots(figsize=(11.0, 3.4))
+    left = 0.0
+    for time in moments:
+        seen = project(np.asarray(animation.points[round(time * scene.fps)], dtype=float), -30.0, 14.0)
+        seen[:, 0] += left - seen[:, 0].min()
+        draw(axes, scene.mesh, seen, np.full(len(scene.mesh.triangles), 0.6), COLOURS)
+        for line in [*bars, *strings.pairs]:
+            axes.plot(*seen[line, :2].T, "-", color="black", linewidth=1.6 if len(line) == 3 else 0.7)
+        right = seen[:, 0].max()
+        axes.text((left + right) / 2, 0.1, f"{time:g} s", ha="center", color=GREY)
+        left = right + 0.2
+    axes.set_aspect("equal")
+    axes.axis("off")
+    save(figure, "mobile.png")
+
+
 if __name__ == "__main__":
     picture_hanging()
+    picture_mobile()
     picture_deformation()
     picture_cantilever()
