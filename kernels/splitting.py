@@ -83,7 +83,7 @@ def local_minimiser(term: Term, dtype):
             p = solve_definite(H, right, n)
             slope = -wp.dot(right, p)
             if not (wp.dot(p, p) > dtype(64.0) * epsilon(r) * epsilon(r) * wp.ddot(z, z)):
-                return z
+                return z + (g - g)  # NaN where forces are not finite, which would else pass for the minimum
             direction = y_type()
             for i in range(n):
                 direction[i // 3, i % 3] = p[i]

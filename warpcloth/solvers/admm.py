@@ -33,7 +33,9 @@ class ADMM(ImplicitStep):
     Energies that are concave somewhere, hinges above all, need not converge with a small one.
 
     ``residual`` is the larger of the primal and the dual residual, and both are accelerations over gravity's (in m/s² without
-    any), the largest of any vertex: of the forces DᵀW²(Dx − z) and DᵀW²(z − z before) over the masses.
+    any), the largest of any vertex: of the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before) over the masses. The first is
+    at least that of stiffness k, by which the forces of U at Dx and at z differ: without it a small weight would pass for
+    convergence.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
@@ -100,6 +102,7 @@ class ADMMStepper(Stepper):
         self._add_inertia, self._plain_step = (model.kernel(factory, model.dtype) for factory in (add_inertia, plain_step))
         gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         self._scale = np.where(gravity > 0.0, gravity, 1.0)
+        self._gap_scale = self._scale * min(1.0, options.weight)
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
         self.iterations = 0
         self._start = Segment(model.device, self._launch_start)
@@ -113,7 +116,7 @@ class ADMMStepper(Stepper):
         self.iterations = 0
         while True:
             self._local()
-            self.primal = np.where(active, self._primal.read() / self._scale, self.primal)
+            self.primal = np.where(active, self._primal.read() / self._gap_scale, self.primal)
             self.dual = np.where(active, self._dual.read() / self._scale, self.dual)
             residual = np.maximum(self.primal, self.dual)  # keeps NaN
             finite = np.isfinite(residual)
@@ -140,7 +143,10 @@ class ADMMStepper(Stepper):
         rest_shape = model.array(np.tile(model.scene.mesh.points, (model.copies, 1)), model.vec3)
         kernel = model.kernel(kernels.stiffness_scale, elements.term, model.dtype)
         model.launch(kernel, elements.count, [*elements.arguments, rest_shape], [scale])
-        return scale
+        found = scale.numpy()
+        # A hinge that has no normal at rest has no curvature there, and would weigh nothing.
+        found = np.where(found > 0.0, found, found.max() or 1.0)
+        return model.array(found, model.dtype)
 
     # What the segments record.
 
