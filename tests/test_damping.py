@@ -183,6 +183,55 @@ def test_merged_is_the_sum(name, device):
         assert np.abs(merged_force - force).max() < 1e3 * EPS * np.abs(force).max()
 
 
+def test_merging_is_element_by_element(device):
+    """Also where the first and the last element agree, and one has neither stiffness nor damping."""
+    he, stiffness, damping = 0.5, np.full(72, 30.0), np.full(72, 0.7)
+    stiffness[7], damping[7:9] = 0.0, (0.0, 2.0)
+    scene = replace(crumpled("Spring"), terms=[replace(DAMPED["Spring"], stiffness=stiffness, damping=damping)])
+    (merged,) = damped_terms(scene.build(device=device, dtype="float64"), he)
+    both = stiffness + damping / he
+    assert np.array_equal(merged.stiffness.numpy(), both)
+    assert np.abs(merged.origin.share.numpy() - damping / he / np.where(both > 0.0, both, 1.0)).max() < 4 * EPS
+
+
+def test_lengths_to_come_are_none_below_nought(device):
+    """A spring that shrank to less than a quarter in the last step of BDF2 has s̃ = (4s₀ − s₋₁)/3 < 0, which no length is."""
+    scene, rests = crumpled("Spring"), []
+    for scale in (-1.0, -4.0):  # x₀ − x₋₁ = scale·x₀: from 2 and from 5 times the size
+        D = Dissipation(scene, 0.1, device, scale * scene.positions, bdf2=True)
+        (elements,) = dissipations(D.model, 0.1)
+        Past(D.model, [elements]).launch(D.model.positions, D.model.array(scale * scene.positions, D.model.vec3), bdf2=True)
+        rests.append(elements.rest.numpy()[:, 0])
+    y = np.diff(scene.positions[scene.terms[0].stencil(scene.mesh)], axis=1)[:, 0]
+    assert np.abs(rests[0] - (4.0 - 2.0) / 3.0 * np.linalg.norm(y, axis=1)).max() < 100 * EPS
+    assert (rests[1] == 0.0).all()
+
+
+@pytest.mark.parametrize("integrator", ["euler", "midpoint", "bdf2"])
+def test_a_hinge_is_damped_through_folded_flat(integrator, device):
+    """θ jumps there by 2π and its rate does not: D of a step through it is that of the same turn an angle of 1 before."""
+    mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, -1.0, 0.0]]), [[0, 1, 2], [1, 0, 3]])
+    turn, he, beta, found = 0.03, 0.1, 0.4, []
+
+    def at(angle):
+        x = mesh.points.copy()
+        x[2] = [0.5, np.cos(angle), np.sin(angle)]
+        return x
+
+    for sign in (1.0, -1.0):
+        for first in (np.pi - 1.0, np.pi - 1.3 * turn, np.pi - 0.2 * turn, np.pi + 0.5 * turn):
+            before, now, after = (at(sign * (first + part * turn)) for part in (-1.0, 0.0, 1.0))
+            terms = [wc.DihedralBending(stiffness=0.0, damping=beta)]
+            scene = wc.Scene(mesh, masses=np.ones(4), positions=now, terms=terms, gravity=(0.0, 0.0, 0.0))
+            knows = {"euler": {}, "midpoint": {"midpoint": True}, "bdf2": {"bdf2": True}}[integrator]
+            D = Dissipation(scene, he, device, now - before if knows else None, **knows)
+            found.append(D.energy(after))
+    assert found == pytest.approx([found[0]] * len(found), rel=1e-9)
+    # The measure of this hinge is 1, and the changes of s less s̃ are those of a steady turn.
+    expected = {"euler": 1.0, "midpoint": 1.0, "bdf2": 2.0 / 3.0}[integrator] * turn
+    assert found[0] == pytest.approx(0.5 * beta / he * expected**2, rel=2.0 * turn)
+
+
 def oscillator(damping, omega=2.0, h=0.1):
     """A unit mass on a damped spring of rest length 1 from a pin, stretched by 0.25: u″ = −ω²u − βu′."""
     mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), edges=[[0, 1]])
@@ -257,6 +306,19 @@ def test_limit_of_a_damped_net(device):
     c = ratio * k
     limit = step_limits(damped.build(device=device, dtype="float64"))[0]
     assert limit == pytest.approx(4.0 / (c + np.sqrt(c * c + 4.0 * k)), rel=1e-3)
+
+
+def test_limit_where_one_part_is_stiff_and_another_damped(device):
+    """That of the worse part, though no part has both the largest stiffness and the largest damping."""
+    mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]), edges=[[0, 1], [2, 3]])
+    for k, beta in (((9.0, 1.0), (0.0, 2.0)), ((4.0, 1.0), (0.5, 3.0)), ((10.0, 0.0), (0.0, 10.0 / 3.0))):
+        spring = wc.Spring(stiffness=k, damping=beta)
+        scene = wc.Scene(mesh, masses=np.ones(4), terms=[spring], pins=[0, 2], gravity=(0.0, 0.0, 0.0))
+        rest, motion = step_limits(scene.build(device=device, dtype="float64"))
+        k, beta = np.array(k), np.array(beta)
+        assert rest == pytest.approx((4.0 / (beta + np.sqrt(beta**2 + 4.0 * k))).min(), rel=1e-6)
+        k, beta = 2.0 * k, 2.0 * beta  # of Gershgorin, with the block of the pin
+        assert motion == pytest.approx((4.0 / (beta + np.sqrt(beta**2 + 4.0 * k))).min(), rel=1e-9)
 
 
 @pytest.mark.parametrize("solver", [wc.Explicit(substeps=1), wc.Newton(substeps=1, tolerance=1e-12, integrator="midpoint")])

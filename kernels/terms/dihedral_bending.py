@@ -72,10 +72,12 @@ def undefined(y: Any):
 @wp.func
 def wrap(angle: Any):
     """Into (−π, π], from within (−3π, 3π)."""
-    if angle > type(angle)(wp.pi):
-        angle -= type(angle)(2.0 * wp.pi)
-    if angle <= -type(angle)(wp.pi):
-        angle += type(angle)(2.0 * wp.pi)
+    pi = type(angle)(wp.pi)
+    turn = pi + pi  # a product of literals would be one of float32
+    if angle > pi:
+        angle -= turn
+    if angle <= -pi:
+        angle += turn
     return angle
 
 
