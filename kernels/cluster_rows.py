@@ -32,7 +32,6 @@ def linearise_clusters(dtype):
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
-        inverse_mass: wp.array(dtype=dtype),
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         h: dtype,

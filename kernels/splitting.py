@@ -66,7 +66,7 @@ def local_minimiser(term: Term, dtype):
 
     @wp.func
     def newton(v: y_type, z: y_type, rest: rest_type, r: dtype, steps: int):
-        n = steps - steps + size
+        n = steps - steps + size  # unknown to the compiler, or it would unroll
         now = value(v, z, rest, r)
         other = value(v, v, rest, r)
         if not (now <= other):
@@ -88,7 +88,7 @@ def local_minimiser(term: Term, dtype):
             for i in range(n):
                 direction[i // 3, i % 3] = p[i]
             t = dtype(1.0)
-            halvings = steps - steps
+            halvings = steps - steps  # 0, and no constant, so that it may change in the loop
             searching = halvings == 0
             while searching:
                 after = value(v, z + t * direction, rest, r)

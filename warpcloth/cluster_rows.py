@@ -47,8 +47,8 @@ class ClusterRows:
 
     def launch_linearise(self, x, d, h, least, multipliers, *out):
         """As :meth:`warpcloth.constraints.TermRows.launch_linearise`."""
-        model, cells = self.model, self.cells
-        given = [cells.offsets, cells.shape, *self.elements.arguments, model.inverse_mass, x, d, h, least, *self._where]
+        cells = self.cells
+        given = [cells.offsets, cells.shape, *self.elements.arguments, x, d, h, least, *self._where]
         self._launch("linearise_clusters", cells.count, given, [multipliers, self._rotations, *out])
 
     def launch_apply(self, v, out):
