@@ -71,27 +71,27 @@ def predict(dtype):
 
 @cache
 def start_bdf2(dtype):
-    """Kernel over vertices, the past of a motion of constant a₀ = g − ∇U/m: move = x₀ − x₋₁ = h v₀ − ½h²a₀, v₋₁ = v₀ − h a₀."""
+    """Kernel over vertices: move ← x₀ − x₋₁ = h(v₁ − 7/4(v₂ − v₁)), v₋₁ ← v₀ − 3/2(v₁ − v₀), where v₋₁ has v₁ before.
+
+    v₁ and v₂ are those of two steps of implicit Euler of hₑ = 2h/3; see :class:`warpcloth.integrators.BDF2`.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def start(
         inverse_mass: wp.array(dtype=dtype),
-        gravity: wp.array(dtype=vec3),
-        per_copy: int,
         h: dtype,
-        gradient: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
-        # out
+        second: wp.array(dtype=vec3),
+        # in and out
         move: wp.array(dtype=vec3),
         v_before: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        w = inverse_mass[i]
-        if w > dtype(0.0):
-            change = h * (gravity[i // per_copy] - w * gradient[i])
-            move[i] = h * (v[i] - dtype(0.5) * change)
-            v_before[i] = v[i] - change
+        if inverse_mass[i] > dtype(0.0):
+            first = v_before[i]
+            move[i] = h * (first - dtype(1.75) * (second[i] - first))
+            v_before[i] = v[i] - dtype(1.5) * (first - v[i])
 
     return start
 

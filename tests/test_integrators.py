@@ -82,7 +82,7 @@ def test_order_on_an_oscillator(name, integrator, device):
 def test_energy_of_an_oscillator(name, integrator, omega_h, device):
     """With w = v + iωu, z = iωh: Euler w/(1 − z), midpoint w(1 + z/2)/(1 − z/2), which keeps |w|, BDF2 the roots of its law.
 
-    (3/2 − z)r² − 2r + 1/2 = 0, from w₋₁ = w₀(1 − z) + ½h²ω·(i a₀), a₀ = −ω²u₀.
+    (3/2 − z)r² − 2r + 1/2 = 0, from v₋₁ and u₋₁ of two steps of Euler of 2h/3, w₀/(1 − 2z/3)ⁿ.
     """
     h, steps = 0.1, 40
     omega, z = omega_h / h, 1j * omega_h
@@ -90,7 +90,8 @@ def test_energy_of_an_oscillator(name, integrator, omega_h, device):
     w = swing(bound(scene, SOLVERS[name], device, integrator=integrator), steps, omega)
     n = np.arange(steps + 1)
     if integrator == "bdf2":
-        before = w[0] * (1.0 - z) - 0.5j * h**2 * omega**2 * w[0].imag
+        v = (w[0] / (1.0 - z / 1.5) ** np.arange(3)).real
+        before = (2.5 * v[0] - 1.5 * v[1]) + 1j * w[0].imag - z * (v[1] - 1.75 * (v[2] - v[1]))
         r = (2.0 + np.array([1.0, -1.0]) * np.sqrt(1.0 + 2.0 * z)) / (3.0 - 2.0 * z)
         parts = np.linalg.solve([[1.0, 1.0], 1.0 / r], [w[0], before])
         exact = (parts[:, None] * r[:, None] ** n).sum(axis=0)
@@ -183,6 +184,50 @@ def test_order_on_a_net_whose_pins_move(name, integrator, damping, device):
         errors.append(np.sqrt(((ends - true_end(damping)) ** 2).mean(axis=(1, 2))))
     found = np.log2(np.divide(errors[:-1], errors[1:]))
     assert np.abs(found[-1] - (1 if integrator == "euler" else 2)).max() < 0.15
+
+
+# A net of 6 × 6, stretched at rest or its vertices in any motion: ωh of the stiffest mode 0.8 to 800, βh/m of an edge 4 to 4e5.
+STARTS = {f"stretched, {k:g} N/m": (1.02, 0.0, {"stiffness": k}) for k in (1.0, 1e2, 1e4, 1e6)}
+STARTS |= {f"damped by {b:g} N s/m": (1.0, 0.1, {"stiffness": 1e2, "damping": b}) for b in (1.0, 1e3, 1e5)}
+
+
+@pytest.mark.parametrize("start", STARTS)
+@each_solver
+def test_bdf2_gains_no_energy_where_it_starts(name, start, device):
+    """Not out of balance by ωh·ωu of speed a step, nor damped by βh/m of it, whatever they are."""
+    (stretch, speed, spring), mesh = STARTS[start], wc.Mesh.grid(6, 6)
+    scene = wc.Scene(
+        mesh,
+        density=0.1,
+        positions=stretch * mesh.points,
+        velocities=speed * np.random.default_rng(0).normal(size=(36, 3)),
+        terms=[wc.Spring(pairs=("structural", "shear"), **spring)],
+        gravity=(0.0, 0.0, 0.0),
+        fps=60.0,
+    )
+    # Residuals are relative to the first, and such forces are not found to 1e-11.
+    loose = {"iterations": 100} if "xpbd" in name else {"iterations": 100, "tolerance": 1e-6}
+    stepper = bound(scene, SOLVERS[name], device, integrator="bdf2", **loose)
+    pairs, energies = scene.terms[0].stencil(mesh), []
+    lengths = np.linalg.norm(np.diff(mesh.points[pairs], axis=1)[:, 0], axis=1)
+    for step in range(11):
+        if step:
+            stepper.step()
+        x, v = (array.numpy() for array in stepper.state)
+        strained = np.linalg.norm(np.diff(x[pairs], axis=1)[:, 0], axis=1) - lengths
+        kinetic = 0.5 * (scene.vertex_masses[:, None] * v**2).sum()
+        energies.append(kinetic + 0.5 * spring["stiffness"] * (strained**2).sum())
+    assert max(energies[1:]) < energies[0]
+
+
+def test_the_start_of_bdf2_leaves_the_state(device):
+    """It takes a step to learn a₀ and puts back where everything is, pins and their keyframes too."""
+    scene = held(2.0)
+    for name in SOLVERS:
+        stepper = bound(scene, SOLVERS[name], device, integrator="bdf2", substeps=4)
+        assert np.array_equal(stepper.state.x.numpy(), stepper.model.positions.numpy())
+        assert np.array_equal(stepper.state.v.numpy(), stepper.model.velocities.numpy())
+        assert stepper.count.numpy()[0] == 0
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "bdf2"])

@@ -5,7 +5,8 @@ minimiser is taken for (Hairer and Wanner 1996, *Solving ordinary differential e
 correction d = x − x̃, velocities follow from d/hₑ = hₑ a with a = −∇U/m at the minimiser.
 """
 
-from .damping import Forces
+import warp as wp
+
 from .kernels import step as kernels
 
 
@@ -23,6 +24,9 @@ class Euler:
 
     def __init__(self, stepper):
         self.stepper, self.he = stepper, self.part * stepper.h
+
+    def start(self):
+        """Before the first step: what a method needs that looks back."""
 
     def launch_past(self, past):
         """Where a step begins, what its damping needs: (s − s̃)/hₑ is the rate of s then."""
@@ -72,9 +76,14 @@ class Midpoint(Euler):
 class BDF2(Euler):
     """hₑ = 2h/3, x̃ = (4x₀ − x₋₁)/3 + hₑ(4v₀ − v₋₁)/3 + hₑ² g; the minimiser is x₁, v₁ = (4v₀ − v₋₁)/3 + hₑ(a₁ + g).
 
-    Of second order. It starts as if from a motion of constant a₀ = −∇(U + D)/m + g: x₋₁ = x₀ − h v₀ + ½h²a₀, v₋₁ = v₀ − h a₀.
-    That keeps the order, and one hₑ for all steps. Pins stand still before the start. Damping looks back over kinks of their
-    motion: right after one its force has half of the jump too much, which is just what (v₀ − v₋₁)/3 lacks.
+    Of second order. Two steps of Euler of hₑ from x₀, to v₁ and v₂, say what was before:
+
+        v₋₁ = v₀ − h a₀, a₀ = (v₁ − v₀)/hₑ;  x₋₁ = x₀ − h v̄ + ½h²(v₂ − v₁)/hₑ, v̄ = 2v₁ − v₂
+
+    v̄ is v₀ but for O(h²) and for what is stiff or damped so much that the first step stops it, which x₋₁ must not have move on.
+    Errors of O(h) in accelerations keep the order, hₑ the one matrix for all steps, and from no start does linear motion gain
+    energy. Pins stand still before the start. Damping looks back over kinks of their motion: right after one its force has half
+    of the jump too much, which is just what (v₀ − v₋₁)/3 lacks.
 
     Attributes:
         move: x₀ − x₋₁ (N,) [m].
@@ -85,11 +94,23 @@ class BDF2(Euler):
 
     def __init__(self, stepper):
         super().__init__(stepper)
-        model = stepper.model
-        self.move, self.v_before, gradient = (model.vectors() for _ in range(3))
-        Forces(model, stepper.h).add(*stepper.state, gradient)
-        given = [self._gravity, self._n, stepper.h, gradient, stepper.state.v]
-        self._launch(kernels.start_bdf2, given, [self.move, self.v_before])
+        self.move, self.v_before = (stepper.model.vectors() for _ in range(2))
+
+    def start(self):
+        """Finds what was before, by steps with x₋₁ = x₀ and v₋₁ = v₀, which are those of Euler of hₑ, and puts the state back.
+
+        How these steps end counts as it does of others.
+        """
+        stepper, model, (x, v) = self.stepper, self.stepper.model, self.stepper.state
+        for _ in range(2):
+            self.move.zero_()
+            wp.copy(self.v_before, v)
+            if stepper.count is not None:
+                stepper.count.fill_(-1)  # pins are led to their first keyframe, which is where they are
+            stepper.step()
+        self._launch(kernels.start_bdf2, [stepper.h, model.velocities, v], [self.move, self.v_before])
+        wp.copy(x, model.positions)
+        wp.copy(v, model.velocities)
 
     def launch_past(self, past):
         past.launch(self.stepper.state.x, self.move, bdf2=True)

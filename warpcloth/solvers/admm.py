@@ -109,6 +109,7 @@ class ADMMStepper(Stepper):
         self._local = Segment(model.device, self._launch_local)
         self._move = Segment(model.device, self._launch_move)
         self._finish = Segment(model.device, lambda: self.launch_finish(self.correction))
+        self.integrator.start()
 
     def step(self):
         self._start()

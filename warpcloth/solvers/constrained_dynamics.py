@@ -155,6 +155,7 @@ class ConstrainedDynamicsStepper(Stepper):
         self._solve = Segment(device, self._launch_solve) if self._linear.capturable else self._launch_solve
         self._move = Segment(device, self._launch_move)
         self._finish = Segment(device, lambda: self.launch_finish(self.correction))
+        self.integrator.start()
 
     def step(self):
         self._start()

@@ -63,6 +63,7 @@ class NewtonStepper(Stepper):
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.he**2)
         self._predict = Segment(model.device, self.launch_prediction)
         self._finish = Segment(model.device, lambda: self.launch_finish(self.minimiser.correction))
+        self.integrator.start()
 
     def step(self):
         self._predict()

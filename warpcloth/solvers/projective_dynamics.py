@@ -101,6 +101,7 @@ class ProjectiveDynamicsStepper(Stepper):
         self._start = Segment(model.device, self._launch_start)
         self._move = Segment(model.device, self._launch_move)
         self._finish = Segment(model.device, lambda: self.launch_finish(self.correction))
+        self.integrator.start()
 
     def step(self):
         self._start()

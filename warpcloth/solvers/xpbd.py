@@ -106,6 +106,7 @@ class XPBDStepper(Stepper):
         self._start = Segment(model.device, self._launch_start)
         self._sweep = Segment(model.device, self.sweep.launch)
         self._last = Segment(model.device, self._launch_last)
+        self.integrator.start()
 
     def _launch_start(self):
         self.launch_prediction()
