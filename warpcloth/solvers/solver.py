@@ -84,6 +84,8 @@ class ImplicitStep(Step):
 class Stepper:
     """A solver bound to a model: all it needs is allocated, and ``step`` moves the state on by one step.
 
+    The constructor of one that takes an integrator ends with ``integrator.start()``, which may step.
+
     Attributes:
         state: :class:`State`.
         h: Step [s].
