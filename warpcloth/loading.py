@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .mesh import Mesh
+from .mesh import STAGE_ENDINGS, Mesh
 
-# trimesh would split vertices at texture seams and make a mesh of every material; an OBJ's objects stay apart.
-_OPTIONS = {
+# What is read, and how: trimesh would split vertices at texture seams and make a mesh of every material; an OBJ's objects
+# stay apart.
+ENDINGS = {
     ".obj": {"split_objects": True, "group_material": False, "skip_materials": True},
     ".ply": {"fix_texture": False, "skip_materials": True},
     ".stl": {},
@@ -17,10 +18,10 @@ _OPTIONS = {
     ".gltf": {},
 }
 # STL has no shared vertices at all; glTF stores a vertex once for every normal and texture coordinate that it has.
-_WELDED = (".stl", ".glb", ".gltf")
+WELDED = (".stl", ".glb", ".gltf")
 
 
-def read_file(path, name=None):
+def read_file(path, name=None, kind=Mesh):
     """The triangle mesh in a file.
 
     Vertices keep the order of the file. STL and glTF repeat a vertex wherever triangles differ in normal or texture,
@@ -36,6 +37,7 @@ def read_file(path, name=None):
         path: An .obj, .ply, .stl, .off, .glb or .gltf file.
         name: Of the geometry (OBJ: object; glTF: node; STL: solid), if the file has several. Vertices of the others are
             left out.
+        kind: `Mesh` or `Surface`.
 
     Returns:
         Mesh: float64 points, as exact as the file's numbers.
@@ -46,12 +48,33 @@ def read_file(path, name=None):
             relative indices; it has several geometries and `name` is none of them; or Mesh refuses it. The message
             begins with the path.
     """
+    points, triangles, st = read_arrays(path, name)
+    try:
+        return kind(points, triangles, texture_coordinates=st)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_arrays(path, name=None):
+    """What a mesh is made of, as `read_file` describes it.
+
+    Args:
+        path: As for `read_file`.
+        name: As for `read_file`.
+
+    Returns:
+        Points (n, 3) float64, finite or not, triangles (T, 3) int64 and texture coordinates (n, 2) or None.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: As for `read_file`.
+    """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     ending = path.suffix.lower()
-    if ending not in _OPTIONS:
-        raise ValueError(f"{path}: the ending must be one of {' '.join(_OPTIONS)} .usd .usda .usdc .usdz")
+    if ending not in ENDINGS:
+        raise ValueError(f"{path}: the ending must be one of {' '.join((*ENDINGS, *STAGE_ENDINGS))}")
     if path.stat().st_size == 0:
         raise ValueError(f"{path}: the file is empty")
     # trimesh counts relative indices from the end of the file instead of from their line: other triangles, silently.
@@ -60,7 +83,7 @@ def read_file(path, name=None):
     import trimesh
 
     try:
-        scene = trimesh.load_scene(path, process=False, maintain_order=True, **_OPTIONS[ending])
+        scene = trimesh.load_scene(path, process=False, maintain_order=True, **ENDINGS[ending])
     except Exception as error:  # the readers raise whatever a broken file makes them stumble over
         raise ValueError(f"{path}: cannot be read as {ending}, {type(error).__name__}: {error}") from error
     found = {node: scene.graph[node] for node in scene.graph.nodes_geometry}
@@ -73,11 +96,11 @@ def read_file(path, name=None):
     if name is not None and name not in found:
         raise ValueError(f"{path}: has no geometry {name!r}, it has {names}")
     transform, geometry = found[next(iter(found)) if name is None else name]
-    return _mesh(path, scene.geometry[geometry], transform, len(found) > 1)
+    return _arrays(path, scene.geometry[geometry], transform, len(found) > 1)
 
 
-def _mesh(path, geometry, transform, drop_unused):
-    """The Mesh of a trimesh.Trimesh, as read_file describes it."""
+def _arrays(path, geometry, transform, drop_unused):
+    """Points, triangles and texture coordinates of a trimesh.Trimesh, as read_file describes them."""
     ending = path.suffix.lower()
     points = np.asarray(geometry.vertices, dtype=np.float64)
     triangles = np.asarray(geometry.faces, dtype=np.int64)
@@ -95,15 +118,12 @@ def _mesh(path, geometry, transform, drop_unused):
     if drop_unused:
         kept = np.unique(triangles)
         triangles = np.searchsorted(kept, triangles)
-    if ending in _WELDED:
+    if ending in WELDED:
         first, place = _first_of_equals(points[kept])
         if st is not None and not np.array_equal(st[kept], st[kept][first][place]):
             st = None
         kept, triangles = kept[first], place[triangles]
-    try:
-        return Mesh(points[kept], triangles, texture_coordinates=None if st is None else st[kept])
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return points[kept], triangles, None if st is None else st[kept]
 
 
 def _first_of_equals(points):

@@ -7,6 +7,8 @@ import numpy as np
 
 from .selection import select
 
+STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+
 # A float32 coordinate is rounded by 6e-8 of its size, so a triangle flatter than this has an area made of rounding.
 _FLATTEST = 1e-7
 
@@ -38,7 +40,7 @@ class Mesh:
     grid_shape: tuple[int, int] | None = None
 
     def __post_init__(self):
-        points = _coordinates("points", self.points, 3)
+        points = _numbers("points", self.points, 3)
         n = len(points)
         if (self.triangles is None) == (self.edges is None):
             raise ValueError("triangles, edges: give exactly one of the two, for the edges of triangles follow from them")
@@ -46,7 +48,7 @@ class Mesh:
         keep(self, "points", _read_only(points))
         if self.triangles is not None:
             keep(self, "triangles", _read_only(_indices("triangles", self.triangles, 3, n)))
-            self._refuse_flat_triangles()
+            self._refuse_degenerate()
             order, first, _ = self._sides
             start = order[first]
             corners = np.stack([start, start + 1], axis=1) % 3
@@ -54,6 +56,7 @@ class Mesh:
         else:
             keep(self, "triangles", _read_only(np.empty((0, 3), np.int32)))
             keep(self, "edges", _read_only(_indices("edges", self.edges, 2, n)))
+            self._refuse_degenerate()
             self._refuse_repeated_edges()
         if self.texture_coordinates is not None:
             st = _coordinates("texture_coordinates", self.texture_coordinates, 2)
@@ -69,7 +72,7 @@ class Mesh:
             keep(self, "grid_shape", (nx, ny))
 
     def __repr__(self):
-        return f"Mesh({len(self.points)} points, {len(self.triangles)} triangles, {len(self.edges)} edges)"
+        return f"{type(self).__name__}({len(self.points)} points, {len(self.triangles)} triangles, {len(self.edges)} edges)"
 
     @classmethod
     def grid(cls, nx, ny, size=1.0, pattern="diagonal"):
@@ -152,15 +155,15 @@ class Mesh:
             prim: Name of the geometry, or path of the prim, where the file has several.
 
         Returns:
-            Mesh: Vertices in the order of the file.
+            Mesh: Vertices in the order of the file; of the class that it is asked of.
         """
-        if str(path).lower().endswith((".usd", ".usda", ".usdc", ".usdz")):
+        if str(path).lower().endswith(STAGE_ENDINGS):
             from .usd import read_mesh
 
-            return read_mesh(path, prim)
+            return read_mesh(path, prim, cls)
         from .loading import read_file
 
-        return read_file(path, prim)
+        return read_file(path, prim, cls)
 
     def select(self, text):
         """Vertices described by a text such as "z == 0 and not corners": see `selection.select`.
@@ -341,19 +344,42 @@ class Mesh:
         """Pairs (E, 2) with the smaller index first, in lexicographic order, each once, int32."""
         return np.stack(np.divmod(np.unique(self._keys(pairs)), len(self.points)), axis=1).astype(np.int32)
 
-    def _refuse_flat_triangles(self):
-        sides = self.points[self.triangles] - self.points[np.roll(self.triangles, 1, axis=1)]
-        longest_squared = np.einsum("tki,tki->tk", sides, sides).max(axis=1)
-        # 2·area/longest² is the height over the longest side, by that side.
-        flat = 2 * self.triangle_areas <= _FLATTEST * longest_squared
-        _refuse("triangles", self.triangles, flat, f"must be higher than {_FLATTEST:g} of its longest side")
+    def _flat(self):
+        """Whether a triangle has no area to speak of (T,), or none that can be told."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            sides = self.points[self.triangles] - self.points[np.roll(self.triangles, 1, axis=1)]
+            longest_squared = np.einsum("tki,tki->tk", sides, sides).max(axis=1)
+            # 2·area/longest² is the height over the longest side, by that side.
+            return ~(2 * self.triangle_areas > _FLATTEST * longest_squared)
+
+    def _refuse_degenerate(self):
+        _refuse("points", self.points, ~np.isfinite(self.points).all(axis=1), "must be finite")
+        _refuse("triangles", self.triangles, _repeated(self.triangles), "must be 3 different vertices")
+        _refuse("triangles", self.triangles, self._flat(), f"must be higher than {_FLATTEST:g} of its longest side")
 
     def _refuse_repeated_edges(self):
+        _refuse("edges", self.edges, _repeated(self.edges), "must be 2 different vertices")
         keys = self._keys(self.edges)
         repeated = np.ones(len(keys), dtype=bool)
         repeated[np.unique(keys, return_index=True)[1]] = False
         _refuse("edges", self.edges, repeated, "must occur once, in either direction")
         _refuse("edges", self.edges, self.edge_lengths == 0, "must have two different end points")
+
+
+class Surface(Mesh):
+    """A mesh that is only measured: a triangle may be flat or name a vertex twice, and a point need not be finite.
+
+    A garment then need not be refused for one bad triangle; whoever measures leaves out those that are `degenerate`, and says
+    so. Edges and what follows from them count such triangles too, so that an edge may join a vertex with itself.
+    """
+
+    @cached_property
+    def degenerate(self):
+        """Sorted triangles (k,), int32, that a `Mesh` would refuse."""
+        return _read_only(np.flatnonzero(self._flat() | _repeated(self.triangles)).astype(np.int32))
+
+    def _refuse_degenerate(self):
+        """Refuses nothing."""
 
 
 def _read_only(array):
@@ -381,8 +407,12 @@ def _rows(name, value, width, kinds):
     return array
 
 
+def _numbers(name, value, width):
+    return _rows(name, value, width, "fiu").astype(np.float64)
+
+
 def _coordinates(name, value, width):
-    rows = _rows(name, value, width, "fiu").astype(np.float64)
+    rows = _numbers(name, value, width)
     _refuse(name, rows, ~np.isfinite(rows).all(axis=1), "must be finite")
     return rows
 
@@ -390,9 +420,13 @@ def _coordinates(name, value, width):
 def _indices(name, value, width, n):
     rows = _rows(name, value, width, "iu")
     _refuse(name, rows, ((rows < 0) | (rows >= n)).any(axis=1), f"must be indices of the {n} points, 0 to {n - 1}")
-    ordered = np.sort(rows, axis=1)
-    _refuse(name, rows, (ordered[:, 1:] == ordered[:, :-1]).any(axis=1), f"must be {width} different vertices")
     return rows.astype(np.int32)
+
+
+def _repeated(rows):
+    """Whether a row (count, width) has a number twice."""
+    ordered = np.sort(rows, axis=1)
+    return (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
 
 
 def _count(name, value):

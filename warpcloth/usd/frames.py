@@ -5,7 +5,7 @@ import os
 import numpy as np
 from pxr import Sdf, UsdGeom
 
-from .stage import curve_vertices, find_prim, first_points, followed, local_to_metres, open_stage
+from .stage import curve_vertices, find_prim, first_points, followed, local_to_metres, moving_space, open_stage, topology
 
 _VECTORS = ("points", "velocities")
 
@@ -16,7 +16,10 @@ class FrameSequence:
     A frame is read when it is indexed, and nothing is kept, so memory stays flat however many frames there are.
     `np.asarray(sequence)` reads all of them. Once the file has been written again, by another run or the same, reading raises
     a RuntimeError: USD may still hold some of the earlier frames, and would mix them with the new ones. After the file was
-    deleted reading goes on for as long as USD holds it.
+    deleted reading goes on for as long as USD holds it. A frame with another number of values than the first one, or of points
+    with other faces than the prim has, raises a ValueError.
+
+    Points of a prim whose transform is animated are taken where that puts them at their own time codes.
 
     Attributes:
         shape: (frames, n, 3); of a primvar (frames, n), or where it is uniform (frames, faces of the prim).
@@ -38,7 +41,8 @@ class FrameSequence:
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is no stage, the prim cannot be told, or the attribute is not animated or of another type.
+            ValueError: It is no stage, the prim cannot be told, or the attribute is not animated or of another type; velocities
+                are asked of a prim whose transform is animated.
         """
         if attribute not in _VECTORS and not str(attribute).startswith("primvars:"):
             raise ValueError(f'attribute = {attribute!r}: must be "points", "velocities" or a primvar, "primvars:<name>"')
@@ -47,7 +51,7 @@ class FrameSequence:
         self._identity = _identity(self._file)  # before it is opened, so that no change is missed
         self._stage = open_stage(path)
         found = find_prim(self._stage, path, prim)
-        where = f"{path}, prim {found.GetPath()}"
+        self._where = where = f"{path}, prim {found.GetPath()}"
         self._attribute = found.GetAttribute(attribute)
         self.time_codes = np.array(self._attribute.GetTimeSamples() if self._attribute else [])
         if not len(self.time_codes):
@@ -56,11 +60,19 @@ class FrameSequence:
         if not vectors and self._attribute.GetTypeName() != Sdf.ValueTypeNames.FloatArray:
             raise ValueError(f"{where}: {attribute} has type {self._attribute.GetTypeName()}, must be float[]")
         self.times = (self.time_codes - self.time_codes[0]) / self._stage.GetTimeCodesPerSecond()
-        transform = local_to_metres(found, where)
-        self._linear = transform[:3, :3] if vectors and not np.array_equal(transform[:3, :3], np.eye(3)) else None
+        # Velocities in a moving space would need those of that space too; nobody has asked for it yet.
+        self._moving = found if attribute == "points" and moving_space(found) else None
+        self._transform = np.eye(4) if self._moving or not vectors else local_to_metres(found, where)
+        if attribute != "points":
+            self._transform[3, :3] = 0.0
         self._scale = 1.0 if vectors else scale
-        self._offset = transform[3, :3] if attribute == "points" and transform[3, :3].any() else None
-        count = len(self._attribute.Get(self.time_codes[0]))
+        self._faces = []  # what is sampled of the faces, and has to stay as it is
+        if attribute == "points" and found.IsA(UsdGeom.Mesh):
+            mesh = UsdGeom.Mesh(found)
+            faces = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+            self._faces = [(sampled, topology(sampled)) for sampled in faces if sampled.GetNumTimeSamples()]
+        first = self._attribute.Get(self.time_codes[0])
+        self._count = count = 0 if first is None else len(first)
         # Curves show a vertex several times where they meet; the first is read.
         self._points = None
         if not found.IsA(UsdGeom.Mesh) and (vectors or UsdGeom.Primvar(self._attribute).GetInterpolation() == "vertex"):
@@ -101,22 +113,55 @@ class FrameSequence:
         result = self[:]
         return result if dtype is None else result.astype(dtype, copy=False)
 
+    def exact(self, frame):
+        """One frame of points in float64, which holds more of what a transform makes of the file's float32.
+
+        Args:
+            frame: Its number, from 0.
+
+        Returns:
+            np.ndarray: (n, 3) [m].
+        """
+        value = self._values(frame).astype(np.float64)
+        transform = self._transform
+        if self._moving:
+            code = self.time_codes[frame]
+            transform = local_to_metres(self._moving, f"{self._where}, time code {code:g}", code)
+        # Not by the identity, which makes all of a point NaN where one coordinate is.
+        if not np.array_equal(transform[:3, :3], np.eye(3)):
+            value = value @ transform[:3, :3]
+        return value + transform[3, :3] if transform[3, :3].any() else value
+
     def _read(self, frame):
+        if self.ndim == 3:
+            return self.exact(frame).astype(np.float32)
+        return (self._values(frame) * self._scale).astype(np.float32, copy=False)
+
+    def _values(self, frame):
+        """What the file has of a frame, a vertex once."""
         if _identity(self._file) not in (None, self._identity):
             raise RuntimeError(
                 f"{self._file}: has been written again since these frames were opened; open it again, "
                 "and give runs that are to be compared an output each"
             )
-        value = np.array(self._attribute.Get(self.time_codes[frame]), dtype=np.float32)
-        if self._points is not None:
-            value = value[self._points]
-        if self._linear is not None:
-            value = value.astype(np.float64) @ self._linear
-        if self._offset is not None:
-            value = value + self._offset
-        if self._scale != 1.0:
-            value = value * self._scale
-        return value.astype(np.float32, copy=False)
+        code = self.time_codes[frame]
+        values = self._attribute.Get(code)
+        found = 0 if values is None else len(values)
+        if found != self._count:
+            name = self._attribute.GetName()
+            raise ValueError(f"{self._where}: {found} {name} at time code {code:g}, must be {self._count} as at the first")
+        for sampled, fixed in self._faces:
+            now = topology(sampled, code)
+            if len(now) != len(fixed):
+                raise ValueError(f"{self._where}: {len(now)} {sampled.GetName()} at time code {code:g}, must stay {len(fixed)}")
+            if not np.array_equal(now, fixed):
+                place = int(np.argmax(now != fixed))
+                raise ValueError(
+                    f"{self._where}: {sampled.GetName()}[{place}] is {now[place]} at time code {code:g}, "
+                    f"must stay {fixed[place]}"
+                )
+        values = np.array(values, dtype=np.float32)
+        return values if self._points is None else values[self._points]
 
 
 def _identity(path):

@@ -31,6 +31,7 @@ class StageMesh:
         start: First time code, None where the stage does not say.
         pins: Sorted vertex indices (p,) int32 by name, of every GeomSubset of points.
         point_vertices: Curves: the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
+        rest: Whether the stage says a rest shape, the default points; else the mesh is that of one time code.
     """
 
     mesh: Mesh
@@ -44,22 +45,24 @@ class StageMesh:
     start: float | None
     pins: dict
     point_vertices: np.ndarray | None = None
+    rest: bool = True
 
 
-def read_mesh(path, prim=None):
+def read_mesh(path, prim=None, kind=Mesh):
     """The rest shape of a cloth: see `read_stage_mesh`, which also tells what the stage says about it.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
         prim: Path or name of the prim; may be left out where there is only one mesh.
+        kind: `Mesh` or `Surface`.
 
     Returns:
         Mesh: In metres and the stage's world space.
     """
-    return read_stage_mesh(path, prim).mesh
+    return read_stage_mesh(path, prim, kind).mesh
 
 
-def read_stage_mesh(path, prim=None):
+def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
     The points at the default time are the rest shape. A stage with time samples alone is read at its first sample, with a
@@ -71,6 +74,9 @@ def read_stage_mesh(path, prim=None):
         path: A .usd, .usda, .usdc or .usdz file.
         prim: Path or name of the prim; may be left out where the stage has one mesh (or no mesh and one curves prim),
             and for a result of `AnimationWriter`, which names its own.
+        kind: `Mesh` or `Surface`.
+        time: Time code at which the transform is taken, which may be animated then, and the points without a warning where
+            they have no default.
 
     Returns:
         StageMesh: The mesh and its surroundings.
@@ -83,20 +89,20 @@ def read_stage_mesh(path, prim=None):
     stage = open_stage(path)
     found = find_prim(stage, path, prim)
     where = f"{path}, prim {found.GetPath()}"
-    transform = local_to_metres(found, where)
-    points = _rest_points(found, where) @ transform[:3, :3] + transform[3, :3]
+    transform = local_to_metres(found, where, time)
+    points = _rest_points(found, where, time) @ transform[:3, :3] + transform[3, :3]
     point_vertices = None
     try:
         if found.IsA(UsdGeom.Mesh):
             triangles = _triangles(found, len(points))
             if np.linalg.det(transform[:3, :3]) < 0:
                 triangles = triangles[:, ::-1]
-            mesh = Mesh(points, triangles, texture_coordinates=_texture_coordinates(found, len(points)))
+            mesh = kind(points, triangles, texture_coordinates=_texture_coordinates(found, len(points)))
         else:
             point_vertices = curve_vertices(found, len(points))
             edges = point_vertices[_curve_edges(found)]
             edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
-            mesh = Mesh(points[first_points(point_vertices)], edges=edges)
+            mesh = kind(points[first_points(point_vertices)], edges=edges)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     layer = stage.GetRootLayer()
@@ -113,6 +119,7 @@ def read_stage_mesh(path, prim=None):
         start=stage.GetStartTimeCode() if layer.HasStartTimeCode() else None,
         pins=_pins(found, point_vertices),
         point_vertices=point_vertices,
+        rest=UsdGeom.PointBased(found).GetPointsAttr().Get() is not None,
     )
 
 
@@ -189,29 +196,39 @@ def _listed(prims, types=False, most=12):
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def local_to_metres(prim, where):
+def moving_space(prim):
+    """The prim, or prim above it, whose transform is animated; None where the prim's space stands still."""
+    ancestor = prim
+    while ancestor and not ancestor.IsPseudoRoot():
+        xformable = UsdGeom.Xformable(ancestor)
+        if xformable and xformable.TransformMightBeTimeVarying():
+            return ancestor
+        if xformable and xformable.GetResetXformStack():
+            break
+        ancestor = ancestor.GetParent()
+    return None
+
+
+def local_to_metres(prim, where, time=None):
     """The transform (4, 4) float64 from a prim's own space and units to the stage's world space [m], for row vectors.
 
     Args:
         prim: The prim.
         where: File and prim, for messages.
+        time: Time code, or None where it must be the same at all of them.
 
     Returns:
         np.ndarray: The matrix; its last column is [0, 0, 0, 1].
 
     Raises:
-        ValueError: The transform is animated, projects, or cannot be inverted.
+        ValueError: The transform is animated and no time is given, or it projects, or cannot be inverted.
     """
-    ancestor = prim
-    while ancestor and not ancestor.IsPseudoRoot():
-        xformable = UsdGeom.Xformable(ancestor)
-        # Points in a moving space would need velocities of that space too; nobody has asked for it yet.
-        if xformable and xformable.TransformMightBeTimeVarying():
-            raise ValueError(f"{where}: the transform of {ancestor.GetPath()} is animated, must be fixed for a cloth")
-        if xformable and xformable.GetResetXformStack():
-            break
-        ancestor = ancestor.GetParent()
-    matrix = np.array(UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
+    moving = moving_space(prim) if time is None else None
+    if moving:
+        raise ValueError(f"{where}: the transform of {moving.GetPath()} is animated, must be fixed for a cloth")
+    # A transform of one sample stands still, and says nothing at the default time.
+    code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(time)
+    matrix = np.array(UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(code))
     if not np.isfinite(matrix).all() or (matrix[:, 3] != [0, 0, 0, 1]).any():
         raise ValueError(f"{where}: the transform to world space is {matrix.tolist()}, must be affine and finite")
     if not np.linalg.matrix_rank(matrix[:3, :3]) == 3:
@@ -245,11 +262,13 @@ def first_points(point_vertices):
     return np.unique(point_vertices, return_index=True)[1]
 
 
-def _rest_points(prim, where):
-    """Points (P, 3) float64 in the prim's own space at the default time, or else at the first sample."""
+def _rest_points(prim, where, time=None):
+    """Points (P, 3) float64 in the prim's own space at the default time, or else at the time or with a warning the first."""
     attribute = UsdGeom.PointBased(prim).GetPointsAttr()
     value = attribute.Get()
-    if value is None and attribute.GetNumTimeSamples():
+    if value is None and time is not None:
+        value = attribute.Get(time)
+    elif value is None and attribute.GetNumTimeSamples():
         first = attribute.GetTimeSamples()[0]
         warnings.warn(
             f"{where}: points have no default value; the sample at time code {first:g} is taken as the rest shape. "
@@ -262,10 +281,10 @@ def _rest_points(prim, where):
     return np.array(value, dtype=np.float64)
 
 
-def _topology(attribute):
-    """An integer array attribute at the default time, or at its first sample; empty where it has no value."""
-    value = attribute.Get()
-    if value is None:
+def topology(attribute, time=None):
+    """An integer array attribute at a time code, or at the default time or else its first sample; empty without a value."""
+    value = attribute.Get() if time is None else attribute.Get(time)
+    if value is None and time is None:
         value = attribute.Get(Usd.TimeCode.EarliestTime())
     return np.array(value if value is not None else [], dtype=np.int32)
 
@@ -273,7 +292,7 @@ def _topology(attribute):
 def _triangles(prim, count):
     """Triangles (T, 3) int32 of a Mesh prim, counter-clockwise seen from the front in the prim's own space."""
     mesh = UsdGeom.Mesh(prim)
-    counts, corners = _topology(mesh.GetFaceVertexCountsAttr()), _topology(mesh.GetFaceVertexIndicesAttr())
+    counts, corners = topology(mesh.GetFaceVertexCountsAttr()), topology(mesh.GetFaceVertexIndicesAttr())
     if len(counts) == 0:
         raise ValueError("has no faces")
     if (counts < 3).any():
@@ -294,7 +313,7 @@ def _triangles(prim, count):
 def _curve_edges(prim):
     """Pairs of points (E, 2) that the segments of linear curves join."""
     curves = UsdGeom.BasisCurves(prim)
-    counts = _topology(curves.GetCurveVertexCountsAttr())
+    counts = topology(curves.GetCurveVertexCountsAttr())
     end = np.cumsum(counts)
     inner = np.setdiff1d(np.arange(counts.sum()), end - 1)
     edges = np.stack([inner, inner + 1], axis=1)
@@ -312,7 +331,7 @@ def _texture_coordinates(prim, count):
     interpolation = primvar.GetInterpolation()
     if interpolation in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and st.shape == (count, 2):
         return st
-    corners = _topology(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr())
+    corners = topology(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr())
     if interpolation != UsdGeom.Tokens.faceVarying or st.shape != (len(corners), 2):
         return None
     at_vertices = np.zeros((count, 2))
@@ -325,7 +344,7 @@ def _pins(prim, point_vertices):
     pins = {}
     for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
         if subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.point:
-            points = _topology(subset.GetIndicesAttr())
+            points = topology(subset.GetIndicesAttr())
             vertices = points if point_vertices is None else point_vertices[points]
             pins[subset.GetPrim().GetName()] = np.unique(vertices)
     return pins
