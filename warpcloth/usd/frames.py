@@ -5,7 +5,17 @@ import os
 import numpy as np
 from pxr import Sdf, UsdGeom
 
-from .stage import curve_vertices, find_prim, first_points, followed, local_to_metres, moving_space, open_stage, topology
+from .stage import (
+    curve_vertices,
+    find_prim,
+    first_points,
+    followed,
+    local_to_metres,
+    moving_space,
+    open_stage,
+    placed,
+    topology,
+)
 
 _VECTORS = ("points", "velocities")
 
@@ -114,23 +124,19 @@ class FrameSequence:
         return result if dtype is None else result.astype(dtype, copy=False)
 
     def exact(self, frame):
-        """One frame of points in float64, which holds more of what a transform makes of the file's float32.
+        """One frame of points or velocities in float64, which holds more of what a transform makes of the file's float32.
 
         Args:
             frame: Its number, from 0.
 
         Returns:
-            np.ndarray: (n, 3) [m].
+            np.ndarray: (n, 3) [m] or [m/s].
         """
-        value = self._values(frame).astype(np.float64)
         transform = self._transform
         if self._moving:
             code = self.time_codes[frame]
             transform = local_to_metres(self._moving, f"{self._where}, time code {code:g}", code)
-        # Not by the identity, which makes all of a point NaN where one coordinate is.
-        if not np.array_equal(transform[:3, :3], np.eye(3)):
-            value = value @ transform[:3, :3]
-        return value + transform[3, :3] if transform[3, :3].any() else value
+        return placed(self._values(frame).astype(np.float64), transform)
 
     def _read(self, frame):
         if self.ndim == 3:

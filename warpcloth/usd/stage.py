@@ -90,7 +90,7 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
     found = find_prim(stage, path, prim)
     where = f"{path}, prim {found.GetPath()}"
     transform = local_to_metres(found, where, time)
-    points = _rest_points(found, where, time) @ transform[:3, :3] + transform[3, :3]
+    points = placed(_rest_points(found, where, time), transform)
     point_vertices = None
     try:
         if found.IsA(UsdGeom.Mesh):
@@ -235,6 +235,15 @@ def local_to_metres(prim, where, time=None):
         raise ValueError(f"{where}: the transform to world space is {matrix.tolist()}, must be invertible")
     matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(prim.GetStage())
     return matrix
+
+
+def placed(points, transform):
+    """Points (P, 3) where a transform (4, 4) puts them; what is not finite stays so."""
+    # The identity is left out, for it makes all of a point NaN where one coordinate is.
+    if not np.array_equal(transform[:3, :3], np.eye(3)):
+        with np.errstate(invalid="ignore"):
+            points = points @ transform[:3, :3]
+    return points + transform[3, :3]
 
 
 def curve_vertices(prim, count):

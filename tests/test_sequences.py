@@ -1,0 +1,548 @@
+"""Mesh sequences: stages of other programs and our own, folders of files, arrays, and everything that is refused."""
+
+import re
+import tracemalloc
+import warnings
+
+import numpy as np
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+import warpcloth as wc
+from warpcloth.mesh import Mesh, Surface
+from warpcloth.scenes import chain, hanging
+from warpcloth.sequences import as_sequence, open_sequence
+from warpcloth.usd import AnimationWriter, FrameSequence, read_mesh
+
+EPS32, EPS = np.finfo(np.float32).eps, np.finfo(np.float64).eps
+FRAMES = 5
+MESH = Mesh.grid(3, 3)
+NAN = np.nan
+
+
+def motion(mesh, frame):
+    """Points that tell the frame and the vertex, of numbers that float32 has exactly."""
+    return mesh.points + np.array([frame, 0.0, 0.125 * frame]) + 0.25 * (np.arange(3 * len(mesh.points)).reshape(-1, 3) % 2)
+
+
+def frames(mesh=MESH, count=FRAMES):
+    return np.array([motion(mesh, frame) for frame in range(count)])
+
+
+# ---------------------------------------------------------------------------------------------------------- stages
+
+
+def cache(path, codes=(101, 102, 103, 104), rest=True, moving=True):
+    """What another program may write: two quads in cm, z up, left-handed, under a group that turns and moves.
+
+    Returns:
+        Stage, prim, and the points of each frame in world space [m], (F, 6, 3).
+    """
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    stage.SetTimeCodesPerSecond(48)
+    stage.SetFramesPerSecond(24)
+    group = UsdGeom.Xform.Define(stage, "/Rig")
+    move, turn = group.AddTranslateOp(), group.AddRotateZOp(UsdGeom.XformOp.PrecisionDouble)
+    group.AddScaleOp().Set(Gf.Vec3f(2, 3, 4))
+    sheet = UsdGeom.Mesh.Define(stage, "/Rig/Sheet")
+    sheet.CreateOrientationAttr("leftHanded")
+    sheet.CreateFaceVertexCountsAttr([4, 4])
+    sheet.CreateFaceVertexIndicesAttr([0, 1, 4, 3, 1, 2, 5, 4])
+    points = np.array([(x, y, 0) for y in (0, 100) for x in (0, 100, 250)], dtype=np.float32)
+    if rest:
+        sheet.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    placed = []
+    for frame, code in enumerate(codes):
+        now = points + np.float32([0, 0, 10 * frame])
+        sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(now), code)
+        angle = 30.0 + 20.0 * frame if moving else 30.0
+        place = (7.0 * frame, -3.0, 0.5) if moving else (7.0, -3.0, 0.5)
+        if moving or frame == 0:
+            move.Set(Gf.Vec3d(place), code)
+            turn.Set(angle, code)
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        turned = (now.astype(np.float64) * [2, 3, 4]) @ np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)])
+        placed.append(0.01 * (turned + place))
+    stage.Save()
+    return stage, sheet.GetPrim(), np.array(placed)
+
+
+# Coordinates up to 5 m, of a few products of numbers whose rounding is EPS each.
+PLACED = 5 * 16 * EPS
+
+
+@pytest.mark.parametrize("ending", ["usda", "usdc"])
+@pytest.mark.parametrize("moving", [True, False], ids=["moving", "still"])
+def test_cache_of_another_program(tmp_path, ending, moving):
+    _stage, _prim, expected = cache(tmp_path / f"cache.{ending}", moving=moving)
+    sequence = open_sequence(tmp_path / f"cache.{ending}")
+    assert len(sequence) == 4 and sequence.missing == [] and sequence.declared
+    for frame, points in enumerate(expected):
+        assert sequence[frame].dtype == np.float64
+        np.testing.assert_allclose(sequence[frame], points, rtol=0, atol=PLACED)
+    assert sequence.labels.tolist() == [101, 102, 103, 104] and sequence.labels.dtype == np.int64
+    np.testing.assert_allclose(sequence.times, np.arange(4) / 48, rtol=4 * EPS)
+    # Quads are cut from their first corner, and turned for the front of a left-handed prim.
+    assert isinstance(sequence.mesh, Surface)
+    assert sequence.mesh.triangles.tolist() == [[4, 1, 0], [3, 4, 0], [5, 2, 1], [4, 5, 1]]
+    np.testing.assert_allclose(sequence.mesh.points, expected[0], rtol=0, atol=PLACED)
+    assert sequence.stage.prim == "/Rig/Sheet" and sequence.path == sequence.stage.path == str(tmp_path / f"cache.{ending}")
+    assert (sequence.stage.up_axis, sequence.stage.meters_per_unit) == ("Z", 0.01)
+
+
+def test_a_transform_of_one_sample_counts(tmp_path):
+    _stage, _prim, expected = cache(tmp_path / "cache.usda", moving=False)
+    np.testing.assert_allclose(read_mesh(tmp_path / "cache.usda").points, expected[0], rtol=0, atol=PLACED)
+    np.testing.assert_allclose(FrameSequence(tmp_path / "cache.usda"), expected, rtol=0, atol=5 * EPS32)
+
+
+def test_velocities_in_a_moving_space_are_refused(tmp_path):
+    stage, prim, expected = cache(tmp_path / "cache.usda")
+    UsdGeom.Mesh(prim).CreateVelocitiesAttr().Set(Vt.Vec3fArray(6), 101)
+    stage.Save()
+    np.testing.assert_allclose(FrameSequence(tmp_path / "cache.usda"), expected, rtol=0, atol=5 * EPS32)
+    with pytest.raises(ValueError, match=r"cache.usda, prim /Rig/Sheet: the transform of /Rig is animated"):
+        FrameSequence(tmp_path / "cache.usda", attribute="velocities")
+
+
+def test_without_a_rest_shape_the_first_frame_is_taken(tmp_path):
+    _stage, _prim, expected = cache(tmp_path / "cache.usda", rest=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sequence = open_sequence(tmp_path / "cache.usda")
+    assert not sequence.declared
+    np.testing.assert_array_equal(sequence.mesh.points, sequence[0])
+    np.testing.assert_allclose(sequence[0], expected[0], rtol=0, atol=PLACED)
+
+
+@pytest.mark.parametrize(
+    ("codes", "missing"),
+    [
+        ((0, 1, 2), []),
+        ((3,), []),
+        ((1, 2, 4), [3]),
+        ((1, 3, 4), [2]),
+        ((-2, 0, 2, 8, 10), [4, 6]),
+        ((0, 0.5, 1.5, 2), [1.0]),
+        ((0, 0.4, 0.8, 1.6000000000000001), [1.2]),
+        ((1, 10, 17, 40), []),  # poses, not frames
+        ((1, 1.25, 2, 2.25, 3, 3.25), []),  # a shutter of a quarter
+    ],
+)
+def test_time_codes(tmp_path, codes, missing):
+    cache(tmp_path / "cache.usda", codes)
+    sequence = open_sequence(tmp_path / "cache.usda")
+    assert sequence.labels.tolist() == list(codes)
+    assert sequence.labels.dtype == (np.float64 if any(code % 1 for code in codes) else np.int64)
+    assert sequence.missing == pytest.approx(missing, rel=4 * EPS)
+    assert all(isinstance(label, int) for label in sequence.missing) or sequence.labels.dtype == np.float64
+    for fps in (None, 30):
+        times = (np.array(codes) - codes[0]) / (fps or 48)
+        np.testing.assert_allclose(open_sequence(tmp_path / "cache.usda", fps=fps).times, times, rtol=4 * EPS)
+
+
+def test_result_of_a_run(tmp_path, device):
+    scene = hanging.scene(n=4)
+    output = str(tmp_path / "out.usdc")
+    kept = wc.simulate(scene, wc.Newton(dt=1 / 240), frames=3, device=device)
+    written = wc.simulate(scene, wc.Newton(dt=1 / 240), frames=3, device=device, output=output)
+    sequence = open_sequence(output)
+    assert sequence.declared and sequence.labels.tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(sequence.mesh.points, scene.mesh.points, atol=EPS32)
+    for other in (as_sequence(scene.mesh, kept), as_sequence(scene.mesh, written), sequence):
+        assert len(other) == 4 and other.mesh.triangles.tolist() == scene.mesh.triangles.tolist()
+        np.testing.assert_allclose(other.times, kept.times, rtol=4 * EPS)
+        for frame, points in enumerate(other):
+            assert points.dtype == np.float64
+            np.testing.assert_array_equal(points, kept.points[frame])
+
+
+def test_faces_may_be_sampled(tmp_path):
+    stage, prim, expected = cache(tmp_path / "cache.usda")
+    for name in ("faceVertexCounts", "faceVertexIndices"):
+        attribute = prim.GetAttribute(name)
+        value = attribute.Get()
+        attribute.Clear()
+        for code in (101, 103):
+            attribute.Set(value, code)
+    stage.Save()
+    sequence = open_sequence(tmp_path / "cache.usda")
+    np.testing.assert_allclose(sequence[3], expected[3], rtol=0, atol=PLACED)
+
+
+BROKEN_FRAMES = [  # attribute, its value at time code 103, message
+    ("points", Vt.Vec3fArray(5), "5 points at time code 103, must be 6"),
+    ("points", Vt.Vec3fArray(7), "7 points at time code 103, must be 6"),
+    ("points", Sdf.ValueBlock(), "0 points at time code 103, must be 6"),
+    ("faceVertexCounts", [4], "1 faceVertexCounts at time code 103, must stay 2"),
+    ("faceVertexCounts", [3, 5], r"faceVertexCounts\[0\] is 3 at time code 103, must stay 4"),
+    ("faceVertexIndices", [0, 1, 4, 3], "4 faceVertexIndices at time code 103, must stay 8"),
+    ("faceVertexIndices", [0, 1, 4, 3, 1, 2, 4, 5], r"faceVertexIndices\[6\] is 4 at time code 103, must stay 5"),
+    ("/Rig.xformOp:rotateZ", NAN, "time code 103: the transform to world space is .*, must be affine and finite"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), BROKEN_FRAMES)
+def test_broken_frame_of_a_stage(tmp_path, name, value, message):
+    stage, prim, expected = cache(tmp_path / "cache.usda")
+    attribute = stage.GetAttributeAtPath(name) if name[0] == "/" else prim.GetAttribute(name)
+    if name.startswith("face"):
+        attribute.Set(attribute.Get(), 101)
+    attribute.Set(value, 103)
+    stage.Save()
+    sequence = open_sequence(tmp_path / "cache.usda")
+    np.testing.assert_allclose(sequence[1], expected[1], rtol=0, atol=PLACED)
+    where = re.escape(str(tmp_path / "cache.usda"))
+    with pytest.raises(ValueError, match=f"^{where}, prim /Rig/Sheet[:,] {message}"):
+        sequence[2]
+
+
+def test_stages_that_are_refused(tmp_path):
+    stage, prim, _ = cache(tmp_path / "cache.usda")
+    with pytest.raises(ValueError, match=r"cache.usda, prim Shirt: there is no such prim"):
+        open_sequence(tmp_path / "cache.usda", prim="Shirt")
+    UsdGeom.Mesh(prim).GetPointsAttr().Set(Vt.Vec3fArray(9))
+    stage.Save()
+    with pytest.raises(ValueError, match=r"cache.usda, prim /Rig/Sheet: 6 points at time code 101, must be 9 as at rest"):
+        open_sequence(tmp_path / "cache.usda")
+    prim.GetAttribute("points").Clear()
+    prim.GetAttribute("points").Set(Vt.Vec3fArray(6))
+    stage.Save()
+    with pytest.raises(ValueError, match=r"cache.usda, prim /Rig/Sheet: points have no time samples.*not animated"):
+        open_sequence(tmp_path / "cache.usda")
+    with pytest.raises(FileNotFoundError, match=r"none\.usdc: there is no such file"):
+        open_sequence(tmp_path / "none.usdc")
+    links = chain.scene().mesh
+    with AnimationWriter(tmp_path / "chain.usda", links, 24) as writer:
+        writer.append(links.points, 0 * links.points)
+    with pytest.raises(ValueError, match=r"chain.usda: has edges and no triangles"):
+        open_sequence(tmp_path / "chain.usda")
+
+
+# ---------------------------------------------------------------------------------------------------------- files
+
+
+def export(path, points, triangles=MESH.triangles):
+    """Writes a text file whose numbers are exact."""
+    points = [" ".join(map(repr, point)) for point in np.asarray(points, dtype=np.float64).tolist()]
+    if path.suffix.lower() == ".obj":
+        lines = [f"v {point}" for point in points] + ["f " + " ".join(str(i + 1) for i in row) for row in triangles]
+    else:
+        faces = [f"{len(row)} " + " ".join(map(str, row)) for row in triangles]
+        head = ["OFF", f"{len(points)} {len(faces)} 0"]
+        if path.suffix.lower() == ".ply":
+            head = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property double {x}" for x in "xyz")]
+            head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+        lines = head + points + faces
+    path.write_text("\n".join(lines) + "\n")
+
+
+def folder(path, names, ending="obj"):
+    """Frame k of the motion under the k-th name."""
+    path.mkdir(exist_ok=True)
+    for frame, name in enumerate(names):
+        export(path / f"{name}.{ending}", motion(MESH, frame))
+    return path
+
+
+NUMBERED = [  # names in the order of their numbers, labels, missing
+    (["a_8", "a_9", "a_10", "a_11"], [8, 9, 10, 11], []),
+    (["v2_shirt.0998", "v2_shirt.0999", "v2_shirt.1000"], [998, 999, 1000], []),
+    (["2m", "4m", "8m", "10m"], [2, 4, 8, 10], [6]),
+    (["take7_1", "take3_2", "take5_5"], [1, 2, 5], [3, 4]),
+    (["00", "1"], [0, 1], []),
+    (["lone3"], [3], []),
+]
+
+
+@pytest.mark.parametrize("ending", ["obj", "ply", "off", "OBJ"])
+@pytest.mark.parametrize(("names", "labels", "missing"), NUMBERED, ids=[row[0][0] for row in NUMBERED])
+def test_files_in_order(tmp_path, ending, names, labels, missing):
+    where = folder(tmp_path / "frames", names, ending)
+    (where / "cloth.mtl").write_text("newmtl red\n")
+    (where / f".hidden_7.{ending}").write_text("")
+    (where / f"sub_7.{ending}").mkdir()
+    for path in (where, where / f"*.{ending}"):
+        sequence = open_sequence(path, fps=25)
+        assert sequence.labels.tolist() == labels and sequence.missing == missing
+        np.testing.assert_allclose(sequence.times, (np.array(labels) - labels[0]) / 25, rtol=4 * EPS)
+        assert isinstance(sequence.mesh, Surface) and not sequence.declared and sequence.stage is None
+        assert sequence.mesh.triangles.tolist() == MESH.triangles.tolist() and sequence.path == str(path)
+        np.testing.assert_array_equal(sequence.mesh.points, motion(MESH, 0))
+        for frame, points in enumerate(sequence):
+            np.testing.assert_array_equal(points, motion(MESH, frame))
+
+
+def test_a_pattern_chooses(tmp_path):
+    folder(tmp_path / "a", ["shirt_1", "shirt_2", "trousers_1"])
+    assert len(open_sequence(str(tmp_path / "?" / "shirt_*"), fps=24)) == 2
+    folder(tmp_path / "[a]", ["1", "2"])  # a folder that looks like a pattern
+    assert len(open_sequence(tmp_path / "[a]", fps=24)) == 2
+
+
+def test_one_of_several_objects(tmp_path):
+    for frame in range(3):
+        export(tmp_path / f"{frame}.obj", motion(MESH, frame))
+        cloth = (tmp_path / f"{frame}.obj").read_text()
+        (tmp_path / f"{frame}.obj").write_text(f"o shirt\n{cloth}o ball\nv 0 0 {frame}\nv 1 0 0\nv 0 1 0\nf 10 11 12\n")
+    assert open_sequence(tmp_path, "shirt", 24)[2].shape == (9, 3)
+    assert open_sequence(tmp_path, "ball", 24)[2][0, 2] == 2.0
+    with pytest.raises(ValueError, match=r"0.obj: has several geometries, name one of them: 'ball', 'shirt'"):
+        open_sequence(tmp_path, fps=24)
+
+
+def other_triangle(path):
+    export(path, MESH.points, [*MESH.triangles[:5].tolist(), (4, 8, 7), *MESH.triangles[6:].tolist()])
+
+
+BROKEN_FILES = [  # what frame 3 is, message
+    (lambda path: export(path, MESH.points[:8], MESH.triangles[:1]), "8 vertices, must be 9 as in .*cloth_1.obj"),
+    (lambda path: export(path, MESH.points, MESH.triangles[:-1]), "7 triangles, must be 8 as in .*cloth_1.obj"),
+    (other_triangle, r"triangle 5 has vertices \[4, 8, 7\], must be \[.*\] as in .*cloth_1.obj"),
+    (lambda path: path.write_text(""), "the file is empty"),
+    (lambda path: path.write_text("v 0 0 0\n"), "has no triangles"),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), BROKEN_FILES, ids=["vertices", "count", "triangle", "empty", "cloud"])
+def test_broken_file(tmp_path, damage, message):
+    where = folder(tmp_path / "frames", ["cloth_1", "cloth_2", "cloth_3", "cloth_4"])
+    damage(where / "cloth_3.obj")
+    sequence = open_sequence(where, fps=24)
+    np.testing.assert_array_equal(sequence[3], motion(MESH, 3))
+    with pytest.raises(ValueError, match=f"^{re.escape(str(where / 'cloth_3.obj'))}: {message}"):
+        sequence[2]
+
+
+REFUSED_FOLDERS = [  # names of files, what is opened, fps, kind of error, message
+    (["1.obj", "2.obj"], "", None, ValueError, r"says no times; give fps, .*\(--fps\)"),
+    (["1.obj", "2.obj"], "", 0, ValueError, "fps is 0; it must be a number above 0"),
+    (["1.obj", "2.ply"], "", 24, ValueError, r'has files of several kinds, .obj .ply; give a pattern of one, such as "\*.obj"'),
+    (["1.stl", "2.stl"], "", 24, ValueError, ".stl files repeat vertices, .* must end with .obj .ply .off"),
+    (["1.glb", "2.glb"], "*.glb", 24, ValueError, ".glb files repeat vertices"),
+    (["1.obj", "cloth.obj"], "", 24, ValueError, "cloth.obj: has no number in its name"),
+    (["1.obj", "a_01.obj"], "", 24, ValueError, "a_01.obj: has number 1, the last in its name, as .*1.obj has"),
+    (["1.mtl"], "", 24, ValueError, "no mesh files there; they must end with .obj .ply .off"),
+    (["1.obj"], "*.ply", 24, ValueError, r"\*.ply: no mesh files there"),
+    (["1.obj"], "1.obj", 24, ValueError, r'1.obj: is one mesh; it must be a folder of them, or a pattern such as ".*/\*.obj"'),
+    (["1.mtl"], "1.mtl", 24, ValueError, "1.mtl: must be a folder or pattern of mesh files, or end with .usd .* .npz .npy"),
+    (["1.obj"], "elsewhere", 24, FileNotFoundError, "elsewhere: no such file or folder"),
+]
+
+
+@pytest.mark.parametrize(("names", "opened", "fps", "kind", "message"), REFUSED_FOLDERS)
+def test_folders_that_are_refused(tmp_path, names, opened, fps, kind, message):
+    for name in names:
+        export(tmp_path / name, MESH.points)
+    where = "" if fps == 0 else re.escape(str(tmp_path))
+    with pytest.raises(kind, match=f"^{where}.*{message}"):
+        open_sequence(tmp_path / opened, fps=fps)
+
+
+# ---------------------------------------------------------------------------------------------------------- arrays
+
+
+def test_array_files(tmp_path):
+    points, times = frames().astype(np.float32), np.array([0.0, 0.1, 0.3, 0.4, 0.5])
+    np.savez(tmp_path / "a.npz", points=points, triangles=MESH.triangles)
+    np.savez(tmp_path / "timed.npz", times=times, triangles=MESH.triangles, points=np.asfortranarray(points))
+    np.save(tmp_path / "a.npy", points)
+    opened = [
+        (open_sequence(tmp_path / "a.npz", fps=10), np.arange(FRAMES) / 10, False),
+        (open_sequence(tmp_path / "timed.npz"), times, False),
+        (open_sequence(tmp_path / "timed.npz", fps=10), np.arange(FRAMES) / 10, False),
+        (open_sequence(tmp_path / "a.npy", fps=10, mesh=MESH), np.arange(FRAMES) / 10, True),
+    ]
+    for sequence, expected, declared in opened:
+        assert sequence.labels.tolist() == list(range(FRAMES)) and sequence.missing == []
+        assert sequence.declared == declared and sequence.mesh.triangles.tolist() == MESH.triangles.tolist()
+        np.testing.assert_array_equal(sequence.mesh.points, MESH.points if declared else points[0])
+        np.testing.assert_allclose(sequence.times, expected, rtol=4 * EPS)
+        np.testing.assert_array_equal(list(sequence), points)
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz"])
+def test_array_files_stay_on_disk(tmp_path, ending):
+    mesh, count = Mesh.grid(32, 32), 200
+    points = np.zeros((count, 1024, 3))
+    if ending == "npz":
+        np.savez(tmp_path / "a.npz", points=points, triangles=mesh.triangles)
+    else:
+        np.save(tmp_path / "a.npy", points)
+    tracemalloc.start()
+    try:
+        for frame in open_sequence(tmp_path / f"a.{ending}", fps=24, mesh=mesh):
+            assert not frame.any()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    # The mesh and its topology take less than 10 frames, and all frames would be 200.
+    assert peak < 40 * points[0].nbytes
+
+
+REFUSED_ARRAYS = [  # ending, what is written, fps, message
+    ("npz", {"points": frames()}, 24, "has no array 'triangles', only points"),
+    ("npz", {"points": frames(), "triangles": MESH.triangles}, None, r"says no times; give fps"),
+    ("npz", {"points": frames()[0], "triangles": MESH.triangles}, 24, r"points has shape \(9, 3\); it must be \(frames, vert"),
+    ("npz", {"points": frames()[:, :8], "triangles": MESH.triangles}, 24, "must be indices of the 8 points"),
+    ("npz", {"points": frames(), "triangles": MESH.triangles, "times": [0, 1]}, None, r"times has shape \(2,\); .* \(5,\)"),
+    (
+        "npz",
+        {"points": frames(), "triangles": MESH.triangles, "times": [0, 1, 1, 2, 3]},
+        None,
+        r"times\[2\] is 1.0; it must be la",
+    ),
+    ("npz", {"points": np.array(["x"]), "triangles": MESH.triangles}, 24, "points.npy has type <U1, must be real numbers"),
+    ("npz", b"no archive", 24, "is no .npz file"),
+    ("npy", b"no array", 24, "magic string"),
+    ("npy", b"", 24, ""),
+    ("npy", frames(), None, "says no times; give fps"),
+    ("npy", frames()[:, :8], 24, r"points has shape \(5, 8, 3\); it must be \(frames, 9, 3\) for the points of the mesh"),
+]
+
+
+@pytest.mark.parametrize(("ending", "content", "fps", "message"), REFUSED_ARRAYS)
+def test_array_files_that_are_refused(tmp_path, ending, content, fps, message):
+    path = tmp_path / f"a.{ending}"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif ending == "npz":
+        np.savez(path, **content)
+    else:
+        np.save(path, content)
+    with pytest.raises(ValueError, match=f"^{re.escape(str(path))}: .*{message}"):
+        open_sequence(path, fps=fps, mesh=MESH)
+
+
+def test_array_files_that_need_more(tmp_path):
+    np.save(tmp_path / "a.npy", frames())
+    with pytest.raises(ValueError, match=r"a.npy: has no triangles; give a rest mesh that has them \(--rest\)"):
+        open_sequence(tmp_path / "a.npy", fps=24)
+    np.savez_compressed(tmp_path / "a.npz", points=frames(), triangles=MESH.triangles)
+    with pytest.raises(ValueError, match=r"a.npz: points.npy is compressed, .*; write it by np.savez"):
+        open_sequence(tmp_path / "a.npz", fps=24)
+
+
+@pytest.mark.parametrize(
+    "held",
+    [frames(), frames().astype(np.float32), list(frames()), tuple(frames().tolist()), np.asfortranarray(frames())],
+    ids=["array", "float32", "list", "tuple", "columns"],
+)
+def test_what_python_holds(held):
+    even = as_sequence(MESH, held, dt=0.1)
+    np.testing.assert_allclose(even.times, 0.1 * np.arange(FRAMES), rtol=4 * EPS)
+    times = np.array([-1.0, 0.0, 0.5, 2.0, 2.25])
+    sequence = as_sequence(MESH, held, times=times)
+    np.testing.assert_array_equal(sequence.times, times)
+    assert sequence.mesh is MESH and sequence.path is None and sequence.stage is None and sequence.declared
+    assert sequence.labels.tolist() == list(range(FRAMES)) and len(sequence) == FRAMES
+    np.testing.assert_array_equal(list(sequence), frames())
+    assert all(points.dtype == np.float64 for points in sequence)
+    np.testing.assert_array_equal(sequence[-1], sequence[np.int32(FRAMES - 1)])
+    sequence[0][:] = 7.0
+    np.testing.assert_array_equal(sequence[0], frames()[0])
+    for wrong, kind in ((FRAMES, IndexError), (-FRAMES - 1, IndexError), (1.0, TypeError), (slice(2), TypeError)):
+        with pytest.raises(kind):
+            sequence[wrong]
+
+
+REFUSED = [  # mesh, frames, options, message
+    (MESH, frames(), {}, "dt is None; it must be the time from a frame to the next, or give times"),
+    (MESH, frames(), {"dt": 0.1, "times": np.arange(5)}, "dt, times: both are given"),
+    (MESH, frames(), {"dt": 0.0}, "dt is 0.0; it must be a number above 0"),
+    (MESH, frames(), {"times": [0, 1, 2, 3]}, r"times has shape \(4,\); it must be \(5,\)"),
+    (MESH, frames(), {"times": [0, 1, 2, NAN, 4]}, r"times\[3\] is nan; it must be finite"),
+    (MESH, frames(), {"times": [0, 2, 1, 3, 4]}, r"times\[2\] is 1.0; it must be later than the one before"),
+    (MESH, frames()[:, :8], {"dt": 1}, r"frames has shape \(5, 8, 3\); it must be \(frames, 9, 3\)"),
+    (MESH, frames()[0], {"dt": 1}, r"frames has shape \(9, 3\); it must be"),
+    (MESH, frames()[:0], {"dt": 1}, r"frames has shape \(0, 9, 3\); it must be"),
+    (MESH, [], {"dt": 1}, r"frames has shape \(0, 9, 3\); it must be"),
+    (MESH, np.stack([frames(), frames()], 1), {"dt": 1}, r"of several copies give one, as in frames\[:, 0\]"),
+    (MESH, [*frames()[:3], frames()[3, :8]], {"dt": 1}, r"frames\[3\] has shape \(8, 3\); it must be \(9, 3\)"),
+    (MESH, [frames()[0], "curtain"], {"dt": 1}, r"frames\[1\] is 'curtain', which is not numeric"),
+    (MESH, frames().astype(complex), {"dt": 1}, "frames has type complex128; it must be real numbers"),
+    (MESH, 7, {"dt": 1}, r"frames has shape \(\); it must be"),
+    (MESH.points, frames(), {"dt": 1}, "mesh is .*; it must be a Mesh"),
+    (Mesh.chain(9), frames(), {"dt": 1}, "mesh: has edges and no triangles"),
+]
+
+
+@pytest.mark.parametrize(("mesh", "held", "options", "message"), REFUSED)
+def test_what_python_holds_and_is_refused(mesh, held, options, message):
+    with pytest.raises(ValueError, match=message):
+        as_sequence(mesh, held, **options)
+
+
+# ---------------------------------------------------------------------------------------------------------- flaws
+
+
+@pytest.mark.parametrize("kind", ["array", "npz", "obj", "ply", "off", "usda"])
+@pytest.mark.parametrize("frame", [0, 2])
+def test_points_that_are_not_finite_are_as_they_are(tmp_path, kind, frame):
+    points = frames()
+    points[frame, 4, 1], points[frame, 7] = NAN, (np.inf, 0.0, -np.inf)
+    if kind == "array":
+        sequence = as_sequence(MESH, points, dt=1)
+    elif kind == "npz":
+        np.savez(tmp_path / "a.npz", points=points, triangles=MESH.triangles)
+        sequence = open_sequence(tmp_path / "a.npz", fps=24)
+    elif kind == "usda":
+        stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        sheet = UsdGeom.Mesh.Define(stage, "/Sheet")
+        sheet.CreateFaceVertexCountsAttr([3] * len(MESH.triangles))
+        sheet.CreateFaceVertexIndicesAttr(np.array(MESH.triangles).reshape(-1))
+        for code, now in enumerate(points):
+            sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(now.astype(np.float32)), code)
+        stage.Save()
+        sequence = open_sequence(tmp_path / "a.usda")
+    else:
+        for number, now in enumerate(points):
+            export(tmp_path / f"{number}.{kind}", now)
+        sequence = open_sequence(tmp_path, fps=24)
+    np.testing.assert_array_equal(list(sequence), points)
+    around = np.flatnonzero(np.isin(MESH.triangles, (4, 7)).any(axis=1)).tolist()
+    if kind != "array":
+        assert sequence.mesh.degenerate.tolist() == (around if frame == 0 else [])
+
+
+def flawed():
+    """A square of two triangles with some that are none beside it."""
+    points = [(0, 0, 0), (1, 0, 0), (0, 0, 1), (1, 0, 1), (2, 0, 0), (0.5, 1e-9, 0)]
+    return points, [(0, 2, 3), (0, 1, 4), (0, 3, 1), (2, 2, 3), (0, 1, 5), (3, 3, 3)]
+
+
+@pytest.mark.parametrize("kind", ["arrays", "obj", "usda"])
+def test_surface_has_what_a_mesh_refuses(tmp_path, kind):
+    points, triangles = flawed()
+    if kind == "arrays":
+        surface, mesh = Surface(points, triangles), lambda: Mesh(points, triangles)
+    else:
+        path = tmp_path / f"flawed.{kind}"
+        if kind == "obj":
+            export(path, points, triangles)
+        else:
+            stage = Usd.Stage.CreateNew(str(path))
+            UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+            sheet = UsdGeom.Mesh.Define(stage, "/Sheet")
+            sheet.CreatePointsAttr(points)
+            sheet.CreateFaceVertexCountsAttr([3] * len(triangles))
+            sheet.CreateFaceVertexIndicesAttr(np.array(triangles).reshape(-1))
+            stage.Save()
+        surface, mesh = Surface.load(path), lambda: Mesh.load(path)
+    assert isinstance(surface, Surface) and repr(surface).startswith("Surface(6 points, 6 triangles")
+    assert surface.degenerate.tolist() == [1, 3, 4, 5] and surface.degenerate.dtype == np.int32
+    assert surface.triangles.tolist() == [list(triangle) for triangle in triangles]
+    np.testing.assert_array_equal(surface.triangle_areas[[0, 2, 3, 5]], [0.5, 0.5, 0.0, 0.0])
+    with pytest.raises(ValueError, match=r"triangles\[3\] = \[2, 2, 3\]: must be 3 different vertices"):
+        mesh()
+    assert len(Surface(MESH.points, MESH.triangles).degenerate) == 0
+
+
+def test_surface_still_refuses_what_is_no_mesh():
+    with pytest.raises(ValueError, match=r"triangles\[0\] = \[0, 1, 9\]: must be indices of the 9 points"):
+        Surface(MESH.points, [(0, 1, 9)])
+    with pytest.raises(ValueError, match=r"points: has shape \(9, 2\)"):
+        Surface(MESH.points[:, :2], [(0, 1, 2)])
