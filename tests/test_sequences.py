@@ -82,6 +82,9 @@ def test_cache_of_another_program(tmp_path, ending, moving):
     for frame, points in enumerate(expected):
         assert sequence[frame].dtype == np.float64
         np.testing.assert_allclose(sequence[frame], points, rtol=0, atol=PLACED)
+    held = as_sequence(sequence.mesh, FrameSequence(tmp_path / f"cache.{ending}"))
+    np.testing.assert_array_equal(held.times, sequence.times)
+    np.testing.assert_array_equal(list(held), list(sequence))
     assert sequence.labels.tolist() == [101, 102, 103, 104] and sequence.labels.dtype == np.int64
     np.testing.assert_allclose(sequence.times, np.arange(4) / 48, rtol=4 * EPS)
     # Quads are cut from their first corner, and turned for the front of a left-handed prim.
@@ -126,7 +129,9 @@ def test_without_a_rest_shape_the_first_frame_is_taken(tmp_path):
         ((1, 3, 4), [2]),
         ((-2, 0, 2, 8, 10), [4, 6]),
         ((0, 0.5, 1.5, 2), [1.0]),
-        ((0, 0.4, 0.8, 1.6000000000000001), [1.2]),
+        ((0, 0.5, 1.5), [1.0]),
+        ((1001, 1001.4, 1001.8, 1002.6, 1003), [1002.2]),
+        ((1, 2, 4, 6, 8), [3, 5, 7]),
         ((1, 10, 17, 40), []),  # poses, not frames
         ((1, 1.25, 2, 2.25, 3, 3.25), []),  # a shutter of a quarter
     ],
@@ -347,12 +352,12 @@ def test_folders_that_are_refused(tmp_path, names, opened, fps, kind, message):
 def test_array_files(tmp_path):
     points, times = frames().astype(np.float32), np.array([0.0, 0.1, 0.3, 0.4, 0.5])
     np.savez(tmp_path / "a.npz", points=points, triangles=MESH.triangles)
-    np.savez(tmp_path / "timed.npz", times=times, triangles=MESH.triangles, points=np.asfortranarray(points))
+    np.savez(tmp_path / "timed[1].npz", times=times, triangles=MESH.triangles, points=np.asfortranarray(points))
     np.save(tmp_path / "a.npy", points)
     opened = [
         (open_sequence(tmp_path / "a.npz", fps=10), np.arange(FRAMES) / 10, False),
-        (open_sequence(tmp_path / "timed.npz"), times, False),
-        (open_sequence(tmp_path / "timed.npz", fps=10), np.arange(FRAMES) / 10, False),
+        (open_sequence(tmp_path / "timed[1].npz"), times, False),
+        (open_sequence(tmp_path / "timed[1].npz", fps=10), np.arange(FRAMES) / 10, False),
         (open_sequence(tmp_path / "a.npy", fps=10, mesh=MESH), np.arange(FRAMES) / 10, True),
     ]
     for sequence, expected, declared in opened:

@@ -376,7 +376,7 @@ class Surface(Mesh):
     @cached_property
     def degenerate(self):
         """Sorted triangles (k,), int32, that a `Mesh` would refuse."""
-        return _read_only(np.flatnonzero(self._flat() | _repeated(self.triangles)).astype(np.int32))
+        return _read_only(np.flatnonzero(self._flat()).astype(np.int32))
 
     def _refuse_degenerate(self):
         """Refuses nothing."""

@@ -76,11 +76,11 @@ class Sequence:
     def missing(self):
         """Labels that a gap in the numbering leaves out, a list.
 
-        The spacing is the median of the intervals; there are no gaps where some interval is no multiple of it. Time codes that
-        are not whole may be exposures within a frame: of these no more than a third of the intervals can be gaps.
+        The spacing is the smallest interval; nothing is missing where some other is no multiple of it. Time codes that are not
+        whole may be exposures within a frame: of these no more than a third of the intervals, or one, can be gaps.
         """
         intervals = np.diff(self.labels)
-        spacing = np.sort(intervals)[(len(intervals) - 1) // 2] if len(intervals) else 1
+        spacing = intervals.min() if len(intervals) else 1
         multiples = np.rint(intervals / spacing).astype(np.int64)
         gaps = np.flatnonzero(multiples > 1)
         uneven = np.abs(intervals / spacing - multiples) > 1e-6  # a time code has fewer than ten digits, and float64 sixteen
