@@ -1,5 +1,6 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
+from .analysis import Analysis, Analyzer, analyze
 from .arap import Arap
 from .deform import Deformation, deform
 from .equilibrium import Equilibrium, equilibrium
@@ -25,6 +26,8 @@ __all__ = [
     "ADMM",
     "PBD",
     "XPBD",
+    "Analysis",
+    "Analyzer",
     "Animation",
     "Arap",
     "Attachment",
@@ -47,6 +50,7 @@ __all__ = [
     "SpringLimit",
     "StVKMembrane",
     "StrainLimit",
+    "analyze",
     "deform",
     "equilibrium",
     "kabsch",

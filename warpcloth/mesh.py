@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from .kernels.deformation import FLATTEST
 from .selection import select
 
 STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")

@@ -86,7 +86,7 @@ def kabsch(P, Q, weights=None, neighbours=None):
             f"P has shape {(*rest.batch, 3)} and Q {(*turned.batch, 3)}; both must be (…, n, 3) with one n above 0"
         )
     n = rest.batch[-1]
-    sizes, members = _sets(neighbours, n)
+    sizes, members = point_sets(neighbours, n)
     w = np.ones(n) if weights is None else numeric("weights", _on_host(weights), f"have shape {(n,)} or (…, {n})")
     if w.ndim == 0 or w.shape[-1] != n:
         raise ValueError(f"weights has shape {w.shape}; it must be {(n,)} or (…, {n})")
@@ -116,7 +116,7 @@ def kabsch(P, Q, weights=None, neighbours=None):
     return rest.like(R, leading if neighbours is None else (*leading, len(sizes)), (3, 3))
 
 
-def _sets(neighbours, n):
+def point_sets(neighbours, n):
     """Number of members of each set (C,), and all members one after another."""
     if neighbours is None:
         return np.array([n]), np.arange(n)

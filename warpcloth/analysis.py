@@ -1,0 +1,318 @@
+"""Measures of an animated cloth: deformation, strain, rotation and their rates, frame by frame or of all frames at once."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+
+import numpy as np
+
+from .checks import choice
+from .measures import chosen
+from .model import DTYPES
+from .pairs import pairs_of
+from .sequences import Sequence, as_sequence, open_sequence
+from .surfaces import RATES, Neighbourhoods, Triangles, check_material, material_directions
+
+_SHOWN = 8  # elements that a sentence names
+
+
+@dataclass(frozen=True, eq=False)
+class Exclusion:
+    """What could not be measured.
+
+    Attributes:
+        frame: Number of the frame; None for the rest shape.
+        kind: "triangle", "vertex" or "frame", of which there are no elements.
+        elements: Indices (k,).
+        reason: Why, as the end of a sentence.
+    """
+
+    frame: float | None
+    kind: str
+    elements: np.ndarray
+    reason: str
+
+    def __str__(self):
+        where = "rest shape" if self.frame is None else f"frame {self.frame:g}"
+        if self.kind == "frame":
+            return f"{where} {self.reason}"
+        named = ", ".join(map(str, self.elements[:_SHOWN].tolist())) + (", …" if len(self.elements) > _SHOWN else "")
+        kind = {"triangle": ("triangle", "triangles"), "vertex": ("vertex", "vertices")}[self.kind][len(self.elements) > 1]
+        count = f"{len(self.elements)} " if len(self.elements) > 1 else ""
+        return f"{where}, {count}{kind} {named}: {self.reason}"
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One row of an analysis: a frame measured against its reference.
+
+    Attributes:
+        row: Its place among the rows.
+        reference: Number of the reference frame; None for the rest shape.
+        frame: Number of the frame.
+        place: Place of the frame in its sequence.
+        time: Of the frame [s]; NaN where the sequence has no times.
+        points: (n, 3) [m].
+        values: Arrays (E, *shape) by name of measure, NaN in what is excluded. They are valid until the next sample is asked for.
+        excluded: List of :class:`Exclusion` that this row is the first to meet.
+    """
+
+    row: int
+    reference: float | None
+    frame: float
+    place: int
+    time: float
+    points: np.ndarray
+    values: dict
+    excluded: list
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis(Mapping):
+    """Measures of all rows, arrays (rows, E, *shape) by name: ``analysis["stretch"]``.
+
+    Attributes:
+        mesh: The mesh, E of whose triangles or vertices were measured.
+        on: "triangle" or "vertex".
+        measures: What each is, :class:`warpcloth.measures.Measure` by name.
+        references: Number of each row's reference frame; None for the rest shape.
+        frames: Numbers of the frames (rows,).
+        times: Of the frames (rows,) [s].
+        excluded: What could not be measured, list of :class:`Exclusion`; the values there are NaN.
+    """
+
+    mesh: object
+    on: str
+    measures: dict
+    references: list
+    frames: np.ndarray
+    times: np.ndarray
+    excluded: list
+    values: dict = field(repr=False)
+
+    def __getitem__(self, name):
+        return self.values[name]
+
+    def __iter__(self):
+        return iter(self.values)
+
+    def __len__(self):
+        return len(self.values)
+
+    @property
+    def pairs(self):
+        """(reference, frame) of each row, "rest" for the rest shape."""
+        return [("rest" if start is None else start, frame) for start, frame in zip(self.references, self.frames, strict=True)]
+
+
+def analyze(mesh, frames, dt=None, **options):
+    """Measures an animation.
+
+    With a ``neighbourhood`` of each vertex, else of each triangle: see :data:`warpcloth.measures.MEASURES` for all measures, or
+    the table in the README. Everything is kept; :class:`Analyzer` gives a row at a time, in memory that does not grow.
+
+    Args:
+        mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape; None for that of the file.
+        frames: Points (F, n, 3) [m], an :class:`warpcloth.Animation`, anything that :func:`warpcloth.open_sequence` opens or
+            returned.
+        dt: Time between frames [s], which rates need; a file or an animation has its own.
+        options: As of :class:`Analyzer`.
+
+    Returns:
+        :class:`Analysis`.
+
+    Raises:
+        ValueError: As :class:`Analyzer`; or a frame is broken.
+    """
+    analyzer = Analyzer(mesh, frames, dt, **options)
+    values = {
+        measure.name: np.empty((len(analyzer.pairs), analyzer.count, *measure.shape), analyzer.dtype)
+        for measure in analyzer.measures
+    }
+    references, labels, times, excluded = [], [], [], []
+    for sample in analyzer:
+        for name, found in sample.values.items():
+            values[name][sample.row] = found
+        references.append(sample.reference)
+        labels.append(sample.frame)
+        times.append(sample.time)
+        excluded += sample.excluded
+    measures = {measure.name: measure for measure in analyzer.measures}
+    return Analysis(analyzer.mesh, analyzer.on, measures, references, np.array(labels), np.array(times), excluded, values)
+
+
+class Analyzer:
+    """Measures of an animation, row by row: ``for sample in Analyzer(mesh, frames): …`` gives a :class:`Sample` for each.
+
+    A row is a frame against its reference. Memory holds three frames, however many there are.
+
+    Args:
+        mesh: As of :func:`analyze`.
+        frames: As there.
+        dt: As there.
+        measures: Names, or "all" that can be had with what is given. Nothing else is computed.
+        reference: "rest", "first", "previous" or the number of a frame, see :func:`warpcloth.pairs.pairs_of`; instead of it
+            ``pairs`` or ``lag``.
+        pairs: "1:2,1:3", reference and frame.
+        lag: Frames from reference to frame.
+        every: Every k-th frame alone.
+        neighbourhood: None for triangles; of vertices "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m],
+            "nearest:2%" of all vertices, or a set of vertices for each. Fixed by the rest shape.
+        rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt then; "logarithm", exact for a
+            constant L. All for turns below 180° from frame to frame. Of the first frame, which has none before it, rates are NaN.
+        directions: Warp and weft: "st" for the texture coordinates, or a vector (3,) in the rest shape.
+        material: A membrane term for energy and stress, such as :class:`warpcloth.NeoHookeanMembrane`.
+        device: A Warp device.
+        dtype: "float32" or "float64".
+
+    Attributes:
+        mesh, sequence: What is measured.
+        on, count: "triangle" or "vertex", and how many.
+        measures: List of :class:`warpcloth.measures.Measure`.
+        pairs: List of :class:`warpcloth.pairs.Pair`.
+
+    Raises:
+        ValueError: An option is none of those above; a measure needs one that is not given; the mesh has no triangles.
+    """
+
+    def __init__(
+        self,
+        mesh,
+        frames,
+        dt=None,
+        measures=("stretch",),
+        reference=None,
+        pairs=None,
+        lag=None,
+        every=1,
+        neighbourhood=None,
+        rates="midpoint",
+        directions=None,
+        material=None,
+        device="cpu",
+        dtype="float64",
+    ):
+        choice("rates", rates, tuple(RATES))
+        choice("dtype", dtype, tuple(DTYPES))
+        self.sequence = _sequence(mesh, frames, dt)
+        self.mesh = self.sequence.mesh if mesh is None else mesh
+        if not len(self.mesh.triangles):
+            raise ValueError("mesh: is of edges alone, must have triangles, for what is measured is a surface")
+        self.on = "triangle" if neighbourhood is None else "vertex"
+        self.measures = self._chosen(measures, directions, material)
+        self.pairs, self._left_out = pairs_of(self.sequence.labels, reference, pairs, lag, every)
+        self.rates, self.dtype = rates, DTYPES[dtype][1]
+        if self.on == "triangle":
+            if material is not None:
+                check_material(material)
+            threads = None if directions is None else material_directions(self.mesh, directions)
+            self._elements = Triangles(self.mesh, self.measures, threads, material, device, dtype)
+        else:
+            for name, value in (("directions", directions), ("material", material)):
+                if value is not None:
+                    raise ValueError(f"{name}: is for measures of triangles, must be None with a neighbourhood")
+            self._elements = Neighbourhoods(self.mesh, self.measures, neighbourhood, device, dtype)
+        self.count = self._elements.count
+
+    def _chosen(self, names, directions, material):
+        given = {"directions": directions is not None, "material": material is not None}
+        given["rate"] = self.sequence.times is not None
+        found = chosen(names, self.on, [need for need, there in given.items() if there])
+        advice = {
+            "directions": 'directions="st" or a vector',
+            "material": "material=NeoHookeanMembrane(stiffness=1e3, poisson_ratio=0.3) or another membrane",
+            "rate": "dt, the time between frames [s]",
+        }
+        for measure in found:
+            for need in (measure.needs, "rate" if measure.rate else ""):
+                if need and not given[need]:
+                    raise ValueError(f"measures: {measure.name!r} needs {advice[need]}")
+        return found
+
+    def __len__(self):
+        return len(self.pairs)
+
+    def __iter__(self):
+        elements, sequence = self._elements, self.sequence
+        labels, times = sequence.labels, sequence.times
+        excluded = [_frame(label, "is missing") for label in sequence.missing]
+        excluded += [_frame(label, reason) for label, reason in self._left_out]
+        rates = ", ".join(measure.name for measure in self.measures if measure.rate)
+        held, seen, reference = {}, set(), _NONE
+        for row, pair in enumerate(self.pairs):
+            places = {pair.reference, pair.frame} | ({pair.before} if pair.before is not None else set())
+            held = {place: held[place] if place in held else self._read(place) for place in places}
+            for place in places - seen:
+                vertices = np.flatnonzero(held[place].lost_vertices)
+                if len(vertices):
+                    excluded.append(Exclusion(self._label(place), "vertex", vertices, "is not at a finite place"))
+            if pair.reference != reference:
+                reference = pair.reference
+                without = elements.refer(held[reference].points)
+                none = without & ~held[reference].lost
+                if none.any() and reference not in seen:
+                    excluded.append(Exclusion(self._label(reference), self.on, np.flatnonzero(none), elements.without))
+            seen |= places
+            elements.measure(held[pair.frame].points)
+            if rates and pair.before is None:
+                excluded.append(_frame(labels[pair.frame], f"has none before it, and so no {rates}"))
+            elif rates:
+                elements.start(held[pair.before].points)
+                elements.rates(times[pair.frame] - times[pair.before], self.rates)
+            values = elements.read()
+            known = without | held[pair.reference].lost | held[pair.frame].lost
+            undefined = {}
+            for measure in self.measures:
+                lost = self._exclude(measure, pair, values[measure.name], known, held)
+                if len(lost):
+                    undefined.setdefault((measure.undefined, lost.tobytes()), (lost, []))[1].append(measure.name)
+            for (reason, _), (lost, names) in undefined.items():
+                reason = f"{reason}, so that {', '.join(names)} cannot be said"
+                excluded.append(Exclusion(labels[pair.frame], self.on, lost, reason))
+            time = np.nan if times is None else times[pair.frame]
+            points = held[pair.frame].points
+            yield Sample(row, self._label(reference), labels[pair.frame], pair.frame, time, points, values, excluded)
+            excluded = []
+
+    def _exclude(self, measure, pair, values, known, held):
+        """Makes what could not be measured NaN in all its numbers; returns elements that are not ``known`` to be so."""
+        if measure.rate:
+            if pair.before is None:
+                values[:] = np.nan
+                return ()
+            known = known | held[pair.before].lost
+        lost = known | np.isnan(values.reshape(len(values), -1)).any(axis=1)
+        values[lost] = np.nan
+        return np.flatnonzero(lost & ~known)
+
+    def _read(self, place):
+        points = self.mesh.points if place is None else np.asarray(self.sequence[place], dtype=np.float64)
+        lost = ~np.isfinite(points).all(axis=1)
+        return _Held(points, lost, self._elements.touched(lost) if lost.any() else np.zeros(self.count, dtype=bool))
+
+    def _label(self, place):
+        return None if place is None else self.sequence.labels[place]
+
+
+_NONE = object()
+
+
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """Points of a frame, which of them are not finite (n,), and which elements those touch (E,)."""
+
+    points: np.ndarray
+    lost_vertices: np.ndarray
+    lost: np.ndarray
+
+
+def _frame(label, reason):
+    return Exclusion(label, "frame", np.empty(0, dtype=int), reason)
+
+
+def _sequence(mesh, frames, dt):
+    if isinstance(frames, Sequence):
+        return frames
+    if isinstance(frames, (str, PathLike)):
+        return open_sequence(frames, fps=None if dt is None else 1.0 / dt)
+    return as_sequence(mesh, frames, dt)
