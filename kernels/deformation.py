@@ -212,11 +212,11 @@ def unit_directions(dtype):
 def measure_triangles(dtype):
     """Kernel over triangles: what follows from F = F̂'s first two columns, F = R U = W diag(λ) Vᵀ.
 
-    Outputs: R = W Vᵀ and W (3×2), U = V diag(λ) Vᵀ and C = FᵀF and E = ½(C − I) (2×2), λ₁ ≥ λ₂, the directions T V and W as rows
-    (2×3), the angle of the rotation [r₁, r₂, r₁×r₂] Tᵀ, J = ‖f₁×f₂‖, the stretches ‖F a‖ of material directions and the
+    Outputs: R = W Vᵀ (3×2), U = V diag(λ) Vᵀ and C = FᵀF and E = ½(C − I) (2×2), λ₁ ≥ λ₂, the directions T V and W as
+    rows (2×3), the angle of the rotation [r₁, r₂, r₁×r₂] Tᵀ, J = ‖f₁×f₂‖, the stretches ‖F a‖ of material directions and the
     angle between them.
     """
-    vec3, mat33 = types(dtype)
+    _, mat33 = types(dtype)
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
     mat32, mat23 = wp.types.matrix((3, 2), dtype), wp.types.matrix((2, 3), dtype)
 
@@ -343,8 +343,8 @@ def rate_of(before: Any, after: Any, dt: Any, method: int):
 def measure_rates(dtype):
     """Kernel over elements: the velocity gradient L = ḞF⁻¹ = D + W and other rates between the gradients F̂₀ and F̂₁.
 
-    L is 2(F̂₁ − F̂₀)(F̂₁ + F̂₀)⁻¹/dt by midpoint, (F̂₁ − F̂₀)F̂₀⁻¹/dt forward, log(F̂₁F̂₀⁻¹)/dt by logarithm. D = P ½(L + Lᵀ) P with P the
-    projection to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch of the normal is not measured; W = ½(L − Lᵀ).
+    L is 2(F̂₁ − F̂₀)(F̂₁ + F̂₀)⁻¹/dt by midpoint, (F̂₁ − F̂₀)F̂₀⁻¹/dt forward, log(F̂₁F̂₀⁻¹)/dt by logarithm. D = P ½(L + Lᵀ) P with
+    P the projection to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch of the normal is not measured; W = ½(L − Lᵀ).
     Rates of stretches and of lengths are of the numbers themselves by the same method; of angles, differences.
     """
     vec3, mat33 = types(dtype)
@@ -483,10 +483,10 @@ def vertex_normals(dtype):
 def neighbourhood_gradients(dtype):
     """Kernel over vertices: fits of the map of a set of points to p = X − X̄ and q = x − x̄, X̄ and x̄ their centroids.
 
-    F = (Σ q pᵀ + l̄² n Nᵀ)(Σ p pᵀ + l̄² N Nᵀ)⁻¹, l̄² the mean of ‖p‖², the least squares of Σ‖q − Fp‖² (Müller et al. 2005, Meshless
-    deformations based on shape matching) with one pair more, (l̄N, l̄n): a set may be planar, and its stretch along the normal is
-    then prescribed, to 1. The outputs are F̂ = F T with T = [t₁, t₂, N], T, the rotation R with the largest tr(RᵀΣqpᵀ) (Kabsch
-    1976), the residual √(mean ‖q − Rp‖²) [m], and H = Σ p qᵀ [m²].
+    F = (Σ q pᵀ + l̄² n Nᵀ)(Σ p pᵀ + l̄² N Nᵀ)⁻¹, l̄² the mean of ‖p‖², the least squares of Σ‖q − Fp‖² (Müller et al.
+    2005, *Meshless deformations based on shape matching*) with one pair more, (l̄N, l̄n): a set may be planar, and its stretch
+    along the normal is then prescribed, to 1. The outputs are F̂ = F T with T = [t₁, t₂, N], T, the rotation R with the largest
+    tr(RᵀΣqpᵀ) (Kabsch 1976), the residual √(mean ‖q − Rp‖²) [m], and H = Σ p qᵀ [m²].
     """
     vec3, mat33 = types(dtype)
 

@@ -53,7 +53,7 @@ class Sample:
         place: Place of the frame in its sequence.
         time: Of the frame [s]; NaN where the sequence has no times.
         points: (n, 3) [m].
-        values: Arrays (E, *shape) by name of measure, NaN in what is excluded. They are valid until the next sample is asked for.
+        values: Arrays (E, *shape) by name of measure, NaN in what is excluded; the next sample overwrites them.
         excluded: List of :class:`Exclusion` that this row is the first to meet.
     """
 
@@ -158,8 +158,8 @@ class Analyzer:
         every: Every k-th frame alone.
         neighbourhood: None for triangles; of vertices "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m],
             "nearest:2%" of all vertices, or a set of vertices for each. Fixed by the rest shape.
-        rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt then; "logarithm", exact for a
-            constant L. All for turns below 180° from frame to frame. Of the first frame, which has none before it, rates are NaN.
+        rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt then; "logarithm", exact
+            for a constant L. All for turns below 180° from frame to frame. A first frame, which has none before it, has none.
         directions: Warp and weft: "st" for the texture coordinates, or a vector (3,) in the rest shape.
         material: A membrane term for energy and stress, such as :class:`warpcloth.NeoHookeanMembrane`.
         device: A Warp device.

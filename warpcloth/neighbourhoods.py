@@ -7,20 +7,20 @@ import numpy as np
 from .checks import shown
 from .rotation import point_sets
 
-_RULE = 'must be "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, or a set of vertices for each'
+_RULE = 'must be "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, or a set for each'
 _SHARE = 2.0  # per cent
 
 
 def neighbourhoods(mesh, chosen):
     """The neighbourhood of each vertex, itself among them.
 
-    Rings follow edges. Nearest points are those of the rest shape, as the crow flies: of a garment they may belong to a layer that
-    only lies near. A vertex without a triangle has none, and is in none.
+    Rings follow edges. Nearest points are those of the rest shape, as the crow flies: of a garment they may belong to a layer
+    that only lies near. A vertex without a triangle has none, and is in none.
 
     Args:
         mesh: The :class:`warpcloth.Mesh`.
-        chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, which "nearest" says
-            too; or sets of vertices, (n, k) or n lists.
+        chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, which is
+            "nearest" too; or sets of vertices, (n, k) or n lists.
 
     Returns:
         tuple: offsets (n + 1,) and members, int32: those of vertex i are members[offsets[i]:offsets[i + 1]].
@@ -75,7 +75,7 @@ def _nearest(mesh, used, chosen):
         k = int(value) if kind == "k" else int(np.ceil(value / 100.0 * len(points)))
         if k < 3 or k > len(points):
             raise ValueError(
-                f"neighbourhood = {shown(chosen)}: is {k} of {len(points)} vertices, must be 3 or more and no more than there are"
+                f"neighbourhood = {shown(chosen)}: is {k} of the {len(points)} vertices, must be 3 or more and at most all"
             )
         members = np.empty((len(points), k), dtype=np.int32)
         for start in range(0, len(points), 4096):

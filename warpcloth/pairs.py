@@ -98,7 +98,7 @@ def _place(labels, value, where, rule):
     found = np.flatnonzero(np.isclose(labels, number, rtol=0.0, atol=1e-6))
     if not len(found):
         raise ValueError(
-            f"{where}: there is no frame {number:g} among the {len(labels)} from {labels[0]:g} to {labels[-1]:g}; must be {rule}"
+            f"{where}: there is no frame {number:g}, only {len(labels)} from {labels[0]:g} to {labels[-1]:g}; must be {rule}"
         )
     return int(found[0])
 

@@ -1,0 +1,67 @@
+"""Neighbourhoods of vertices against brute force."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.neighbourhoods import neighbourhoods
+
+GRID = wc.Mesh.grid(7, 6, size=(1.0, 0.9), pattern="alternating")
+SHEET = wc.Mesh(np.concatenate([[[0.5, 0.0, 0.5]], GRID.points]), GRID.triangles + 1)  # vertex 0 is in no triangle
+DISTANCES = np.linalg.norm(SHEET.points[1:, None] - SHEET.points[None, 1:], axis=2)
+
+
+def sets(chosen, mesh=SHEET):
+    offsets, members = neighbourhoods(mesh, chosen)
+    return [set(members[a:b].tolist()) for a, b in pairwise(offsets)]
+
+
+def linked():
+    near = [{i} for i in range(len(SHEET.points))]
+    for a, b in SHEET.edges.tolist():
+        near[a].add(b)
+        near[b].add(a)
+    near[0] = set()
+    return near
+
+
+def test_rings():
+    near = linked()
+    assert sets("1-ring") == near
+    assert sets("2-ring") == [set().union(*(near[j] for j in around)) for around in near]
+
+
+def test_radius():
+    assert sets("nearest:radius=0.2") == [set()] + [set((np.flatnonzero(d <= 0.2) + 1).tolist()) for d in DISTANCES]
+
+
+@pytest.mark.parametrize("chosen, k", [("nearest:k=6", 6), ("nearest:25%", 11), ("nearest:8%", 4)])
+def test_nearest(chosen, k):
+    found = sets(chosen)
+    assert not found[0]
+    for around, distances in zip(found[1:], DISTANCES, strict=True):
+        assert len(around) == k
+        assert max(distances[j - 1] for j in around) <= np.sort(distances)[k - 1] * (1 + 1e-12)
+
+
+def test_two_per_cent_of_the_vertices_where_nothing_else_is_said():
+    mesh = wc.Mesh.grid(30, 20)
+    assert sets("nearest", mesh) == sets("nearest:2%", mesh)
+    assert {len(around) for around in sets("nearest", mesh)} == {12}
+
+
+def test_own_sets():
+    own = [[i, (i + 1) % 43, (i + 7) % 43] for i in range(43)]
+    assert sets(own) == [set(around) for around in own]
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [*"ring 3-ring nearest:k=2 nearest:k=99 nearest:k=3.5 nearest:k= nearest:radius=-1 nearest:radius=nan".split()]
+    + [*"nearest:0% nearest:101%".split(), [[0, 1, 2]], 3],
+)
+def test_refused(chosen):
+    with pytest.raises(ValueError, match="neighbour"):
+        neighbourhoods(SHEET, chosen)
