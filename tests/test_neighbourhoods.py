@@ -57,11 +57,10 @@ def test_own_sets():
     assert sets(own) == [set(around) for around in own]
 
 
-@pytest.mark.parametrize(
-    "chosen",
-    [*"ring 3-ring nearest:k=2 nearest:k=99 nearest:k=3.5 nearest:k= nearest:radius=-1 nearest:radius=nan".split()]
-    + [*"nearest:0% nearest:101%".split(), [[0, 1, 2]], 3],
-)
+WRONG = "ring 3-ring nearest:k=2 nearest:k=99 nearest:k=3.5 nearest:k= nearest:radius=-1 nearest:radius=nan nearest:0%"
+
+
+@pytest.mark.parametrize("chosen", [*WRONG.split(), "nearest:101%", [[0, 1, 2]], 3])
 def test_refused(chosen):
     with pytest.raises(ValueError, match="neighbour"):
         neighbourhoods(SHEET, chosen)

@@ -322,7 +322,6 @@ def test_broken_file(tmp_path, damage, message):
 
 
 REFUSED_FOLDERS = [  # names of files, what is opened, fps, kind of error, message
-    (["1.obj", "2.obj"], "", None, ValueError, r"says no times; give fps, .*\(--fps\)"),
     (["1.obj", "2.obj"], "", 0, ValueError, "fps is 0; it must be a number above 0"),
     (["1.obj", "2.ply"], "", 24, ValueError, r'has files of several kinds, .obj .ply; give a pattern of one, such as "\*.obj"'),
     (["1.stl", "2.stl"], "", 24, ValueError, ".stl files repeat vertices, .* must end with .obj .ply .off"),
@@ -389,7 +388,6 @@ def test_array_files_stay_on_disk(tmp_path, ending):
 
 REFUSED_ARRAYS = [  # ending, what is written, fps, message
     ("npz", {"points": frames()}, 24, "has no array 'triangles', only points"),
-    ("npz", {"points": frames(), "triangles": MESH.triangles}, None, r"says no times; give fps"),
     ("npz", {"points": frames()[0], "triangles": MESH.triangles}, 24, r"points has shape \(9, 3\); it must be \(frames, vert"),
     ("npz", {"points": frames()[:, :8], "triangles": MESH.triangles}, 24, "must be indices of the 8 points"),
     ("npz", {"points": frames(), "triangles": MESH.triangles, "times": [0, 1]}, None, r"times has shape \(2,\); .* \(5,\)"),
@@ -403,7 +401,6 @@ REFUSED_ARRAYS = [  # ending, what is written, fps, message
     ("npz", b"no archive", 24, "is no .npz file"),
     ("npy", b"no array", 24, "magic string"),
     ("npy", b"", 24, ""),
-    ("npy", frames(), None, "says no times; give fps"),
     ("npy", frames()[:, :8], 24, r"points has shape \(5, 8, 3\); it must be \(frames, 9, 3\) for the points of the mesh"),
 ]
 
@@ -453,8 +450,15 @@ def test_what_python_holds(held):
             sequence[wrong]
 
 
+def test_frames_without_times(tmp_path):
+    assert as_sequence(MESH, frames()).times is None
+    np.save(tmp_path / "f.npy", frames())
+    assert open_sequence(tmp_path / "f.npy", mesh=MESH).times is None
+    np.savez(tmp_path / "f.npz", points=frames(), triangles=MESH.triangles)
+    assert open_sequence(tmp_path / "f.npz").times is None
+
+
 REFUSED = [  # mesh, frames, options, message
-    (MESH, frames(), {}, "dt is None; it must be the time from a frame to the next, or give times"),
     (MESH, frames(), {"dt": 0.1, "times": np.arange(5)}, "dt, times: both are given"),
     (MESH, frames(), {"dt": 0.0}, "dt is 0.0; it must be a number above 0"),
     (MESH, frames(), {"times": [0, 1, 2, 3]}, r"times has shape \(4,\); it must be \(5,\)"),

@@ -79,6 +79,7 @@ class Analysis(Mapping):
         frames: Numbers of the frames (rows,).
         times: Of the frames (rows,) [s].
         excluded: What could not be measured, list of :class:`Exclusion`; the values there are NaN.
+        arrays: The arrays.
     """
 
     mesh: object
@@ -88,16 +89,16 @@ class Analysis(Mapping):
     frames: np.ndarray
     times: np.ndarray
     excluded: list
-    values: dict = field(repr=False)
+    arrays: dict = field(repr=False)
 
     def __getitem__(self, name):
-        return self.values[name]
+        return self.arrays[name]
 
     def __iter__(self):
-        return iter(self.values)
+        return iter(self.arrays)
 
     def __len__(self):
-        return len(self.values)
+        return len(self.arrays)
 
     @property
     def pairs(self):

@@ -10,9 +10,6 @@ from .selection import select
 
 STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 
-# A float32 coordinate is rounded by 6e-8 of its size, so a triangle flatter than this has an area made of rounding.
-_FLATTEST = 1e-7
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mesh:
@@ -351,12 +348,12 @@ class Mesh:
             sides = self.points[self.triangles] - self.points[np.roll(self.triangles, 1, axis=1)]
             longest_squared = np.einsum("tki,tki->tk", sides, sides).max(axis=1)
             # 2·area/longest² is the height over the longest side, by that side.
-            return ~(2 * self.triangle_areas > _FLATTEST * longest_squared)
+            return ~(2 * self.triangle_areas > FLATTEST * longest_squared)
 
     def _refuse_degenerate(self):
         _refuse("points", self.points, ~np.isfinite(self.points).all(axis=1), "must be finite")
         _refuse("triangles", self.triangles, _repeated(self.triangles), "must be 3 different vertices")
-        _refuse("triangles", self.triangles, self._flat(), f"must be higher than {_FLATTEST:g} of its longest side")
+        _refuse("triangles", self.triangles, self._flat(), f"must be higher than {FLATTEST:g} of its longest side")
 
     def _refuse_repeated_edges(self):
         _refuse("edges", self.edges, _repeated(self.edges), "must be 2 different vertices")

@@ -29,7 +29,6 @@ from .loading import ENDINGS, WELDED, read_arrays
 from .mesh import STAGE_ENDINGS, Mesh, Surface
 
 _FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
-_NO_TIMES = "says no times; give fps, the frames of a second (--fps)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class Sequence:
         mesh: The rest shape, a `Surface` where it was read from a file.
         labels: (F,) numbers of the frames as the input has them: time codes, or the numbers in file names; int64 where all are
             whole, else float64.
-        times: (F,) [s], increasing.
+        times: (F,) [s], increasing; None where nobody says them.
         read: Function that gives the points of a frame from its index, 0 to F − 1.
         path: The file, folder or pattern, or None.
         stage: `usd.StageMesh` of a stage, or None; where its space moves, as it is at the first frame.
@@ -55,7 +54,7 @@ class Sequence:
 
     mesh: Mesh
     labels: np.ndarray
-    times: np.ndarray
+    times: np.ndarray | None
     read: Callable
     path: str | None = None
     stage: Any = None
@@ -98,8 +97,8 @@ def open_sequence(path, prim=None, fps=None, mesh=None):
     Args:
         path: A stage, a folder, a pattern, an .npz or an .npy file.
         prim: Path or name of the prim, or name of the geometry in each of the files, where there are several.
-        fps: Frames a second: numbers in file names, or time codes, in place of what the stage says. Needed where the input says
-            no times.
+        fps: Frames a second: numbers in file names, or time codes, in place of what the stage says. Without it there are no
+            times where the input says none.
         mesh: The `Mesh` of an .npy file, which has no triangles; others have their own, and do not look at it.
 
     Returns:
@@ -107,7 +106,7 @@ def open_sequence(path, prim=None, fps=None, mesh=None):
 
     Raises:
         FileNotFoundError: There is no such file or folder.
-        ValueError: It is none of the above, holds no frames or no times, or what there is does not fit together; the message
+        ValueError: It is none of the above, holds no frames, or what there is does not fit together; the message
             begins with the path.
     """
     path = os.fspath(path)
@@ -140,13 +139,13 @@ def as_sequence(mesh, frames, dt=None, times=None):
         mesh: The `Mesh`, its points the rest shape.
         frames: An array (F, n, 3) [m], a list of F arrays (n, 3), `usd.FrameSequence`, `Animation` or `Deformation`.
         dt: Time from each frame to the next [s].
-        times: (F,) [s], increasing. One of the two, or none where the frames have times of their own.
+        times: (F,) [s], increasing. One of the two; without either those of the frames, if they have any.
 
     Returns:
         Sequence: It holds on to `frames`.
 
     Raises:
-        ValueError: A frame, named by its index, does not fit the mesh; times do not increase, or none are given; or `mesh`
+        ValueError: A frame, named by its index, does not fit the mesh; times do not increase; or `mesh`
             is no mesh with triangles.
     """
     if not isinstance(mesh, Mesh):
@@ -157,10 +156,11 @@ def as_sequence(mesh, frames, dt=None, times=None):
         checks.number("dt", dt, above=0.0)
     elif times is None:
         times = getattr(frames, "times", None)
-        if times is None:
-            raise ValueError("dt is None; it must be the time from a frame to the next, or give times")
     count, read = _array("frames", getattr(frames, "points", frames), mesh)
-    times = dt * np.arange(count) if dt is not None else _increasing(times, count)
+    if dt is not None:
+        times = dt * np.arange(count)
+    elif times is not None:
+        times = _increasing(times, count)
     return Sequence(mesh, np.arange(count), times, read)
 
 
@@ -205,8 +205,6 @@ def _open_files(path, found, prim, fps):
             raise ValueError(
                 f"{file}: has number {int(digits[-1])}, the last in its name, as {other} has; each must be used once"
             )
-    if fps is None:
-        raise ValueError(f"{path}: {_NO_TIMES}")
     labels = np.array(sorted(numbered), dtype=np.int64)
     paths = [numbered[label] for label in labels.tolist()]
     points, triangles, st = read_arrays(paths[0], prim)
@@ -215,7 +213,8 @@ def _open_files(path, found, prim, fps):
     except ValueError as error:
         raise ValueError(f"{paths[0]}: {error}") from error
     read = partial(_read_file, paths, prim, mesh.triangles, len(points))
-    return Sequence(mesh, labels, (labels - labels[0]) / fps, read, path, declared=False)
+    times = None if fps is None else (labels - labels[0]) / fps
+    return Sequence(mesh, labels, times, read, path, declared=False)
 
 
 def _read_file(paths, prim, expected, count, frame):
@@ -293,13 +292,11 @@ def _array(name, frames, mesh):
     if found[1:] != shape or not found[0]:
         copies = f"; of several copies give one, as in {name}[:, 0]" if len(found) == 4 else ""
         raise ValueError(f"{name} has shape {found}; it must be (frames, {shape[0]}, 3) for the points of the mesh{copies}")
-    return found[0], getattr(frames, "exact", frames.__getitem__)
+    return found[0], frames.exact if hasattr(frames, "exact") else frames.__getitem__
 
 
 def _even(count, fps):
-    if fps is None:
-        raise ValueError(_NO_TIMES)
-    return np.arange(count) / fps
+    return None if fps is None else np.arange(count) / fps
 
 
 def _increasing(times, count):
