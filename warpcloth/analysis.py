@@ -6,7 +6,7 @@ from os import PathLike
 
 import numpy as np
 
-from .checks import choice
+from .checks import choice, number
 from .measures import chosen
 from .model import DTYPES
 from .pairs import pairs_of
@@ -206,7 +206,8 @@ class Analyzer:
         if self.on == "triangle":
             if material is not None:
                 check_material(material)
-            threads = None if directions is None else material_directions(self.mesh, directions)
+            seams = self.sequence.stage and self.sequence.stage.corner_coordinates
+            threads = None if directions is None else material_directions(self.mesh, directions, seams)
             self._elements = Triangles(self.mesh, self.measures, threads, material, device, dtype)
         else:
             for name, value in (("directions", directions), ("material", material)):
@@ -312,8 +313,20 @@ def _frame(label, reason):
 
 
 def _sequence(mesh, frames, dt):
-    if isinstance(frames, Sequence):
-        return frames
     if isinstance(frames, (str, PathLike)):
-        return open_sequence(frames, fps=None if dt is None else 1.0 / dt)
-    return as_sequence(mesh, frames, dt)
+        if dt is not None:
+            number("dt", dt, above=0.0)
+        frames = open_sequence(frames, fps=None if dt is None else 1.0 / dt, mesh=mesh)
+    elif not isinstance(frames, Sequence):
+        return as_sequence(mesh, frames, dt)
+    if mesh is not None and not same_topology(mesh, frames.mesh):
+        raise ValueError(
+            f"mesh: {len(mesh.points)} vertices and {len(mesh.triangles)} triangles, must be those of the frames, "
+            f"{len(frames.mesh.points)} and {len(frames.mesh.triangles)}, in their order"
+        )
+    return frames
+
+
+def same_topology(one, other):
+    """Whether two meshes have as many vertices and the same triangles."""
+    return len(one.points) == len(other.points) and np.array_equal(one.triangles, other.triangles)

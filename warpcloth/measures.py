@@ -35,7 +35,7 @@ class Measure:
 _TURNED = "turns by 180° or more, or has collapsed"
 _EQUAL = "has equal stretches, and so no principal directions"
 _FORCES = {"needs": "material"}
-_THREADS = {"needs": "directions", "undefined": "has collapsed, or has no texture coordinates of its own"}
+_THREADS = {"needs": "directions", "undefined": "has collapsed, or has no such directions"}
 _RATES = (
     Measure("velocity_gradient", (3, 3), "1/s", "L = ḞF⁻¹", 0.0, True, undefined=_TURNED),
     Measure("rate_of_strain", (3, 3), "1/s", "D = ½(L + Lᵀ) in the tangent plane", 0.0, True, undefined=_TURNED),

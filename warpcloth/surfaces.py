@@ -194,13 +194,14 @@ class Neighbourhoods(_Elements):
         self.launch(deformation.neighbourhood_gradients(self.scalar), inputs, outputs)
 
 
-def material_directions(mesh, chosen):
+def material_directions(mesh, chosen, corner_coordinates=None):
     """Two directions in the material of each triangle, as coefficients α of its edges: X₁ − X₀ and X₂ − X₀ times α.
 
     Args:
         mesh: A mesh of triangles.
         chosen: "st", along which one texture coordinate grows and the other does not; or a vector (3,), whose part in the
             plane of each triangle of the rest shape is the first, and the second is square to it.
+        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), where vertices do not have one each.
 
     Returns:
         np.ndarray: (T, 2, 2), warp and weft in columns; NaN where there is none: the texture is degenerate, or the vector
@@ -216,9 +217,11 @@ def material_directions(mesh, chosen):
         if isinstance(chosen, str):
             if chosen != "st":
                 raise ValueError(f"directions = {shown(chosen)}: {rule}")
-            if mesh.texture_coordinates is None:
-                raise ValueError('directions = "st": the mesh has no texture coordinates, one for each vertex; give a vector')
-            st = mesh.texture_coordinates[mesh.triangles]
+            st = corner_coordinates
+            if mesh.texture_coordinates is not None:
+                st = mesh.texture_coordinates[mesh.triangles]
+            if st is None:
+                raise ValueError('directions = "st": the mesh has no texture coordinates that were read; give a vector')
             Ds = np.stack([st[:, 1] - st[:, 0], st[:, 2] - st[:, 0]], axis=2)
             determinant = Ds[:, 0, 0] * Ds[:, 1, 1] - Ds[:, 0, 1] * Ds[:, 1, 0]
             cofactors = np.stack([Ds[:, 1, 1], -Ds[:, 0, 1], -Ds[:, 1, 0], Ds[:, 0, 0]], axis=1).reshape(-1, 2, 2)

@@ -31,6 +31,8 @@ class StageMesh:
         start: First time code, None where the stage does not say.
         pins: Sorted vertex indices (p,) int32 by name, of every GeomSubset of points.
         point_vertices: Curves: the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
+        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), where vertices on seams have several
+            and the mesh has none; else None.
         rest: Whether the stage says a rest shape, the default points; else the mesh is that of one time code.
     """
 
@@ -45,6 +47,7 @@ class StageMesh:
     start: float | None
     pins: dict
     point_vertices: np.ndarray | None = None
+    corner_coordinates: np.ndarray | None = None
     rest: bool = True
 
 
@@ -91,13 +94,15 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
     where = f"{path}, prim {found.GetPath()}"
     transform = local_to_metres(found, where, time)
     points = placed(_rest_points(found, where, time), transform)
-    point_vertices = None
+    point_vertices = corner_coordinates = None
     try:
         if found.IsA(UsdGeom.Mesh):
-            triangles = _triangles(found, len(points))
+            corners, triangles = _corners(found, len(points))
             if np.linalg.det(transform[:3, :3]) < 0:
                 triangles = triangles[:, ::-1]
-            mesh = kind(points, triangles, texture_coordinates=_texture_coordinates(found, len(points)))
+            at_vertices, at_corners = _texture_coordinates(found, len(points), corners)
+            corner_coordinates = None if at_corners is None else at_corners[triangles]
+            mesh = kind(points, corners[triangles], texture_coordinates=at_vertices)
         else:
             point_vertices = curve_vertices(found, len(points))
             edges = point_vertices[_curve_edges(found)]
@@ -119,6 +124,7 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
         start=stage.GetStartTimeCode() if layer.HasStartTimeCode() else None,
         pins=_pins(found, point_vertices),
         point_vertices=point_vertices,
+        corner_coordinates=corner_coordinates,
         rest=UsdGeom.PointBased(found).GetPointsAttr().Get() is not None,
     )
 
@@ -298,8 +304,9 @@ def topology(attribute, time=None):
     return np.array(value if value is not None else [], dtype=np.int32)
 
 
-def _triangles(prim, count):
-    """Triangles (T, 3) int32 of a Mesh prim, counter-clockwise seen from the front in the prim's own space."""
+def _corners(prim, count):
+    """Vertices (C,) int32 of the corners of a Mesh prim's faces, and the three corners of each triangle (T, 3), which run
+    counter-clockwise seen from the front in the prim's own space."""
     mesh = UsdGeom.Mesh(prim)
     counts, corners = topology(mesh.GetFaceVertexCountsAttr()), topology(mesh.GetFaceVertexIndicesAttr())
     if len(counts) == 0:
@@ -315,8 +322,8 @@ def _triangles(prim, count):
     start = np.repeat(np.cumsum(counts) - counts, counts - 2)
     # Position of each triangle within its polygon's fan.
     step = np.arange(len(start)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
-    triangles = corners[np.stack([start, start + step + 1, start + step + 2], axis=1)]
-    return triangles[:, ::-1] if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded else triangles
+    fans = np.stack([start, start + step + 1, start + step + 2], axis=1)
+    return corners, fans[:, ::-1] if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded else fans
 
 
 def _curve_edges(prim):
@@ -331,21 +338,20 @@ def _curve_edges(prim):
     return edges
 
 
-def _texture_coordinates(prim, count):
-    """`primvars:st` as (n, 2), or None where there are none or a vertex has several (a seam)."""
+def _texture_coordinates(prim, count, corners):
+    """`primvars:st` of vertices (n, 2), or else, where one has several (a seam), of the corners (C, 2); None of the other."""
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
     if not (primvar and primvar.HasValue()):
-        return None
+        return None, None
     st = np.array(primvar.ComputeFlattened(), dtype=np.float64)
     interpolation = primvar.GetInterpolation()
     if interpolation in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and st.shape == (count, 2):
-        return st
-    corners = topology(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr())
+        return st, None
     if interpolation != UsdGeom.Tokens.faceVarying or st.shape != (len(corners), 2):
-        return None
+        return None, None
     at_vertices = np.zeros((count, 2))
     at_vertices[corners] = st
-    return at_vertices if np.array_equal(at_vertices[corners], st) else None
+    return (at_vertices, None) if np.array_equal(at_vertices[corners], st) else (None, st)
 
 
 def _pins(prim, point_vertices):
