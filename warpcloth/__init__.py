@@ -7,6 +7,7 @@ from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
 from .rotation import kabsch, polar, svd
 from .scene import Pins, Scene
+from .sequences import Sequence, as_sequence, open_sequence
 from .simulate import Animation, simulate
 from .solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
 from .terms import (
@@ -46,14 +47,17 @@ __all__ = [
     "QuadraticBending",
     "RigidCluster",
     "Scene",
+    "Sequence",
     "Spring",
     "SpringLimit",
     "StVKMembrane",
     "StrainLimit",
     "analyze",
+    "as_sequence",
     "deform",
     "equilibrium",
     "kabsch",
+    "open_sequence",
     "polar",
     "simulate",
     "svd",

@@ -14,6 +14,7 @@ from .sequences import Sequence, as_sequence, open_sequence
 from .surfaces import RATES, Neighbourhoods, Triangles, check_material, material_directions
 
 _SHOWN = 8  # elements that a sentence names
+_MOST = 100  # missing frames that have a sentence each
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +194,7 @@ class Analyzer:
         device="cpu",
         dtype="float64",
     ):
+        self._given = {name: value for name, value in locals().items() if name != "self"}
         choice("rates", rates, tuple(RATES))
         choice("dtype", dtype, tuple(DTYPES))
         self.sequence = _sequence(mesh, frames, dt)
@@ -231,13 +233,29 @@ class Analyzer:
                     raise ValueError(f"measures: {measure.name!r} needs {advice[need]}")
         return found
 
+    def of(self, *measures):
+        """The same analysis of other measures."""
+        return Analyzer(**(self._given | {"frames": self.sequence, "dt": None, "measures": measures}))
+
+    @property
+    def areas(self):
+        """Rest areas (E,) of triangles, or lumped ones of vertices [m²]."""
+        return self.mesh.triangle_areas if self.on == "triangle" else self.mesh.vertex_areas
+
+    def places(self, points):
+        """Where the elements are among points (n, 3): the centroids of triangles, or the vertices, (E, 3)."""
+        if self.on == "vertex":
+            return points
+        a, b, c = self.mesh.triangles.T
+        return (points[a] + points[b] + points[c]) / 3.0
+
     def __len__(self):
         return len(self.pairs)
 
     def __iter__(self):
         elements, sequence = self._elements, self.sequence
         labels, times = sequence.labels, sequence.times
-        excluded = [_frame(label, "is missing") for label in sequence.missing]
+        excluded = _missing(sequence.missing)
         excluded += [_frame(label, reason) for label, reason in self._left_out]
         rates = ", ".join(measure.name for measure in self.measures if measure.rate)
         held, seen, reference = {}, set(), _NONE
@@ -306,6 +324,13 @@ class _Held:
     points: np.ndarray
     lost_vertices: np.ndarray
     lost: np.ndarray
+
+
+def _missing(labels):
+    """Exclusions of frames that are not there; of very many, as one stray file may leave, a single one."""
+    if len(labels) <= _MOST:
+        return [_frame(label, "is missing") for label in labels]
+    return [_frame(labels[0], f"is missing, and so are {len(labels) - 1} more, the last of them {labels[-1]:g}")]
 
 
 def _frame(label, reason):

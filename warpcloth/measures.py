@@ -19,6 +19,7 @@ class Measure:
         neutral: Its value where nothing is deformed, the middle of a scale; None where it starts at 0.
         rate: Whether it is a rate, from the frame before to this one.
         needs: "directions" or "material", of :func:`warpcloth.analyze`; "" for neither.
+        summed: Whether its scalars say something; of rotations and unit vectors they are the same everywhere.
         undefined: Why a value may be missing of an element that has a reference and finite points.
     """
 
@@ -29,6 +30,7 @@ class Measure:
     neutral: float | None = None
     rate: bool = False
     needs: str = ""
+    summed: bool = True
     undefined: str = "has collapsed"
 
 
@@ -49,13 +51,13 @@ _RATES = (
 _LISTED = {
     "triangle": (
         Measure("deformation_gradient", (3, 2), "1", "F = [x₁ − x₀, x₂ − x₀] Dm⁻¹, from the triangle's rest frame to space"),
-        Measure("rotation", (3, 2), "1", "R of F = R U"),
+        Measure("rotation", (3, 2), "1", "R of F = R U", summed=False),
         Measure("right_stretch", (2, 2), "1", "U of F = R U"),
         Measure("right_cauchy_green", (2, 2), "1", "C = FᵀF = U²"),
         Measure("green_strain", (2, 2), "1", "E = ½(C − I)", 0.0),
         Measure("stretch", (2,), "1", "principal stretches λ₁ ≥ λ₂, the singular values of F", 1.0),
-        Measure("rest_directions", (2, 3), "1", "principal directions in the reference, unit vectors"),
-        Measure("directions", (2, 3), "1", "principal directions in the frame, unit vectors"),
+        Measure("rest_directions", (2, 3), "1", "principal directions in the reference, unit vectors", summed=False),
+        Measure("directions", (2, 3), "1", "principal directions in the frame, unit vectors", summed=False),
         Measure("rotation_angle", (), "rad", "angle of R as a rotation in space, 0 to π"),
         Measure("area_ratio", (), "1", "area over that of the reference, λ₁λ₂", 1.0),
         Measure("length_ratio", (2,), "1", "stretches along warp and weft", 1.0, **_THREADS),
@@ -69,12 +71,12 @@ _LISTED = {
                 **_THREADS),
     ),
     "vertex": (
-        Measure("rotation", (3, 3), "1", "rotation that fits the neighbourhood best (Kabsch 1976)"),
+        Measure("rotation", (3, 3), "1", "rotation that fits the neighbourhood best (Kabsch 1976)", summed=False),
         Measure("rotation_angle", (), "rad", "its angle, 0 to π"),
         Measure("residual", (), "m", "root of the mean squared distance that this rotation leaves"),
         Measure("deformation_gradient", (3, 3), "1", "F of least squares, with the normal as one pair more"),
         Measure("stretch", (3,), "1", "singular values λ₁ ≥ λ₂ ≥ λ₃ of F; that along the normal is prescribed, 1", 1.0),
-        Measure("directions", (3, 3), "1", "their directions in the frame, unit vectors"),
+        Measure("directions", (3, 3), "1", "their directions in the frame, unit vectors", summed=False),
         Measure("cross_covariance", (3, 3), "m²", "H = Σ p qᵀ, which has the rotation and the shape of the set in it"),
         *_RATES,
     ),
@@ -120,8 +122,10 @@ def scalars(measure, values):
 
     Returns:
         dict: Arrays (E,) by name: of a number itself, of a few numbers each, as ``stretch_1``, of a matrix its Frobenius norm,
-        as ``spin_norm``.
+        as ``spin_norm``. None of rotations and unit vectors.
     """
+    if not measure.summed:
+        return {}
     if not measure.shape:
         return {measure.name: values}
     if len(measure.shape) == 1:

@@ -12,7 +12,7 @@ import warnings
 
 import numpy as np
 
-from . import deform, run
+from . import analyze, deform, run
 from .terminal import Interrupted, say, show_warning
 
 
@@ -86,18 +86,21 @@ def _parser():
     info = add("info", run.info, "Say what is in a scene, and what is built from it.", epilog=run.EPILOG)
     deforms = add("deform", deform.deform, "Deform a mesh as rigidly as its handles allow.", epilog=deform.EPILOG)
     deform.add_arguments(deforms)
+    analyzes = add("analyze", analyze.analyze, "Measure how an animated cloth deforms.", epilog=analyze.EPILOG)
+    analyze.add_arguments(analyzes)
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
         sub.add_argument("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
         sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
     runs.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not the scene's")
-    for sub in (runs, info, deforms):
+    for sub in (runs, info, deforms, analyzes):
         sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
-        sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub is deforms else "float32")
+        sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
         sub.add_argument("--json", action="store_true", help="print one JSON object")
     for sub in (runs, deforms):
         sub.add_argument("-o", "--output", required=True, metavar="FILE", help="the .usd, .usda, .usdc or .usdz file to write")
+    for sub in (runs, deforms, analyzes):
         sub.add_argument("--single-file", action="store_true", help="one file in the end, with no folder of frames beside it")
     scenes = add("scenes", run.scenes, "List scenes and their parameters.")
     scenes.add_argument("folder", nargs="?", help="a folder of .py files, if not the ones whose scenes are known by name")

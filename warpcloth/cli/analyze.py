@@ -1,0 +1,234 @@
+"""The command ``analyze``: measures an animation, and writes what it found as a stage, tables, arrays and pictures."""
+
+import time
+from pathlib import Path
+
+from .. import scene_files
+from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place
+
+EPILOG = """\
+INPUT is a USD stage, a folder of .obj, .ply or .off files or a pattern such as "frames/*.obj", or arrays, .npz or .npy.
+Measures are listed by --measure help. What is coloured is one number of a measure: stretch_1, area_ratio, rate_of_strain_norm.
+What cannot be measured is left out and listed, as points that are not finite or triangles without area.
+
+  warpcloth analyze cache.usdc --measure stretch area_ratio -o measured.usdc --plot measured.png
+  warpcloth analyze frames/ --fps 24 --rest pattern.obj --neighbourhood 1-ring --measure rotation residual --csv table.csv
+  warpcloth analyze cache.usdc --lag 3 --measure rate_of_strain stretch_rate -o rates.usdc --still one.png --still-frames 24
+"""
+_SENTENCES = 8
+_MATERIALS = {"neo-hookean": "NeoHookeanMembrane", "stvk": "StVKMembrane", "corotated": "CorotatedMembrane"}
+
+
+def add_arguments(parser):
+    """Adds what the command takes but for what all commands do."""
+    add = parser.add_argument
+    add("input", metavar="INPUT", nargs="?", help="the animation: a stage, a folder or pattern of mesh files, .npz or .npy")
+    add("--prim", help="path or name of the prim, or geometry, of a file with several")
+    add("--fps", type=float, help="frames per second, where the input does not say; rates need it")
+    add("--rest", metavar="MESH", help="the rest shape: a mesh file or stage with the same triangles; else that of INPUT")
+    add("--rest-prim", metavar="PRIM", help="of the rest shape, as --prim")
+    add("--measure", nargs="+", default=["stretch"], metavar="NAME", help="measures, or all, or help; stretch where not given")
+    add("--neighbourhood", metavar="N", help="measure vertices: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%")
+    add("--reference", metavar="R", help="rest (default), first, previous, or the number of a frame")
+    add("--pairs", metavar="A:B,…", help="instead, pairs of reference and frame, such as 1:2,1:3,72:75")
+    add("--lag", type=int, metavar="K", help="instead, each frame against the one K before it")
+    add("--every", type=int, default=1, metavar="K", help="every K-th frame alone")
+    add("--rates", choices=("midpoint", "forward", "logarithm"), default="midpoint", help="midpoint where not given")
+    add("--directions", metavar="D", help="warp and weft: st, or a vector such as 1,0,0 for the warp")
+    add("--material", choices=tuple(_MATERIALS), help="for energy and stress; neo-hookean where --stiffness is given")
+    add("--stiffness", type=float, metavar="K", help="of the material: Young's modulus times thickness [N/m]")
+    add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material, 0 where not given")
+    add("-o", "--output", metavar="FILE", help="a .usd, .usda, .usdc or .usdz file: measures as primvars, one as colour")
+    add(
+        "--colour",
+        metavar="NAME",
+        help="what is coloured, such as stretch_1; the first number of the first measure if not given",
+    )
+    add(
+        "--range",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="of the colours; else of all frames, without the last 1 %%",
+    )
+    add("--up-axis", choices=("Y", "Z"), default="Y", help="of what is no stage; Y where not given")
+    add("--curves", action="store_true", help="show the principal directions as curves")
+    add("--csv", metavar="FILE", help="a table: percentiles of every frame, the worst element and its place")
+    add("--report", metavar="FILE", help="the same and what is left out, as JSON")
+    add("--npz", metavar="FILE", help="the measures themselves, (frames, elements, …)")
+    add("--plot", metavar="FILE", help="percentiles over time, .png, .svg or .pdf")
+    add("--still", metavar="FILE", help="pictures, .png; the number of the frame is put before the ending")
+    add("--still-frames", type=float, nargs="+", metavar="FRAME", help="of which frames; of the last where not given")
+
+
+def analyze(arguments):
+    from ..measures import MEASURES
+    from ..reports import write_report
+
+    if arguments.measure == ["help"]:
+        print(_listed(MEASURES))
+        return 0
+    files = {name: getattr(arguments, name) for name in ("output", "csv", "report", "npz", "plot", "still")}
+    for path in filter(None, files.values()):
+        check_writable(path)
+    if arguments.output:
+        frames_folder_of(arguments)  # refuses an ending that is none
+    started = time.perf_counter()
+    analyzer = _analyzer(arguments)
+    progress = Progress(len(analyzer), first="measuring")
+    try:
+        found = write_report(
+            analyzer,
+            usd=arguments.output,
+            csv=arguments.csv,
+            json=arguments.report,
+            npz=arguments.npz,
+            plot=arguments.plot,
+            stills=_stills(arguments, analyzer),
+            colour=arguments.colour,
+            colour_range=arguments.range,
+            curves=arguments.curves,
+            single_file=arguments.single_file,
+            up_axis=arguments.up_axis,
+            progress=progress,
+        )
+    except KeyboardInterrupt:
+        files = ", ".join(filter(None, files.values())) or "no file"
+        raise Interrupted(f"interrupted after {progress.frame or 0} of {len(analyzer)} frames; they are in {files}") from None
+    finally:
+        progress.close()
+    facts = {
+        "input": arguments.input,
+        "vertices": len(analyzer.mesh.points),
+        "triangles": len(analyzer.mesh.triangles),
+        "measured": analyzer.on,
+        "neighbourhood": arguments.neighbourhood,
+        "rows": found.rows,
+        "first_frame": analyzer.sequence.labels[analyzer.pairs[0].frame].item(),
+        "last_frame": analyzer.sequence.labels[analyzer.pairs[-1].frame].item(),
+        "seconds": time.perf_counter() - started,
+        "extremes": {name: _extremes(extremes) for name, extremes in found.extremes.items()},
+        "excluded": found.excluded,
+        "exclusions": found.exclusions,
+        "coloured": found.coloured,
+        "colour_range": found.scale,
+        "rates": arguments.rates,
+        "device": arguments.device,
+        "dtype": arguments.dtype,
+        "file": arguments.output,
+        "frames_folder": frames_folder_of(arguments) if arguments.output else None,
+        **{name: path for name, path in files.items() if name != "output"},
+    }
+    print(as_json(facts) if arguments.json else _summary(facts))
+    return 0
+
+
+def _analyzer(arguments):
+    from ..analysis import Analyzer
+    from ..mesh import Surface
+    from ..sequences import open_sequence
+
+    if arguments.input is None:
+        raise ValueError("INPUT is missing, what is to be measured; see warpcloth analyze --help")
+    rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
+    sequence = open_sequence(arguments.input, arguments.prim, arguments.fps, rest)
+    directions = arguments.directions
+    if directions is not None and directions != "st":
+        directions = [scene_files.convert("--directions", number, (float,)) for number in directions.split(",")]
+    return Analyzer(
+        rest,
+        sequence,
+        measures="all" if arguments.measure == ["all"] else arguments.measure,
+        reference=arguments.reference,
+        pairs=arguments.pairs,
+        lag=arguments.lag,
+        every=arguments.every,
+        neighbourhood=arguments.neighbourhood,
+        rates=arguments.rates,
+        directions=directions,
+        material=_material(arguments),
+        device=find_device(arguments.device),
+        dtype=arguments.dtype,
+    )
+
+
+def _material(arguments):
+    from .. import terms
+
+    kind = arguments.material
+    if arguments.stiffness is None:
+        for name in ("material", "poisson"):
+            if getattr(arguments, name) is not None:
+                raise ValueError(f"--{name} is given without --stiffness, Young's modulus times thickness [N/m]")
+        return None
+    options = {"stiffness": arguments.stiffness}
+    if arguments.poisson is not None:
+        if kind == "corotated":
+            raise ValueError("--poisson: the corotated membrane has none, leave it out")
+        options["poisson_ratio"] = arguments.poisson
+    return getattr(terms, _MATERIALS[kind or "neo-hookean"])(**options)
+
+
+def _stills(arguments, analyzer):
+    """Paths of the pictures by frame."""
+    labels = [analyzer.sequence.labels[pair.frame].item() for pair in analyzer.pairs]
+    if arguments.still is None:
+        if arguments.still_frames:
+            raise ValueError("--still-frames is given without --still, the name of the pictures")
+        return None
+    path = Path(arguments.still)
+    width = max(len(f"{label:g}") for label in labels)
+    chosen = arguments.still_frames or [labels[-1]]
+    return {frame: path.with_name(f"{path.stem}_{f'{frame:g}'.zfill(width)}{path.suffix}") for frame in chosen}
+
+
+def _extremes(extremes):
+    """The smallest and the largest value of a scalar, and where they are."""
+    facts = {}
+    for end, summary in (("smallest", extremes.smallest), ("largest", extremes.largest)):
+        if summary is None:
+            facts[end] = None
+            continue
+        value = summary.percentiles[0 if end == "smallest" else -1]
+        facts[end] = {"value": value, "frame": summary.frame, "reference": summary.reference, "element": getattr(summary, end)}
+        facts[end] |= {"at": list(getattr(summary, f"{end}_at")), "median": summary.percentiles[4], "unit": summary.unit}
+    return facts
+
+
+def _summary(facts):
+    rows = [("", "smallest", "frame", facts["measured"], "largest", "frame", facts["measured"], "unit")]
+    for name, ends in facts["extremes"].items():
+        if ends["smallest"] is None:
+            rows.append((name, *("–",) * 7))
+            continue
+        cells = [(f"{end['value']:.5g}", f"{end['frame']:g}", str(end["element"])) for end in ends.values()]
+        rows.append((name, *cells[0], *cells[1], ends["largest"]["unit"]))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    table = ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    frames = f"{facts['rows']} from {facts['first_frame']:g} to {facts['last_frame']:g}"
+    of = f"{facts['triangles']} triangles" if facts["measured"] == "triangle" else f"{facts['vertices']} vertices"
+    around = f", {facts['neighbourhood']}" if facts["neighbourhood"] else ""
+    lines = [f"{facts['input']}: {of}{around}, {frames}, in {facts['seconds']:.3g} s", *table]
+    if facts["coloured"]:
+        low, high = facts["colour_range"]
+        lines.append(f"  colours       {facts['coloured']}, {low:.5g} to {high:.5g}")
+    if facts["file"]:
+        lines.append(f"  file          {place(facts)}")
+    lines += [f"  {name:<13} {facts[name]}" for name in ("csv", "report", "npz", "plot") if facts[name]]
+    if facts["excluded"]:
+        lines.append("  left out")
+        lines += [f"    {sentence}" for sentence in facts["exclusions"][:_SENTENCES]]
+        more = facts["excluded"] - _SENTENCES
+        lines += [f"    and {more} more, all of them in --report FILE"] if more > 0 else []
+    return "\n".join(lines)
+
+
+def _listed(measures):
+    lines = []
+    for on, found in measures.items():
+        lines.append(f"of each {on}" + (", with --neighbourhood" if on == "vertex" else ""))
+        for measure in found.values():
+            shape = "×".join(map(str, measure.shape)) or "–"
+            needs = f" (needs --{measure.needs})" if measure.needs else ""
+            lines.append(f"  {measure.name:<21} {shape:<4} {measure.unit:<6} {measure.text}{needs}")
+    return "\n".join(lines)
