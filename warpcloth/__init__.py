@@ -2,6 +2,7 @@
 
 from .analysis import Analysis, Analyzer, analyze
 from .arap import Arap
+from .compare import Comparison, compare
 from .deform import Deformation, deform
 from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
@@ -32,6 +33,7 @@ __all__ = [
     "Animation",
     "Arap",
     "Attachment",
+    "Comparison",
     "ConstrainedDynamics",
     "CorotatedMembrane",
     "Deformation",
@@ -54,6 +56,7 @@ __all__ = [
     "StrainLimit",
     "analyze",
     "as_sequence",
+    "compare",
     "deform",
     "equilibrium",
     "kabsch",

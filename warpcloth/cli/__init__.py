@@ -1,4 +1,4 @@
-"""The command ``warpcloth``: runs scenes, lists them, says what is in one, and deforms meshes.
+"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, and compares animations.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
 saved), 2 wrong use (one line on stderr), 130 interrupted. Any other error ends with 2 and one line as well, for most come of
@@ -12,7 +12,7 @@ import warnings
 
 import numpy as np
 
-from . import analyze, deform, run
+from . import analyze, compare, deform, run
 from .terminal import Interrupted, say, show_warning
 
 
@@ -88,16 +88,19 @@ def _parser():
     deform.add_arguments(deforms)
     analyzes = add("analyze", analyze.analyze, "Measure how an animated cloth deforms.", epilog=analyze.EPILOG)
     analyze.add_arguments(analyzes)
+    compares = add("compare", compare.compare, "Say how far two animations are apart.", epilog=compare.EPILOG)
+    compare.add_arguments(compares)
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
         sub.add_argument("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
         sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
     runs.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not the scene's")
-    for sub in (runs, info, deforms, analyzes):
+    for sub in (runs, info, deforms, analyzes, compares):
         sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
-        sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
         sub.add_argument("--json", action="store_true", help="print one JSON object")
+    for sub in (runs, info, deforms, analyzes):
+        sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
     for sub in (runs, deforms):
         sub.add_argument("-o", "--output", required=True, metavar="FILE", help="the .usd, .usda, .usdc or .usdz file to write")
     for sub in (runs, deforms, analyzes):

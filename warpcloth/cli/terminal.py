@@ -70,7 +70,7 @@ def check_writable(output):
 class Progress:
     """Counts frames, and shows them on a terminal."""
 
-    def __init__(self, frames, hint=None, first="compiling"):
+    def __init__(self, frames=None, hint=None, first="compiling"):
         self.frame, self.frames, self.hint, self.bar = None, frames, hint, None
         if sys.stderr.isatty():
             from tqdm import tqdm
@@ -91,7 +91,7 @@ class Progress:
             return
         if frame == 0:
             self.bar.set_description("running", refresh=False)
-            self.bar.reset()
+            self.bar.reset(total=frames)
         else:
             elapsed = self.bar.format_dict["elapsed"]
             self.bar.set_postfix_str(f"{elapsed / frame:.3g} s each", refresh=False)

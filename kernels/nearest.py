@@ -1,0 +1,69 @@
+"""Kernels over points: their distance to a surface of triangles."""
+
+from functools import cache
+
+import warp as wp
+
+# By the square of its longest side, the least normal whose direction is more than rounding.
+FLAT = wp.constant(wp.float64(1e-12))
+FAR = wp.constant(wp.float32(4.0))  # above the diagonal of [−1, 1]³
+
+
+@wp.func
+def from_segment(a: wp.vec3d, b: wp.vec3d):
+    """Squared distance of the origin to the segment from a to b, which may be a point."""
+    d = b - a
+    length_sq, t = wp.length_sq(d), wp.float64(0.0)
+    if length_sq > wp.float64(0.0):
+        t = wp.clamp(-wp.dot(a, d) / length_sq, wp.float64(0.0), wp.float64(1.0))
+    return wp.length_sq(a + t * d)
+
+
+@wp.func
+def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Squared distance of the origin to a triangle, which may be flat: that to its plane, or else to the nearest side."""
+    nearest = wp.min(from_segment(a, b), wp.min(from_segment(b, c), from_segment(c, a)))
+    n = wp.cross(b - a, c - a)
+    longest_sq = wp.max(wp.length_sq(b - a), wp.max(wp.length_sq(c - b), wp.length_sq(a - c)))
+    if wp.length(n) > FLAT * longest_sq:
+        above = wp.min(wp.dot(wp.cross(b, c), n), wp.min(wp.dot(wp.cross(c, a), n), wp.dot(wp.cross(a, b), n)))
+        if above >= wp.float64(0.0):
+            height = wp.dot(a, wp.normalize(n))
+            nearest = wp.min(nearest, height * height)
+    return nearest
+
+
+@cache
+def distances():
+    """Kernel over points: out[i] = distance of points[i] to the triangles of ``mesh``.
+
+    The mesh holds in float32 what ``x`` holds in float64. Its query finds the triangle, whose distance is then computed in
+    float64. It leaves out flat triangles and is wrong about those that are nearly so; ``flat`` names them, to be tried one by
+    one. All within [−1, 1]³.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def measure(
+        # elements
+        mesh: wp.uint64,
+        triangles: wp.array(dtype=wp.vec3i),
+        flat: wp.array(dtype=wp.int32),
+        # state in
+        x: wp.array(dtype=wp.vec3d),
+        points: wp.array(dtype=wp.vec3d),
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        p = points[i]
+        nearest = wp.float64(wp.inf)
+        query = wp.mesh_query_point_no_sign(mesh, wp.vec3(p), FAR)
+        if query.result:
+            v = triangles[query.face]
+            nearest = from_triangle(x[v[0]] - p, x[v[1]] - p, x[v[2]] - p)
+        for k in range(flat.shape[0]):
+            v = triangles[flat[k]]
+            nearest = wp.min(nearest, from_triangle(x[v[0]] - p, x[v[1]] - p, x[v[2]] - p))
+        out[i] = wp.sqrt(nearest)
+
+    return measure

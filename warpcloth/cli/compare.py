@@ -1,0 +1,227 @@
+"""The command ``compare``: how far two animations are apart."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from ..checks import whole
+from .terminal import Progress, as_json, check_writable, find_device
+
+_SHOWN = 8  # frames or exclusions of each that the summary names
+_PICTURES = (".png", ".pdf", ".svg")
+
+EPILOG = """\
+A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames that
+both have at one time are compared, and the others are said. With the same triangles vertices are compared, and stretches, each
+against its own rest shape, which of a folder or an .npz file is the first frame where no --rest-a or --rest-b says another;
+with other triangles the surfaces alone.
+
+  warpcloth compare hanging.usdc frames --fps-b 24 --rest-b rest.obj --csv apart.csv
+"""
+
+
+def add_arguments(parser):
+    """Adds what the command takes but for what all commands do."""
+    for name, of in (("a", "A"), ("b", "B")):
+        parser.add_argument(name, metavar=of, help="an animation" if of == "A" else "another")
+    for name, of in (("a", "A"), ("b", "B")):
+        parser.add_argument(f"--prim-{name}", metavar="PRIM", help=f"path or name of the prim of {of}, if it has several")
+        parser.add_argument(f"--rest-{name}", metavar="MESH", help=f"mesh file with the rest shape of {of}")
+        parser.add_argument(f"--fps-{name}", type=float, metavar="FPS", help=f"frames per second of {of} alone")
+    parser.add_argument("--fps", type=float, help="frames per second of both, if they do not say")
+    parser.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not all")
+    parser.add_argument("--csv", metavar="FILE", help="write a line for each frame")
+    parser.add_argument("--plot", metavar="FILE", help=f"draw the distances over time, as {', '.join(_PICTURES)}")
+
+
+def compare(arguments):
+    from ..compare import compare, opened
+
+    if arguments.frames is not None:
+        whole("frames", arguments.frames, least=0)
+    _check_outputs(arguments)
+    device = find_device(arguments.device)
+    a, b = (_open(arguments, name, opened) for name in ("a", "b"))
+    progress = Progress()
+    try:
+        found = compare(a, b, frames=arguments.frames, device=device, progress=progress)
+    finally:
+        progress.close()
+    columns = _columns(found)
+    if arguments.csv:
+        _write_csv(arguments.csv, columns)
+    if arguments.plot:
+        _plot(arguments.plot, found, (arguments.a, arguments.b))
+    facts = _facts(arguments, found, (a, b))
+    if arguments.json:
+        per_frame = {name: np.asarray(column).tolist() for name, column in columns.items()}
+        print(as_json(facts | {"device": str(device), "frames": per_frame}))
+    else:
+        print(_summary(facts, found))
+    return 0
+
+
+def _check_outputs(arguments):
+    if arguments.plot:
+        if Path(arguments.plot).suffix.lower() not in _PICTURES:
+            raise ValueError(f"--plot {arguments.plot}: must end with {', '.join(_PICTURES)}")
+        try:
+            import matplotlib  # noqa: F401 so that it is missed before anything is read
+        except ImportError:
+            raise ValueError("--plot needs matplotlib: pip install 'warpcloth[chart]'") from None
+    for output in filter(None, (arguments.csv, arguments.plot)):
+        check_writable(output)
+
+
+def _open(arguments, name, opened):
+    source, prim, rest, fps = (getattr(arguments, key) for key in (name, f"prim_{name}", f"rest_{name}", f"fps_{name}"))
+    if rest is not None:
+        from ..mesh import Surface
+
+        source = (Surface.load(rest), source)
+    return opened(name, source, prim, arguments.fps if fps is None else fps)
+
+
+def _columns(found):
+    """Columns of the table by name, each (F,), in SI units: a and b of what is taken both ways, 1 and 2 of the stretches."""
+    columns = {"time": found.times, "frame_a": found.labels[:, 0], "frame_b": found.labels[:, 1], "size": found.sizes}
+    if found.same_topology:
+        columns |= {name: getattr(found, name) for name in ("rms", "relative_rms", "largest", "largest_vertex")}
+        for name in ("stretch_rms", "stretch_largest"):
+            columns |= {f"{name}_{k + 1}": column for k, column in enumerate(getattr(found, name).T)}
+    for name in ("surface_mean", "surface_rms", "surface_largest"):
+        columns |= {f"{name}_{of}": column for of, column in zip("ab", getattr(found, name).T, strict=True)}
+    return columns | {"hausdorff": found.hausdorff, "hausdorff_bound": found.hausdorff_bound}
+
+
+def _write_csv(path, columns):
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(columns)
+        for row in zip(*(column.tolist() for column in columns.values()), strict=True):
+            table.writerow("" if value != value else value for value in row)
+
+
+def _facts(arguments, found, sequences):
+    """What the summary says: the worst of each number with the frame that has it, and the root mean square over all."""
+    facts = {
+        "a": arguments.a,
+        "b": arguments.b,
+        "vertices": [len(s.mesh.points) for s in sequences],
+        "triangles": [len(s.mesh.triangles) for s in sequences],
+        "same_topology": found.same_topology,
+        "rest_declared": [bool(s.declared) for s in sequences],
+        "compared": int(np.isfinite(found.hausdorff).sum()),
+        "unmatched": [
+            [s.labels[place].item() for place in places] for s, places in zip(sequences, found.unmatched, strict=True)
+        ],
+        "excluded": [[str(one) for one in excluded] for excluded in found.excluded],
+        "hausdorff": _worst(found, found.hausdorff),
+        "hausdorff_bound": _worst(found, found.hausdorff_bound),
+        "surface_rms": [_over_frames(column) for column in found.surface_rms.T],
+        "surface_largest": [_worst(found, column) for column in found.surface_largest.T],
+    }
+    if found.same_topology:
+        facts |= {
+            "rms": _over_frames(found.rms),
+            "relative_rms": _over_frames(found.relative_rms),
+            "worst_rms": _worst(found, found.rms),
+            "largest": _worst(found, found.largest),
+            "stretch_rms": [_over_frames(column) for column in found.stretch_rms.T],
+            "stretch_largest": _worst(found, found.stretch_largest.max(axis=1)),
+        }
+        facts["largest"]["vertex"] = int(found.largest_vertex[np.nanargmax(found.largest)])
+    return facts
+
+
+def _over_frames(values):
+    """Root mean square over the frames that have a value, NaN where none has."""
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
+
+
+def _worst(found, values):
+    """The largest of the values (F,) and its frame, or None where there is none."""
+    if np.isnan(values).all():
+        return None
+    row = int(np.nanargmax(values))
+    frame_a, frame_b = found.labels[row].tolist()
+    return {"value": float(values[row]), "frame_a": frame_a, "frame_b": frame_b, "time": float(found.times[row])}
+
+
+def _summary(facts, found):
+    vertices, triangles = (" and ".join(f"{n:,}" for n in dict.fromkeys(facts[name])) for name in ("vertices", "triangles"))
+    mesh = "the same triangles" if facts["same_topology"] else "different triangles, so that surfaces alone are compared"
+    lines = [
+        f"{facts['a']} and {facts['b']}: {facts['compared']} of {len(found.times)} common frames compared",
+        f"  meshes        {mesh}; {vertices} vertices, {triangles} triangles",
+    ]
+    if facts["same_topology"]:
+        lines += [
+            f"  vertices      RMS {_metres(facts['rms'])} over all frames, {100.0 * facts['relative_rms']:.3g} % of the size",
+            f"                worst RMS {_at(facts['worst_rms'])}",
+            f"                largest {_at(facts['largest'])}, of vertex {facts['largest']['vertex']}",
+        ]
+    rms = " and ".join(_metres(value) for value in facts["surface_rms"])
+    lines += [
+        f"  surfaces      RMS {rms} over all frames, from A and from B",
+        f"  Hausdorff     {_at(facts['hausdorff'])}, as vertices have it; at most {_metres(facts['hausdorff_bound']['value'])}",
+    ]
+    if facts["same_topology"]:
+        worst = facts["stretch_largest"]
+        if worst is None:
+            lines.append("  stretches     none compared")
+        else:
+            rms = " and ".join(f"{value:.3g}" for value in facts["stretch_rms"])
+            largest = f"{worst['value']:.3g} in {_frame(worst)}"
+            lines.append(f"  stretches     RMS of the differences of λ₁ and λ₂ {rms} over all frames, largest {largest}")
+        first = [of for of, declared in zip("AB", facts["rest_declared"], strict=True) if not declared]
+        if first:
+            lines.append(f"                from the first frame of {' and of '.join(first)}, where no rest shape is given")
+    for of, labels in zip("AB", facts["unmatched"], strict=True):
+        if labels:
+            few = ", ".join(f"{label:g}" for label in labels[:_SHOWN]) + (", …" if len(labels) > _SHOWN else "")
+            lines.append(f"  not compared  {len(labels)} of the frames of {of}, without a partner: {few}")
+    for of, excluded in zip("AB", facts["excluded"], strict=True):
+        lines += [f"  excluded      {of}: {one}" for one in excluded[:_SHOWN]]
+        if len(excluded) > _SHOWN:
+            lines.append(f"                {of}: {len(excluded) - _SHOWN} more, which --json names")
+    return "\n".join(lines)
+
+
+def _metres(value):
+    return f"{value:.4g} m"
+
+
+def _at(worst):
+    return f"{_metres(worst['value'])} in {_frame(worst)}"
+
+
+def _frame(worst):
+    a, b = worst["frame_a"], worst["frame_b"]
+    return f"frame {a:g} ({worst['time']:.4g} s)" if a == b else f"frames {a:g} and {b:g} ({worst['time']:.4g} s)"
+
+
+def _plot(path, found, names):
+    """Distances over time, and differences of stretches below where there are some."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 5.0 if found.same_topology else 3.2), layout="constrained")
+    axes = figure.subplots(2 if found.same_topology else 1, sharex=True, squeeze=False)[:, 0]
+    lines = {"RMS of vertices": found.rms, "largest of vertices": found.largest, "Hausdorff": found.hausdorff}
+    if not found.same_topology:
+        lines = {"RMS from A": found.surface_rms[:, 0], "RMS from B": found.surface_rms[:, 1], "Hausdorff": found.hausdorff}
+    for (label, values), style in zip(lines.items(), (".-", ".-", "."), strict=True):
+        axes[0].plot(found.times, values, style, label=label)
+    axes[0].set(title=f"{Path(names[0]).name} and {Path(names[1]).name}", ylabel="distance [m]")
+    if found.same_topology:
+        for label, values in (("RMS", found.stretch_rms), ("largest", found.stretch_largest)):
+            for k, column in enumerate(values.T):
+                axes[1].plot(found.times, column, ".-", label=f"{label} of λ{'₁₂'[k]}")
+        axes[1].set(ylabel="difference of stretches")
+    for axis in axes:
+        axis.legend()
+        axis.set_ylim(bottom=0.0)
+    axes[-1].set_xlabel("time [s]")
+    figure.savefig(path, dpi=130)
