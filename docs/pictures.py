@@ -9,10 +9,11 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import ListedColormap, Normalize
 
 import warpcloth as wc
+from warpcloth.chart.picture import paint
+from warpcloth.chart.view import View, brightness
 from warpcloth.scenes import bar_twist, bunny, cantilever, hanging, mobile
 
 DOCS = Path(__file__).parent
@@ -29,14 +30,6 @@ def save(figure, name):
     plt.close(figure)
 
 
-def project(points, azimuth=-38.0, elevation=24.0):
-    """Right, up and towards the viewer (…, 3), in parallel projection; angles in degrees from +z and from the horizontal."""
-    a, e = np.radians([azimuth, elevation])
-    towards = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
-    right = np.array([np.cos(a), 0.0, -np.sin(a)])
-    return points @ np.stack([right, np.cross(towards, right), towards], axis=1)
-
-
 def strain(mesh, points):
     """Mean of l/L − 1 over the edges of a vertex, averaged over each triangle, (T,)."""
     lengths = [np.linalg.norm(np.diff(x[mesh.edges], axis=1)[:, 0], axis=1) for x in (points, mesh.points)]
@@ -45,23 +38,12 @@ def strain(mesh, points):
     return at_vertices[mesh.triangles].mean(axis=1)
 
 
-def brightness(corners):
-    """Light from the viewer's upper left on either side of each triangle, (T,)."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    normals *= np.where(normals[:, 2] < 0.0, -1.0, 1.0)[:, None]
-    light = np.array([-0.4, 0.6, 0.7])
-    return 0.7 + 0.3 * np.clip(normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
-
-
 def draw(axes, mesh, seen, values, colours):
     """The triangles of a mesh from the back to the front, coloured by values from 0 to 1 (T,)."""
     corners = seen[mesh.triangles]
-    order = np.argsort(corners[..., 2].mean(axis=1))
     faces = colours(np.clip(values, 0.0, 1.0))
-    faces[:, :3] *= brightness(corners)[:, None]
-    # Edges in the colour of their triangle close the hairlines between neighbours.
-    axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=faces[order], edgecolors=faces[order], linewidths=0.4))
+    faces[:, :3] *= brightness(corners, 0.7)[:, None]
+    paint(axes, corners[..., :2], corners[..., 2].mean(axis=1), faces)
 
 
 def finish(figure, axes, colours, most, label, extend):
@@ -85,7 +67,7 @@ def picture_hanging(moments=(0.0, 0.25, 0.4, 0.5, 0.75, 1.0, 1.25), worst=0.0015
     left = 0.0
     for time in moments:
         points = np.asarray(animation.points[round(time * scene.fps)], dtype=float)
-        seen = project(points)
+        seen = View().project(points)
         seen[:, 0] += left - seen[:, 0].min()
         draw(axes, scene.mesh, seen, strain(scene.mesh, points) / worst, COLOURS)
         axes.plot(*seen[scene.pins.vertices, :2].T, "o", color="black", markersize=3.5)
@@ -132,7 +114,7 @@ def picture_deformation(frames=(0, 16, 32, 48), most=150.0):
         size = np.ptp(scene.mesh.points[:, 1]) * (3.2 if scene.name == "bar_twist" else 0.5)
         down = 0.0
         for frame in frames if scene.name == "bar_twist" else frames[::3]:
-            seen = project(found.points[frame] / size, azimuth, 18.0)
+            seen = View(azimuth, 18.0).project(found.points[frame] / size)
             seen[:, :2] += [left - seen[:, 0].min(), down - seen[:, 1].max()]
             draw(axes, scene.mesh, seen, np.degrees(found.angles[frame])[scene.mesh.triangles].mean(axis=1) / most, COLOURS)
             if scene.name == "bar_twist":
@@ -154,7 +136,7 @@ def picture_mobile(moments=(0.0, 1.0, 2.0, 3.0)):
     figure, axes = plt.subplots(figsize=(11.0, 3.4))
     left = 0.0
     for time in moments:
-        seen = project(np.asarray(animation.points[round(time * scene.fps)], dtype=float), -30.0, 14.0)
+        seen = View(-30.0, 14.0).project(np.asarray(animation.points[round(time * scene.fps)], dtype=float))
         seen[:, 0] += left - seen[:, 0].min()
         draw(axes, scene.mesh, seen, np.full(len(scene.mesh.triangles), 0.6), COLOURS)
         for line in [*bars, *strings.pairs]:

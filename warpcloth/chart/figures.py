@@ -1,0 +1,40 @@
+"""Figures of matplotlib without pyplot, which holds figures and a window system for the whole process."""
+
+import importlib.util
+from pathlib import Path
+
+GREY = "0.35"
+# Without the date the same figure has the same bytes.
+_METADATA = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+
+
+def require_matplotlib():
+    """Says in a sentence what is missing.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    if not importlib.util.find_spec("matplotlib"):
+        raise ImportError("colours and charts need matplotlib: pip install 'warpcloth[chart]'")
+
+
+def check_path(path, endings):
+    """Refuses a file that cannot be written, before anything is drawn.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ValueError: The name has none of the endings.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {' or '.join(endings)}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
+
+
+def save(figure, path):
+    """Writes a figure in the format of its ending: .png, .svg or .pdf."""
+    from matplotlib import rc_context
+
+    with rc_context({"svg.hashsalt": "warpcloth"}):  # ids in an SVG are random without a salt
+        figure.savefig(path, dpi=150, facecolor="white", metadata=_METADATA[Path(path).suffix.lower()])

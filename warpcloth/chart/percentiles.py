@@ -1,0 +1,106 @@
+"""Percentiles of measures over time."""
+
+import math
+
+import numpy as np
+
+from ..checks import choice
+from .figures import GREY, check_path, require_matplotlib, save
+
+_ENDINGS = (".png", ".svg", ".pdf")
+# Columns of the percentiles 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, and the grey of each band.
+_BANDS = ((1, 7, "0.88", "1 to 99 %"), (2, 6, "0.76", "5 to 95 %"), (3, 5, "0.6", "25 to 75 %"))
+_MEDIAN, _EXTREMES = 4, (0, 8)
+_NOTE = {"ha": "right", "fontsize": 7, "color": GREY, "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1.0}}
+
+
+def plot_percentiles(path, summaries, along="time", neutrals=None):
+    """Plots each scalar in a panel: its median, the bands from 25 to 75, 5 to 95 and 1 to 99 %, and thin its extremes.
+
+    Rows without values leave gaps. Extremes far outside the bands leave the panel, which then says how far they go.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        summaries: In the order of the rows, each with ``name``, ``unit``, ``time`` [s], ``frame`` and ``percentiles``: of 0, 1,
+            5, 25, 50, 75, 95, 99 and 100 %.
+        along: "time" or "frame".
+        neutrals: A dictionary from names to the value of an undeformed element, drawn as a line; None is none.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: There is nothing to plot, or the path has another ending.
+    """
+    require_matplotlib()
+    check_path(path, _ENDINGS)
+    choice("along", along, ("time", "frame"))
+    rows = {}
+    for summary in summaries:
+        rows.setdefault(summary.name, []).append(summary)
+    if not rows:
+        raise ValueError(f"{path}: there are no summaries; a plot must have one or more")
+    from matplotlib.figure import Figure
+
+    columns = min(math.ceil(math.sqrt(len(rows))), 5)
+    lines = math.ceil(len(rows) / columns)
+    figure = Figure(figsize=(max(3.6 * columns, 5.0), 2.6 * lines + 0.4), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False, sharex=True).ravel()
+    for axes, (name, found) in zip(panels, rows.items(), strict=False):
+        at = np.array([getattr(summary, along) for summary in found], dtype=np.float64)
+        _panel(axes, at, np.array([summary.percentiles for summary in found], dtype=np.float64), (neutrals or {}).get(name))
+        unit = "" if found[0].unit == "1" else f" [{found[0].unit}]"
+        axes.set_ylabel(f"{name}{unit}", color=GREY, parse_math=False)
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel("time [s]" if along == "time" else "frame", color=GREY)
+    for axes in panels[len(rows) :]:
+        axes.remove()
+    known = {}
+    for axes in panels[: len(rows)]:
+        known.update(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    figure.legend(known.values(), known, loc="outside upper center", ncols=3, frameon=False, fontsize=8, labelcolor=GREY)
+    save(figure, path)
+
+
+def _panel(axes, at, percentiles, neutral):
+    """One scalar: percentiles (F, 9) over ``at`` (F,)."""
+    percentiles = np.where(np.isfinite(percentiles), percentiles, np.nan)
+    alone = _alone(~np.isnan(percentiles).any(axis=1))
+    for k, (low, high, grey, label) in enumerate(_BANDS):
+        low, high = percentiles[:, low], percentiles[:, high]
+        axes.fill_between(at, low, high, color=grey, linewidth=0, label=label)
+        axes.vlines(at[alone], low[alone], high[alone], color=grey, linewidth=2 + 2 * k)
+    for column, label in zip(_EXTREMES, ("extremes", None), strict=True):
+        axes.plot(at, percentiles[:, column], color="0.45", linewidth=0.5, label=label)
+        axes.plot(at[alone], percentiles[alone, column], "_", color="0.45", markersize=5, markeredgewidth=0.5)
+    axes.plot(at, percentiles[:, _MEDIAN], color="black", linewidth=1.2, label="median")
+    axes.plot(at[alone], percentiles[alone, _MEDIAN], "o", color="black", markersize=3)
+    if neutral is not None:
+        axes.axhline(neutral, color="tab:blue", linewidth=0.8, linestyle=(0, (4, 3)), label="undeformed")
+    _frame(axes, percentiles, neutral)
+    axes.tick_params(colors=GREY, labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("0.7")
+
+
+def _alone(known):
+    """Which rows have no row with values beside them, so that no line and no band shows them."""
+    padded = np.pad(known, 1)
+    return known & ~padded[:-2] & ~padded[2:]
+
+
+def _frame(axes, percentiles, neutral):
+    """Limits what is shown to the bands and as much again on either side, and says how far extremes are beyond that."""
+    known = percentiles[~np.isnan(percentiles)]
+    bands = percentiles[:, 1:8]
+    bands = np.append(bands[~np.isnan(bands)], [] if neutral is None else [neutral])
+    if not len(known):
+        axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=GREY)
+        axes.set_yticks([])
+        return
+    reach = np.ptp(bands) if len(bands) else 0.0
+    if reach > 0.0 and known.max() > bands.max() + reach:
+        axes.set_ylim(top=bands.max() + reach)
+        axes.text(0.99, 0.98, f"to {known.max():.3g}", va="top", transform=axes.transAxes, **_NOTE)
+    if reach > 0.0 and known.min() < bands.min() - reach:
+        axes.set_ylim(bottom=bands.min() - reach)
+        axes.text(0.99, 0.02, f"to {known.min():.3g}", va="bottom", transform=axes.transAxes, **_NOTE)
