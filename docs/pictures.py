@@ -43,7 +43,8 @@ def draw(axes, mesh, seen, values, colours):
     corners = seen[mesh.triangles]
     faces = colours(np.clip(values, 0.0, 1.0))
     faces[:, :3] *= brightness(corners, 0.7)[:, None]
-    paint(axes, corners[..., :2], corners[..., 2].mean(axis=1), faces)
+    # Edges in the colour of their triangle close the hairlines between neighbours.
+    paint(axes, corners[..., :2], corners[..., 2].mean(axis=1), faces, 0.4)
 
 
 def finish(figure, axes, colours, most, label, extend):

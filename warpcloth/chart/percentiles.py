@@ -63,8 +63,9 @@ def plot_percentiles(path, summaries, along="time", neutrals=None):
 
 def _panel(axes, at, percentiles, neutral):
     """One scalar: percentiles (F, 9) over ``at`` (F,)."""
+    _frame(axes, percentiles, neutral)
     percentiles = np.where(np.isfinite(percentiles), percentiles, np.nan)
-    alone = _alone(~np.isnan(percentiles).any(axis=1))
+    alone = _alone(~np.isnan(percentiles[:, _MEDIAN]))
     for k, (low, high, grey, label) in enumerate(_BANDS):
         low, high = percentiles[:, low], percentiles[:, high]
         axes.fill_between(at, low, high, color=grey, linewidth=0, label=label)
@@ -76,7 +77,6 @@ def _panel(axes, at, percentiles, neutral):
     axes.plot(at[alone], percentiles[alone, _MEDIAN], "o", color="black", markersize=3)
     if neutral is not None:
         axes.axhline(neutral, color="tab:blue", linewidth=0.8, linestyle=(0, (4, 3)), label="undeformed")
-    _frame(axes, percentiles, neutral)
     axes.tick_params(colors=GREY, labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("0.7")
@@ -91,16 +91,20 @@ def _alone(known):
 def _frame(axes, percentiles, neutral):
     """Limits what is shown to the bands and as much again on either side, and says how far extremes are beyond that."""
     known = percentiles[~np.isnan(percentiles)]
-    bands = percentiles[:, 1:8]
-    bands = np.append(bands[~np.isnan(bands)], [] if neutral is None else [neutral])
-    if not len(known):
-        axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=GREY)
+    finite = known[np.isfinite(known)]
+    if not len(finite):
+        axes.text(0.5, 0.5, "nothing finite" if len(known) else "no values", ha="center", transform=axes.transAxes, color=GREY)
         axes.set_yticks([])
         return
-    reach = np.ptp(bands) if len(bands) else 0.0
-    if reach > 0.0 and known.max() > bands.max() + reach:
-        axes.set_ylim(top=bands.max() + reach)
+    bands = percentiles[:, 1:8]
+    bands = np.append(bands[np.isfinite(bands)], [] if neutral is None else [neutral])
+    shown = np.append(finite, bands)
+    low, high = shown.min(), shown.max()
+    if len(bands) and np.ptp(bands) > 0.0:
+        reach = np.ptp(bands)
+        low, high = max(low, bands.min() - reach), min(high, bands.max() + reach)
+        axes.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
+    if known.max() > high:
         axes.text(0.99, 0.98, f"to {known.max():.3g}", va="top", transform=axes.transAxes, **_NOTE)
-    if reach > 0.0 and known.min() < bands.min() - reach:
-        axes.set_ylim(bottom=bands.min() - reach)
+    if known.min() < low:
         axes.text(0.99, 0.02, f"to {known.min():.3g}", va="bottom", transform=axes.transAxes, **_NOTE)

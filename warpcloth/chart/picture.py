@@ -11,9 +11,8 @@ from .view import View, brightness
 
 # Inches: the longer side of what is shown, what is beside and above it, and gaps.
 _SIDE, _RIGHT, _TOP, _GAP = 6.0, 1.2, 0.5, 0.15
-# Points: edges in the colour of their triangle close the hairlines between neighbours.
-EDGE = 0.4
-_LINE = 0.7
+# Points: edges in the colour of their triangle close the hairlines between neighbours, at 150 dots per inch from 0.8 on.
+_EDGE, _LINE = 0.8, 0.7
 # The bar has the colours in full light, from which shaded ones must not stray far.
 _LEAST_LIGHT = 0.85
 _GREYS = (0.0, 1.0, 0.5)
@@ -56,7 +55,7 @@ def draw(path, points, triangles, values, scale, on="triangle", title="", unit="
     placed = np.isfinite(corners).all(axis=(1, 2))
     colours = scale.srgb(values if on == "triangle" else values[triangles])[placed]
     outlines, colours = (_whole if on == "triangle" else _thirds)(corners[placed], colours)
-    widths = np.full(len(outlines), EDGE)
+    widths = np.full(len(outlines), _EDGE)
     depths = outlines[..., 2].mean(axis=1)
     if directions:
         segments, greys = _segments(view, directions)
@@ -71,7 +70,7 @@ def draw(path, points, triangles, values, scale, on="triangle", title="", unit="
     save(figure, path)
 
 
-def paint(axes, outlines, depths, colours, widths=EDGE):
+def paint(axes, outlines, depths, colours, widths):
     """Draws polygons from the back to the front.
 
     Args:
@@ -107,7 +106,7 @@ def _whole(corners, colours):
 
 
 def _thirds(corners, colours):
-    """Outlines (3T, 4, 3) and lit colours (3T, 3) of the thirds of triangles, by their corners and the colours there (T, 3, 3)."""
+    """Outlines (3T, 4, 3) and lit colours (3T, 3) of thirds of triangles, by their corners and the colours there (T, 3, 3)."""
     following, before = np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)
     middle = np.broadcast_to(corners.mean(axis=1, keepdims=True), corners.shape)
     outlines = np.stack([corners, (corners + following) / 2.0, middle, (corners + before) / 2.0], axis=2)

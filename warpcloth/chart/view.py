@@ -69,7 +69,8 @@ class View:
         right = np.array([np.cos(a), 0.0, -np.sin(a)])
         columns, signs = _UPRIGHT[self.up_axis]
         upright = np.asarray(points)[..., columns] * signs
-        return upright @ np.stack([right, np.cross(towards, right), towards], axis=1)
+        with np.errstate(invalid="ignore"):  # of a point that is not finite every coordinate may become NaN
+            return upright @ np.stack([right, np.cross(towards, right), towards], axis=1)
 
 
 def brightness(corners, least):
