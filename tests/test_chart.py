@@ -1,6 +1,7 @@
 """Colours, pictures and plots: colours by their tables, pictures and plots by their pixels."""
 
 import json
+import re
 import sys
 import warnings
 from types import SimpleNamespace
@@ -326,17 +327,35 @@ def test_rows_without_values_leave_gaps(missing, gaps, tmp_path):
     assert share(tmp_path / "plot.png", np.full(3, 0.88)) > 500
 
 
+def texts(path, *arguments, **options):
+    """All texts of a plot, which an SVG has as such."""
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        plot_percentiles(path, *arguments, **options)
+    return re.findall(r"<text[^>]*>(.*?)</text>", path.read_text(encoding="utf-8"))
+
+
 def test_extremes_far_away_leave_the_panel(tmp_path):
-    """The bands, 8 high, keep more than half of the height that they have beside extremes of 0 and 10; a note tells them apart."""
+    """The bands, 8 high, keep more than half of the height that they have beside extremes of 0 and 10; a note says how far."""
     heights, notes = [], []
-    for largest in (10.0, 1e6, np.inf):
-        plot_percentiles(tmp_path / "plot.png", summaries([[*LEVEL[:8], largest]] * 5), along="frame")
-        picture = imread(tmp_path / "plot.png")[..., :3]
-        band = (np.abs(picture - 0.88) < 2 * STEP).all(axis=-1)
+    for extremes in ((0.0, 10.0), (-50.0, 1e6), (0.0, np.inf)):
+        rows = summaries([[extremes[0], *LEVEL[1:8], extremes[1]]] * 5)
+        plot_percentiles(tmp_path / "plot.png", rows)
+        band = (np.abs(imread(tmp_path / "plot.png")[..., :3] - 0.88) < 2 * STEP).all(axis=-1)
         heights.append(np.ptp(np.flatnonzero(band.sum(axis=1) > 100)))
-        notes.append((picture[75:120, -100:] < 0.6).any())
-    assert heights[0] > 150 and min(heights[1:]) > 0.5 * heights[0]
-    assert notes == [False, True, True]
+        notes.append([text for text in texts(tmp_path / "plot.svg", rows) if text.startswith("to ")])
+    assert heights[0] > 150 and min(heights[1:]) > 0.35 * heights[0]
+    assert notes == [[], ["to 1e+06", "to -50"], ["to inf"]]
+
+
+def test_axes_say_what_they_show(tmp_path):
+    rows = summaries([LEVEL] * 4, unit="1/s") + summaries([NONE] * 4, "spin") + summaries([[np.inf] * 9], "size", "m")
+    found = texts(tmp_path / "plot.svg", rows, neutrals={"stretch": 4.0})
+    assert {"stretch [1/s]", "spin", "size [m]", "time [s]", "no values", "nothing finite", "median", "undeformed"} <= set(
+        found
+    )
+    assert {"25 to 75 %", "5 to 95 %", "1 to 99 %", "extremes"} <= set(found)
+    found = texts(tmp_path / "plot.svg", rows, "frame")
+    assert "frame" in found and "undeformed" not in found
 
 
 def test_each_scalar_has_a_panel_and_neutral_values_a_line(tmp_path):
