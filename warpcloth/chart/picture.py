@@ -114,16 +114,15 @@ def _thirds(corners, colours):
 
 
 def _segments(view, directions):
-    """Ends (S, 2, 3) as they are seen and greys (S, 3) of all directions that are finite."""
+    """Ends (S, 2, 3) as they are seen and greys (S, 3) of all directions; nothing is drawn of those that are not finite."""
     ends, greys = [], []
     for (name, (centres, vectors)), grey in zip(directions.items(), cycle(_GREYS), strict=False):
         if np.shape(centres) != np.shape(vectors) or np.shape(centres)[1:] != (3,):
             shapes = f"centres {np.shape(centres)} and vectors {np.shape(vectors)}"
             raise ValueError(f"directions[{name!r}] has {shapes}; both must be (E, 3)")
         centres, halves = view.project(centres), view.project(vectors) / 2.0
-        found = np.stack([centres - halves, centres + halves], axis=1)
-        ends.append(found[np.isfinite(found).all(axis=(1, 2))])
-        greys.append(np.full((len(ends[-1]), 3), grey))
+        ends.append(np.stack([centres - halves, centres + halves], axis=1))
+        greys.append(np.full((len(centres), 3), grey))
     return np.concatenate(ends), np.concatenate(greys)
 
 
