@@ -885,7 +885,7 @@ def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step, single_file):
             raise OSError("no space left on device")
         replace(*paths)
 
-    monkeypatch.setattr("warpcloth.usd.writer.os.replace", replace_until_full)
+    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace_until_full)
     writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
     appended = 0
     try:

@@ -43,7 +43,7 @@ def _initialise_warp(wp):
 
 def frames_folder_of(arguments):
     """The folder that belongs to the output, or None where the output is one file."""
-    from ..usd.writer import frames_folder
+    from ..usd.chunks import frames_folder
 
     output = Path(arguments.output)
     return None if arguments.single_file or output.suffix == ".usdz" else str(frames_folder(output))

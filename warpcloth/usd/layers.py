@@ -1,155 +1,19 @@
-"""What all frames share: the layer that an animation is put on, and how a frame is expressed in its prim."""
+"""What all frames share: the layer that an animation is put on, a complete stage or one over an artist's."""
 
 import os
 import warnings
-from dataclasses import dataclass, field
 
 import numpy as np
 from pxr import Ar, Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
 
 from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh
+from .targets import SAMPLED, Target
 
-# Attributes with one sample for each frame.
-SAMPLED = {
-    "points": Sdf.ValueTypeNames.Point3fArray,
-    "velocities": Sdf.ValueTypeNames.Vector3fArray,
-    "normals": Sdf.ValueTypeNames.Normal3fArray,
-    "extent": Sdf.ValueTypeNames.Float3Array,
-}
 # Attributes of the artist's prim that would be used instead of ours, or beside ours with values of another motion.
 _BLOCKED = ("accelerations", "primvars:normals", "primvars:normals:indices")
-# Primvars that say something else already.
-_TAKEN = ("normals", "st", "displayColor", "displayOpacity", VERTEX_PRIMVAR)
 _COLOUR = (0.17, 0.35, 0.58)
 # Curves are drawn as tubes this thick, as a part of the mean edge length.
 _CURVE_WIDTH = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class Target:
-    """The prim to animate, and all that a frame needs to be expressed in its own space and units.
-
-    Attributes:
-        prim: Path of the prim.
-        triangles: (T, 3), for normals; empty for curves.
-        transform: (4, 4) from the prim's space to metres, as in `StageMesh`; None where they are the same.
-        point_vertices: Vertex of each point of the prim, or None where they are the same.
-        half_width: How far the shape reaches around its points, in the prim's units; curves have a width.
-        face_triangles: Number of triangles of each face of the prim (F,), or None where each has one.
-        primvars: Interpolation of each sampled primvar, "vertex" or "uniform", by name.
-    """
-
-    prim: str
-    triangles: np.ndarray
-    transform: np.ndarray | None = None
-    point_vertices: np.ndarray | None = None
-    half_width: float = 0.0
-    face_triangles: np.ndarray | None = None
-    primvars: dict = field(default_factory=dict)
-
-    @property
-    def attributes(self):
-        """Types of the sampled attributes by name; curves are drawn as tubes, which need no normals."""
-        own = {name: kind for name, kind in SAMPLED.items() if name != "normals" or len(self.triangles)}
-        return own | {f"primvars:{name}": Sdf.ValueTypeNames.FloatArray for name in self.primvars}
-
-    def declare(self, layer, names):
-        """Makes sure that a layer has some of the sampled attributes, without giving them values."""
-        prim = layer.GetPrimAtPath(self.prim) or Sdf.CreatePrimInLayer(layer, self.prim)
-        for name in names:
-            if name not in prim.attributes:
-                Sdf.AttributeSpec(prim, name, self.attributes[name])
-            if name.startswith("primvars:"):
-                prim.attributes[name].SetInfo("interpolation", self.primvars[name.removeprefix("primvars:")])
-
-    def samples(self, points, velocities, primvars=None):
-        """The attribute values of a frame.
-
-        Args:
-            points: (n, 3) [m], world space.
-            velocities: (n, 3) [m/s].
-            primvars: Values by name, (n,) or, where uniform, one for each triangle (T,).
-
-        Returns:
-            dict: An array of pxr for each of `attributes`.
-        """
-        own = self._vectors(points, velocities)
-        for name, value in (primvars or {}).items():
-            if self.primvars[name] == "vertex":
-                value = value if self.point_vertices is None else value[self.point_vertices]
-            elif self.face_triangles is not None:
-                starts = np.cumsum(self.face_triangles) - self.face_triangles
-                value = np.add.reduceat(value, starts) / self.face_triangles
-            own[f"primvars:{name}"] = Vt.FloatArray.FromNumpy(np.ascontiguousarray(value, dtype=np.float32))
-        return own
-
-    def _vectors(self, points, velocities):
-        values = {"points": points, "velocities": velocities}
-        if len(self.triangles):
-            values["normals"] = vertex_normals(points, self.triangles)
-        if self.transform is not None:
-            linear, offset = self.transform[:3, :3], self.transform[3, :3]
-            inverse = np.linalg.inv(linear)
-            values["points"] = (np.asarray(points, np.float64) - offset) @ inverse
-            values["velocities"] = np.asarray(velocities, np.float64) @ inverse
-            if "normals" in values:
-                # Normals are covectors: they stay at right angles to the surface, and on its front, under the transpose.
-                values["normals"] = _unit(values["normals"] @ linear.T)
-        if self.point_vertices is not None:
-            values = {name: value[self.point_vertices] for name, value in values.items()}
-        values = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in values.items()}
-        values["extent"] = self._extent(values["points"])
-        return {name: Vt.Vec3fArray.FromNumpy(value) for name, value in values.items()}
-
-    def _extent(self, points):
-        # A column at a time: NumPy reduces a short last axis several times slower.
-        low, high = [c.min() for c in points.T], [c.max() for c in points.T]
-        return np.array([low, high], dtype=np.float32) + np.float32([[-self.half_width], [self.half_width]])
-
-
-def check_primvars(primvars, mesh):
-    """Refuses primvars, interpolation by name, that a mesh cannot have.
-
-    Raises:
-        ValueError: A name that is none or is taken, or an interpolation that is not "vertex" or, of triangles, "uniform".
-    """
-    for name, interpolation in primvars.items():
-        valid = isinstance(name, str) and Sdf.Path.IsValidNamespacedIdentifier(name) and not name.endswith(":indices")
-        if not valid or name.startswith("primvars:"):
-            raise ValueError(f"primvars: {name!r} must be a name such as rotationAngle, without primvars: before it")
-        if name in _TAKEN:
-            raise ValueError(f"primvars: {name!r} has a meaning already, must be none of {', '.join(_TAKEN)}")
-        allowed = ("vertex", "uniform") if len(mesh.triangles) else ("vertex",)
-        if interpolation not in allowed:
-            of = "" if len(mesh.triangles) else " of a mesh of edges"
-            raise ValueError(f"primvars[{name!r}] = {interpolation!r}: must be {' or '.join(map(repr, allowed))}{of}")
-
-
-def vertex_normals(points, triangles):
-    """Unit normals (n, 3) of vertices: the normals of their triangles, weighted by area.
-
-    A vertex without area (isolated, or all its triangles collapsed) has no normal, and gets +y so that all have length 1.
-
-    Args:
-        points: (n, 3).
-        triangles: (T, 3).
-
-    Returns:
-        np.ndarray: (n, 3) float64.
-    """
-    origin = points[triangles[:, 0]]
-    doubled_areas = np.cross(points[triangles[:, 1]] - origin, points[triangles[:, 2]] - origin)
-    corners = triangles.T.ravel()
-    return _unit(np.stack([np.bincount(corners, np.tile(n, 3), len(points)) for n in doubled_areas.T], axis=1))
-
-
-def _unit(vectors):
-    length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-    none = length == 0
-    if none.any():
-        vectors, length = vectors.copy(), length.copy()
-        vectors[none], length[none] = (0, 1, 0), 1
-    return vectors / length[:, None]
 
 
 def scene_layer(mesh, pins, up_axis, name):
@@ -163,7 +27,12 @@ def scene_layer(mesh, pins, up_axis, name):
 
     Returns:
         The layer, the `Target` in it, and its root's metadata.
+
+    Raises:
+        ValueError: The name, or that of a pin, is none.
     """
+    if not Sdf.Path.IsValidIdentifier(name):
+        raise ValueError(f"prim = {name!r}: must be a name of letters, digits and _ where there is no source")
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -183,13 +52,12 @@ def scene_layer(mesh, pins, up_axis, name):
         geometry.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     else:
         geometry, target = _define_curves(stage, path, mesh)
-    rest = target.samples(mesh.points, np.zeros_like(mesh.points))
-    for name in target.attributes:
-        if name != "velocities":
-            geometry.GetPrim().GetAttribute(name).Set(rest[name])
+    for name, value in target.samples({"points": mesh.points}).items():
+        geometry.GetPrim().GetAttribute(name).Set(value)
     _add_primvars(geometry, mesh)
     _add_pins(geometry, target, pins or {}, len(mesh.points))
-    _bind_material(stage, geometry)
+    UsdGeom.Scope.Define(stage, "/World/Looks")
+    bind_material(geometry.GetPrim(), define_material(stage, "/World/Looks/Cloth"))
     return layer, target, root_metadata(stage)
 
 
@@ -275,14 +143,13 @@ def _add_pins(geometry, target, pins, count):
         )
 
 
-def _bind_material(stage, geometry):
+def define_material(stage, path):
     """A UsdPreviewSurface that reads displayColor: viewers that ignore displayColor itself show it through this."""
-    UsdGeom.Scope.Define(stage, "/World/Looks")
-    material = UsdShade.Material.Define(stage, "/World/Looks/Cloth")
-    surface = UsdShade.Shader.Define(stage, "/World/Looks/Cloth/Surface")
+    material = UsdShade.Material.Define(stage, path)
+    surface = UsdShade.Shader.Define(stage, f"{path}/Surface")
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.8)
-    reader = UsdShade.Shader.Define(stage, "/World/Looks/Cloth/Colour")
+    reader = UsdShade.Shader.Define(stage, f"{path}/Colour")
     reader.CreateIdAttr("UsdPrimvarReader_float3")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
     reader.CreateInput("fallback", Sdf.ValueTypeNames.Float3).Set(Gf.Vec3f(*_COLOUR))
@@ -290,7 +157,12 @@ def _bind_material(stage, geometry):
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(result)
     output = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
     material.CreateSurfaceOutput().ConnectToSource(output)
-    UsdShade.MaterialBindingAPI.Apply(geometry.GetPrim()).Bind(material)
+    return material
+
+
+def bind_material(prim, material):
+    """Binds a material to a prim."""
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
 
 def over_layer(source, prim, mesh, primvars):
@@ -302,32 +174,22 @@ def over_layer(source, prim, mesh, primvars):
         source: File of the stage.
         prim: Path or name of the prim, or None.
         mesh: The `Mesh` that is simulated.
-        primvars: Names of those that will be sampled; the artist's of the same name are blocked.
+        primvars: Interpolation of those that will be sampled, by name; the artist's of the same name are blocked.
 
     Returns:
         The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, and real paths of all files of the
         artist's stage.
 
     Raises:
-        ValueError: As `read_stage_mesh`; the prim is an instance; the mesh has another number of vertices or other triangles;
-            a primvar of the artist has another type than float[].
+        ValueError: As `read_stage_mesh` and `artist_prim`; a primvar of the artist has another type than float[].
     """
     surroundings = read_stage_mesh(source, prim)
-    where = f"{source}, prim {surroundings.prim}"
-    count = len(surroundings.mesh.points)
-    if count != len(mesh.points):
-        raise ValueError(f"{where}: has {count} vertices, must have as many as the mesh, {len(mesh.points)}")
-    if not np.array_equal(surroundings.mesh.triangles, mesh.triangles):
-        raise ValueError(f"{where}: has other triangles than the mesh; read the mesh from this prim")
-    stage = open_stage(source)
-    artist = find_prim(stage, source, surroundings.prim)
-    if artist.IsInstanceProxy():
-        raise ValueError(f"{where}: is part of an instance, which no layer can animate; set instanceable = false first")
+    stage, artist = artist_prim(surroundings, mesh)
+    identity = np.array_equal(surroundings.transform, np.eye(4))
+    target = artist_target(artist, surroundings, primvars, transform=None if identity else surroundings.transform)
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     over = Sdf.CreatePrimInLayer(layer, surroundings.prim)
-    target = _artist_target(artist, surroundings)
-    shape = surroundings.mesh.points
-    rest = target.samples(shape, np.zeros_like(shape))
+    rest = target.samples({"points": surroundings.mesh.points})
     defaults = ["extent"]
     if artist.GetAttribute("points").Get() is None:
         defaults.append("points")
@@ -339,23 +201,40 @@ def over_layer(source, prim, mesh, primvars):
         Sdf.AttributeSpec(over, name, SAMPLED[name]).default = rest[name]
     if "normals" in defaults:
         over.attributes["normals"].SetInfo("interpolation", UsdGeom.Tokens.vertex)
-    sampled = [f"primvars:{name}" for name in primvars]
-    for name in (*_BLOCKED, *sampled, *(f"{name}:indices" for name in sampled)):
-        attribute = artist.GetAttribute(name)
-        if attribute and attribute.HasAuthoredValue():
-            kind = attribute.GetTypeName()
-            if name in sampled and kind != Sdf.ValueTypeNames.FloatArray:
-                raise ValueError(f"{where}: {name} has type {kind}, must be float[] or not be there; a layer cannot change it")
-            blocked = Sdf.AttributeSpec(over, name, kind)
-            blocked.default = Sdf.ValueBlock()
-            if name in sampled:
-                blocked.SetInfo("elementSize", 1)  # or the artist's would hold
-    files = {os.path.realpath(used.realPath) for used in stage.GetUsedLayers() if used.realPath}
-    return layer, target, root_metadata(stage), surroundings, files
+    for name in _BLOCKED:
+        _block(artist, over, name)
+    declare_primvars(layer, artist, target, surroundings.path)
+    return layer, target, root_metadata(stage), surroundings, files_of(stage)
 
 
-def _artist_target(artist, surroundings):
-    identity = np.array_equal(surroundings.transform, np.eye(4))
+def artist_prim(surroundings, mesh):
+    """The prim that a layer is to be put over.
+
+    Args:
+        surroundings: The `StageMesh`.
+        mesh: The `Mesh` that the frames are of.
+
+    Returns:
+        The stage, which has to be kept, and the prim in it.
+
+    Raises:
+        ValueError: The prim is an instance; the mesh has another number of vertices or other triangles.
+    """
+    where = f"{surroundings.path}, prim {surroundings.prim}"
+    count = len(surroundings.mesh.points)
+    if count != len(mesh.points):
+        raise ValueError(f"{where}: has {count} vertices, must have as many as the mesh, {len(mesh.points)}")
+    if not np.array_equal(surroundings.mesh.triangles, mesh.triangles):
+        raise ValueError(f"{where}: has other triangles than the mesh; read the mesh from this prim")
+    stage = open_stage(surroundings.path)
+    artist = find_prim(stage, surroundings.path, surroundings.prim)
+    if artist.IsInstanceProxy():
+        raise ValueError(f"{where}: is part of an instance, which no layer can animate; set instanceable = false first")
+    return stage, artist
+
+
+def artist_target(artist, surroundings, primvars, **options):
+    """The `Target` of an artist's prim; more of its fields by name."""
     half_width = 0.0
     if artist.IsA(UsdGeom.Curves):
         widths = UsdGeom.Curves(artist).GetWidthsAttr().Get()
@@ -365,11 +244,47 @@ def _artist_target(artist, surroundings):
     return Target(
         surroundings.prim,
         surroundings.mesh.triangles,
-        transform=None if identity else surroundings.transform,
         point_vertices=surroundings.point_vertices,
         half_width=half_width,
         face_triangles=face_triangles if (face_triangles > 1).any() else None,
+        primvars=primvars,
+        **options,
     )
+
+
+def declare_primvars(layer, artist, target, path):
+    """Declares the sampled primvars in a layer, and blocks what the artist has under their names.
+
+    Raises:
+        ValueError: One of the artist's has another type.
+    """
+    sampled = {name: kind for name, kind in target.attributes.items() if name.startswith("primvars:")}
+    over = layer.GetPrimAtPath(target.prim)
+    for name, kind in sampled.items():
+        attribute = artist.GetAttribute(name)
+        if attribute and attribute.HasAuthoredValue() and attribute.GetTypeName() != kind:
+            raise ValueError(
+                f"{path}, prim {target.prim}: {name} has type {attribute.GetTypeName()}, must be {kind} or not be there; "
+                "a layer cannot change it"
+            )
+        if _block(artist, over, name):
+            over.attributes[name].SetInfo("elementSize", 1)  # or the artist's would hold
+        _block(artist, over, f"{name}:indices")
+    target.declare(layer, sampled)
+
+
+def _block(artist, over, name):
+    """Blocks what an attribute has, in an over of its prim; whether there was anything."""
+    attribute = artist.GetAttribute(name)
+    if not (attribute and attribute.HasAuthoredValue()):
+        return False
+    Sdf.AttributeSpec(over, name, attribute.GetTypeName()).default = Sdf.ValueBlock()
+    return True
+
+
+def files_of(stage):
+    """Real paths of all files that a stage is made of."""
+    return {os.path.realpath(used.realPath) for used in stage.GetUsedLayers() if used.realPath}
 
 
 def root_metadata(stage):

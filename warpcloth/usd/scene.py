@@ -11,9 +11,9 @@ from ..mesh import Mesh
 from ..scene import Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
 from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
+from .chunks import export
 from .layers import scene_layer
 from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
-from .writer import export
 
 _EARTH = 9.81  # [m/s²]
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none

@@ -1,0 +1,307 @@
+"""Writing samples so that the result can be opened at any moment, whatever happens to the process that writes it."""
+
+import os
+import re
+import secrets
+import shutil
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Usd, UsdUtils
+
+from .layers import flatten, relative_path
+from .stage import METADATA_KEY, followed
+
+_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+
+
+class ChunkWriter:
+    """Writes samples of a few prims over a layer, in chunks that are each written once.
+
+    While it runs, the result is a small root layer, `path`, and a folder beside it, `<stem>_frames/<run>/`, with
+
+    - `rest.usdc`: all that is not animated. Without a source a complete stage, /World/Cloth and its material; with one,
+      what has to be said once about the artist's prim. It is weaker than the frames and stronger than the source.
+    - `frames_000000.usdc` and so on: value clips of `chunk` frames. USD interpolates between the last frame of one and
+      the first frame of the next too.
+    - `manifest.usda`: the names of the animated attributes, so that no chunk need be opened to find them.
+
+    Every file is written under another name, complete, and then renamed; the root is replaced after each chunk. So a
+    process killed at any moment leaves a result that opens, with at most one chunk of frames missing, and the result of
+    an earlier run stays whole until the first chunk of this one stands. Files are not forced to the disk (fsync): a
+    killed process loses nothing by that, a power failure may lose the newest chunks. Memory holds one chunk. The folder
+    belongs to the file: move them together, or make one file of them with `close(single_file=True)`. One writer at a
+    time for an output.
+
+    Attributes:
+        path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
+        frames: Number of frames appended.
+    """
+
+    # Of all sampled prims: name of their set of value clips; a set in a source below with the same name is not seen.
+    _clip_set = METADATA_KEY
+
+    def __init__(self, output, mesh, chunk):
+        """Checks the output; a writer says next what its samples are put on, by `_put_on`.
+
+        Args:
+            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file. Of a link the file that it stands
+                for is written, with the folder beside that; viewers find the frames through a link in the same folder only.
+            mesh: The `Mesh`.
+            chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
+        """
+        self._output = Path(os.path.abspath(followed(output)))
+        _check_output(self._output)
+        if self._output.suffix != Path(output).suffix:
+            raise ValueError(f"output = {output}: is a link to {self._output}, must end as that does")
+        if int(chunk) != chunk or chunk < 1:
+            raise ValueError(f"chunk = {chunk}: must be a whole number, at least 1")
+        self._chunk = int(chunk)
+        self._counts = {"vertex": len(mesh.points), "uniform": len(mesh.triangles)}
+        self._folder = frames_folder(self._output)
+        if self._folder.exists() and not self._folder.is_dir():
+            raise ValueError(f"{self._folder}: is a file, must be free for the folder of frames")
+        # A name never used before: pxr may still hold layers of an earlier run in this process, and would show those.
+        self._run = self._folder / f"{self._output.suffix[1:]}-{secrets.token_hex(4)}"
+        self.path = str(self._run / "animation.usdc" if self._output.suffix == ".usdz" else self._output)
+        self.frames = 0
+        self._span = None  # first and last time code appended
+        self._pending = []
+        self._chunks = []  # (first time code, file) of each chunk that stands
+        self._closed = False
+
+    def _put_on(self, rest, targets, root_metadata, metadata, source=None, files=()):
+        """Says what the samples are put on.
+
+        Args:
+            rest: Layer of all that is not sampled; it has the sampled attributes without samples.
+            targets: The `Target` of each sampled prim, first the one that the file is about.
+            root_metadata: What only root layers say; rates too.
+            metadata: Numbers and texts for customLayerData, or None.
+            source: File of the artist's stage below, or None.
+            files: Real paths of all files of that stage.
+        """
+        if os.path.realpath(self._output) in files:
+            raise ValueError(f"output = {self._output}: is a file of the source's stage, which must not be changed")
+        self._rest, self._targets = rest, targets
+        self._source = None if source is None else Path(os.path.abspath(source))
+        facts = {METADATA_KEY: {**_facts(metadata or {}), "prim": targets[0].prim}}
+        self._root_metadata = {**root_metadata, "customLayerData": facts}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        if kind is None:
+            self.close()
+        elif not self._closed:
+            # What there is may be worth a look; it stays in chunks, for nobody waits for one file.
+            self._write_chunk()
+            self._closed = True
+
+    def close(self, single_file=False):
+        """Writes what is pending. Without a single frame nothing is written.
+
+        Args:
+            single_file: Make one self-contained file, with all of the source in it, and remove the folder. Frames are
+                copied chunk by chunk, so that memory stays flat; .usda alone is written from a binary file. A .usdz
+                always is one.
+
+        Raises:
+            OSError: A file could not be written; the chunks that stand stay.
+        """
+        if self._closed:
+            return
+        self._write_chunk()
+        self._closed = True
+        if self._chunks and (single_file or self._output.suffix == ".usdz"):
+            self._write_single_file()
+
+    def _append(self, time, samples):
+        """Adds a frame: at a time code values by path of attribute; every `chunk` frames they are written."""
+        self._pending.append((time, samples))
+        self._span = (time if self._span is None else self._span[0], time)
+        self.frames += 1
+        if len(self._pending) >= self._chunk:
+            self._write_chunk()
+
+    def _check_open(self):
+        if self._closed:
+            raise ValueError(f"{self._output}: is closed, no frame can be appended")
+
+    def _checked_primvars(self, primvars, unknown=False):
+        """Values of all primvars that were declared; where they may be unknown, NaN."""
+        declared, primvars = self._targets[0].primvars, primvars or {}
+        if primvars.keys() != declared.keys():
+            names = ", ".join(map(repr, primvars)) or "none"
+            raise ValueError(f"primvars: {names} at frame {self.frames}, must be {', '.join(map(repr, declared)) or 'none'}")
+        return {
+            name: self._checked(f"primvars[{name!r}]", primvars[name], interpolation, (), unknown)
+            for name, interpolation in declared.items()
+        }
+
+    def _checked(self, name, values, interpolation="vertex", components=(3,), unknown=False):
+        values = np.asarray(values)
+        shape = (self._counts[interpolation], *components)
+        if values.shape != shape:
+            raise ValueError(f"{name}: shape {values.shape} at frame {self.frames}, must be {shape}")
+        with np.errstate(over="ignore"):
+            single = values.astype(np.float32, copy=False)
+        good = np.isfinite(single) | np.isnan(single) if unknown else np.isfinite(single)
+        if not good.all():
+            row = int(np.argmin(good)) // (3 if components else 1)
+            where = f"frame {self.frames}, {'vertex' if interpolation == 'vertex' else 'triangle'} {row}"
+            allowed = "finite in float32" + (", or NaN where there is none" if unknown else "")
+            raise ValueError(f"{name}: {values[row].tolist()} at {where}, must be {allowed}")
+        return values
+
+    def _attributes(self):
+        """Paths of all sampled attributes."""
+        return [f"{target.prim}.{name}" for target in self._targets for name in target.attributes]
+
+    def _write_chunk(self):
+        """Writes the pending frames as a clip, and a root that has it."""
+        if not self._pending:
+            return
+        if not self._chunks:
+            self._start_run()
+        layer = self._declared(Sdf.Layer.CreateAnonymous(".usdc"))
+        for time, values in self._pending:
+            for attribute, value in values.items():
+                layer.SetTimeSample(attribute, time, value)
+        for name in ("timeCodesPerSecond", "framesPerSecond"):
+            layer.pseudoRoot.SetInfo(name, self._root_metadata[name])
+        layer.startTimeCode, layer.endTimeCode = self._pending[0][0], self._pending[-1][0]
+        path = self._run / f"frames_{len(self._chunks):06d}.usdc"
+        export(layer, path)
+        chunks = [*self._chunks, (self._pending[0][0], path)]
+        self._write_root(chunks)
+        # Only now, so that a chunk whose writing was interrupted is written again by close.
+        self._chunks, self._pending = chunks, []
+        if len(chunks) == 1:
+            self._remove_other_runs()
+
+    def _start_run(self):
+        self._run.mkdir(parents=True, exist_ok=True)
+        export(self._rest, self._run / "rest.usdc")
+        export(self._declared(Sdf.Layer.CreateAnonymous(".usda")), self._run / "manifest.usda")
+
+    def _declared(self, layer):
+        """The layer, with all sampled attributes in it."""
+        for target in self._targets:
+            target.declare(layer, target.attributes)
+        return layer
+
+    def _write_root(self, chunks):
+        """Writes a root that has these chunks."""
+        folder = Path(self.path).parent
+        layer = Sdf.Layer.CreateAnonymous(".usda")
+        stage = Usd.Stage.Open(layer)
+        asset_paths = [Sdf.AssetPath(relative_path(path, folder)) for _, path in chunks]
+        for target in self._targets:
+            clips = Usd.ClipsAPI(stage.OverridePrim(target.prim))
+            clips.SetClipAssetPaths(asset_paths, self._clip_set)
+            clips.SetClipManifestAssetPath(Sdf.AssetPath(relative_path(self._run / "manifest.usda", folder)), self._clip_set)
+            clips.SetClipPrimPath(target.prim, self._clip_set)
+            clips.SetClipActive([(time, index) for index, (time, _) in enumerate(chunks)], self._clip_set)
+            # Clip time is stage time. One frame has one time: listed twice, USD 25.5 reports the frame twice.
+            clips.SetClipTimes([(time, time) for time in sorted(set(self._span))], self._clip_set)
+        del clips, stage
+        self._describe(layer)
+        # Last, for an anonymous layer cannot tell what they are relative to.
+        layer.subLayerPaths = [relative_path(path, folder) for path in self._base_paths()]
+        export(layer, self.path, self._run)
+
+    def _describe(self, layer):
+        """Writes on a root layer what is read from root layers only."""
+        start, end = self._span
+        for name, value in {"startTimeCode": start, "endTimeCode": end, **self._root_metadata}.items():
+            layer.pseudoRoot.SetInfo(name, value)
+
+    def _base_paths(self):
+        return [self._run / "rest.usdc"] + ([self._source] if self._source else [])
+
+    def _remove_other_runs(self):
+        """Removes what earlier runs to the same output left, now that the output no longer refers to it."""
+        own_kind = re.compile(re.escape(self._output.suffix[1:]) + "-[0-9a-f]{8}")
+        for folder in self._folder.iterdir():
+            if folder != self._run and own_kind.fullmatch(folder.name):
+                shutil.rmtree(folder)
+
+    def _write_single_file(self):
+        packed = self._output.suffix == ".usdz"
+        flat = self._declared(flatten(self._base_paths(), self._describe, None if packed else self._output.parent))
+        for attribute in self._attributes():
+            flat.GetAttributeAtPath(attribute).ClearInfo("timeSamples")
+        single = self._run / f"{self._output.stem}.usdc"
+        flat.Export(str(single))
+        self._copy_frames(single)
+        finished = self._run / f"finished{self._output.suffix}"
+        if packed:
+            if not UsdUtils.CreateNewUsdzPackage(str(single), str(finished)):
+                raise OSError(f"{finished}: could not be written")
+        elif self._output.suffix == ".usda":
+            export(Sdf.Layer.FindOrOpen(str(single)), finished)
+        else:
+            os.replace(single, finished)
+        os.replace(finished, self._output)
+        self.path = str(self._output)
+        shutil.rmtree(self._run)
+        if not any(self._folder.iterdir()):
+            self._folder.rmdir()
+
+    def _copy_frames(self, single):
+        """Copies all chunks to a binary layer, saved in place: nobody needs that file if the process dies."""
+        layer = Sdf.Layer.FindOrOpen(str(single))
+        for _, path in self._chunks:
+            chunk = Sdf.Layer.FindOrOpen(str(path))
+            for attribute in self._attributes():
+                for time in chunk.ListTimeSamplesForPath(attribute):
+                    layer.SetTimeSample(attribute, time, chunk.QueryTimeSample(attribute, time))
+            if not layer.Save():
+                raise OSError(f"{single}: could not be written")
+
+
+def frames_folder(output):
+    """The folder of frames that belongs to an output; of a link beside the file that it stands for."""
+    output = Path(followed(output))
+    return output.parent / f"{output.stem}_frames"
+
+
+def _check_output(output):
+    if output.suffix not in _ENDINGS:
+        raise ValueError(f"output = {output}: must end with one of {', '.join(_ENDINGS)}")
+    if not output.parent.is_dir():
+        raise FileNotFoundError(f"output = {output}: the folder {output.parent} does not exist")
+    if output.is_dir():
+        raise ValueError(f"output = {output}: is a folder, must be a file")
+
+
+def check_scene(fps, up_axis):
+    """Refuses what a stage cannot have."""
+    if not (np.isscalar(fps) and np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps = {fps}: must be positive and finite")
+    if up_axis not in ("Y", "Z"):
+        raise ValueError(f'up_axis = {up_axis!r}: must be "Y" or "Z"')
+
+
+def _facts(metadata, place="metadata"):
+    """Metadata as a file can keep it: numbers, texts and more of such by name."""
+    facts = {}
+    for name, value in metadata.items():
+        if isinstance(value, dict):
+            facts[name] = _facts(value, f"{place}[{name!r}]")
+        else:
+            facts[name] = value.item() if isinstance(value, np.generic) else value
+            if not isinstance(facts[name], (bool, int, float, str)):
+                raise ValueError(f"{place}[{name!r}] = {value!r}: must be a number, a text, or a dict of those")
+    return facts
+
+
+def export(layer, path, unfinished_in=None):
+    """Writes a layer under another name first, so that the path has either what was there or the whole layer."""
+    path = Path(path)
+    unfinished = Path(unfinished_in or path.parent) / f"unfinished{path.suffix}"
+    if not layer.Export(str(unfinished)):
+        raise OSError(f"{path}: could not be written")
+    os.replace(unfinished, path)

@@ -1,0 +1,176 @@
+"""A prim whose attributes are sampled, and how a frame is expressed in its own space and units."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pxr import Sdf, Vt
+
+from .stage import VERTEX_PRIMVAR
+
+# Attributes with one sample for each frame.
+SAMPLED = {
+    "points": Sdf.ValueTypeNames.Point3fArray,
+    "velocities": Sdf.ValueTypeNames.Vector3fArray,
+    "normals": Sdf.ValueTypeNames.Normal3fArray,
+    "extent": Sdf.ValueTypeNames.Float3Array,
+}
+DISPLAY_COLOUR = "primvars:displayColor"
+# Primvars that say something else already.
+_TAKEN = ("normals", "st", "displayColor", "displayOpacity", VERTEX_PRIMVAR)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The prim to animate, and all that a frame needs to be expressed in its own space and units.
+
+    Attributes:
+        prim: Path of the prim.
+        triangles: (T, 3), for normals; empty for curves.
+        transform: (4, 4) from the prim's space to metres, as in `StageMesh`; None where they are the same.
+        point_vertices: Vertex of each point of the prim, or None where they are the same.
+        half_width: How far the shape reaches around its points, in the prim's units; curves have a width.
+        face_triangles: Number of triangles of each face of the prim (F,), or None where each has one.
+        vectors: Names of the vectors that are sampled, of `SAMPLED`; curves are drawn as tubes, which need no normals.
+        primvars: Interpolation of each sampled primvar, "vertex" or "uniform", by name.
+        coloured: Name of the primvar that a sampled displayColor shows, or None: no colours are sampled.
+    """
+
+    prim: str
+    triangles: np.ndarray
+    transform: np.ndarray | None = None
+    point_vertices: np.ndarray | None = None
+    half_width: float = 0.0
+    face_triangles: np.ndarray | None = None
+    vectors: tuple = tuple(SAMPLED)
+    primvars: dict = field(default_factory=dict)
+    coloured: str | None = None
+
+    @property
+    def attributes(self):
+        """Types of the sampled attributes by name."""
+        own = {name: SAMPLED[name] for name in self.vectors if name != "normals" or len(self.triangles)}
+        own |= {f"primvars:{name}": Sdf.ValueTypeNames.FloatArray for name in self.primvars}
+        return own | ({DISPLAY_COLOUR: Sdf.ValueTypeNames.Color3fArray} if self.coloured else {})
+
+    def declare(self, layer, names):
+        """Makes sure that a layer has some of the sampled attributes, without giving them values."""
+        prim = layer.GetPrimAtPath(self.prim) or Sdf.CreatePrimInLayer(layer, self.prim)
+        for name in names:
+            if name not in prim.attributes:
+                Sdf.AttributeSpec(prim, name, self.attributes[name])
+            if name.startswith("primvars:"):
+                shown = self.coloured if name == DISPLAY_COLOUR else name.removeprefix("primvars:")
+                prim.attributes[name].SetInfo("interpolation", self.primvars[shown])
+
+    def samples(self, vectors, primvars=None, colours=None):
+        """The attribute values of a frame.
+
+        Args:
+            vectors: "points" (n, 3) [m], world space, and "velocities" (n, 3) [m/s], those that are sampled.
+            primvars: Values by name, (n,) or, where uniform, one for each triangle (T,). NaN is a value that is not known: a
+                face has the mean of the others.
+            colours: (n, 3) or (T, 3), as the primvar that they show; a face has the mean over its triangles with a value.
+
+        Returns:
+            dict: An array of pxr for each of `attributes`.
+        """
+        own = self._vectors(vectors)
+        for name, values in (primvars or {}).items():
+            own[f"primvars:{name}"] = Vt.FloatArray.FromNumpy(self._shown(values, name, np.isfinite(values)))
+        if colours is not None:
+            known = np.isfinite(primvars[self.coloured])
+            if self.primvars[self.coloured] == "uniform" and self.face_triangles is not None:
+                # A face without any value has the colour that says so, the mean over all its triangles.
+                known |= np.repeat(~np.logical_or.reduceat(known, _starts(self.face_triangles)), self.face_triangles)
+            own[DISPLAY_COLOUR] = Vt.Vec3fArray.FromNumpy(self._shown(colours, self.coloured, known))
+        return own
+
+    def _shown(self, values, primvar, known):
+        """Values for the prim's own points or faces, in float32."""
+        if self.primvars[primvar] == "vertex":
+            values = values if self.point_vertices is None else values[self.point_vertices]
+        elif self.face_triangles is not None:
+            values = _face_means(values, known, self.face_triangles)
+        return np.ascontiguousarray(values, dtype=np.float32)
+
+    def _vectors(self, vectors):
+        values = dict(vectors)
+        if "normals" in self.attributes:
+            values["normals"] = vertex_normals(values["points"], self.triangles)
+        if self.transform is not None:
+            linear, offset = self.transform[:3, :3], self.transform[3, :3]
+            inverse = np.linalg.inv(linear)
+            for name, value in values.items():
+                # Normals are covectors: they stay at right angles to the surface, and on its front, under the transpose.
+                if name == "normals":
+                    values[name] = _unit(value @ linear.T)
+                else:
+                    values[name] = (np.asarray(value, np.float64) - (offset if name == "points" else 0.0)) @ inverse
+        if self.point_vertices is not None:
+            values = {name: value[self.point_vertices] for name, value in values.items()}
+        values = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in values.items()}
+        if "extent" in self.vectors:
+            values["extent"] = self._extent(values["points"])
+        return {name: Vt.Vec3fArray.FromNumpy(value) for name, value in values.items()}
+
+    def _extent(self, points):
+        # A column at a time: NumPy reduces a short last axis several times slower.
+        low, high = [c.min() for c in points.T], [c.max() for c in points.T]
+        return np.array([low, high], dtype=np.float32) + np.float32([[-self.half_width], [self.half_width]])
+
+
+def check_primvars(primvars, mesh):
+    """Refuses primvars, interpolation by name, that a mesh cannot have.
+
+    Raises:
+        ValueError: A name that is none or is taken, or an interpolation that is not "vertex" or, of triangles, "uniform".
+    """
+    for name, interpolation in primvars.items():
+        valid = isinstance(name, str) and Sdf.Path.IsValidNamespacedIdentifier(name) and not name.endswith(":indices")
+        if not valid or name.startswith("primvars:"):
+            raise ValueError(f"primvars: {name!r} must be a name such as rotationAngle, without primvars: before it")
+        if name in _TAKEN:
+            raise ValueError(f"primvars: {name!r} has a meaning already, must be none of {', '.join(_TAKEN)}")
+        allowed = ("vertex", "uniform") if len(mesh.triangles) else ("vertex",)
+        if interpolation not in allowed:
+            of = "" if len(mesh.triangles) else " of a mesh of edges"
+            raise ValueError(f"primvars[{name!r}] = {interpolation!r}: must be {' or '.join(map(repr, allowed))}{of}")
+
+
+def vertex_normals(points, triangles):
+    """Unit normals (n, 3) of vertices: the normals of their triangles, weighted by area.
+
+    A vertex without area (isolated, or all its triangles collapsed) has no normal, and gets +y so that all have length 1.
+
+    Args:
+        points: (n, 3).
+        triangles: (T, 3).
+
+    Returns:
+        np.ndarray: (n, 3) float64.
+    """
+    origin = points[triangles[:, 0]]
+    doubled_areas = np.cross(points[triangles[:, 1]] - origin, points[triangles[:, 2]] - origin)
+    corners = triangles.T.ravel()
+    return _unit(np.stack([np.bincount(corners, np.tile(n, 3), len(points)) for n in doubled_areas.T], axis=1))
+
+
+def _unit(vectors):
+    length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    none = length == 0
+    if none.any():
+        vectors, length = vectors.copy(), length.copy()
+        vectors[none], length[none] = (0, 1, 0), 1
+    return vectors / length[:, None]
+
+
+def _starts(counts):
+    return np.cumsum(counts) - counts
+
+
+def _face_means(values, known, face_triangles):
+    """Mean of each face over those of its triangles that have a value, NaN where none has: (T, …) to (F, …)."""
+    known = known.reshape(-1, *[1] * (values.ndim - 1))
+    starts = _starts(face_triangles)
+    with np.errstate(invalid="ignore"):
+        return np.add.reduceat(np.where(known, values, 0.0), starts) / np.add.reduceat(known, starts, dtype=int)
