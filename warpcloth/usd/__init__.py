@@ -1,8 +1,18 @@
-"""USD stages: a cloth or a whole scene read from one, an animation written as one. Nothing else here imports pxr."""
+"""USD stages: a cloth or a scene read from one, an animation or measures written as one. Nothing else here imports pxr."""
 
 from .frames import FrameSequence
+from .measures import MeasureWriter
 from .scene import read_scene, write_scene
 from .stage import StageMesh, read_mesh, read_stage_mesh
 from .writer import AnimationWriter
 
-__all__ = ["AnimationWriter", "FrameSequence", "StageMesh", "read_mesh", "read_scene", "read_stage_mesh", "write_scene"]
+__all__ = [
+    "AnimationWriter",
+    "FrameSequence",
+    "MeasureWriter",
+    "StageMesh",
+    "read_mesh",
+    "read_scene",
+    "read_stage_mesh",
+    "write_scene",
+]

@@ -13,7 +13,7 @@ from .targets import SAMPLED, Target
 _BLOCKED = ("accelerations", "primvars:normals", "primvars:normals:indices")
 _COLOUR = (0.17, 0.35, 0.58)
 # Curves are drawn as tubes this thick, as a part of the mean edge length.
-_CURVE_WIDTH = 0.05
+CURVE_WIDTH = 0.05
 
 
 def scene_layer(mesh, pins, up_axis, name):
@@ -69,7 +69,7 @@ def _define_curves(stage, path, mesh):
     paths = edge_paths(mesh.edges, len(mesh.points))
     point_vertices = np.concatenate(paths).astype(np.int32)
     lengths = np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1)
-    width = float(np.float32(_CURVE_WIDTH * lengths.mean()))
+    width = float(np.float32(CURVE_WIDTH * lengths.mean()))
     curves = UsdGeom.BasisCurves.Define(stage, path)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
     curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)

@@ -1,0 +1,100 @@
+"""Directions of elements as curves beside the prim that they are measured on: one straight segment for each element."""
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+from .layers import CURVE_WIDTH, bind_material
+from .targets import Target
+
+# The first direction dark, the second light: both are seen on any colour of a map.
+_COLOURS = ((0.05, 0.05, 0.05), (0.95, 0.95, 0.95))
+
+
+def check_directions(directions, mesh):
+    """Refuses directions, interpolation by name, that a mesh cannot have.
+
+    Raises:
+        ValueError: A name that is none, or an interpolation that is not "vertex" or, of triangles, "uniform".
+    """
+    allowed = ("vertex", "uniform") if len(mesh.triangles) else ("vertex",)
+    for name, interpolation in directions.items():
+        if not (isinstance(name, str) and Sdf.Path.IsValidIdentifier(name)):
+            raise ValueError(f"directions: {name!r} must be a name such as principal1, of letters, digits and _")
+        if interpolation not in allowed:
+            raise ValueError(f"directions[{name!r}] = {interpolation!r}: must be {' or '.join(map(repr, allowed))}")
+
+
+def define_directions(stage, prim, mesh, directions, material):
+    """Defines linear BasisCurves `<prim>_<name>` beside a prim, without length until they are sampled.
+
+    Args:
+        stage: The stage, its edit target the layer to write to.
+        prim: Path of the prim that the elements are of.
+        mesh: The `Mesh`.
+        directions: "vertex" or "uniform" by name: segments of vertices or of triangles.
+        material: The material to bind, which shows displayColor.
+
+    Returns:
+        list: The `Target` of each, in the space and units of the prim's parent at the default time.
+
+    Raises:
+        ValueError: The stage has another prim in that place.
+    """
+    transform = to_metres(stage, prim, Usd.TimeCode.Default())
+    mean_length = np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1).mean()
+    width = float(np.float32(CURVE_WIDTH * mean_length / np.cbrt(abs(np.linalg.det(transform[:3, :3])))))
+    targets = []
+    for row, (name, interpolation) in enumerate(directions.items()):
+        path = f"{prim}_{name}"
+        free_place(stage, path, "BasisCurves")
+        curves = UsdGeom.BasisCurves.Define(stage, path)
+        target = Target(path, np.empty((0, 3), np.int32), transform, half_width=width / 2, vectors=("points", "extent"))
+        places = mesh.points if interpolation == "vertex" else mesh.points[mesh.triangles].mean(axis=1)
+        for attribute, value in target.samples({"points": np.repeat(places, 2, axis=0)}).items():
+            curves.GetPrim().GetAttribute(attribute).Set(value)
+        curves.CreateTypeAttr(UsdGeom.Tokens.linear)
+        curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
+        curves.CreateCurveVertexCountsAttr(Vt.IntArray(len(places), 2))
+        curves.CreateWidthsAttr([width])
+        curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+        colour = Gf.Vec3f(*_COLOURS[row % len(_COLOURS)])
+        curves.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([colour])
+        bind_material(curves.GetPrim(), material)
+        targets.append(target)
+    return targets
+
+
+def segments(centres, vectors, nowhere):
+    """Ends (2E, 3) of a segment for each element, c ± v/2; without length where either is not known.
+
+    Args:
+        centres: (E, 3) [m].
+        vectors: (E, 3) [m], the segments from end to end.
+        nowhere: (3,) [m], in place of centres that are not known where none is.
+
+    Returns:
+        np.ndarray: Finite, two rows for each element.
+    """
+    placed = np.isfinite(centres).all(axis=1)[:, None]
+    # Amid the others, so that what is not seen makes no extent larger.
+    middle = np.mean(centres, axis=0, where=placed) if placed.any() else nowhere
+    centres = np.where(placed, centres, middle)
+    half = np.where(placed & np.isfinite(vectors).all(axis=1)[:, None], 0.5 * np.asarray(vectors), 0.0)
+    return np.stack([centres - half, centres + half], axis=1).reshape(-1, 3)
+
+
+def to_metres(stage, prim, time):
+    """The transform (4, 4) from the space of a prim's siblings to the stage's world space [m] at a time, for row vectors."""
+    parent = stage.GetPrimAtPath(prim).GetParent()
+    matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(parent))
+    if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix[:3, :3]) < 3:
+        raise ValueError(f"prim {parent.GetPath()}: the transform to world space is {matrix.tolist()}, must be invertible")
+    matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(stage)
+    return matrix
+
+
+def free_place(stage, path, kind):
+    """Refuses a path where a stage has a prim of another type than the one to define there."""
+    prim = stage.GetPrimAtPath(path)
+    if prim and prim.GetTypeName() != kind:
+        raise ValueError(f"prim {path}: is {prim.GetTypeName() or 'untyped'} in the source, must be free for a {kind}")

@@ -1,0 +1,211 @@
+"""Writing measures of a cloth: numbers and colours of its elements, over the stage that was measured or on one of their own."""
+
+import math
+import warnings
+from dataclasses import replace
+
+from pxr import Sdf, Usd, UsdGeom, UsdShade
+
+from .chunks import ChunkWriter, check_scene
+from .directions import check_directions, define_directions, free_place, segments, to_metres
+from .layers import (
+    artist_prim,
+    artist_target,
+    bind_material,
+    declare_primvars,
+    define_material,
+    files_of,
+    root_metadata,
+    scene_layer,
+)
+from .targets import DISPLAY_COLOUR, check_primvars
+
+
+class MeasureWriter(ChunkWriter):
+    """Writes measures of vertices or triangles as sampled primvars: `ChunkWriter` says in what files.
+
+    With a source the result is a layer over the stage that was measured, which it sublayers by a relative path and never
+    changes. Points stay the source's own, with its time codes and rates. To the measured prim it adds `primvars:<name>` and,
+    where a measure is shown in colours, `primvars:displayColor`, doubleSided, and a material below it that shows
+    displayColor, bound in place of the prim's own and those of its faces. Without a source it is a complete stage,
+    /World/Cloth, with points, normals and extent too.
+
+    A value that is not known is NaN, in the file too. An artist's faces with more corners than three have the mean over
+    those of their triangles that have a value, and the mean of the same triangles' colours.
+
+    Directions are linear BasisCurves beside the prim, `<prim>_<name>`: a segment for each element, moving with it. Beside a
+    prim that is a root they are roots too, and a reference to the default prim has none of them.
+
+    Attributes:
+        path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
+        frames: Number of frames appended.
+    """
+
+    def __init__(
+        self,
+        output,
+        mesh,
+        primvars,
+        coloured=None,
+        directions=None,
+        source=None,
+        fps=24.0,
+        up_axis="Y",
+        chunk=10,
+        metadata=None,
+    ):
+        """Checks everything that can be checked before the first frame; writes nothing yet.
+
+        Args:
+            output: File to write: as of `AnimationWriter`.
+            mesh: The `Mesh`; its points are the rest shape. With a source: as read from it.
+            primvars: "vertex", a value for each vertex, or "uniform", one for each triangle, by name of each primvar.
+            coloured: Name of the primvar that displayColor shows, or None: no colours.
+            directions: "vertex" or "uniform" by name of each set of segments, or None.
+            source: The `StageMesh` that was measured, or None.
+            fps: Frames per second, also time codes per second; a source has its own.
+            up_axis: "Y" or "Z"; a source has its own.
+            chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
+            metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers, texts or dicts
+                of such.
+
+        Raises:
+            FileNotFoundError: The output's folder does not exist.
+            ValueError: A parameter is not as above; the output is a file of the source's stage; the source's prim is an
+                instance, is of another mesh, or has a primvar of another type under one of the names.
+        """
+        super().__init__(output, mesh, chunk)
+        # Its own, or earlier measures and the motion of a result that was measured would not be seen.
+        self._clip_set = f"measures_{self._run.name[-8:]}"
+        check_scene(fps, up_axis)
+        primvars, directions = dict(primvars), dict(directions or {})
+        check_primvars(primvars, mesh)
+        check_directions(directions, mesh)
+        if coloured is not None and coloured not in primvars:
+            raise ValueError(f"coloured = {coloured!r}: must be one of {', '.join(map(repr, primvars)) or 'none'}, or None")
+        self._with_points, self._stage = source is None, None
+        if source is None:
+            rest, target, facts = _scene(mesh, up_axis, primvars, coloured)
+            facts |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
+            stage, path, files = Usd.Stage.Open(rest), None, ()
+            material = UsdShade.Material.Get(stage, "/World/Looks/Cloth")
+        else:
+            rest, target, stage = _over(source, mesh, primvars, coloured)
+            facts, path, files = _facts_of(stage, source), source.path, files_of(stage)
+            material = _show_colours(stage, source, with_mesh=bool(coloured)) if coloured or directions else None
+            self._stage = stage
+        self._directions = dict(directions)
+        targets = define_directions(stage, target.prim, mesh, directions, material) if directions else []
+        self._nowhere = mesh.points.mean(axis=0)
+        self._put_on(rest, [target, *targets], facts, metadata, path, files)
+
+    def append(self, time_code, primvars, colours=None, directions=None, points=None):
+        """Adds a frame; every `chunk` frames they are written.
+
+        Args:
+            time_code: Time code of the frame in the source, or its number; after the one before, at any distance.
+            primvars: Values by name of all that were declared, (n,) or, where uniform, (T,). NaN where there is none.
+            colours: (n, 3) or (T, 3) linear RGB, as the primvar that they show; if there is one.
+            directions: Centres and vectors [m], both (n, 3) or (T, 3) in world space, by name of all that were declared.
+                Where either is NaN there is no segment.
+            points: (n, 3) [m], world space; without a source. A frame with points that are not finite cannot be drawn:
+                leave it out.
+
+        Raises:
+            ValueError: Other values than declared, a wrong shape, a value that is infinite as float32, with the frame and
+                the vertex or triangle; a time code that is not after the last; the writer is closed.
+        """
+        self._check_open()
+        if not math.isfinite(time_code) or (self._span and time_code <= self._span[1]):
+            raise ValueError(f"time_code = {time_code} at frame {self.frames}: must be finite and after the one before")
+        target, time = self._targets[0], float(time_code)
+        primvars = self._checked_primvars(primvars, unknown=True)
+        _check_given("colours", colours, target.coloured)
+        if colours is not None:
+            colours = self._checked("colours", colours, target.primvars[target.coloured])
+        _check_given("points", points, self._with_points)
+        vectors = {} if points is None else {"points": self._checked("points", points)}
+        values = [target.samples(vectors, primvars, colours), *self._curves(time, directions or {})]
+        samples = zip(self._targets, values, strict=True)
+        self._append(time, {f"{t.prim}.{name}": value for t, own in samples for name, value in own.items()})
+
+    def _curves(self, time, directions):
+        """Samples of the curves, in the space that they have at a time."""
+        if directions.keys() != self._directions.keys():
+            names = [", ".join(map(repr, given)) or "none" for given in (directions, self._directions)]
+            raise ValueError(f"directions: {names[0]} at frame {self.frames}, must be {names[1]}")
+        for target, (name, interpolation) in zip(self._targets[1:], self._directions.items(), strict=True):
+            both = [
+                self._checked(f"{part} of directions[{name!r}]", values, interpolation, unknown=True)
+                for part, values in zip(("centres", "vectors"), directions[name], strict=True)
+            ]
+            if self._stage:
+                target = replace(target, transform=to_metres(self._stage, target.prim, time))
+            yield target.samples({"points": segments(*both, self._nowhere)})
+
+
+def _check_given(name, value, wanted):
+    if (value is None) == bool(wanted):
+        raise ValueError(f"{name}: must be {'given with each frame' if wanted else 'left out, this writer has none'}")
+
+
+def _scene(mesh, up_axis, primvars, coloured):
+    """A complete stage to be measured on, as a layer; the `Target` in it, and its root's metadata."""
+    rest, target, facts = scene_layer(mesh, None, up_axis, "Cloth")
+    target = replace(target, vectors=("points", "normals", "extent"), primvars=primvars, coloured=coloured)
+    target.declare(rest, target.attributes)
+    if coloured:
+        # One colour for all has no place where each element has its own.
+        rest.GetAttributeAtPath(f"{target.prim}.{DISPLAY_COLOUR}").ClearDefaultValue()
+    return rest, target, facts
+
+
+def _over(source, mesh, primvars, coloured):
+    """A layer of primvars over the artist's prim, the `Target`, and the stage with that layer as its edit target."""
+    stage, artist = artist_prim(source, mesh)
+    target = artist_target(artist, source, primvars, vectors=(), coloured=coloured)
+    rest = Sdf.Layer.CreateAnonymous(".usdc")
+    Sdf.CreatePrimInLayer(rest, target.prim)
+    declare_primvars(rest, artist, target, source.path)
+    stage.GetSessionLayer().subLayerPaths.append(rest.identifier)
+    stage.SetEditTarget(Usd.EditTarget(rest))
+    return rest, target, stage
+
+
+def _facts_of(stage, source):
+    """What the source's root layer says, rates and range with it, for the root layer over it."""
+    root = stage.GetRootLayer()
+    rates = {"timeCodesPerSecond": source.time_codes_per_second, "framesPerSecond": source.fps or source.time_codes_per_second}
+    start = {"startTimeCode": root.startTimeCode} if root.HasStartTimeCode() else {}
+    end = {"endTimeCode": root.endTimeCode} if root.HasEndTimeCode() else {}
+    return root_metadata(stage) | rates | start | end
+
+
+def _show_colours(stage, source, with_mesh):
+    """A material below the prim that shows displayColor; bound to the prim and its faces, if these are coloured."""
+    path = f"{source.prim}/DisplayColour"
+    free_place(stage, path, "Material")
+    material = define_material(stage, path)
+    if not with_mesh:
+        return material
+    prim = stage.GetPrimAtPath(source.prim)
+    UsdGeom.Gprim(prim).CreateDoubleSidedAttr(True)
+    parts = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), familyName=UsdShade.Tokens.materialBind)
+    for part in (prim, *(subset.GetPrim() for subset in parts)):
+        bind_material(part, material)
+        # Materials for a purpose come before those for all.
+        for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
+            bound = UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(purpose)[0]
+            if bound and bound.GetPath() != path:
+                UsdShade.MaterialBindingAPI(part).Bind(material, materialPurpose=purpose)
+        bound = {
+            UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(p)[0]
+            for p in UsdShade.MaterialBindingAPI.GetMaterialPurposes()
+        }
+        if hiding := sorted(str(other.GetPath()) for other in bound if other.GetPath() != path):
+            warnings.warn(
+                f"{source.path}, prim {part.GetPath()}: the material {hiding[0]} is bound above it, stronger than any on it, "
+                "and may hide the colours",
+                stacklevel=4,
+            )
+    return material
