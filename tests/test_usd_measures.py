@@ -26,7 +26,7 @@ from test_usd import (
 )
 from usd_validation import validate
 
-from warpcloth.mesh import Mesh
+from warpcloth.mesh import Mesh, Surface
 from warpcloth.usd import FrameSequence, MeasureWriter, read_mesh, read_stage_mesh
 
 # At no constant distance, and none of them 0, where float noise would hide; the third is a sample of no artist.
@@ -83,15 +83,13 @@ def over_mirrored(folder):
 
 
 def over_moving(folder):
-    """A parent that moves: read before it does, for there is no one place of the rest shape then."""
     path = artist_stage(folder / "artist.usda")
-    read = read_stage_mesh(path)
     stage = Usd.Stage.Open(path)
     translate = stage.GetPrimAtPath("/Set/Group").GetAttribute("xformOp:translate")
     for code in (101, 112):
         translate.Set(Gf.Vec3d(code, 2 * code, 0), code)
     stage.Save()
-    return read
+    return read_stage_mesh(path, kind=Surface, time=101.0)
 
 
 def over_root(folder):
@@ -278,6 +276,26 @@ def test_no_place_at_all_is_the_middle_of_the_rest_shape(tmp_path):
     stage, prim = animated_prim(writer.path)
     points = np.array(stage.GetPrimAtPath(f"{prim.GetPath()}_axis").GetAttribute("points").Get(0))
     np.testing.assert_array_equal(points, np.tile(np.float32(mesh.points.mean(axis=0)), (16, 1)))
+
+
+def test_a_rest_shape_may_have_holes_where_the_source_has_the_points(tmp_path):
+    """A point that is not finite, and a triangle that names a vertex twice, are the artist's; curves are ours, and finite."""
+    points = [(0, 0, 0), (1, 0, 0), (0, 0, 1), (np.nan, 0, 0)]
+    stage, _ = define_mesh(tmp_path / "a.usda", points, [3, 3, 3], [0, 2, 1, 0, 1, 1, 1, 2, 3])
+    stage.Save()
+    source = read_stage_mesh(tmp_path / "a.usda", kind=Surface)
+    options = {"coloured": "a", "directions": {"axis": "uniform"}, "source": source}
+    with MeasureWriter(tmp_path / "out.usda", source.mesh, {"a": "uniform"}, **options) as writer:
+        centres = source.mesh.points[source.mesh.triangles].mean(axis=1)
+        writer.append(1, {"a": [1, np.nan, np.nan]}, np.eye(3), {"axis": (centres, np.ones((3, 3)))})
+    assert np.isnan(FrameSequence(writer.path, attribute="primvars:a")[0]).tolist() == [False, True, True]
+    stage = Usd.Stage.Open(writer.path)
+    axis = stage.GetPrimAtPath("/Sheet_axis")
+    for code in (Usd.TimeCode.Default(), 1):
+        for name in ("points", "extent", "widths"):
+            assert np.isfinite(axis.GetAttribute(name).Get(code)).all(), (name, code)
+    with pytest.raises(ValueError, match="points of the rest shape: .*nan.* at frame 0, vertex 3, must be finite"):
+        MeasureWriter(tmp_path / "out.usdc", source.mesh, {})
 
 
 @pytest.mark.parametrize("ending", ["usdc", "usdz"])

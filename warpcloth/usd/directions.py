@@ -4,6 +4,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from .layers import CURVE_WIDTH, bind_material
+from .stage import local_to_metres
 from .targets import Target
 
 # The first direction dark, the second light: both are seen on any colour of a map.
@@ -24,7 +25,7 @@ def check_directions(directions, mesh):
             raise ValueError(f"directions[{name!r}] = {interpolation!r}: must be {' or '.join(map(repr, allowed))}")
 
 
-def define_directions(stage, prim, mesh, directions, material):
+def define_directions(stage, prim, mesh, directions, material, nowhere):
     """Defines linear BasisCurves `<prim>_<name>` beside a prim, without length until they are sampled.
 
     Args:
@@ -33,15 +34,16 @@ def define_directions(stage, prim, mesh, directions, material):
         mesh: The `Mesh`.
         directions: "vertex" or "uniform" by name: segments of vertices or of triangles.
         material: The material to bind, which shows displayColor.
+        nowhere: As of `segments`.
 
     Returns:
-        list: The `Target` of each, in the space and units of the prim's parent at the default time.
+        list: The `Target` of each, in the space and units of the prim's parent at its first time.
 
     Raises:
         ValueError: The stage has another prim in that place.
     """
-    transform = to_metres(stage, prim, Usd.TimeCode.Default())
-    mean_length = np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1).mean()
+    transform = to_metres(stage, prim, Usd.TimeCode.EarliestTime())
+    mean_length = np.nanmean(np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1))
     width = float(np.float32(CURVE_WIDTH * mean_length / np.cbrt(abs(np.linalg.det(transform[:3, :3])))))
     targets = []
     for row, (name, interpolation) in enumerate(directions.items()):
@@ -50,7 +52,7 @@ def define_directions(stage, prim, mesh, directions, material):
         curves = UsdGeom.BasisCurves.Define(stage, path)
         target = Target(path, np.empty((0, 3), np.int32), transform, half_width=width / 2, vectors=("points", "extent"))
         places = mesh.points if interpolation == "vertex" else mesh.points[mesh.triangles].mean(axis=1)
-        for attribute, value in target.samples({"points": np.repeat(places, 2, axis=0)}).items():
+        for attribute, value in target.samples({"points": segments(places, np.zeros_like(places), nowhere)}).items():
             curves.GetPrim().GetAttribute(attribute).Set(value)
         curves.CreateTypeAttr(UsdGeom.Tokens.linear)
         curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
@@ -77,20 +79,26 @@ def segments(centres, vectors, nowhere):
     """
     placed = np.isfinite(centres).all(axis=1)[:, None]
     # Amid the others, so that what is not seen makes no extent larger.
-    middle = np.mean(centres, axis=0, where=placed) if placed.any() else nowhere
-    centres = np.where(placed, centres, middle)
+    centres = np.where(placed, centres, _middle(centres, nowhere))
     half = np.where(placed & np.isfinite(vectors).all(axis=1)[:, None], 0.5 * np.asarray(vectors), 0.0)
     return np.stack([centres - half, centres + half], axis=1).reshape(-1, 3)
+
+
+def _middle(points, otherwise):
+    """The mean of those points that are finite."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return points.mean(axis=0) if len(points) else otherwise
 
 
 def to_metres(stage, prim, time):
     """The transform (4, 4) from the space of a prim's siblings to the stage's world space [m] at a time, for row vectors."""
     parent = stage.GetPrimAtPath(prim).GetParent()
-    matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(parent))
-    if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix[:3, :3]) < 3:
-        raise ValueError(f"prim {parent.GetPath()}: the transform to world space is {matrix.tolist()}, must be invertible")
-    matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(stage)
-    return matrix
+    return local_to_metres(parent, f"prim {parent.GetPath()}, time code {time}", time)
+
+
+def middle(mesh):
+    """Where elements stand that have no place in any frame (3,) [m]: amid the rest shape, whose points need not be finite."""
+    return _middle(mesh.points, np.zeros(3))
 
 
 def free_place(stage, path, kind):

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 from pxr import Ar, Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
 
-from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh
+from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh, topology
 from .targets import SAMPLED, Target
 
 # Attributes of the artist's prim that would be used instead of ours, or beside ours with values of another motion.
@@ -239,8 +239,7 @@ def artist_target(artist, surroundings, primvars, **options):
     if artist.IsA(UsdGeom.Curves):
         widths = UsdGeom.Curves(artist).GetWidthsAttr().Get()
         half_width = float(np.max(widths)) / 2 if widths else 0.0
-    counts = UsdGeom.Mesh(artist).GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()) if artist.IsA(UsdGeom.Mesh) else []
-    face_triangles = np.array(counts, dtype=np.int32) - 2
+    face_triangles = topology(UsdGeom.Mesh(artist).GetFaceVertexCountsAttr()) - 2 if artist.IsA(UsdGeom.Mesh) else np.array([])
     return Target(
         surroundings.prim,
         surroundings.mesh.triangles,

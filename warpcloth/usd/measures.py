@@ -7,7 +7,7 @@ from dataclasses import replace
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from .chunks import ChunkWriter, check_scene
-from .directions import check_directions, define_directions, free_place, segments, to_metres
+from .directions import check_directions, define_directions, free_place, middle, segments, to_metres
 from .layers import (
     artist_prim,
     artist_target,
@@ -58,7 +58,8 @@ class MeasureWriter(ChunkWriter):
 
         Args:
             output: File to write: as of `AnimationWriter`.
-            mesh: The `Mesh`; its points are the rest shape. With a source: as read from it.
+            mesh: The `Mesh` or `Surface`; its points are the rest shape. With a source: as read from it, and only there may
+                some not be finite.
             primvars: "vertex", a value for each vertex, or "uniform", one for each triangle, by name of each primvar.
             coloured: Name of the primvar that displayColor shows, or None: no colours.
             directions: "vertex" or "uniform" by name of each set of segments, or None.
@@ -85,6 +86,7 @@ class MeasureWriter(ChunkWriter):
             raise ValueError(f"coloured = {coloured!r}: must be one of {', '.join(map(repr, primvars)) or 'none'}, or None")
         self._with_points, self._stage = source is None, None
         if source is None:
+            self._checked("points of the rest shape", mesh.points)
             rest, target, facts = _scene(mesh, up_axis, primvars, coloured)
             facts |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
             stage, path, files = Usd.Stage.Open(rest), None, ()
@@ -95,8 +97,8 @@ class MeasureWriter(ChunkWriter):
             material = _show_colours(stage, source, with_mesh=bool(coloured)) if coloured or directions else None
             self._stage = stage
         self._directions = dict(directions)
-        targets = define_directions(stage, target.prim, mesh, directions, material) if directions else []
-        self._nowhere = mesh.points.mean(axis=0)
+        self._nowhere = middle(mesh)
+        targets = define_directions(stage, target.prim, mesh, directions, material, self._nowhere) if directions else []
         self._put_on(rest, [target, *targets], facts, metadata, path, files)
 
     def append(self, time_code, primvars, colours=None, directions=None, points=None):
