@@ -294,7 +294,7 @@ def test_a_rest_shape_may_have_holes_where_the_source_has_the_points(tmp_path):
     for code in (Usd.TimeCode.Default(), 1):
         for name in ("points", "extent", "widths"):
             assert np.isfinite(axis.GetAttribute(name).Get(code)).all(), (name, code)
-    with pytest.raises(ValueError, match="points of the rest shape: .*nan.* at frame 0, vertex 3, must be finite"):
+    with pytest.raises(ValueError, match=r"points of the rest shape: .*nan.* at frame 0, vertex 3, must be finite"):
         MeasureWriter(tmp_path / "out.usdc", source.mesh, {})
 
 
