@@ -432,7 +432,7 @@ def test_the_command_compares_surfaces_of_different_meshes(files, tmp_path, capf
         ("compare {}/cloth.usdc {}/cloth.usdc --prim-b /None", "None"),
         ("compare {}/cloth.usdc {}/cloth.usdc --fps-a 0", "fps is 0.0; it must be a number above 0"),
         ("compare {}/cloth.usdc {}/cloth.usdc --frames -1", "frames is -1; it must be a whole number"),
-        ("compare {}/cloth.usdc {}/cloth.usdc --plot {}/o.txt", "o.txt: must end with .png, .pdf, .svg"),
+        ("compare {}/cloth.usdc {}/cloth.usdc --plot {}/o.txt", "o.txt: the ending is '.txt'; it must be .png or .svg or .pdf"),
         ("compare {}/cloth.usdc {}/cloth.usdc --csv /proc/o.csv", "/proc"),
         ("compare {}/cloth.usdc {}/finer.usdc --rest-b {}/rest.obj", "b: its mesh is"),
     ],

@@ -1,5 +1,6 @@
 """An analysis as files: a USD stage with its measures, tables, arrays, plots and pictures, written row by row."""
 
+import warnings
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -75,7 +76,7 @@ def write_report(
         npz: Path of the measures themselves, (rows, E, *shape).
         plot: Path of a picture of the percentiles over time, .png, .svg or .pdf.
         stills: Paths of pictures, .png, by number of the frame.
-        colour: The scalar to show, such as "stretch_1"; the first where not given.
+        colour: The scalar to show, such as "stretch_1"; the first where not given; "none" for a stage without colours.
         colour_range: (low, high) of its colours; else from the least first percentile to the largest ninety-ninth of all rows,
             about the value of what is undeformed where there is one.
         curves: Whether stage and pictures show the principal directions, as long as their stretches.
@@ -93,7 +94,8 @@ def write_report(
     listed = {name: measure for measure in analyzer.measures for name in scalar_names(measure)}
     report = Report(extremes={name: Extremes() for name in listed})
     _check(analyzer, listed, usd or stills, usd, stills, colour, curves)
-    if usd or stills:
+    _check_pictures(plot, stills)
+    if (usd or stills) and colour != "none" and (stills or colour or _can_colour()):
         report.coloured = colour or next(iter(listed))
         report.scale = _range(analyzer, report.coloured, listed[report.coloured], colour_range)
     kept = []
@@ -153,8 +155,8 @@ def camel(name):
 def _check(analyzer, listed, coloured, usd, stills, colour, curves):
     if coloured and not listed:
         raise ValueError(f"colour: {analyzer.measures[0].name} has no number to be coloured; measure something else too")
-    if colour is not None and colour not in listed:
-        raise ValueError(f"colour = {colour!r}: must be one of {', '.join(listed)}")
+    if colour is not None and colour not in listed and (colour != "none" or stills):
+        raise ValueError(f"colour = {colour!r}: must be one of {', '.join(listed)}" + ("" if stills else ", or none"))
     names = {measure.name for measure in analyzer.measures}
     if curves and not {"stretch", "directions"} <= names:
         raise ValueError("curves: need the measures stretch and directions")
@@ -169,6 +171,29 @@ def _check(analyzer, listed, coloured, usd, stills, colour, curves):
             raise ValueError(f"stills: frame {frame:g} is not measured; it must be one of {frames[0]:g} to {frames[-1]:g}")
 
 
+def _can_colour():
+    """Whether there are colour maps; without them a stage has its measures all the same."""
+    from .chart.figures import require_matplotlib
+
+    try:
+        require_matplotlib()
+    except ImportError as error:
+        warnings.warn(f"the stage has no colours: {error}", stacklevel=3)
+        return False
+    return True
+
+
+def _check_pictures(plot, stills):
+    """Refuses pictures that cannot be written, before anything is measured."""
+    if plot or stills:
+        from .chart.figures import PICTURES, check_path
+
+        if plot:
+            check_path(plot, PICTURES)
+        for path in (stills or {}).values():
+            check_path(path, PICTURES[:1])
+
+
 def _range(analyzer, name, measure, given):
     """(low, high) of the colours of a scalar."""
     from .chart import Scale, range_over
@@ -180,8 +205,8 @@ def _range(analyzer, name, measure, given):
             places = np.zeros((len(numbers), 3))
             about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
             summaries.append(summarise(name, measure.unit, numbers, places, analyzer.areas, **about))
-        given = range_over(summaries, measure.neutral)
-    scale = Scale(*given, measure.neutral)
+        given = range_over(summaries, _neutral(measure))
+    scale = Scale(*given, _neutral(measure))
     return scale.low, scale.high
 
 
@@ -197,10 +222,16 @@ def _rate(sequence):
     return float((sequence.labels[-1] - sequence.labels[0]) / (sequence.times[-1] - sequence.times[0]))
 
 
+def _neutral(measure):
+    """Where the scale of a scalar of a measure has its middle; norms begin at 0."""
+    return measure.neutral if len(measure.shape) < 2 else None
+
+
 def _input(analyzer):
     mesh, sequence = analyzer.mesh, analyzer.sequence
     facts = {"file": sequence.path, "vertices": len(mesh.points), "triangles": len(mesh.triangles), "frames": len(sequence)}
-    return facts | {"on": analyzer.on, "rates": analyzer.rates}
+    facts |= {"on": analyzer.on, "rates": analyzer.rates}
+    return {name: value for name, value in facts.items() if value is not None}
 
 
 def _archive(analyzer, path):
@@ -214,12 +245,14 @@ class _Shown:
     """What is looked at: a stage and pictures, coloured by one scalar on one scale."""
 
     def __init__(self, analyzer, report, listed, usd, stills, curves, single_file, up_axis, stack):
-        from .chart import Scale
-
         self.analyzer, self.name, self.curves, self.stills = analyzer, report.coloured, curves, stills or {}
-        measure = listed[self.name]
-        self.unit, self.over = measure.unit, analyzer.sequence.stage is not None
-        self.scale = Scale(*report.scale, measure.neutral)
+        self.over, self.scale, metadata = analyzer.sequence.stage is not None, None, {"analysis": _input(analyzer)}
+        if self.name:
+            from .chart import Scale
+
+            self.unit = listed[self.name].unit
+            self.scale = Scale(*report.scale, _neutral(listed[self.name]))
+            metadata["legend"] = self.scale.legend(self.name, self.unit)
         self.length = _SEGMENT * np.sqrt(np.median(analyzer.mesh.triangle_areas))
         sequence = analyzer.sequence
         if self.stills:
@@ -238,12 +271,12 @@ class _Shown:
                 usd,
                 analyzer.mesh if sequence.stage is None else sequence.mesh,
                 {camel(name): kind for name in listed},
-                coloured=camel(self.name),
+                coloured=camel(self.name) if self.name else None,
                 directions=dict.fromkeys(names, kind),
                 source=sequence.stage,
                 fps=_rate(sequence),
                 up_axis=up_axis,
-                metadata={"legend": self.scale.legend(self.name, self.unit), "analysis": _input(analyzer)},
+                metadata=metadata,
             )
             stack.callback(self.writer.close, single_file=single_file)
 
@@ -254,7 +287,7 @@ class _Shown:
         if self.writer and (self.over or finite):  # without a stage below it a frame needs points
             largest = np.finfo(np.float32).max
             primvars = {camel(name): np.where(np.abs(numbers) <= largest, numbers, np.nan) for name, numbers in values.items()}
-            colours = self.scale.linear(values[self.name])
+            colours = self.scale.linear(values[self.name]) if self.scale else None
             self.writer.append(sample.frame, primvars, colours, segments, None if self.over else sample.points)
         if sample.frame in self.stills:
             from .chart import draw

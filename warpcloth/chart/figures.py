@@ -4,6 +4,7 @@ import importlib.util
 from pathlib import Path
 
 GREY = "0.35"
+PICTURES = (".png", ".svg", ".pdf")
 # Without the date the same figure has the same bytes.
 _METADATA = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
@@ -23,8 +24,10 @@ def check_path(path, endings):
 
     Raises:
         FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
         ValueError: The name has none of the endings.
     """
+    require_matplotlib()
     path = Path(path)
     if path.suffix.lower() not in endings:
         raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {' or '.join(endings)}")

@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from ..checks import choice
-from .figures import GREY, check_path, require_matplotlib, save
+from .figures import GREY, PICTURES, check_path, save
 
-_ENDINGS = (".png", ".svg", ".pdf")
 # Columns of the percentiles 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, and the grey of each band.
 _BANDS = ((1, 7, "0.88", "1 to 99 %"), (2, 6, "0.76", "5 to 95 %"), (3, 5, "0.6", "25 to 75 %"))
 _MEDIAN, _EXTREMES = 4, (0, 8)
@@ -31,8 +30,7 @@ def plot_percentiles(path, summaries, along="time", neutrals=None):
         ImportError: matplotlib is not installed.
         ValueError: There is nothing to plot, or the path has another ending.
     """
-    require_matplotlib()
-    check_path(path, _ENDINGS)
+    check_path(path, PICTURES)
     choice("along", along, ("time", "frame"))
     rows = {}
     for summary in summaries:

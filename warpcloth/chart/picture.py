@@ -6,7 +6,7 @@ import numpy as np
 
 from ..checks import choice
 from .colour import EXCLUDED
-from .figures import GREY, check_path, require_matplotlib, save
+from .figures import GREY, check_path, save
 from .view import View, brightness
 
 # Inches: the longer side of what is shown, what is beside and above it, and gaps.
@@ -43,7 +43,6 @@ def draw(path, points, triangles, values, scale, on="triangle", title="", unit="
         ImportError: matplotlib is not installed.
         ValueError: An array has another shape, a triangle refers to no vertex, no point is finite, the file is no .png.
     """
-    require_matplotlib()
     check_path(path, (".png",))
     choice("on", on, ("triangle", "vertex"))
     points, values, triangles = np.asarray(points, np.float64), np.asarray(values, np.float64), np.asarray(triangles)

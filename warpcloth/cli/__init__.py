@@ -1,4 +1,4 @@
-"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, and compares animations.
+"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures and compares animations.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
 saved), 2 wrong use (one line on stderr), 130 interrupted. Any other error ends with 2 and one line as well, for most come of
@@ -53,6 +53,8 @@ def _sentence(error, debug):
     """What an error says; ours are sentences, others need their kind, and a hint at how to see more."""
     if isinstance(error, OSError):
         return f"{error.filename}: {error.strerror}" if error.strerror and error.filename else error
+    if isinstance(error, ImportError) and error.name is None:  # a sentence about an extra, no module that broke
+        return error
     if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError):
         return error
     more = "" if debug else " (run again with --debug for the traceback)"

@@ -42,7 +42,7 @@ def add_arguments(parser):
     add(
         "--colour",
         metavar="NAME",
-        help="what is coloured, such as stretch_1; the first number of the first measure if not given",
+        help="what is coloured, such as stretch_1, or none; the first number where not given",
     )
     add(
         "--range",

@@ -1,15 +1,15 @@
 """The command ``compare``: how far two animations are apart."""
 
 import csv
-from pathlib import Path
 
 import numpy as np
 
+from ..chart.figures import PICTURES, check_path
 from ..checks import whole
+from ..outputs import TEXT, Output
 from .terminal import Progress, as_json, check_writable, find_device
 
 _SHOWN = 8  # frames or exclusions of each that the summary names
-_PICTURES = (".png", ".pdf", ".svg")
 
 EPILOG = """\
 A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames that
@@ -32,7 +32,7 @@ def add_arguments(parser):
     parser.add_argument("--fps", type=float, help="frames per second of both, if they do not say")
     parser.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not all")
     parser.add_argument("--csv", metavar="FILE", help="write a line for each frame")
-    parser.add_argument("--plot", metavar="FILE", help=f"draw the distances over time, as {', '.join(_PICTURES)}")
+    parser.add_argument("--plot", metavar="FILE", help=f"draw the distances over time, as {', '.join(PICTURES)}")
 
 
 def compare(arguments):
@@ -52,7 +52,9 @@ def compare(arguments):
     if arguments.csv:
         _write_csv(arguments.csv, columns)
     if arguments.plot:
-        _plot(arguments.plot, found, (arguments.a, arguments.b))
+        from ..chart import plot_distances
+
+        plot_distances(arguments.plot, found, (arguments.a, arguments.b))
     facts = _facts(arguments, found, (a, b))
     if arguments.json:
         per_frame = {name: np.asarray(column).tolist() for name, column in columns.items()}
@@ -64,12 +66,7 @@ def compare(arguments):
 
 def _check_outputs(arguments):
     if arguments.plot:
-        if Path(arguments.plot).suffix.lower() not in _PICTURES:
-            raise ValueError(f"--plot {arguments.plot}: must end with {', '.join(_PICTURES)}")
-        try:
-            import matplotlib  # noqa: F401 so that it is missed before anything is read
-        except ImportError:
-            raise ValueError("--plot needs matplotlib: pip install 'warpcloth[chart]'") from None
+        check_path(arguments.plot, PICTURES)
     for output in filter(None, (arguments.csv, arguments.plot)):
         check_writable(output)
 
@@ -96,8 +93,8 @@ def _columns(found):
 
 
 def _write_csv(path, columns):
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
+    with Output(path, "x", **TEXT) as output:
+        table = csv.writer(output.file, lineterminator="\n")
         table.writerow(columns)
         for row in zip(*(column.tolist() for column in columns.values()), strict=True):
             table.writerow("" if value != value else value for value in row)
@@ -201,27 +198,3 @@ def _at(worst):
 def _frame(worst):
     a, b = worst["frame_a"], worst["frame_b"]
     return f"frame {a:g} ({worst['time']:.4g} s)" if a == b else f"frames {a:g} and {b:g} ({worst['time']:.4g} s)"
-
-
-def _plot(path, found, names):
-    """Distances over time, and differences of stretches below where there are some."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 5.0 if found.same_topology else 3.2), layout="constrained")
-    axes = figure.subplots(2 if found.same_topology else 1, sharex=True, squeeze=False)[:, 0]
-    lines = {"RMS of vertices": found.rms, "largest of vertices": found.largest, "Hausdorff": found.hausdorff}
-    if not found.same_topology:
-        lines = {"RMS from A": found.surface_rms[:, 0], "RMS from B": found.surface_rms[:, 1], "Hausdorff": found.hausdorff}
-    for (label, values), style in zip(lines.items(), (".-", ".-", "."), strict=True):
-        axes[0].plot(found.times, values, style, label=label)
-    axes[0].set(title=f"{Path(names[0]).name} and {Path(names[1]).name}", ylabel="distance [m]")
-    if found.same_topology:
-        for label, values in (("RMS", found.stretch_rms), ("largest", found.stretch_largest)):
-            for k, column in enumerate(values.T):
-                axes[1].plot(found.times, column, ".-", label=f"{label} of λ{'₁₂'[k]}")
-        axes[1].set(ylabel="difference of stretches")
-    for axis in axes:
-        axis.legend()
-        axis.set_ylim(bottom=0.0)
-    axes[-1].set_xlabel("time [s]")
-    figure.savefig(path, dpi=130)
