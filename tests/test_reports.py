@@ -12,6 +12,7 @@ from usd_validation import validate
 
 import warpcloth as wc
 from warpcloth.chart import Scale
+from warpcloth.chart.colour import table
 from warpcloth.cli import main
 from warpcloth.measures import scalars
 from warpcloth.reports import camel, scalar_names, write_report
@@ -200,6 +201,7 @@ def test_a_stage_without_colours(cloth, tmp_path, monkeypatch, capsys):
     """On request, or with a warning where there are no colour maps."""
     assert main(["analyze", str(cloth), "-o", str(tmp_path / "a.usdc"), "--colour", "none"]) == 0
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    table.cache_clear()
     capsys.readouterr()
     assert main(["analyze", str(cloth), "-o", str(tmp_path / "b.usdc")]) == 0
     said = capsys.readouterr()
