@@ -9,7 +9,7 @@ from functools import cache
 import warp as wp
 
 from .assemble import types
-from .project import spread_compliance
+from .project import place, spread_compliance
 from .rotation import nearest_rotation
 
 
@@ -109,8 +109,8 @@ def correct_clusters(dtype, multipliers: bool, per_step: bool):
         lambdas: wp.array(dtype=lambda_type),
         d: wp.array(dtype=vec3),
     ):
-        start = first + wp.tid() * each
-        for c in range(start, start + each):
+        for k in range(wp.abs(each)):
+            c = place(first, each, wp.tid(), k)
             _R = fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
             for e in range(offsets[c], offsets[c + 1]):
                 v = stencil[e, 0]

@@ -261,12 +261,22 @@ def advance_multipliers(term: Term, dtype, scalar: bool):
     return advance
 
 
+@wp.func
+def place(first: int, each: int, thread: int, k: int):
+    """The k-th of what a thread takes in a sweep, see :func:`correct_in_place`."""
+    e = first + thread * wp.abs(each) + k
+    if each < 0:
+        e = first - (thread + 1) * each - 1 - k
+    return e
+
+
 @cache
 def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
     """Kernel of a Gauss–Seidel sweep: each element sees what those before it did; d += ω Δx, λ += ω Δλ.
 
     A thread takes ``each`` elements one after the other, from first + thread·each on: 1 of a colour, in which no two share a
-    vertex that moves, or all of a copy. Pins are never written, so elements may share them.
+    vertex that moves, or all of a copy; of a negative ``each`` as many, from the last to the first. Pins are never written, so
+    elements may share them.
     """
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
@@ -289,8 +299,8 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
         lambdas: wp.array(dtype=lambda_type),
         d: wp.array(dtype=vec3),
     ):
-        start = first + wp.tid() * each
-        for e in range(start, start + each):
+        for k in range(wp.abs(each)):
+            e = place(first, each, wp.tid(), k)
             r = rest[e]
             before = lambda_type(dtype(0.0))
             if wp.static(multipliers):

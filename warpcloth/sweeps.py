@@ -154,10 +154,10 @@ class Sweep:
         if not self.in_place:
             self._total.zero_()
 
-    def launch(self):
-        """One sweep."""
+    def launch(self, backward=False):
+        """One sweep; of Gauss–Seidel also backward, from the last term, colour and element to the first."""
         if self.in_place:
-            self._launch_in_place()
+            self._launch_in_place(backward)
             return
         model = self.model
         fit_cells(model, self.elements, self.x, self.correction)
@@ -169,20 +169,22 @@ class Sweep:
                 model.launch(self._advance[i], elements.count, given, [self.multipliers[i]])
         model.launch(self._apply, model.count, [self._scale], [self._total, self.correction])
 
-    def _launch_in_place(self):
+    def _launch_in_place(self, backward):
         model = self.model
-        for i, elements in enumerate(self.elements):
+        way = -1 if backward else 1
+        for i in range(len(self.elements))[::way]:
+            elements = self.elements[i]
             cells = elements.cells
             of_cells = [cells.offsets, cells.shape] if cells else []
             each = (cells or elements).per_copy if self.ordered else 1
-            for first, count in self.ranges[i]:
+            for first, count in self.ranges[i][::way]:
                 given = [
                     *of_cells,
                     *elements.arguments,
                     model.inverse_mass,
                     self.x,
                     first,
-                    each,
+                    way * each,
                     self.h,
                     self.spread,
                     self.relaxation,
