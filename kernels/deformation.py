@@ -122,7 +122,7 @@ def logarithm(A: Any):
 
 @cache
 def frame_triangles(dtype):
-    """Kernel over triangles: their frames T in the reference X, and Dm⁻¹ = [[r₀, r₁], [0, r₂]] [1/m] there.
+    """Kernel over triangles: their frames T in the reference X, Dm⁻¹ = [[r₀, r₁], [0, r₂]] [1/m] and the shortest altitude [m].
 
     Dm are the edges [X₁ − X₀, X₂ − X₀] in t₁, t₂, with t₁ along the first.
     """
@@ -135,6 +135,7 @@ def frame_triangles(dtype):
         # out
         frames: wp.array(dtype=mat33),
         inverse_edges: wp.array(dtype=vec3),
+        sizes: wp.array(dtype=dtype),
     ):
         t = wp.tid()
         a = X[triangles[t, 1]] - X[triangles[t, 0]]
@@ -150,6 +151,7 @@ def frame_triangles(dtype):
         normal = (dtype(1.0) / doubled) * normal
         frames[t] = wp.matrix_from_cols(first, wp.cross(normal, first), normal)
         inverse_edges[t] = vec3(dtype(1.0) / length, -wp.dot(b, first) / doubled, length / doubled)
+        sizes[t] = doubled / wp.sqrt(longest)
 
     return set_frames
 
@@ -345,7 +347,8 @@ def measure_rates(dtype):
 
     L is 2(F̂₁ − F̂₀)(F̂₁ + F̂₀)⁻¹/dt by midpoint, (F̂₁ − F̂₀)F̂₀⁻¹/dt forward, log(F̂₁F̂₀⁻¹)/dt by logarithm. D = P ½(L + Lᵀ) P with
     P the projection to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch of the normal is not measured; W = ½(L − Lᵀ).
-    Rates of stretches and of lengths are of the numbers themselves by the same method; of angles, differences.
+    Rates of stretches and of lengths are of the numbers themselves by the same method; of angles, differences. Points are
+    rounded by ``rounding`` [m], and elements in the reference as wide as ``sizes`` [m].
     """
     vec3, mat33 = types(dtype)
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
@@ -374,9 +377,11 @@ def measure_rates(dtype):
         before: wp.array(dtype=mat33),
         after: wp.array(dtype=mat33),
         materials: wp.array(dtype=mat22),
+        sizes: wp.array(dtype=dtype),
         # parameters
         dt: dtype,
         method: int,
+        rounding: dtype,
         # out
         velocity_gradient: wp.array(dtype=mat33),
         rate_of_strain: wp.array(dtype=mat33),
@@ -425,8 +430,8 @@ def measure_rates(dtype):
                 a0 = wp.vector(V0[0, 0], V0[1, 0])
                 a1 = wp.vector(V1[0, 0], V1[1, 0])
                 in_frame, in_space = turn(a0, a1, column(U0, 0), column(U1, 0), dt)
-                tiny = dtype(16.0) * epsilon(dt)
-                # Of equal stretches every direction is principal.
+                # Of equal stretches every direction is principal, and of those that differ by rounding one is made of it.
+                tiny = dtype(16.0) * epsilon(dt) + dtype(4.0) * rounding / sizes[e]
                 if not (S0[0] - S0[1] > tiny * S0[0] and S1[0] - S1[1] > tiny * S1[0]):
                     in_frame = dtype(wp.NAN)
                     in_space = in_frame * vec3(dtype(1.0), dtype(1.0), dtype(1.0))

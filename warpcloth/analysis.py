@@ -278,7 +278,8 @@ class Analyzer:
                 excluded.append(_frame(labels[pair.frame], f"has none before it, and so no {rates}"))
             elif rates:
                 elements.start(held[pair.before].points)
-                elements.rates(times[pair.frame] - times[pair.before], self.rates)
+                rounding = np.finfo(sequence.precision).eps * max(held[place].largest for place in places)
+                elements.rates(times[pair.frame] - times[pair.before], self.rates, rounding)
             values = elements.read()
             known = without | held[pair.reference].lost | held[pair.frame].lost
             undefined = {}
@@ -308,7 +309,8 @@ class Analyzer:
     def _read(self, place):
         points = self.mesh.points if place is None else np.asarray(self.sequence[place], dtype=np.float64)
         lost = ~np.isfinite(points).all(axis=1)
-        return _Held(points, lost, self._elements.touched(lost) if lost.any() else np.zeros(self.count, dtype=bool))
+        largest = np.abs(points).max(initial=0.0, where=~lost[:, None])
+        return _Held(points, largest, lost, self._elements.touched(lost) if lost.any() else np.zeros(self.count, dtype=bool))
 
     def _label(self, place):
         return None if place is None else self.sequence.labels[place]
@@ -319,9 +321,10 @@ _NONE = object()
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """Points of a frame, which of them are not finite (n,), and which elements those touch (E,)."""
+    """Points of a frame, their largest coordinate, which are not finite (n,), and which elements those touch (E,)."""
 
     points: np.ndarray
+    largest: float
     lost_vertices: np.ndarray
     lost: np.ndarray
 

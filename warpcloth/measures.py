@@ -35,7 +35,7 @@ class Measure:
 
 
 _TURNED = "turns by 180° or more, or has collapsed"
-_EQUAL = "has equal stretches, and so no principal directions"
+_EQUAL = "has stretches that are equal but for rounding, and so no principal directions"
 _FORCES = {"needs": "material"}
 _THREADS = {"needs": "directions", "undefined": "has collapsed, or has no such directions"}
 _RATES = (

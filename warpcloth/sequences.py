@@ -46,6 +46,7 @@ class Sequence:
         read: Function that gives the points of a frame from its index, 0 to F − 1.
         path: The file, folder or pattern, or None.
         stage: `usd.StageMesh` of a stage, or None; where its space moves, as it is at the first frame.
+        precision: Type of the numbers that the input has, which says how coarsely they are rounded.
         declared: Whether the input says the rest shape; else `mesh` has the points of the first frame.
 
     Raises:
@@ -59,6 +60,7 @@ class Sequence:
     path: str | None = None
     stage: Any = None
     declared: bool = True
+    precision: type = np.float64
 
     def __post_init__(self):
         if not len(self.mesh.triangles):
@@ -156,12 +158,12 @@ def as_sequence(mesh, frames, dt=None, times=None):
         checks.number("dt", dt, above=0.0)
     elif times is None:
         times = getattr(frames, "times", None)
-    count, read = _array("frames", getattr(frames, "points", frames), mesh)
+    count, read, precision = _array("frames", getattr(frames, "points", frames), mesh)
     if dt is not None:
         times = dt * np.arange(count)
     elif times is not None:
         times = _increasing(times, count)
-    return Sequence(mesh, np.arange(count), times, read)
+    return Sequence(mesh, np.arange(count), times, read, precision=precision)
 
 
 def _open_stage(path, prim, fps):
@@ -177,7 +179,7 @@ def _open_stage(path, prim, fps):
         )
     labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
     times = frames.times if fps is None else (codes - codes[0]) / fps
-    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest)
+    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32)
 
 
 def _open_files(path, found, prim, fps):
@@ -245,9 +247,9 @@ def _open_npz(path, fps):
     if points.ndim != 3:
         raise ValueError(f"points has shape {points.shape}; it must be (frames, vertices, 3)")
     mesh = Surface(points[0], triangles)
-    count, read = _array("points", points, mesh)
+    count, read, precision = _array("points", points, mesh)
     times = _even(count, fps) if times is None else _increasing(times, count)
-    return Sequence(mesh, np.arange(count), times, read, path, declared=False)
+    return Sequence(mesh, np.arange(count), times, read, path, declared=False, precision=precision)
 
 
 def _mapped(path, member):
@@ -271,28 +273,30 @@ def _open_npy(path, fps, mesh):
     points = np.lib.format.open_memmap(path, mode="r")
     if mesh is None:
         raise ValueError("has no triangles; give a rest mesh that has them (--rest), or an .npz file")
-    count, read = _array("points", points, mesh)
-    return Sequence(mesh, np.arange(count), _even(count, fps), read, path)
+    count, read, precision = _array("points", points, mesh)
+    return Sequence(mesh, np.arange(count), _even(count, fps), read, path, precision=precision)
 
 
 def _array(name, frames, mesh):
-    """The number of frames, and what gives each from its index, of an array, list or `FrameSequence` that fits the mesh."""
+    """The number of frames, what gives each from its index, and the type of the numbers, of an array, list or `FrameSequence`
+    that fits the mesh."""
     shape = mesh.points.shape
     if isinstance(frames, (list, tuple)):
         for index, frame in enumerate(frames):
             found = checks.numeric(f"{name}[{index}]", frame, f"have shape {shape}").shape
             if found != shape:
                 raise ValueError(f"{name}[{index}] has shape {found}; it must be {shape}")
-        found = (len(frames), *shape)
+        found, dtype = (len(frames), *shape), np.asarray(frames[0] if frames else 0.0).dtype
     else:
         frames = frames if hasattr(frames, "exact") else np.asarray(frames)
-        found = frames.shape
+        found, dtype = frames.shape, frames.dtype
         if frames.dtype.kind not in "iuf":
             raise ValueError(f"{name} has type {frames.dtype}; it must be real numbers")
     if found[1:] != shape or not found[0]:
         copies = f"; of several copies give one, as in {name}[:, 0]" if len(found) == 4 else ""
         raise ValueError(f"{name} has shape {found}; it must be (frames, {shape[0]}, 3) for the points of the mesh{copies}")
-    return found[0], frames.exact if hasattr(frames, "exact") else frames.__getitem__
+    precision = dtype.type if np.issubdtype(dtype, np.floating) else np.float64
+    return found[0], frames.exact if hasattr(frames, "exact") else frames.__getitem__, precision
 
 
 def _even(count, fps):

@@ -26,12 +26,20 @@ class _Elements:
         self.results = {measure.name: self.empty(self._kind(measure.shape)) for measure in measures}
         self.gradients, self.before, self.frames = (self.empty(self.mat33) for _ in range(3))
         self.materials = None
+        self.sizes = self.empty(self.scalar)
 
     def empty(self, kind, count=None):
         return wp.empty(self.count if count is None else count, dtype=kind, device=self.device)
 
     def upload(self, values, kind):
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy), dtype=kind, device=self.device)
+
+    def place(self, points):
+        """Points (n, 3) on the device, in float32 about one of them: measures do not depend on where they are, their digits do."""
+        if self.numpy is np.float32:
+            finite = np.isfinite(points).all(axis=1)
+            points = points - points[finite.argmax()] if finite.any() else points
+        return self.upload(points, self.vec3)
 
     def launch(self, kernel, inputs, outputs, count=None):
         """Launches a kernel; outputs are names of measures, which are left out where nobody has chosen them, or arrays."""
@@ -41,10 +49,11 @@ class _Elements:
     def wanted(self, *names):
         return any(name in self.results for name in names)
 
-    def rates(self, dt, method):
-        """Rates from the gradients ``before`` to ``gradients``, a time dt [s] later."""
+    def rates(self, dt, method, rounding):
+        """Rates from the gradients ``before`` to ``gradients``, a time dt [s] later, of points rounded by ``rounding`` [m]."""
         names = ("velocity_gradient", "rate_of_strain", "spin", "stretch_rate", "rest_direction_rate", "direction_rate")
-        inputs = [self.before, self.gradients, self.materials, self.scalar(dt), int(RATES[method])]
+        inputs = [self.before, self.gradients, self.materials, self.sizes]
+        inputs += [self.scalar(dt), int(RATES[method]), self.scalar(rounding)]
         self.launch(deformation.measure_rates(self.scalar), inputs, (*names, "length_rate", "angle_rate"))
 
     def read(self):
@@ -91,8 +100,8 @@ class Triangles(_Elements):
 
     def refer(self, X):
         """Sets the reference X (n, 3); returns which triangles have none in it, (T,)."""
-        X = self.upload(X, self.vec3)
-        self.launch(deformation.frame_triangles(self.scalar), [self.triangles, X], (self.frames, self.inverse_edges))
+        outputs = (self.frames, self.inverse_edges, self.sizes)
+        self.launch(deformation.frame_triangles(self.scalar), [self.triangles, self.place(X)], outputs)
         if self.materials is not None:
             inputs = [self.coefficients, self.inverse_edges]
             self.launch(deformation.unit_directions(self.scalar), inputs, [self.materials])
@@ -116,7 +125,7 @@ class Triangles(_Elements):
             self.launch(kernel, [self.gradients, self.stiffness, self.rest], names)
 
     def _find_gradients(self, x, out):
-        inputs = [self.triangles, self.inverse_edges, self.upload(x, self.vec3)]
+        inputs = [self.triangles, self.inverse_edges, self.place(x)]
         self.launch(deformation.triangle_gradients(self.scalar), inputs, [out])
 
     def touched(self, vertices):
@@ -156,10 +165,11 @@ class Neighbourhoods(_Elements):
             self.rotations = self.empty(self.mat33)
         self.fits = self.wanted(*(measure.name for measure in measures if measure.rate))
         self.fits |= self.wanted("deformation_gradient", "stretch", "directions")
+        self.sizes = self.upload(np.sqrt(mesh.vertex_areas), self.scalar)
 
     def refer(self, X):
         """Sets the reference X (n, 3); returns which vertices have none in it, (n,): it cannot be fitted to itself."""
-        self.X = self.upload(X, self.vec3)
+        self.X = self.place(X)
         self._find_normals(self.X, self.reference_normals)
         self._fit(X, [self.gradients, self.frames, None, None, None])
         return np.isnan(self.gradients.numpy()[:, 0, 0])
@@ -187,7 +197,7 @@ class Neighbourhoods(_Elements):
         self.launch(deformation.vertex_normals(self.scalar), inputs, [out])
 
     def _fit(self, x, outputs):
-        x = self.upload(x, self.vec3)
+        x = self.place(x)
         if outputs[0] is not None:
             self._find_normals(x, self.normals)
         inputs = [self.offsets, self.members, self.reference_normals, self.X, self.normals, x]

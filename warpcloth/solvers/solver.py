@@ -64,7 +64,8 @@ class ImplicitStep(Step):
     stiff nearly at once. All three are stable for every h in linear motion and converged steps; in free fall, midpoint and BDF2
     are exact. Midpoint does not forgive steps too large for what turns, nor few iterations: of 4 substeps a frame ``hanging``
     diverges with projective dynamics and ADMM, and of more vertices with XPBD, whose sweeps go to and fro by midpoint, for
-    always in one order they made it grow at every step tried. BDF2 takes two steps of Euler when it is bound, to know what was before; it may start out of balance or damped by as much as one likes.
+    always in one order they made it grow at every step tried. BDF2 takes two steps of Euler when it is bound, to know what was
+    before; it may start out of balance or damped by as much as one likes.
 
     Attributes:
         dt, substeps: See :class:`Step`.

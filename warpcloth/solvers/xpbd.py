@@ -31,9 +31,9 @@ class XPBD(ImplicitStep):
     32² vertices stretches by 26 % with 4 × 20 a frame and by 5 % with 80 × 1. Infinite stiffness is α̃ = 0: constraints are met,
     but not in the place that is nearest to x̃, for λ keeps parts of earlier directions.
 
-    By midpoint Gauss–Seidel sweeps go forward and backward in turn. Always in one order, they give to the motion what they leave
-    unbalanced on one side: a ``hanging`` of 32² vertices then diverges in most settings. Two ways converge more slowly than
-    one, so that the integrators that damp keep one.
+    By midpoint Gauss–Seidel sweeps go forward and backward in turn. Always in one order, they give to the motion what they
+    leave unbalanced on one side: a ``hanging`` of 32² vertices then diverges in most settings. Two ways converge more slowly
+    than one, so that the integrators that damp keep one.
 
     ``residual`` says how far from implicit Euler a step ended: the largest unbalanced acceleration ‖∇ᵢ‖/mᵢ over gravity's (in
     m/s² without any). With infinite stiffness, where there is no such force, it is the largest move of the last sweep, over h²,
