@@ -35,7 +35,7 @@ class _Elements:
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy), dtype=kind, device=self.device)
 
     def place(self, points):
-        """Points (n, 3) on the device, in float32 about one of them: measures do not depend on where they are, their digits do."""
+        """Points (n, 3) on the device, in float32 about one of them: measures depend on digits, and not on the place."""
         if self.numpy is np.float32:
             finite = np.isfinite(points).all(axis=1)
             points = points - points[finite.argmax()] if finite.any() else points
