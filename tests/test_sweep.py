@@ -1,0 +1,117 @@
+"""Sweeps: every task once, what is finished is kept, any executor."""
+
+import json
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.chart.machine import machine
+from warpcloth.chart.sweep import Store, cache_folder, sweep
+from warpcloth.chart.tasks import SceneRef, Setup, Task, source_digest, task
+
+
+def square(x, folder=None):
+    """x², and a mark in a folder that it was measured."""
+    if x < 0:
+        raise ValueError(f"x is {x}; it must be 0 or more")
+    if folder:
+        with open(os.path.join(folder, f"{x}-{time.time_ns()}"), "w"):
+            pass
+    return {"square": x * x, "threads": os.environ.get("OMP_NUM_THREADS"), "process": os.getpid()}
+
+
+def squares(count, folder=None):
+    return [task(square, x=x, folder=str(folder) if folder else None) for x in range(count)]
+
+
+@pytest.mark.parametrize("threads", [False, True])
+def test_every_task_once(threads, tmp_path):
+    said = []
+    tasks = squares(5, tmp_path)
+    executor = ThreadPoolExecutor(2) if threads else None
+    before = dict(os.environ)
+    found = list(sweep([*tasks, tasks[2]], executor, progress=lambda *state: said.append(state)))
+    assert sorted(result["square"] for _, result in found) == [0, 1, 4, 9, 16]
+    assert all(result["square"] == each.arguments["x"] ** 2 for each, result in found)
+    assert len(list(tmp_path.iterdir())) == 5 and dict(os.environ) == before
+    if not threads:
+        assert {result["threads"] for _, result in found} == {"1"}
+        assert os.getpid() not in {result["process"] for _, result in found}
+    assert said[0][0] == 1 and said[-1][:2] == (6, 6) and said[-1][2] == 0.0
+    assert [done for done, _, _ in said] == [1, 2, 3, 4, 5, 6]
+
+
+def test_what_is_finished_is_not_measured_again(tmp_path):
+    """After an error amid the tasks, and after a crash amid a line."""
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    path = tmp_path / "results" / "store.jsonl"
+    tasks = squares(3, marks)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(ValueError, match="x is -1"):
+        list(sweep([*tasks, task(square, x=-1)], executor, Store(path)))
+    with path.open("a") as file:
+        file.write('{"key": "half')
+    store = Store(path)
+    assert len(store) == 3 and tasks[1] in store
+    found = dict_of(sweep(squares(4, marks), ThreadPoolExecutor(1), store))
+    assert found == {0: 0, 1: 1, 2: 4, 3: 9} and len(list(marks.iterdir())) == 4
+    assert [json.loads(line)["result"]["square"] for line in path.read_text().splitlines()] == [0, 1, 4, 9]
+
+
+def dict_of(results):
+    return {each.arguments["x"]: result["square"] for each, result in results}
+
+
+def test_an_interruption_keeps_what_is_finished(tmp_path):
+    store = Store(tmp_path / "store.jsonl")
+    with ThreadPoolExecutor(1) as executor:
+        for done, _ in enumerate(sweep(squares(4), executor, store), 1):
+            if done == 2:
+                break
+    assert len(Store(tmp_path / "store.jsonl")) == 2
+
+
+def test_a_file_that_is_no_store_is_refused(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("a\nb\n")
+    with pytest.raises(ValueError, match=r"notes.txt, line 1: is no result"):
+        Store(path)
+    assert path.read_text() == "a\nb\n"
+    with pytest.raises(ValueError, match="is no file"):
+        Store(tmp_path)
+
+
+def test_keys_are_of_what_is_measured_and_of_the_code(monkeypatch):
+    one = task(square, x=1)
+    assert one.key == Task(one.function, dict(one.arguments)).key
+    assert one.key != replace(one, arguments={"x": 2}).key
+    before = one.key
+    monkeypatch.setattr("warpcloth.chart.tasks.source_digest", lambda: "another")
+    assert one.key != before and len(source_digest()) == 16
+
+
+def test_scenes_and_setups_as_data():
+    scene = SceneRef("hanging", {"n": 4}).load()
+    assert len(scene.mesh.points) == 16 and str(SceneRef("hanging", {"n": 4})) == "hanging(n=4)"
+    assert Setup("xpbd", {"substeps": 8}).record() == wc.XPBD(substeps=8) and str(Setup("pbd", {"dt": 0.1})) == "pbd dt=0.1"
+    for wrong, words in (
+        (lambda: SceneRef("hanging", {"m": 4}).load(), "no parameter 'm', only n,"),
+        (lambda: SceneRef("hanged").load(), "no scene 'hanged'"),
+        (lambda: Setup("newtons").record(), "solver is 'newtons'; it must be one of"),
+        (lambda: Setup("newton", {"steps": 1}).record(), "steps"),
+        (lambda: Setup("newton", {"substeps": 0}).record(), "substeps"),
+    ):
+        with pytest.raises((ValueError, FileNotFoundError), match=words):
+            wrong()
+
+
+def test_the_machine_is_named(monkeypatch, tmp_path):
+    facts = machine()
+    assert facts["numpy"] == np.__version__ and facts["cores"] >= 1 and facts["device"] == "cpu" and facts["processor"]
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path

@@ -1,0 +1,51 @@
+"""What a measurement ran on, for those who read it later."""
+
+import os
+import platform
+from pathlib import Path
+
+
+def machine(device="cpu"):
+    """Names of processor and device, numbers of cores, and versions, by name.
+
+    Args:
+        device: A Warp device.
+    """
+    import numpy
+    import scipy
+    import warp as wp
+
+    from .tasks import source_digest
+
+    found = wp.get_device(device)
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "device": found.name if found.is_cuda else "cpu",
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "numpy": numpy.__version__,
+        "scipy": scipy.__version__,
+        "warp": wp.__version__,
+        "warpcloth": _version(),
+        "source": source_digest(),
+    }
+
+
+def _processor():
+    """The name on the package; Linux alone says it in a file."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _version():
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("warpcloth")
+    except PackageNotFoundError:
+        return "checkout"

@@ -1,0 +1,134 @@
+"""Runs measurements side by side, keeps what is finished, and goes on from there."""
+
+import contextlib
+import json
+import multiprocessing
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from .tasks import run
+
+# One thread a process: more would take the cores of the others, and Warp's CPU kernels use one as it is.
+_ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
+
+
+class Store:
+    """Results by key in a file, a line of JSON each; a line is whole or, after a crash, the last and left out.
+
+    Args:
+        path: The file, made with its folder where there is none; None keeps results in memory.
+
+    Raises:
+        ValueError: The path is no such file.
+    """
+
+    def __init__(self, path=None):
+        self.path, self._results = None if path is None else Path(path), {}
+        if self.path is None:
+            return
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if not self.path.exists():
+            return
+        if not self.path.is_file():
+            raise ValueError(f"{self.path}: is no file; it must be one of results, or free")
+        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
+        for number, line in enumerate(lines):
+            try:
+                entry = json.loads(line)
+                self._results[entry["key"]] = entry["result"]
+            except (ValueError, TypeError, KeyError):
+                if number < len(lines) - 1:
+                    raise ValueError(f"{self.path}, line {number + 1}: is no result; remove the file or give another") from None
+                # Written by a process that ended amid it.
+                whole = "".join(lines[:-1])
+                self.path.write_text(whole, encoding="utf-8")
+
+    def __contains__(self, task):
+        return task.key in self._results
+
+    def __getitem__(self, task):
+        return self._results[task.key]
+
+    def __len__(self):
+        return len(self._results)
+
+    def keep(self, task, result):
+        """Adds a result, on the disk before this returns."""
+        self._results[task.key] = result
+        if self.path is None:
+            return
+        line = json.dumps({"key": task.key, "function": task.function, "arguments": task.arguments, "result": result})
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def sweep(tasks, executor=None, store=None, progress=None, workers=None):
+    """Measures all tasks that the store does not have, and gives (task, result) as they are finished.
+
+    Args:
+        tasks: :class:`warpcloth.chart.tasks.Task`\\s.
+        executor: Any `concurrent.futures.Executor`, such as that of a Dask client; without one, processes of this machine. As
+            with all of Python's, a script that starts them needs ``if __name__ == "__main__":``.
+        store: A :class:`Store`; without one nothing is kept.
+        progress: Function called with (finished, tasks, seconds left or None) at first and after each; or None.
+        workers: Processes side by side, where there is no executor: as many as cores. Times are of a machine that is as busy.
+
+    Raises:
+        Exception: What a task raises; those that are finished are kept, those that have not begun are dropped.
+    """
+    tasks = list(tasks)
+    store = Store() if store is None else store
+    known = [task for task in tasks if task in store]
+    left = list({task.key: task for task in tasks if task not in store}.values())
+    finished, started = len(tasks) - len(left), time.perf_counter()
+    say = progress or (lambda *_: None)
+    say(finished, len(tasks), None)
+    for task in known:
+        yield task, store[task]
+    if not left:
+        return
+    with contextlib.ExitStack() as stack:
+        if executor is None:
+            executor = stack.enter_context(_processes(min(workers or os.cpu_count() or 1, len(left))))
+        futures = {executor.submit(run, task): task for task in left}
+        try:
+            for done, future in enumerate(as_completed(futures), 1):
+                task = futures[future]
+                result = future.result()
+                store.keep(task, result)
+                seconds = (time.perf_counter() - started) / done * (len(left) - done)
+                say(finished + done, len(tasks), seconds)
+                yield task, result
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+@contextlib.contextmanager
+def _processes(workers):
+    """Fresh processes, each with one thread for arithmetic; they read these settings when they start."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(_ONE_THREAD)
+    try:
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            try:
+                yield pool
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def cache_folder():
+    """Where results and reference solutions are kept: ``WARPCLOTH_CACHE``, else warpcloth in the user's folder for caches."""
+    named = os.environ.get("WARPCLOTH_CACHE")
+    return Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpcloth"

@@ -1,0 +1,121 @@
+"""Measurements as data: a scene, a solver with options, and a function that measures; each with a key by which it is kept."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+
+from .. import scene_files
+from ..solvers import SOLVERS
+
+
+@dataclass(frozen=True)
+class SceneRef:
+    """A scene by its name, so that another process can make it.
+
+    Attributes:
+        name: A known name, a .py file or a USD stage.
+        parameters: Of its function, by name.
+    """
+
+    name: str
+    parameters: dict = field(default_factory=dict)
+
+    def load(self):
+        """The :class:`warpcloth.Scene`.
+
+        Raises:
+            FileNotFoundError: There is no such scene.
+            ValueError: It takes no such parameter.
+        """
+        source = scene_files.find_source(self.name)
+        values = source.values({})
+        for name in self.parameters:
+            if name not in source.parameters:
+                raise ValueError(f"{source.path} has no parameter {name!r}, only {', '.join(source.parameters) or 'none'}")
+        return source.scene(values | self.parameters)
+
+    def __str__(self):
+        shown = ", ".join(f"{name}={value}" for name, value in self.parameters.items())
+        return f"{self.name}({shown})" if shown else self.name
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A solver with options, as data.
+
+    Attributes:
+        solver: Its name on the command line, such as "projective-dynamics".
+        options: Of its record, by name; what is not given has its default.
+    """
+
+    solver: str
+    options: dict = field(default_factory=dict)
+
+    def record(self):
+        """The options record, such as ``wc.Newton(substeps=4)``.
+
+        Raises:
+            ValueError: There is no such solver, or an option breaks a rule.
+        """
+        if self.solver not in SOLVERS:
+            raise ValueError(f"solver is {self.solver!r}; it must be one of {', '.join(SOLVERS)}")
+        try:
+            return SOLVERS[self.solver](**self.options)
+        except TypeError as error:
+            raise ValueError(f"{self.solver}: {error}") from None
+
+    def __str__(self):
+        return " ".join([self.solver, *(f"{name}={value}" for name, value in self.options.items())])
+
+
+@dataclass(frozen=True)
+class Task:
+    """One measurement: a function of JSON values that returns JSON values.
+
+    Attributes:
+        function: Module and name, "package.module:function".
+        arguments: Its arguments by name: numbers, texts, lists and dictionaries of such.
+    """
+
+    function: str
+    arguments: dict
+
+    @property
+    def key(self):
+        """A hash of what is measured and of the code that measures it."""
+        text = json.dumps([self.function, self.arguments, source_digest()], sort_keys=True, allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+    def run(self):
+        """Measures, in this process."""
+        module, name = self.function.split(":")
+        return getattr(import_module(module), name)(**self.arguments)
+
+
+def task(function, **arguments):
+    """The :class:`Task` of a function of a module; records such as :class:`SceneRef` become dictionaries.
+
+    Args:
+        function: A function at the top of a module, which another process can import.
+        arguments: Its arguments.
+    """
+    plain = {name: asdict(value) if hasattr(value, "__dataclass_fields__") else value for name, value in arguments.items()}
+    return Task(f"{function.__module__}:{function.__qualname__}", plain)
+
+
+def run(task):
+    """What an executor calls."""
+    return task.run()
+
+
+@cache
+def source_digest():
+    """A hash of the code of this package: what another version measured is measured again."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    files = [path for path in root.rglob("*.py") if path.is_file()]
+    for path in sorted(files, key=lambda path: path.relative_to(root).as_posix()):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
