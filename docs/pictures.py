@@ -14,6 +14,7 @@ from matplotlib.colors import ListedColormap, Normalize
 import warpcloth as wc
 from warpcloth.chart.picture import paint
 from warpcloth.chart.view import View, brightness
+from warpcloth.reports import write_report
 from warpcloth.scenes import bar_twist, bunny, cantilever, hanging, mobile
 
 DOCS = Path(__file__).parent
@@ -150,7 +151,17 @@ def picture_mobile(moments=(0.0, 1.0, 2.0, 3.0)):
     save(figure, "mobile.png")
 
 
+def picture_analysis(n=32, frame=20):
+    """A frame of the hanging cloth with its first principal stretch and both directions, as `analyze` makes it."""
+    scene = hanging.scene(n=n)
+    animation = wc.simulate(scene, wc.Newton(dt=1 / 240), frames=frame)
+    assert animation.status.ok, animation.status
+    analyzer = wc.Analyzer(scene.mesh, animation, measures=("stretch", "directions"))
+    write_report(analyzer, stills={frame: DOCS / "analysis.png"}, curves=True)
+
+
 if __name__ == "__main__":
+    picture_analysis()
     picture_hanging()
     picture_mobile()
     picture_deformation()
