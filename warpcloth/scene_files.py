@@ -12,6 +12,7 @@ import typing
 from dataclasses import dataclass
 from pathlib import Path
 
+from .checks import number
 from .scene import Scene
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
@@ -237,6 +238,13 @@ def convert(name, text, kinds):
         except (KeyError, ValueError, ZeroDivisionError, OverflowError):
             continue
     raise ValueError(f"{name} is {text!r}; it must be {' or '.join(_WORDS[kind] for kind in known)}")
+
+
+def share(name, text):
+    """A share of the whole, written as 1% or 0.01."""
+    value = convert(name, text.removesuffix("%"), (float,)) / (100.0 if text.endswith("%") else 1.0)
+    number(name, value, above=0.0)
+    return value
 
 
 def _truth(text):

@@ -97,6 +97,9 @@ def _parser():
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
         sub.add_argument("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
         sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    info.add_argument("--advise", action="store_true", help="say which terms, precision and resolution matter, by trying")
+    info.add_argument("--tolerance", metavar="SHARE", help="of --advise: a change that does not matter, 1%% where not given")
+    info.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try, 30 where not given")
     runs.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not the scene's")
     for sub in (runs, info, deforms, analyzes, compares):
         sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")

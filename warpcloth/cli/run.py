@@ -28,7 +28,7 @@ def run(arguments):
     frames = scene.frames if arguments.frames is None else arguments.frames
     check_writable(arguments.output)
     device = find_device(arguments.device)
-    setup = _setup(arguments, scene, device)
+    setup = solver_setup(arguments, scene, device)
     progress = Progress(frames, _hint(arguments, setup, scene))
     try:
         animation = simulate(
@@ -86,9 +86,16 @@ def _summary(facts):
 
 
 def info(arguments):
-    _source, values, scene = named_scene(arguments)
+    source, values, scene = named_scene(arguments)
     device = find_device(arguments.device)
-    setup = _setup(arguments, scene, device, limits=True) if arguments.solver or arguments.s else _Setup()
+    if arguments.advise:
+        from .advise import advise_on
+
+        return advise_on(arguments, source, values, scene, device)
+    for name in ("tolerance", "frames"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(f"--{name} is given without --advise, which it is for")
+    setup = solver_setup(arguments, scene, device, limits=True) if arguments.solver or arguments.s else _Setup()
     model = setup.model or scene.build(device=device, dtype=arguments.dtype)
     facts = {
         "scene": {
@@ -189,7 +196,7 @@ class _Built:
         return self._model
 
 
-def _setup(arguments, scene, device, limits=False):
+def solver_setup(arguments, scene, device, limits=False):
     """The solver that the arguments name; ``limits`` asks for those of explicit even where its step is given."""
     from ..solvers import SOLVERS
 

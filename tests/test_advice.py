@@ -1,0 +1,100 @@
+"""What matters in a scene, where it is known beforehand."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.advice import advise
+from warpcloth.cli import main
+from warpcloth.scenes import hanging
+
+NEWTON = wc.Newton(substeps=8, integrator="bdf2")
+
+
+def by_name(found):
+    return {trial.name: trial for trial in found.trials}
+
+
+def test_terms_that_do_nothing_do_not_matter_and_others_do():
+    """Bending of 1e-9 N·m is next to none, an attachment to where a pin stands does nothing, springs hold the cloth."""
+    scene = hanging.scene(n=6, bending=1e-9)
+    scene = replace(scene, terms=[*scene.terms, wc.Attachment(vertices=[0], stiffness=10.0)])
+    found = advise(scene, NEWTON, frames=10)
+    trials = by_name(found)
+    assert trials["without Attachment"].change == 0.0 and trials["without Attachment"].matters is False
+    assert 0.0 < trials["without QuadraticBending"].change < 1e-4 and trials["without QuadraticBending"].matters is False
+    assert trials["without Spring"].matters and trials["without Spring"].change > 0.01
+    assert trials["float64"].matters is False and trials["substeps=16"].matters is False
+    leave_out = [sentence for sentence in found.sentences if "leave it out" in sentence]
+    assert len(leave_out) == 2 and not any("Spring " in sentence for sentence in leave_out)
+
+
+def test_the_change_is_the_distance_of_two_runs():
+    scene = hanging.scene(n=5, bending=1e-2)
+    found = by_name(advise(scene, NEWTON, tolerance=1e-4, frames=6))["without QuadraticBending"]
+    runs = [wc.simulate(each, NEWTON, frames=6).points for each in (scene, replace(scene, terms=scene.terms[:1]))]
+    distance = np.linalg.norm(runs[1].astype(float) - runs[0], axis=2)
+    assert found.change == pytest.approx(np.sqrt((distance**2).mean()), rel=1e-6) and found.matters
+    assert not by_name(advise(scene, NEWTON, tolerance=1.01 * found.change, frames=6))["without QuadraticBending"].matters
+
+
+def test_a_step_that_is_too_large_is_said():
+    found = advise(hanging.scene(n=6), wc.Newton(substeps=1), tolerance=1e-3, frames=20)
+    assert by_name(found)["substeps=2"].matters and "take a smaller one" in found.sentences[0]
+
+
+def test_resolutions_are_compared_by_their_surfaces():
+    """A finer sheet that moves as the coarse one does changes nothing; one in another place by how far it is."""
+
+    def sheet(n, height):
+        mesh, springs = wc.Mesh.grid(n, n), [wc.Spring(stiffness=100.0)]
+        positions = mesh.points + np.array([0.0, height, 0.0])
+        return wc.Scene(mesh, density=0.1, terms=springs, positions=positions, gravity=(0, 0, 0), duration=0.1)
+
+    flat, fine, away = sheet(5, 0.0), sheet(9, 0.0), sheet(9, 0.25)
+    found = by_name(advise(flat, NEWTON, frames=3, resolutions={"fine": fine, "away": away}))
+    assert found["fine"].change < 1e-6 and found["away"].change == pytest.approx(0.25, rel=1e-6)
+
+    def chain(n):
+        return wc.Scene(wc.Mesh.chain(n), density=0.1, terms=[wc.Spring(stiffness=100.0)], pins=[0], duration=0.1)
+
+    found = by_name(advise(chain(4), NEWTON, frames=3, resolutions={"longer": chain(8)}))
+    assert found["longer"].matters is None and "edges alone" in found["longer"].reason
+
+
+def test_what_cannot_run_is_said_and_not_called_needless():
+    """Without the spring the other scene has nothing that Newton takes; diverging without a term is to matter."""
+    scene = hanging.scene(n=5, stiffness=1e6)
+    found = by_name(advise(scene, wc.Explicit(substeps=400, above_limit="allow"), frames=3))
+    assert found["substeps=800"].matters is not None
+    with pytest.raises(ValueError, match="advice needs a run that does not diverge"):
+        advise(scene, wc.Explicit(substeps=4, above_limit="allow"), frames=3)
+
+
+def test_the_command(capsys):
+    command = ["info", "hanging", "-p", "n=6", "--solver", "newton", "-s", "substeps=4", "--advise"]
+    assert main([*command, "--frames", "5", "--tolerance", "1%"]) == 0
+    said = capsys.readouterr().out
+    assert "without QuadraticBending" in said and "n=12" in said and "advice:" in said
+    assert main([*command, "--frames", "2", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert [trial["kind"] for trial in facts["trials"]] == ["term", "term", "precision", "step", "resolution", "resolution"]
+    assert facts["tolerance"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--tolerance 1%", "--tolerance is given without --advise"),
+        ("--frames 3", "--frames is given without --advise"),
+        ("--advise --tolerance much", "tolerance"),
+        ("--advise --tolerance 0%", "tolerance is 0.0; it must be a number above 0"),
+        ("--advise --frames 0", "frames is 0"),
+    ],
+)
+def test_wrong_use(words, said, capsys):
+    assert main(["info", "hanging", "-p", "n=4", *words.split()]) == 2
+    assert said in capsys.readouterr().err

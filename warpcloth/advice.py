@@ -1,0 +1,170 @@
+"""Which declarations of a scene matter: each is left out or changed in turn, and the result and its cost are compared."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .checks import number, whole
+from .distances import surface_distances
+from .simulate import simulate
+
+# A cost that the whole scene itself changed by so much between its first and its last run says nothing.
+_STEADY = 0.25
+_FRAMES = 7  # at which surfaces of other resolutions are compared
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A run of the scene with one thing changed, against the scene as it is.
+
+    Attributes:
+        kind: "term", "precision", "step" or "resolution".
+        name: What was changed, such as "without QuadraticBending" or "n=64".
+        change: RMS distance of the results over vertices and frames, over the longest side of the cloth; of another resolution
+            between the surfaces, both ways. NaN where there is no result.
+        cost: Time of a frame over that of the scene as it is.
+        matters: Whether the change is above the tolerance; None where there is no result.
+        reason: Why there is none, or "".
+    """
+
+    kind: str
+    name: str
+    change: float
+    cost: float
+    matters: bool | None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What :func:`advise` found.
+
+    Attributes:
+        trials: List of :class:`Trial`.
+        frames: Frames that were run.
+        milliseconds: Median of a frame of the scene as it is, of its first and of its last run [ms].
+        tolerance: Below which a change does not matter.
+    """
+
+    trials: list
+    frames: int
+    milliseconds: tuple[float, float]
+    tolerance: float
+
+    @property
+    def steady(self):
+        """Whether both runs of the scene as it is took about as long, so that costs can be compared."""
+        first, last = self.milliseconds
+        return abs(first - last) <= _STEADY * max(first, last)
+
+    @property
+    def sentences(self):
+        """What follows, in words."""
+        found = []
+        step = next(trial for trial in self.trials if trial.kind == "step")
+        if step.matters is not False:
+            found.append(
+                f"half the step changes the result by {step.change:.2%}, so that what changes it by less is not told from the "
+                "step; take a smaller one"
+                if step.matters
+                else f"half the step: {step.reason}"
+            )
+        for trial in self.trials:
+            if trial.kind == "term" and trial.matters is False:
+                saved = f", and a frame takes {trial.cost:.2f} times as long" if self.steady else ""
+                found.append(f"{trial.name} changes the result by {trial.change:.2%} alone{saved}: leave it out")
+            elif trial.kind == "precision" and trial.matters is False:
+                found.append(f"float32 is enough: float64 changes the result by {trial.change:.2%} alone")
+            elif trial.kind == "precision" and trial.matters:
+                found.append(f"float64 changes the result by {trial.change:.2%}: take it")
+        finer = [trial for trial in self.trials if trial.kind == "resolution" and trial.cost > 1.0]
+        coarser = [trial for trial in self.trials if trial.kind == "resolution" and trial.cost <= 1.0]
+        found += [f"{trial.name} changes the result by {trial.change:.2%}: too coarse" for trial in finer if trial.matters]
+        enough = [trial for trial in coarser if trial.matters is False]
+        found += [f"{trial.name} is enough: it changes the result by {trial.change:.2%} alone" for trial in enough]
+        return found
+
+
+def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device="cpu", dtype="float32", progress=None):
+    """Leaves out each term of a scene in turn, and changes precision, step and resolution, over a short run.
+
+    Args:
+        scene: The :class:`warpcloth.Scene`.
+        solver: Its options, with `substeps`.
+        tolerance: Change of the result below which something does not matter, a share of the longest side of the cloth.
+        frames: Frames to run; those of the scene, but no more than 30, if not given.
+        resolutions: The same scene with coarser or finer meshes by name, such as {"n=16": scene}; or None.
+        device: A Warp device.
+        dtype: "float32" or "float64"; the other one is tried.
+        progress: Function called with (trials done, trials) after each; or None.
+
+    Returns:
+        :class:`Advice`.
+
+    Raises:
+        ValueError: An option breaks a rule, or the scene as it is diverges.
+    """
+    number("tolerance", tolerance, above=0.0)
+    frames = min(scene.frames, 30) if frames is None else frames
+    whole("frames", frames, least=1)
+
+    def run(changed, solver=solver, dtype=dtype):
+        found = simulate(changed, solver, device=device, dtype=dtype, frames=frames)
+        return found, 1e3 * float(np.median(found.timings["frames"]))
+
+    base, first = run(scene)
+    if not base.status.ok:
+        raise ValueError(f"{scene.name} as it is: {base.status.message}; advice needs a run that does not diverge")
+    size = float(np.ptp(scene.mesh.points, axis=0).max())
+    other = "float64" if dtype == "float32" else "float32"
+    halved = replace(solver, dt=None, substeps=2 * solver.per_frame(scene.fps))
+    plans = [
+        *(
+            ("term", f"without {term.label}", {"changed": _without(scene, term)})
+            for term in scene.terms
+            if len(scene.terms) > 1
+        ),
+        ("precision", other, {"changed": scene, "dtype": other}),
+        ("step", f"substeps={halved.substeps}", {"changed": scene, "solver": halved}),
+        *(("resolution", name, {"changed": changed}) for name, changed in (resolutions or {}).items()),
+    ]
+    trials = []
+    for kind, name, options in plans:
+        trials.append(_trial(kind, name, options, run, base, first, scene, size, tolerance, device))
+        if progress is not None:
+            progress(len(trials), len(plans))
+    return Advice(trials, frames, (first, run(scene)[1]), tolerance)
+
+
+def _without(scene, term):
+    return replace(scene, terms=[other for other in scene.terms if other is not term])
+
+
+def _trial(kind, name, options, run, base, first, scene, size, tolerance, device):
+    try:
+        found, milliseconds = run(**options)
+    except ValueError as error:
+        return Trial(kind, name, np.nan, np.nan, None, str(error))
+    cost = milliseconds / first
+    if not found.status.ok:
+        # Of a term that holds the cloth together: it matters, by more than can be said.
+        return Trial(kind, name, np.inf, cost, True, found.status.message)
+    if kind == "resolution":
+        if not (len(scene.mesh.triangles) and len(options["changed"].mesh.triangles)):
+            return Trial(kind, name, np.nan, cost, None, "the mesh has edges alone, and no surface to compare")
+        change = _surface_change(base, scene, found, options["changed"], device)
+    else:
+        between = np.asarray(found.points, dtype=np.float64) - np.asarray(base.points, dtype=np.float64)
+        change = float(np.sqrt((between**2).sum(axis=2).mean()))
+    return Trial(kind, name, change / size, cost, bool(change / size > tolerance))
+
+
+def _surface_change(one, first, other, second, device):
+    """RMS distance between two surfaces, from the vertices of each, over some of the frames [m]."""
+    frames = np.unique(np.linspace(0, len(one.points) - 1, _FRAMES).round().astype(int))
+    squares = []
+    for frame in frames.tolist():
+        a, b = (np.asarray(found.points[frame], dtype=np.float64) for found in (one, other))
+        for points, x, mesh in ((a, b, second.mesh), (b, a, first.mesh)):
+            squares.append((surface_distances(points, x, mesh.triangles, device) ** 2).mean())
+    return float(np.sqrt(np.mean(squares)))
