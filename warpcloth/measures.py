@@ -101,7 +101,11 @@ def chosen(names, on, given=("directions", "material", "rate")):
     known = MEASURES[on]
     if isinstance(names, str):
         names = (names,)
-    if tuple(names) == ("all",):
+    try:
+        names = tuple(names)
+    except TypeError:
+        raise ValueError(f"measures = {shown(names)}: must be one or more of {', '.join(known)}, or all") from None
+    if names == ("all",):
         return [m for m in known.values() if (not m.needs or m.needs in given) and (not m.rate or "rate" in given)]
     for name in names:
         if not isinstance(name, str) or name not in known:

@@ -54,12 +54,13 @@ def pairs_of(labels, reference=None, pairs=None, lag=None, every=1):
         return _lagged(labels, kept, lag)
     reference = "rest" if reference is None else reference
     before = [None, *kept[:-1].tolist()]
-    if reference == "previous":
+    named = isinstance(reference, str)
+    if named and reference == "previous":
         found = [Pair(start, int(frame), start) for start, frame in zip(before[1:], kept[1:], strict=True)]
         if not found:
             raise ValueError(f'reference = "previous": the sequence has {len(kept)} frame, must have two or more')
         return found, []
-    if reference in ("rest", "first"):
+    if named and reference in ("rest", "first"):
         start = None if reference == "rest" else 0
     else:
         start = _place(
@@ -74,7 +75,7 @@ def _listed(pairs):
         found = [part.split(":") for part in re.split(r"[,\s]+", pairs.strip())]
     else:
         try:
-            found = [tuple(pair) for pair in pairs]
+            found = [() if isinstance(pair, (str, bytes)) else tuple(pair) for pair in pairs]
         except TypeError:
             raise ValueError(f"pairs = {shown(pairs)}: {rule}") from None
     if not found or any(len(pair) != 2 for pair in found):
@@ -92,7 +93,7 @@ def _pair(labels, pair):
 
 def _place(labels, value, where, rule):
     try:
-        number = float(value)
+        number = float(None if isinstance(value, (bool, np.bool_)) else value)
     except (TypeError, ValueError):
         raise ValueError(f"{where}: must be {rule}") from None
     found = np.flatnonzero(np.isclose(labels, number, rtol=0.0, atol=1e-6))
@@ -106,9 +107,9 @@ def _place(labels, value, where, rule):
 def _lagged(labels, kept, lag):
     if len(labels) < 2:
         raise ValueError(f"lag = {lag}: the sequence has one frame, must have two or more")
-    later = lag * np.diff(labels).min()
+    later = lag * np.diff(labels).min().item()
     found, left_out = [], []
-    for start in kept.tolist():
+    for start in kept.tolist() if later <= labels[-1] - labels[0] + 1e-6 else ():
         target = labels[start] + later
         places = np.flatnonzero(np.isclose(labels, target, rtol=0.0, atol=1e-6))
         if len(places):
