@@ -103,6 +103,31 @@ def test_triangles_without_area_in_the_reference(device, reference):
     assert [str(e) for e in found.excluded if "has no area" in str(e)] == [f"{where}, triangle 7: has no area"]
 
 
+@pytest.mark.parametrize("options", [{"lag": 1}, {"reference": "previous"}, {"pairs": "0:1,0:2,2:3"}])
+def test_a_reference_that_was_measured_before_is_named_too(device, options):
+    mesh = sheet()
+    frames = strained(mesh)
+    a, b, c = mesh.triangles[7]
+    frames[2, c] = 0.25 * frames[2, a] + 0.75 * frames[2, b]
+    found = wc.analyze(mesh, frames, device=device, **options)
+    row = found.pairs.index((2, 3))
+    assert lost(found["stretch"])[row, 7]
+    assert named(found, 2, "triangle") == set(np.flatnonzero(lost(found["stretch"])[row]).tolist())
+
+
+@pytest.mark.parametrize("rates", ["forward", "logarithm"])
+def test_rates_from_nothing_are_not_infinite(device, rates):
+    """A triangle that opens from a point has no λ̇/λ."""
+    mesh = sheet()
+    frames = strained(mesh)
+    frames[1, mesh.triangles[7]] = frames[1, mesh.triangles[7, 0]]
+    options = {"measures": ("stretch_rate", "length_rate"), "directions": (1, 0, 0.3), "rates": rates}
+    found = wc.analyze(mesh, frames, DT, device=device, **options)
+    for values in found.values():
+        assert not np.isinf(values).any() and lost(values)[2, 7]
+        assert set(np.flatnonzero(lost(values)[2]).tolist()) <= named(found, 2, "triangle")
+
+
 def test_a_triangle_crushed_to_a_line_keeps_what_has_a_meaning(device):
     """F, its stretches and area are exact; normals, and what needs them, are undefined there and named."""
     mesh = sheet()
@@ -237,7 +262,9 @@ OPTIONS = [
     ({"measures": "energy_density"}, "'energy_density' needs material="),
     ({"measures": "length_rate"}, "'length_rate' needs directions="),
     ({"measures": "all", "material": wc.Spring(stiffness=1.0)}, "must be a membrane"),
+    ({"measures": 3}, "measures = 3: must be one or more of"),
     ({"directions": "uv"}, 'must be "st" or a vector'),
+    ({"directions": "abc".split()}, 'it must be "st" or a vector'),
     ({"directions": "st"}, "the mesh has no texture coordinates"),
     ({"directions": (0, 0, 0)}, "vector 0"),
     ({"directions": (1, 0)}, "directions has shape"),
@@ -247,6 +274,8 @@ OPTIONS = [
     ({"dtype": "float16"}, "dtype is 'float16'"),
     ({"neighbourhood": "4-ring"}, "neighbourhood = '4-ring'"),
     ({"reference": 77}, "no frame 77"),
+    ({"measures": "spin", "dt": 1e-320}, "dt: 9.99989e-321 s to frame 1, must be from"),
+    ({"measures": "spin", "dt": 1e300, "dtype": "float32"}, "of which float32 has the reciprocal"),
 ]
 
 
@@ -254,7 +283,38 @@ OPTIONS = [
 def test_refused(options, words):
     mesh = sheet()
     with pytest.raises(ValueError, match=words):
-        wc.analyze(mesh, strained(mesh), DT, **options)
+        wc.analyze(mesh, strained(mesh), **({"dt": DT} | options))
+
+
+def test_measures_may_come_from_a_generator():
+    mesh = sheet()
+    assert list(wc.analyze(mesh, strained(mesh), measures=(name for name in ("stretch", "rotation")))) == [
+        "stretch",
+        "rotation",
+    ]
+
+
+def test_a_sequence_has_its_own_times():
+    mesh = sheet()
+    with pytest.raises(ValueError, match="dt: is for arrays and files"):
+        wc.analyze(mesh, as_sequence(mesh, strained(mesh)), dt=DT, measures="spin")
+
+
+def test_iterations_do_not_disturb_one_another():
+    mesh = sheet()
+    analyzer = wc.Analyzer(mesh, strained(mesh), pairs="0:1,0:2,3:1")
+    expected = [sample.values["stretch"].copy() for sample in analyzer]
+    rows = iter(analyzer)
+    for stretch in expected:
+        assert np.array_equal(next(rows).values["stretch"], stretch)
+        assert len(list(analyzer)) == 3
+
+
+def test_points_of_a_sample_are_those_of_the_next_rates():
+    mesh = sheet()
+    for sample in wc.Analyzer(mesh, strained(mesh), DT, measures="spin"):
+        with pytest.raises(ValueError, match="read-only"):
+            sample.points[:] = 0.0
 
 
 def test_rates_need_times():

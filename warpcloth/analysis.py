@@ -53,8 +53,8 @@ class Sample:
         frame: Number of the frame.
         place: Place of the frame in its sequence.
         time: Of the frame [s]; NaN where the sequence has no times.
-        points: (n, 3) [m].
-        values: Arrays (E, *shape) by name of measure, NaN in what is excluded; the next sample overwrites them.
+        points: (n, 3) [m], read-only.
+        values: Arrays (E, *shape) by name of measure, NaN in what is excluded; the analyzer's next sample overwrites them.
         excluded: List of :class:`Exclusion` that this row is the first to meet.
     """
 
@@ -205,6 +205,7 @@ class Analyzer:
         self.measures = self._chosen(measures, directions, material)
         self.pairs, self._left_out = pairs_of(self.sequence.labels, reference, pairs, lag, every)
         self.rates, self.dtype = rates, DTYPES[dtype][1]
+        self._check_times()
         if self.on == "triangle":
             if material is not None:
                 check_material(material)
@@ -217,6 +218,7 @@ class Analyzer:
                     raise ValueError(f"{name}: is for measures of triangles, must be None with a neighbourhood")
             self._elements = Neighbourhoods(self.mesh, self.measures, neighbourhood, device, dtype)
         self.count = self._elements.count
+        self._reference = self._without = None  # what the elements refer to, and which have none in it
 
     def _chosen(self, names, directions, material):
         given = {"directions": directions is not None, "material": material is not None}
@@ -232,6 +234,16 @@ class Analyzer:
                 if need and not given[need]:
                     raise ValueError(f"measures: {measure.name!r} needs {advice[need]}")
         return found
+
+    def _check_times(self):
+        """Refuses times between frames of which a number of this precision has no reciprocal."""
+        if any(measure.rate for measure in self.measures):
+            times, least = self.sequence.times, np.finfo(self.dtype).tiny
+            rule = f"must be from {least:g} to {1.0 / least:g}, of which {np.dtype(self.dtype)} has the reciprocal"
+            for pair in self.pairs:
+                dt = 1.0 if pair.before is None else abs(times[pair.frame] - times[pair.before])
+                if not least <= dt <= 1.0 / least:
+                    raise ValueError(f"dt: {dt:g} s to frame {self._label(pair.frame):g}, {rule}")
 
     def of(self, *measures):
         """The same analysis of other measures."""
@@ -258,7 +270,7 @@ class Analyzer:
         excluded = _missing(sequence.missing)
         excluded += [_frame(label, reason) for label, reason in self._left_out]
         rates = ", ".join(measure.name for measure in self.measures if measure.rate)
-        held, seen, reference = {}, set(), _NONE
+        held, seen, referred = {}, set(), set()
         for row, pair in enumerate(self.pairs):
             places = {pair.reference, pair.frame} | ({pair.before} if pair.before is not None else set())
             held = {place: held[place] if place in held else self._read(place) for place in places}
@@ -266,13 +278,13 @@ class Analyzer:
                 vertices = np.flatnonzero(held[place].lost_vertices)
                 if len(vertices):
                     excluded.append(Exclusion(self._label(place), "vertex", vertices, "is not at a finite place"))
-            if pair.reference != reference:
-                reference = pair.reference
-                without = elements.refer(held[reference].points)
-                none = without & ~held[reference].lost
-                if none.any() and reference not in seen:
-                    excluded.append(Exclusion(self._label(reference), self.on, np.flatnonzero(none), elements.without))
+            without = self._refer(held[pair.reference])
+            if pair.reference not in referred:
+                none = np.flatnonzero(without & ~held[pair.reference].lost)
+                if len(none):
+                    excluded.append(Exclusion(self._label(pair.reference), self.on, none, elements.without))
             seen |= places
+            referred.add(pair.reference)
             elements.measure(held[pair.frame].points)
             if rates and pair.before is None:
                 excluded.append(_frame(labels[pair.frame], f"has none before it, and so no {rates}"))
@@ -292,8 +304,14 @@ class Analyzer:
                 excluded.append(Exclusion(labels[pair.frame], self.on, lost, reason))
             time = np.nan if times is None else times[pair.frame]
             points = held[pair.frame].points
-            yield Sample(row, self._label(reference), labels[pair.frame], pair.frame, time, points, values, excluded)
+            yield Sample(row, self._label(pair.reference), labels[pair.frame], pair.frame, time, points, values, excluded)
             excluded = []
+
+    def _refer(self, held):
+        """Makes the elements refer to a frame, where another iteration may have been since; returns which have none in it."""
+        if self._reference is not held:
+            self._without, self._reference = self._elements.refer(held.points), held
+        return self._without
 
     def _exclude(self, measure, pair, values, known, held):
         """Makes what could not be measured NaN in all its numbers; returns elements that are not ``known`` to be so."""
@@ -302,21 +320,19 @@ class Analyzer:
                 values[:] = np.nan
                 return ()
             known = known | held[pair.before].lost
-        lost = known | np.isnan(values.reshape(len(values), -1)).any(axis=1)
+        lost = known | ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
         values[lost] = np.nan
         return np.flatnonzero(lost & ~known)
 
     def _read(self, place):
-        points = self.mesh.points if place is None else np.asarray(self.sequence[place], dtype=np.float64)
+        points = self.mesh.points.view() if place is None else self.sequence[place]
+        points.flags.writeable = False  # samples share it with the frames that follow
         lost = ~np.isfinite(points).all(axis=1)
         largest = np.abs(points).max(initial=0.0, where=~lost[:, None])
         return _Held(points, largest, lost, self._elements.touched(lost) if lost.any() else np.zeros(self.count, dtype=bool))
 
     def _label(self, place):
         return None if place is None else self.sequence.labels[place]
-
-
-_NONE = object()
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,6 +363,8 @@ def _sequence(mesh, frames, dt):
         frames = open_sequence(frames, fps=None if dt is None else 1.0 / dt, mesh=mesh)
     elif not isinstance(frames, Sequence):
         return as_sequence(mesh, frames, dt)
+    elif dt is not None:
+        raise ValueError("dt: is for arrays and files, must be None with a sequence, which has times or was opened without")
     if mesh is not None and not same_topology(mesh, frames.mesh):
         raise ValueError(
             f"mesh: {len(mesh.points)} vertices and {len(mesh.triangles)} triangles, must be those of the frames, "

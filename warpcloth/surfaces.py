@@ -220,13 +220,13 @@ def material_directions(mesh, chosen, corner_coordinates=None):
     Raises:
         ValueError: It is none of these, or the mesh has no texture coordinates.
     """
-    rule = 'must be "st" or a vector (3,)'
+    rule = 'be "st" or a vector (3,)'
     X = mesh.points[mesh.triangles]
     edges = np.stack([X[:, 1] - X[:, 0], X[:, 2] - X[:, 0]], axis=2)
     with np.errstate(all="ignore"):
         if isinstance(chosen, str):
             if chosen != "st":
-                raise ValueError(f"directions = {shown(chosen)}: {rule}")
+                raise ValueError(f"directions = {shown(chosen)}: must {rule}")
             st = corner_coordinates
             if mesh.texture_coordinates is not None:
                 st = mesh.texture_coordinates[mesh.triangles]
