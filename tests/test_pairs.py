@@ -42,6 +42,10 @@ def test_a_lag_says_what_a_gap_takes():
     assert left_out == [(3, "has no frame 1 later, for 4 is missing")]
 
 
+def test_of_near_time_codes_the_nearest_counts():
+    assert pairs_of(np.array([0.0, 4e-7, 8e-7]), pairs=[(0, 8e-7)])[0] == [Pair(0, 2, 0)]
+
+
 def test_time_codes_may_be_apart():
     rows, _ = pairs_of(np.array([0.0, 2.5, 5.0, 7.5]), lag=2)
     assert rows == [Pair(0, 2, 0), Pair(1, 3, 1)]

@@ -96,12 +96,12 @@ def _place(labels, value, where, rule):
         number = float(None if isinstance(value, (bool, np.bool_)) else value)
     except (TypeError, ValueError):
         raise ValueError(f"{where}: must be {rule}") from None
-    found = np.flatnonzero(np.isclose(labels, number, rtol=0.0, atol=1e-6))
-    if not len(found):
+    apart = np.abs(labels - number)
+    if not apart.min() <= 1e-6:
         raise ValueError(
             f"{where}: there is no frame {number:g}, only {len(labels)} from {labels[0]:g} to {labels[-1]:g}; must be {rule}"
         )
-    return int(found[0])
+    return int(apart.argmin())
 
 
 def _lagged(labels, kept, lag):
