@@ -4,6 +4,7 @@ A gradient is F̂ (3×3) in the tangent frame T = [t₁, t₂, N] of its element
 deformation gradient F (3×2) of the surface, F̂ Tᵀ maps reference to current vectors. Of a triangle the third column is the unit
 normal n, so that F̂ has an inverse; of a neighbourhood it is the least-squares image of N. An element without a reference, as a
 triangle flatter than :data:`FLATTEST`, has a gradient of NaN; one without a current normal has NaN in the last column alone.
+No fourth power of a length is taken: of 1e10 m or 1e-12 m it is no number of float32.
 
 An output that is None is not computed.
 """
@@ -15,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from .assemble import types
-from .rotation import complement, epsilon, nearest_rotation, svd3, svd3x2
+from .rotation import complement, epsilon, nearest_rotation, scaled3, svd3, svd3x2
 
 # A float32 coordinate is rounded by 6e-8 of its size, so a triangle flatter than this has an area made of rounding.
 FLATTEST = 1e-7
@@ -55,6 +56,17 @@ def angle_of(R: Any):
 def angle_between(a: Any, b: Any):
     """Angle of two vectors [rad], 0 to π."""
     return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
+
+
+@wp.func
+def angle_of_threads(F: Any, A: Any):
+    """Angle between the columns of A = F a (3×2), NaN where one is made of rounding beside F."""
+    a = column(A, 0)
+    b = column(A, 1)
+    found = angle_between(a, b)
+    if not (wp.min(wp.length(a), wp.length(b)) > F.dtype(4.0) * epsilon(found) * wp.sqrt(wp.ddot(F, F))):
+        found = undefined(found)
+    return found
 
 
 @wp.func
@@ -124,7 +136,8 @@ def logarithm(A: Any):
 def frame_triangles(dtype):
     """Kernel over triangles: their frames T in the reference X, Dm⁻¹ = [[r₀, r₁], [0, r₂]] [1/m] and the shortest altitude [m].
 
-    Dm are the edges [X₁ − X₀, X₂ − X₀] in t₁, t₂, with t₁ along the first.
+    Dm are the edges [X₁ − X₀, X₂ − X₀] in t₁, t₂, with t₁ along the first. Of a triangle whose altitude may be made of what the
+    points are rounded by, ``rounding`` [m] each, all are NaN.
     """
     vec3, mat33 = types(dtype)
 
@@ -132,6 +145,8 @@ def frame_triangles(dtype):
     def set_frames(
         triangles: wp.array2d(dtype=wp.int32),
         X: wp.array(dtype=vec3),
+        # parameters
+        rounding: dtype,
         # out
         frames: wp.array(dtype=mat33),
         inverse_edges: wp.array(dtype=vec3),
@@ -141,17 +156,18 @@ def frame_triangles(dtype):
         a = X[triangles[t, 1]] - X[triangles[t, 0]]
         b = X[triangles[t, 2]] - X[triangles[t, 0]]
         c = b - a
-        normal = wp.cross(a, b)
-        doubled = wp.length(normal)
-        longest = wp.max(wp.max(wp.length_sq(a), wp.length_sq(b)), wp.length_sq(c))
-        if not (doubled > dtype(FLATTEST) * longest):
-            doubled = dtype(wp.NAN)
         length = wp.length(a)
+        longest = wp.max(wp.max(length, wp.length(b)), wp.length(c))
         first = (dtype(1.0) / length) * a
-        normal = (dtype(1.0) / doubled) * normal
+        normal = wp.cross(first, b)
+        altitude = wp.length(normal)
+        shortest = altitude * (length / longest)
+        if not (shortest > wp.max(dtype(FLATTEST) * longest, dtype(2.0) * rounding)):
+            length, altitude, shortest = dtype(wp.NAN), dtype(wp.NAN), dtype(wp.NAN)
+        normal = (dtype(1.0) / altitude) * normal
         frames[t] = wp.matrix_from_cols(first, wp.cross(normal, first), normal)
-        inverse_edges[t] = vec3(dtype(1.0) / length, -wp.dot(b, first) / doubled, length / doubled)
-        sizes[t] = doubled / wp.sqrt(longest)
+        inverse_edges[t] = vec3(dtype(1.0) / length, -wp.dot(b, first) / (length * altitude), dtype(1.0) / altitude)
+        sizes[t] = shortest
 
     return set_frames
 
@@ -249,6 +265,8 @@ def measure_triangles(dtype):
         C = wp.transpose(F) * F
         U, S, V = svd3x2(F)
         R = U * wp.transpose(V)
+        if wp.isnan(gradients[t][0, 2]):  # a line or a point has more than one
+            R = undefined(R[0, 0]) * R
         f1 = column(F, 0)
         f2 = column(F, 1)
         if gradient:
@@ -285,7 +303,7 @@ def measure_triangles(dtype):
             if length_ratio:
                 length_ratio[t] = vec2(wp.length(a1), wp.length(a2))
             if angle:
-                angle[t] = angle_between(a1, a2)
+                angle[t] = angle_of_threads(F, A)
 
     return measure
 
@@ -440,15 +458,16 @@ def measure_rates(dtype):
                 if direction_rate:
                     direction_rate[e] = in_space
         if materials:
-            A0 = surface_part(F0) * materials[e]
-            A1 = surface_part(F1) * materials[e]
+            f0 = surface_part(F0)
+            f1 = surface_part(F1)
+            A0 = f0 * materials[e]
+            A1 = f1 * materials[e]
             if length_rate:
                 l0 = vec2(wp.length(column(A0, 0)), wp.length(column(A0, 1)))
                 l1 = vec2(wp.length(column(A1, 0)), wp.length(column(A1, 1)))
                 length_rate[e] = vec2(rate_of(l0[0], l1[0], dt, method), rate_of(l0[1], l1[1], dt, method))
             if angle_rate:
-                turned = angle_between(column(A1, 0), column(A1, 1)) - angle_between(column(A0, 0), column(A0, 1))
-                angle_rate[e] = turned / dt
+                angle_rate[e] = (angle_of_threads(f1, A1) - angle_of_threads(f0, A0)) / dt
 
     return measure
 
@@ -473,15 +492,34 @@ def vertex_normals(dtype):
         for k in range(offsets[i], offsets[i + 1]):
             t = incident[k]
             o = x[triangles[t, 0]]
-            normal = wp.cross(x[triangles[t, 1]] - o, x[triangles[t, 2]] - o)
-            total += normal
-            size += wp.length(normal)
+            a = x[triangles[t, 1]] - o
+            width = wp.length(a)
+            if width != dtype(0.0):
+                normal = wp.cross((dtype(1.0) / width) * a, x[triangles[t, 2]] - o)
+                total += width * normal
+                size += width * wp.length(normal)
+        total = (dtype(1.0) / size) * total
         length = wp.length(total)
-        if not (length > dtype(16.0) * epsilon(size) * size):
+        if not (length > dtype(16.0) * epsilon(size)):
             length = dtype(wp.NAN)
         normals[i] = (dtype(1.0) / length) * total
 
     return find_normals
+
+
+@wp.func
+def only_rotation(R: Any, B: Any):
+    """R, or NaN where B has other nearest rotations: of the singular values of B, two with the sign of det B cancel.
+
+    RᵀB has these, and tr(RᵀB) − RᵀB their sums of two as its eigenvalues.
+    """
+    C, size = scaled3(B)
+    P = wp.transpose(R) * C
+    least = wp.determinant(wp.trace(P) * wp.identity(n=3, dtype=B.dtype) - P)
+    found = R
+    if not (least > B.dtype(16.0) * epsilon(least) and size > B.dtype(0.0)):
+        found = undefined(least) * R
+    return found
 
 
 @cache
@@ -490,8 +528,9 @@ def neighbourhood_gradients(dtype):
 
     F = (Σ q pᵀ + l̄² n Nᵀ)(Σ p pᵀ + l̄² N Nᵀ)⁻¹, l̄² the mean of ‖p‖², the least squares of Σ‖q − Fp‖² (Müller et al.
     2005, *Meshless deformations based on shape matching*) with one pair more, (l̄N, l̄n): a set may be planar, and its stretch
-    along the normal is then prescribed, to 1. The outputs are F̂ = F T with T = [t₁, t₂, N], T, the rotation R with the largest
-    tr(RᵀΣqpᵀ) (Kabsch 1976), the residual √(mean ‖q − Rp‖²) [m], and H = Σ p qᵀ [m²].
+    along the normal is then prescribed, to 1. Where p may lie on a line but for what points are rounded by, ``rounding`` [m],
+    F is NaN. The outputs are F̂ = F T with T = [t₁, t₂, N], T, the rotation R with the largest tr(RᵀΣqpᵀ) (Kabsch 1976), NaN
+    where others have as large a one, the residual √(mean ‖q − Rp‖²) [m], and H = Σ p qᵀ [m²].
     """
     vec3, mat33 = types(dtype)
 
@@ -503,6 +542,8 @@ def neighbourhood_gradients(dtype):
         X: wp.array(dtype=vec3),
         normals: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
+        # parameters
+        rounding: dtype,
         # out
         gradients: wp.array(dtype=mat33),
         frames: wp.array(dtype=mat33),
@@ -532,7 +573,12 @@ def neighbourhood_gradients(dtype):
             T = wp.matrix_from_cols(t1, t2, N)
             one = dtype(1.0)
             scale = one / wp.trace(A)  # l̄⁻²; no cube of a length underflows
-            inverse = inverse_beside(scale * A + share * wp.outer(N, N), vec3(one, one, one))
+            weights = scale * A + share * wp.outer(N, N)
+            inverse = inverse_beside(weights, vec3(one, one, one))
+            # Of a set in a plane det/share is the lesser of its two variances, over their sum.
+            narrow = dtype(2.0) * rounding
+            if not (wp.determinant(weights) > share * scale * narrow * narrow):
+                inverse = undefined(one) * inverse
             gradients[i] = (scale * B + share * wp.outer(normals[i], N)) * inverse * T
             if frames:
                 frames[i] = T
@@ -541,7 +587,7 @@ def neighbourhood_gradients(dtype):
         if rotations or residuals:
             R = nearest_rotation(B)
             if rotations:
-                rotations[i] = R
+                rotations[i] = only_rotation(R, B)
             if residuals:
                 total = dtype(0.0)
                 for k in range(first, last):

@@ -138,10 +138,60 @@ def test_a_triangle_crushed_to_a_line_keeps_what_has_a_meaning(device):
     assert found["stretch"][2, 7, 1] <= 8 * np.finfo(float).eps * found["stretch"][2, 7, 0]
     assert np.isfinite(found["deformation_gradient"][2, 7]).all()
     assert found["area_ratio"][2, 7] <= 8 * np.finfo(float).eps * found["stretch"][2, 7, 0] ** 2
+    for name in ("rotation", "rotation_angle"):  # more than one turns a triangle to a line
+        assert np.array_equal(np.argwhere(lost(found[name])), [[2, 7]])
     for name in ("spin", "velocity_gradient", "rate_of_strain"):
         assert np.array_equal(np.argwhere(lost(found[name])[1:]), [[1, 7], [2, 7]])
     assert lost(found["cauchy_stress"])[2, 7] and not lost(found["first_piola_stress"])[2, 7]
     assert 7 in named(found, 2, "triangle") and 7 in named(found, 3, "triangle")
+
+
+@pytest.mark.parametrize("onto", [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)], ids=["point", "line"])
+def test_what_has_collapsed_has_no_rotation(device, onto):
+    """None of it is the identity, and a thread of length 0 has no angle to another."""
+    mesh = sheet()
+    frames = strained(mesh)
+    frames[2] = frames[2] * onto + 0.3
+    around = wc.analyze(
+        mesh, frames, device=device, measures=("rotation", "rotation_angle", "residual"), neighbourhood="1-ring"
+    )
+    names = ("rotation", "rotation_angle", "angle", "angle_rate", "stretch")
+    found = wc.analyze(mesh, frames, DT, device=device, measures=names, directions=(1, 0, 0.3))
+    for one in (around, found):
+        for name in ("rotation", "rotation_angle"):
+            assert lost(one[name])[2].all() and not lost(one[name])[1, :30].any()
+        assert named(one, 2, one.on) | {30} >= set(range(one["rotation"].shape[1]))
+    assert not lost(around["residual"])[2, :30].any() and not lost(found["stretch"]).any()
+    for name in ("angle", "angle_rate"):
+        assert lost(found[name])[2].all() == (onto[0] == 0.0)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("size", [1e-12, 1e12])
+@pytest.mark.parametrize("on", ALL)
+def test_size_does_not_matter(device, on, size, dtype):
+    mesh = sheet()
+    options = {"neighbourhood": ALL[on].get("neighbourhood"), "dtype": dtype, "device": device}
+    expected = wc.analyze(mesh, strained(mesh), measures=("stretch", "rotation_angle"), **options)
+    mesh = Surface(size * mesh.points, mesh.triangles)
+    found = wc.analyze(mesh, size * strained(sheet()), measures=("stretch", "rotation_angle"), **options)
+    for name, values in found.items():
+        # Nothing but the rounding of size itself and of sums differs; edges are of 0.1 to 2 in places to 2.
+        np.testing.assert_allclose(values, expected[name], atol=200 * np.finfo(dtype).eps, rtol=0.0)
+
+
+@pytest.mark.parametrize("on", ALL)
+def test_areas_made_of_what_the_input_is_rounded_by(device, on):
+    """Three points on a line are so in float32 too, though not to its last digit."""
+    line = np.array([0.31, 0.47, 0.83])
+    points = np.array([0.0 * line, line, 0.37 * line, [1.0, 0.0, 0.0]])
+    points = (points + np.array([1.0, 2.0, 3.0])).astype(np.float32)
+    mesh = Surface(points, [[0, 1, 2], [0, 1, 3]])
+    options = {"triangle": {}, "vertex": {"neighbourhood": [[0, 1, 2], [0, 1, 3], [0, 1, 2], [0, 1, 3]]}}[on]
+    found = wc.analyze(mesh, np.stack([points, points * np.float32([1, 2, 1])]), device=device, **options)
+    expected = {"triangle": {0}, "vertex": {0, 2}}[on]
+    assert np.array_equal(np.flatnonzero(lost(found["stretch"])[1]), sorted(expected))
+    assert named(found, None, on) == expected
 
 
 def test_half_a_turn_a_frame_has_no_rate(device):

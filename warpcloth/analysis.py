@@ -290,7 +290,7 @@ class Analyzer:
                 excluded.append(_frame(labels[pair.frame], f"has none before it, and so no {rates}"))
             elif rates:
                 elements.start(held[pair.before].points)
-                rounding = np.finfo(sequence.precision).eps * max(held[place].largest for place in places)
+                rounding = max(held[place].rounding for place in places)
                 elements.rates(times[pair.frame] - times[pair.before], self.rates, rounding)
             values = elements.read()
             known = without | held[pair.reference].lost | held[pair.frame].lost
@@ -310,7 +310,7 @@ class Analyzer:
     def _refer(self, held):
         """Makes the elements refer to a frame, where another iteration may have been since; returns which have none in it."""
         if self._reference is not held:
-            self._without, self._reference = self._elements.refer(held.points), held
+            self._without, self._reference = self._elements.refer(held.points, held.rounding), held
         return self._without
 
     def _exclude(self, measure, pair, values, known, held):
@@ -328,8 +328,11 @@ class Analyzer:
         points = self.mesh.points.view() if place is None else self.sequence[place]
         points.flags.writeable = False  # samples share it with the frames that follow
         lost = ~np.isfinite(points).all(axis=1)
-        largest = np.abs(points).max(initial=0.0, where=~lost[:, None])
-        return _Held(points, largest, lost, self._elements.touched(lost) if lost.any() else np.zeros(self.count, dtype=bool))
+        # By the input, and by what computes about one of the points.
+        rounding, found = self.sequence.rounding(points), points[~lost]
+        if len(found):
+            rounding += np.finfo(self.dtype).eps * np.ptp(found, axis=0).max()
+        return _Held(points, rounding, lost, self._elements.touched(lost) if lost.any() else np.zeros(self.count, dtype=bool))
 
     def _label(self, place):
         return None if place is None else self.sequence.labels[place]
@@ -337,10 +340,10 @@ class Analyzer:
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """Points of a frame, their largest coordinate, which are not finite (n,), and which elements those touch (E,)."""
+    """Points of a frame, what they are rounded by [m], which are not finite (n,), and which elements those touch (E,)."""
 
     points: np.ndarray
-    largest: float
+    rounding: float
     lost_vertices: np.ndarray
     lost: np.ndarray
 

@@ -173,7 +173,9 @@ class _Pair:
         if self.same:
             stretch = [MEASURES["triangle"]["stretch"]]
             self.elements = [Triangles(s.mesh, stretch, None, None, device, "float64") for s in (a, b)]
-            without = [one.refer(s.mesh.points) for one, s in zip(self.elements, (a, b), strict=True)]
+            without = [
+                one.refer(s.mesh.points, s.rounding(s.mesh.points)) for one, s in zip(self.elements, (a, b), strict=True)
+            ]
             for excluded, lost in zip(self.excluded, without, strict=True):
                 if lost.any():
                     reason = "no area, so that stretches are not compared"

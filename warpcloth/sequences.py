@@ -73,6 +73,10 @@ class Sequence:
     def __getitem__(self, frame):
         return np.array(self.read(range(len(self))[operator.index(frame)]), dtype=np.float64)
 
+    def rounding(self, points):
+        """What points (n, 3) in the numbers of the input are rounded by [m]; of those that are not finite it tells nothing."""
+        return np.finfo(self.precision).eps * np.abs(points).max(initial=0.0, where=np.isfinite(points))
+
     @cached_property
     def missing(self):
         """Labels that a gap in the numbering leaves out, a list.

@@ -98,10 +98,10 @@ class Triangles(_Elements):
             self.stiffness = self.upload(np.broadcast_to(elements.stiffness, self.count), self.scalar)
             self.rest = self.upload(elements.rest, wp.types.vector(self.term.parameters, self.scalar))
 
-    def refer(self, X):
-        """Sets the reference X (n, 3); returns which triangles have none in it, (T,)."""
+    def refer(self, X, rounding):
+        """Sets the reference X (n, 3), rounded by ``rounding`` [m]; returns which triangles have none in it, (T,)."""
         outputs = (self.frames, self.inverse_edges, self.sizes)
-        self.launch(deformation.frame_triangles(self.scalar), [self.triangles, self.place(X)], outputs)
+        self.launch(deformation.frame_triangles(self.scalar), [self.triangles, self.place(X), self.scalar(rounding)], outputs)
         if self.materials is not None:
             inputs = [self.coefficients, self.inverse_edges]
             self.launch(deformation.unit_directions(self.scalar), inputs, [self.materials])
@@ -167,9 +167,12 @@ class Neighbourhoods(_Elements):
         self.fits |= self.wanted("deformation_gradient", "stretch", "directions")
         self.sizes = self.upload(np.sqrt(mesh.vertex_areas), self.scalar)
 
-    def refer(self, X):
-        """Sets the reference X (n, 3); returns which vertices have none in it, (n,): it cannot be fitted to itself."""
-        self.X = self.place(X)
+    def refer(self, X, rounding):
+        """Sets the reference X (n, 3), rounded by ``rounding`` [m]; returns which vertices have none in it, (n,).
+
+        These cannot be fitted to themselves.
+        """
+        self.X, self.rounding = self.place(X), self.scalar(rounding)
         self._find_normals(self.X, self.reference_normals)
         self._fit(X, [self.gradients, self.frames, None, None, None])
         return np.isnan(self.gradients.numpy()[:, 0, 0])
@@ -200,7 +203,7 @@ class Neighbourhoods(_Elements):
         x = self.place(x)
         if outputs[0] is not None:
             self._find_normals(x, self.normals)
-        inputs = [self.offsets, self.members, self.reference_normals, self.X, self.normals, x]
+        inputs = [self.offsets, self.members, self.reference_normals, self.X, self.normals, x, self.rounding]
         self.launch(deformation.neighbourhood_gradients(self.scalar), inputs, outputs)
 
 
