@@ -450,6 +450,12 @@ def test_what_python_holds(held):
             sequence[wrong]
 
 
+def test_the_coarsest_numbers_say_how_frames_are_rounded():
+    one = frames()[0]
+    for kinds, precision in (((np.float64, np.float32), np.float32), ((np.float64, np.int64), np.float64)):
+        assert as_sequence(MESH, [one.astype(kind) for kind in kinds]).precision is precision
+
+
 def test_frames_without_times(tmp_path):
     assert as_sequence(MESH, frames()).times is None
     np.save(tmp_path / "f.npy", frames())
@@ -459,6 +465,7 @@ def test_frames_without_times(tmp_path):
 
 
 REFUSED = [  # mesh, frames, options, message
+    (MESH, np.ma.masked_less(frames(), 0.1), {}, "frames is masked in places; it must have all points"),
     (MESH, frames(), {"dt": 0.1, "times": np.arange(5)}, "dt, times: both are given"),
     (MESH, frames(), {"dt": 0.0}, "dt is 0.0; it must be a number above 0"),
     (MESH, frames(), {"times": [0, 1, 2, 3]}, r"times has shape \(4,\); it must be \(5,\)"),

@@ -1,12 +1,13 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
-from .analysis import Analysis, Analyzer, analyze
+from .analysis import Analyzer, analyze
 from .arap import Arap
 from .compare import Comparison, compare
 from .deform import Deformation, deform
 from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
 from .rotation import kabsch, polar, svd
+from .samples import Analysis
 from .scene import Pins, Scene
 from .sequences import Sequence, as_sequence, open_sequence
 from .simulate import Animation, simulate

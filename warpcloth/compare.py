@@ -5,10 +5,11 @@ from os import PathLike
 
 import numpy as np
 
-from .analysis import Exclusion
 from .checks import number, shown, whole
 from .distances import surface_distances, triangle_areas
 from .measures import MEASURES
+from .mesh import same_topology
+from .samples import Exclusion
 from .sequences import Sequence, as_sequence, open_sequence
 from .surfaces import Triangles
 
@@ -137,7 +138,7 @@ def opened(name, source, prim=None, fps=None):
             number("fps", fps, above=0.0)
         return as_sequence(mesh, frames, dt=None if fps is None else 1.0 / fps)
     sequence = open_sequence(frames, prim, fps, mesh)
-    if len(mesh.points) != len(sequence.mesh.points) or not np.array_equal(mesh.triangles, sequence.mesh.triangles):
+    if not same_topology(mesh, sequence.mesh):
         raise ValueError(f"{name}: its mesh is {mesh}, and {frames} has other triangles; it must be the rest shape of these")
     return replace(sequence, mesh=mesh, declared=True)
 
@@ -168,7 +169,7 @@ class _Pair:
         self.sequences, self.device = (a, b), device
         self.triangles = a.mesh.triangles, b.mesh.triangles
         self.used = [np.unique(triangles) for triangles in self.triangles]
-        self.same = len(a.mesh.points) == len(b.mesh.points) and np.array_equal(*self.triangles)
+        self.same = same_topology(a.mesh, b.mesh)
         self.excluded = [[_whole(label, "is missing") for label in s.missing] for s in (a, b)]
         if self.same:
             stretch = [MEASURES["triangle"]["stretch"]]

@@ -380,6 +380,11 @@ class Surface(Mesh):
         """Refuses nothing."""
 
 
+def same_topology(one, other):
+    """Whether two meshes have as many vertices and the same triangles."""
+    return len(one.points) == len(other.points) and np.array_equal(one.triangles, other.triangles)
+
+
 def _read_only(array):
     array.setflags(write=False)
     return array

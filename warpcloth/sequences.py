@@ -290,8 +290,10 @@ def _array(name, frames, mesh):
             found = checks.numeric(f"{name}[{index}]", frame, f"have shape {shape}").shape
             if found != shape:
                 raise ValueError(f"{name}[{index}] has shape {found}; it must be {shape}")
-        found, dtype = (len(frames), *shape), np.asarray(frames[0] if frames else 0.0).dtype
+        found, dtype = (len(frames), *shape), _coarsest(frames)
     else:
+        if np.ma.isMaskedArray(frames) and np.ma.is_masked(frames):
+            raise ValueError(f"{name} is masked in places; it must have all points, or NaN where one is not known")
         frames = frames if hasattr(frames, "exact") else np.asarray(frames)
         found, dtype = frames.shape, frames.dtype
         if frames.dtype.kind not in "iuf":
@@ -301,6 +303,12 @@ def _array(name, frames, mesh):
         raise ValueError(f"{name} has shape {found}; it must be (frames, {shape[0]}, 3) for the points of the mesh{copies}")
     precision = dtype.type if np.issubdtype(dtype, np.floating) else np.float64
     return found[0], frames.exact if hasattr(frames, "exact") else frames.__getitem__, precision
+
+
+def _coarsest(frames):
+    """The type of the frame whose numbers are rounded most."""
+    types = [np.asarray(frame).dtype for frame in frames]
+    return max((kind for kind in types if kind.kind == "f"), key=lambda kind: np.finfo(kind).eps, default=np.dtype(np.float64))
 
 
 def _even(count, fps):

@@ -4,12 +4,12 @@ import numpy as np
 import warp as wp
 
 from .checks import array, numeric, shown
-from .kernels import deformation
+from .kernels import deformation, fits, rates
 from .model import DTYPES
 from .neighbourhoods import neighbourhoods
 from .terms import CorotatedMembrane, NeoHookeanMembrane, StVKMembrane
 
-RATES = {"midpoint": deformation.MIDPOINT, "forward": deformation.FORWARD, "logarithm": deformation.LOGARITHM}
+RATES = {"midpoint": rates.MIDPOINT, "forward": rates.FORWARD, "logarithm": rates.LOGARITHM}
 
 
 class _Elements:
@@ -54,7 +54,7 @@ class _Elements:
         names = ("velocity_gradient", "rate_of_strain", "spin", "stretch_rate", "rest_direction_rate", "direction_rate")
         inputs = [self.before, self.gradients, self.materials, self.sizes]
         inputs += [self.scalar(dt), int(RATES[method]), self.scalar(rounding)]
-        self.launch(deformation.measure_rates(self.scalar), inputs, (*names, "length_rate", "angle_rate"))
+        self.launch(rates.measure_rates(self.scalar), inputs, (*names, "length_rate", "angle_rate"))
 
     def read(self):
         """Results by name, NumPy arrays (E, *shape)."""
@@ -188,7 +188,7 @@ class Neighbourhoods(_Elements):
         names = ("deformation_gradient", "stretch", "directions", "rotation_angle")
         if self.wanted(*names):
             inputs = [self.gradients, self.frames, self.rotations]
-            self.launch(deformation.measure_neighbourhoods(self.scalar), inputs, names)
+            self.launch(fits.measure_neighbourhoods(self.scalar), inputs, names)
 
     def touched(self, vertices):
         """Which neighbourhoods have one of some vertices (n,) bool."""
@@ -197,14 +197,14 @@ class Neighbourhoods(_Elements):
 
     def _find_normals(self, x, out):
         inputs = [self.triangle_offsets, self.incident, self.triangles, x]
-        self.launch(deformation.vertex_normals(self.scalar), inputs, [out])
+        self.launch(fits.vertex_normals(self.scalar), inputs, [out])
 
     def _fit(self, x, outputs):
         x = self.place(x)
         if outputs[0] is not None:
             self._find_normals(x, self.normals)
         inputs = [self.offsets, self.members, self.reference_normals, self.X, self.normals, x, self.rounding]
-        self.launch(deformation.neighbourhood_gradients(self.scalar), inputs, outputs)
+        self.launch(fits.neighbourhood_gradients(self.scalar), inputs, outputs)
 
 
 def material_directions(mesh, chosen, corner_coordinates=None):

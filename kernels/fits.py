@@ -1,0 +1,167 @@
+"""Factories of kernels that fit maps to the neighbourhoods of vertices, see :mod:`.deformation` for F̂ and T."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from .assemble import types
+from .deformation import angle_of, inverse_beside, undefined
+from .rotation import complement, epsilon, nearest_rotation, scaled3, svd3
+
+
+@cache
+def vertex_normals(dtype):
+    """Kernel over vertices: unit normals, those of their triangles weighted by area; NaN where these are none or cancel."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_normals(
+        offsets: wp.array(dtype=wp.int32),
+        incident: wp.array(dtype=wp.int32),
+        triangles: wp.array2d(dtype=wp.int32),
+        x: wp.array(dtype=vec3),
+        # out
+        normals: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        total = vec3()
+        size = dtype(0.0)
+        for k in range(offsets[i], offsets[i + 1]):
+            t = incident[k]
+            o = x[triangles[t, 0]]
+            a = x[triangles[t, 1]] - o
+            width = wp.length(a)
+            if width != dtype(0.0):
+                normal = wp.cross((dtype(1.0) / width) * a, x[triangles[t, 2]] - o)
+                total += width * normal
+                size += width * wp.length(normal)
+        total = (dtype(1.0) / size) * total
+        length = wp.length(total)
+        if not (length > dtype(16.0) * epsilon(size)):
+            length = dtype(wp.NAN)
+        normals[i] = (dtype(1.0) / length) * total
+
+    return find_normals
+
+
+@wp.func
+def only_rotation(R: Any, B: Any):
+    """R, or NaN where B has other nearest rotations: of the singular values of B, two with the sign of det B cancel.
+
+    RᵀB has these, and tr(RᵀB) − RᵀB their sums of two as its eigenvalues.
+    """
+    C, size = scaled3(B)
+    P = wp.transpose(R) * C
+    least = wp.determinant(wp.trace(P) * wp.identity(n=3, dtype=B.dtype) - P)
+    found = R
+    if not (least > B.dtype(16.0) * epsilon(least) and size > B.dtype(0.0)):
+        found = undefined(least) * R
+    return found
+
+
+@cache
+def neighbourhood_gradients(dtype):
+    """Kernel over vertices: fits of the map of a set of points to p = X − X̄ and q = x − x̄, X̄ and x̄ their centroids.
+
+    F = (Σ q pᵀ + l̄² n Nᵀ)(Σ p pᵀ + l̄² N Nᵀ)⁻¹, l̄² the mean of ‖p‖², the least squares of Σ‖q − Fp‖² (Müller et al.
+    2005, *Meshless deformations based on shape matching*) with one pair more, (l̄N, l̄n): a set may be planar, and its stretch
+    along the normal is then prescribed, to 1. Where p may lie on a line but for what points are rounded by, ``rounding`` [m],
+    F is NaN. The outputs are F̂ = F T with T = [t₁, t₂, N], T, the rotation R with the largest tr(RᵀΣqpᵀ) (Kabsch 1976), NaN
+    where others have as large a one, the residual √(mean ‖q − Rp‖²) [m], and H = Σ p qᵀ [m²].
+    """
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def fit(
+        offsets: wp.array(dtype=wp.int32),
+        members: wp.array(dtype=wp.int32),
+        reference_normals: wp.array(dtype=vec3),
+        X: wp.array(dtype=vec3),
+        normals: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # parameters
+        rounding: dtype,
+        # out
+        gradients: wp.array(dtype=mat33),
+        frames: wp.array(dtype=mat33),
+        rotations: wp.array(dtype=mat33),
+        residuals: wp.array(dtype=dtype),
+        cross_covariances: wp.array(dtype=mat33),
+    ):
+        i = wp.tid()
+        first, last = offsets[i], offsets[i + 1]
+        share = dtype(1.0) / dtype(wp.max(last - first, 1))
+        if last == first:
+            share = dtype(wp.NAN)
+        Xo, xo = X[i], x[i]
+        Xm, xm = vec3(), vec3()
+        for k in range(first, last):
+            Xm += share * (X[members[k]] - Xo)
+            xm += share * (x[members[k]] - xo)
+        A, B = mat33(), mat33()
+        for k in range(first, last):
+            p = X[members[k]] - Xo - Xm
+            q = x[members[k]] - xo - xm
+            A += share * wp.outer(p, p)
+            B += share * wp.outer(q, p)
+        if gradients:
+            N = reference_normals[i]
+            t1, t2 = complement(N)
+            T = wp.matrix_from_cols(t1, t2, N)
+            one = dtype(1.0)
+            scale = one / wp.trace(A)  # l̄⁻²; no cube of a length underflows
+            weights = scale * A + share * wp.outer(N, N)
+            inverse = inverse_beside(weights, vec3(one, one, one))
+            # Of a set in a plane det/share is the lesser of its two variances, over their sum.
+            narrow = dtype(2.0) * rounding
+            if not (wp.determinant(weights) > share * scale * narrow * narrow):
+                inverse = undefined(one) * inverse
+            gradients[i] = (scale * B + share * wp.outer(normals[i], N)) * inverse * T
+            if frames:
+                frames[i] = T
+        if cross_covariances:
+            cross_covariances[i] = (dtype(1.0) / share) * wp.transpose(B)
+        if rotations or residuals:
+            R = nearest_rotation(B)
+            if rotations:
+                rotations[i] = only_rotation(R, B)
+            if residuals:
+                total = dtype(0.0)
+                for k in range(first, last):
+                    total += wp.length_sq(x[members[k]] - xo - xm - R * (X[members[k]] - Xo - Xm))
+                residuals[i] = wp.sqrt(share * total)
+
+    return fit
+
+
+@cache
+def measure_neighbourhoods(dtype):
+    """Kernel over vertices: F = F̂ Tᵀ (3×3), its singular values, those directions as rows (3×3) in the current frame, and the
+    angle of R."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def measure(
+        gradients: wp.array(dtype=mat33),
+        frames: wp.array(dtype=mat33),
+        rotations: wp.array(dtype=mat33),
+        # out
+        gradient: wp.array(dtype=mat33),
+        stretch: wp.array(dtype=vec3),
+        directions: wp.array(dtype=mat33),
+        rotation_angle: wp.array(dtype=dtype),
+    ):
+        i = wp.tid()
+        if gradient:
+            gradient[i] = gradients[i] * wp.transpose(frames[i])
+        if stretch or directions:
+            U, S, _V = svd3(gradients[i])
+            if stretch:
+                stretch[i] = S
+            if directions:
+                directions[i] = wp.transpose(U)
+        if rotation_angle:
+            rotation_angle[i] = angle_of(rotations[i])
+
+    return measure
