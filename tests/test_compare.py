@@ -434,6 +434,11 @@ def test_the_command_compares_surfaces_of_different_meshes(files, tmp_path, capf
         ("compare {}/cloth.usdc {}/cloth.usdc --frames -1", "frames is -1; it must be a whole number"),
         ("compare {}/cloth.usdc {}/cloth.usdc --plot {}/o.txt", "o.txt: the ending is '.txt'; it must be .png or .svg or .pdf"),
         ("compare {}/cloth.usdc {}/cloth.usdc --csv /proc/o.csv", "/proc"),
+        *[
+            (f"compare {{}}/cloth.usdc {{}}/obj --fps-b 24 --rest-b {{}}/rest.obj --csv {{}}/{name}", "must not be changed")
+            for name in ("cloth.usdc", "obj/cloth.2.obj", "rest.obj")
+        ],
+        ("compare {}/cloth.usdc {}/cloth.usdc --csv {}/o.png --plot {}/o.png", "o.png: is given for two outputs"),
         ("compare {}/cloth.usdc {}/finer.usdc --rest-b {}/rest.obj", "b: its mesh is"),
     ],
 )

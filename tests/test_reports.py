@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from usd_validation import validate
 
 import warpcloth as wc
@@ -144,6 +144,66 @@ def test_frames_that_are_broken_are_left_out_and_named(folder, capsys):
     assert reasons == [(5, "frame", []), (3, "vertex", [4])]
 
 
+@pytest.mark.parametrize("kind", ["obj", "npz"])
+def test_files_of_the_input_are_not_written_over(folder, kind):
+    sequence = wc.open_sequence(folder / "cloth_*.obj")
+    if kind == "npz":
+        np.savez(folder / "cloth.npz", points=np.array(list(sequence)), triangles=sequence.mesh.triangles)
+        sequence = wc.open_sequence(folder / "cloth.npz")
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    (folder / "link").symlink_to(sequence.files[-1])
+    for path in (sequence.files[-1], folder / "link"):
+        with pytest.raises(ValueError, match="is a file of the input, which must not be changed"):
+            write_report(wc.Analyzer(None, sequence), csv=path)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+@pytest.mark.parametrize("place", [np.nan, np.inf])
+@pytest.mark.parametrize("frame", ["rest", 2])
+@pytest.mark.parametrize("neighbourhood", [None, "1-ring", "nearest:k=4"])
+def test_points_without_a_place_hide_no_other_directions(tmp_path, recwarn, place, frame, neighbourhood):
+    """All elements that do not touch such a point have their values and their segments, whichever is the frame."""
+    mesh = wc.Mesh.grid(6, 6)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "cache.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    sheet = UsdGeom.Mesh.Define(stage, "/Sheet")
+    sheet.CreateFaceVertexCountsAttr([3] * len(mesh.triangles))
+    sheet.CreateFaceVertexIndicesAttr(np.array(mesh.triangles).reshape(-1))
+    for code in range(3):
+        points = mesh.points * [1.0, 1.0, 1.0 + 0.1 * code]
+        if code == {"rest": 0}.get(frame, frame):
+            points[7] = place
+        sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)), code)
+    if frame != "rest":
+        sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(mesh.points.astype(np.float32)))
+    stage.Save()
+    analyzer = wc.Analyzer(None, tmp_path / "cache.usda", measures=["stretch", "directions"], neighbourhood=neighbourhood)
+    report = write_report(analyzer, usd=tmp_path / "out.usdc", curves=True, csv=tmp_path / "t.csv", plot=tmp_path / "p.png")
+    assert report.rows == 3 and report.excluded
+    shown = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    curves = UsdGeom.BasisCurves(shown.GetPrimAtPath("/Sheet_principal1"))
+    stretches = wc.analyze(None, tmp_path / "cache.usda", neighbourhood=neighbourhood)["stretch"][2, :, 0]
+    ends = np.array(curves.GetPointsAttr().Get(2.0)).reshape(-1, 2, 3)
+    seen = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 0.0
+    np.testing.assert_array_equal(seen, np.isfinite(stretches))
+    assert 0 < seen.sum() < len(seen) and np.isfinite(ends).all() and 0.0 < curves.GetWidthsAttr().Get()[0] < 1.0
+    assert not [str(warning.message) for warning in recwarn if issubclass(warning.category, RuntimeWarning)]
+
+
+def test_a_first_frame_at_rest_is_said(folder, cloth, capsys):
+    """What nobody says is at rest is so in the summary and in the files, and frames are numbers there."""
+    said = "rest shape    that of the first frame"
+    for command, declared in (([str(cloth)], True), ([f"{folder}/cloth_*.obj"], False)):
+        assert main(["analyze", *command, "--report", str(folder / "t.json")]) == 0
+        assert (said in capsys.readouterr().out) is not declared
+        assert json.load(open(folder / "t.json"))["input"]["rest_declared"] is declared
+        assert main(["analyze", *command, "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["rest_declared"] is declared and isinstance(facts["extremes"]["stretch_1"]["largest"]["frame"], int)
+    assert main(["analyze", f"{folder}/cloth_*.obj", "--rest", str(folder / "rest.ply")]) == 0
+    assert said not in capsys.readouterr().out
+
+
 def test_another_programs_cache(tmp_path, capsys):
     """Quads in centimetres, z up, left-handed, below a transform that moves, at time codes of its own, with seams in st."""
     stage = Usd.Stage.CreateNew(str(tmp_path / "cache.usda"))
@@ -245,6 +305,10 @@ WRONG = [
     ("CLOTH --range 2 1 -o out.usdc", "low must be below high"),
     ("CLOTH --csv gone/t.csv", "gone"),
     ("CLOTH -o CLOTH", "must not be changed"),
+    *[(f"CLOTH --{option} CLOTH", "must not be changed") for option in ("csv", "report", "npz")],
+    ("CLOTH --rest REST --csv REST", "rest.ply: is a file of the input, which must not be changed"),
+    ("CLOTH --csv t.csv --report ./t.csv", "t.csv: is given for two outputs"),
+    ("CLOTH --plot a_6.png --still a.png", "a_6.png: is given for two outputs"),
     ("CLOTH -o out.txt", "out.txt"),
     ("CLOTH --rest REST", "must be those of the frames"),
     ("CLOTH --fps 0", "fps is 0"),

@@ -307,12 +307,13 @@ class Mesh:
     def triangle_areas(self):
         """Rest areas (T,) [m²], ½‖(x₁−x₀)×(x₂−x₀)‖."""
         x0, x1, x2 = (self.points[corner] for corner in self.triangles.T)
-        return _read_only(np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) / 2)
+        with np.errstate(invalid="ignore", over="ignore"):  # points of a `Surface` may be infinite
+            return _read_only(np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) / 2)
 
     @cached_property
     def vertex_areas(self):
-        """Lumped areas (n,) [m²]: a third of the adjacent triangles' areas; zero without triangles."""
-        third = np.repeat(self.triangle_areas / 3, 3)
+        """Lumped areas (n,) [m²]: a third of the adjacent triangles' areas, of those that are finite; zero without triangles."""
+        third = np.repeat(np.where(np.isfinite(self.triangle_areas), self.triangle_areas, 0.0) / 3, 3)
         return _read_only(np.bincount(self.triangles.ravel(), weights=third, minlength=len(self.points)))
 
     @cached_property

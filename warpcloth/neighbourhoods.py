@@ -15,7 +15,8 @@ def neighbourhoods(mesh, chosen):
     """The neighbourhood of each vertex, itself among them.
 
     Rings follow edges. Nearest points are those of the rest shape, as the crow flies: of a garment they may belong to a layer
-    that only lies near. A vertex without a triangle has none, and is in none.
+    that only lies near, and a vertex that is not at a finite place has none. A vertex without a triangle has none, and is in
+    none.
 
     Args:
         mesh: The :class:`warpcloth.Mesh`.
@@ -55,7 +56,7 @@ def _rings(mesh, used, count):
 def _nearest(mesh, used, chosen):
     from scipy.spatial import cKDTree
 
-    vertices = np.flatnonzero(used)
+    vertices = np.flatnonzero(used & np.isfinite(mesh.points).all(axis=1))
     points = mesh.points[vertices]
     found = re.fullmatch(r"nearest(?::(?:(k|radius)=([0-9.eE+-]+)|([0-9.eE+-]+)%))?", chosen)
     kind, value = (None, None) if not found else (found[1] or "share", found[2] or found[3] or _SHARE)

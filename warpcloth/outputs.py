@@ -7,6 +7,22 @@ import secrets
 TEXT = {"encoding": "utf-8", "newline": ""}
 
 
+def check_apart(outputs, inputs=()):
+    """Refuses files that would be written over one another or over an input; None is no file.
+
+    Raises:
+        ValueError: Two outputs are one file, or one is an input.
+    """
+    taken = {os.path.realpath(path): "is a file of the input, which must not be changed" for path in inputs if path is not None}
+    for path in outputs:
+        if path is None:
+            continue
+        place = os.path.realpath(path)
+        if place in taken:
+            raise ValueError(f"{path}: {taken[place]}")
+        taken[place] = "is given for two outputs; each must have a file of its own"
+
+
 class Output:
     """A file that is written under another name, and renamed at `close`, so that a failure leaves an earlier result whole.
 

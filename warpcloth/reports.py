@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .measures import scalars
+from .outputs import check_apart
 from .summaries import CsvWriter, JsonWriter, Summary, summarise
 
 # Length of a principal direction of stretch 1 beside the square root of the median area of a triangle.
@@ -88,13 +89,14 @@ def write_report(
         :class:`Report`.
 
     Raises:
-        ValueError: There is no such scalar or frame, ``curves`` without the measures "stretch" and "directions", or as the
-            writers have it.
+        ValueError: There is no such scalar or frame, ``curves`` without the measures "stretch" and "directions", a file is
+            given twice or is the input's, or as the writers have it.
     """
     listed = {name: measure for measure in analyzer.measures for name in scalar_names(measure)}
     report = Report(extremes={name: Extremes() for name in listed})
     _check(analyzer, listed, usd or stills, usd, stills, colour, curves)
     _check_pictures(plot, stills)
+    check_apart([usd, csv, json, npz, plot, *(stills or {}).values()], analyzer.sequence.files)
     if (usd or stills) and colour != "none" and (stills or colour or _can_colour()):
         report.coloured = colour or next(iter(listed))
         report.scale = _range(analyzer, report.coloured, listed[report.coloured], colour_range)
@@ -230,7 +232,7 @@ def _neutral(measure):
 def _input(analyzer):
     mesh, sequence = analyzer.mesh, analyzer.sequence
     facts = {"file": sequence.path, "vertices": len(mesh.points), "triangles": len(mesh.triangles), "frames": len(sequence)}
-    facts |= {"on": analyzer.on, "rates": analyzer.rates}
+    facts |= {"rest_declared": mesh is not sequence.mesh or bool(sequence.declared), "on": analyzer.on, "rates": analyzer.rates}
     return {name: value for name, value in facts.items() if value is not None}
 
 
@@ -253,7 +255,9 @@ class _Shown:
             self.unit = listed[self.name].unit
             self.scale = Scale(*report.scale, _neutral(listed[self.name]))
             metadata["legend"] = self.scale.legend(self.name, self.unit)
-        self.length = _SEGMENT * np.sqrt(np.median(analyzer.mesh.triangle_areas))
+        areas = analyzer.mesh.triangle_areas
+        areas = areas[np.isfinite(areas) & (areas > 0.0)]  # others have no segments
+        self.length = _SEGMENT * np.sqrt(np.median(areas)) if len(areas) else 0.0
         sequence = analyzer.sequence
         if self.stills:
             from .chart import View
@@ -285,8 +289,7 @@ class _Shown:
         segments = self._segments(sample, places) if self.curves else None
         finite = np.isfinite(sample.points).all()
         if self.writer and (self.over or finite):  # without a stage below it a frame needs points
-            largest = np.finfo(np.float32).max
-            primvars = {camel(name): np.where(np.abs(numbers) <= largest, numbers, np.nan) for name, numbers in values.items()}
+            primvars = {camel(name): _single(numbers) for name, numbers in values.items()}
             colours = self.scale.linear(values[self.name]) if self.scale else None
             self.writer.append(sample.frame, primvars, colours, segments, None if self.over else sample.points)
         if sample.frame in self.stills:
@@ -310,4 +313,10 @@ class _Shown:
         """Principal directions as long as their stretches, by name: centres and vectors (E, 3) [m]."""
         stretch, directions = sample.values["stretch"], sample.values["directions"]
         count = stretch.shape[1]
-        return {f"principal{k + 1}": (places, self.length * stretch[:, k, None] * directions[:, k]) for k in range(count)}
+        vectors = [self.length * stretch[:, k, None] * directions[:, k] for k in range(count)]
+        return {f"principal{k + 1}": (_single(places), _single(vector)) for k, vector in enumerate(vectors)}
+
+
+def _single(values):
+    """Values of which those are NaN that float32 does not have."""
+    return np.where(np.abs(values) <= np.finfo(np.float32).max, values, np.nan)

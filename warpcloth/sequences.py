@@ -48,6 +48,7 @@ class Sequence:
         stage: `usd.StageMesh` of a stage, or None; where its space moves, as it is at the first frame.
         precision: Type of the numbers that the input has, which says how coarsely they are rounded.
         declared: Whether the input says the rest shape; else `mesh` has the points of the first frame.
+        files: Paths of the files that frames are read from.
 
     Raises:
         ValueError: The mesh has no triangles.
@@ -61,6 +62,7 @@ class Sequence:
     stage: Any = None
     declared: bool = True
     precision: type = np.float64
+    files: tuple = ()
 
     def __post_init__(self):
         if not len(self.mesh.triangles):
@@ -183,7 +185,7 @@ def _open_stage(path, prim, fps):
         )
     labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
     times = frames.times if fps is None else (codes - codes[0]) / fps
-    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32)
+    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32, frames.files)
 
 
 def _open_files(path, found, prim, fps):
@@ -220,7 +222,7 @@ def _open_files(path, found, prim, fps):
         raise ValueError(f"{paths[0]}: {error}") from error
     read = partial(_read_file, paths, prim, mesh.triangles, len(points))
     times = None if fps is None else (labels - labels[0]) / fps
-    return Sequence(mesh, labels, times, read, path, declared=False)
+    return Sequence(mesh, labels, times, read, path, declared=False, files=tuple(paths))
 
 
 def _read_file(paths, prim, expected, count, frame):
@@ -253,7 +255,7 @@ def _open_npz(path, fps):
     mesh = Surface(points[0], triangles)
     count, read, precision = _array("points", points, mesh)
     times = _even(count, fps) if times is None else _increasing(times, count)
-    return Sequence(mesh, np.arange(count), times, read, path, declared=False, precision=precision)
+    return Sequence(mesh, np.arange(count), times, read, path, declared=False, precision=precision, files=(path,))
 
 
 def _mapped(path, member):
@@ -278,7 +280,7 @@ def _open_npy(path, fps, mesh):
     if mesh is None:
         raise ValueError("has no triangles; give a rest mesh that has them (--rest), or an .npz file")
     count, read, precision = _array("points", points, mesh)
-    return Sequence(mesh, np.arange(count), _even(count, fps), read, path, precision=precision)
+    return Sequence(mesh, np.arange(count), _even(count, fps), read, path, precision=precision, files=(path,))
 
 
 def _array(name, frames, mesh):

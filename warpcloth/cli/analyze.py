@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 from .. import scene_files
+from ..outputs import check_apart
 from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place
 
 EPILOG = """\
@@ -25,7 +26,11 @@ def add_arguments(parser):
     add("input", metavar="INPUT", nargs="?", help="the animation: a stage, a folder or pattern of mesh files, .npz or .npy")
     add("--prim", help="path or name of the prim, or geometry, of a file with several")
     add("--fps", type=float, help="frames per second, where the input does not say; rates need it")
-    add("--rest", metavar="MESH", help="the rest shape: a mesh file or stage with the same triangles; else that of INPUT")
+    add(
+        "--rest",
+        metavar="MESH",
+        help="the rest shape: a mesh file or stage with the same triangles; else INPUT's, or its first frame",
+    )
     add("--rest-prim", metavar="PRIM", help="of the rest shape, as --prim")
     add("--measure", nargs="+", default=["stretch"], metavar="NAME", help="measures, or all, or help; stretch where not given")
     add("--neighbourhood", metavar="N", help="measure vertices: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%")
@@ -69,6 +74,7 @@ def analyze(arguments):
         print(_listed(MEASURES))
         return 0
     files = {name: getattr(arguments, name) for name in ("output", "csv", "report", "npz", "plot", "still")}
+    check_apart(files.values(), [arguments.rest])
     for path in filter(None, files.values()):
         check_writable(path)
     if arguments.output:
@@ -103,6 +109,7 @@ def analyze(arguments):
         "triangles": len(analyzer.mesh.triangles),
         "measured": analyzer.on,
         "neighbourhood": arguments.neighbourhood,
+        "rest_declared": arguments.rest is not None or bool(analyzer.sequence.declared),
         "rows": found.rows,
         "first_frame": analyzer.sequence.labels[analyzer.pairs[0].frame].item(),
         "last_frame": analyzer.sequence.labels[analyzer.pairs[-1].frame].item(),
@@ -209,6 +216,8 @@ def _summary(facts):
     of = f"{facts['triangles']} triangles" if facts["measured"] == "triangle" else f"{facts['vertices']} vertices"
     around = f", {facts['neighbourhood']}" if facts["neighbourhood"] else ""
     lines = [f"{facts['input']}: {of}{around}, {frames}, in {facts['seconds']:.3g} s", *table]
+    if not facts["rest_declared"]:
+        lines.append("  rest shape    that of the first frame, for neither the input nor --rest says one")
     if facts["coloured"]:
         low, high = facts["colour_range"]
         lines.append(f"  colours       {facts['coloured']}, {low:.5g} to {high:.5g}")

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..chart.figures import PICTURES, check_path
 from ..checks import whole
-from ..outputs import TEXT, Output
+from ..outputs import TEXT, Output, check_apart
 from .terminal import Progress, as_json, check_writable, find_device
 
 _SHOWN = 8  # frames or exclusions of each that the summary names
@@ -43,6 +43,7 @@ def compare(arguments):
     _check_outputs(arguments)
     device = find_device(arguments.device)
     a, b = (_open(arguments, name, opened) for name in ("a", "b"))
+    check_apart([arguments.csv, arguments.plot], [*a.files, *b.files, arguments.rest_a, arguments.rest_b])
     progress = Progress()
     try:
         found = compare(a, b, frames=arguments.frames, device=device, progress=progress)

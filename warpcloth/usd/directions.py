@@ -43,7 +43,10 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
         ValueError: The stage has another prim in that place.
     """
     transform = to_metres(stage, prim, Usd.TimeCode.EarliestTime())
-    mean_length = np.nanmean(np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1))
+    with np.errstate(invalid="ignore"):
+        lengths = np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    mean_length = lengths.mean() if len(lengths) else 1.0  # without any there are no segments to be seen
     width = float(np.float32(CURVE_WIDTH * mean_length / np.cbrt(abs(np.linalg.det(transform[:3, :3])))))
     targets = []
     for row, (name, interpolation) in enumerate(directions.items()):

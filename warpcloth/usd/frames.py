@@ -5,6 +5,7 @@ import os
 import numpy as np
 from pxr import Sdf, UsdGeom
 
+from .layers import files_of
 from .stage import (
     curve_vertices,
     find_prim,
@@ -89,6 +90,11 @@ class FrameSequence:
             self._points = first_points(curve_vertices(found, count))
             count = len(self._points)
         self.shape = (len(self.time_codes), count, 3)[: 3 if vectors else 2]
+
+    @property
+    def files(self):
+        """Real paths of the files that the stage is made of."""
+        return tuple(sorted(files_of(self._stage)))
 
     @property
     def ndim(self):
