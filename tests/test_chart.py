@@ -14,6 +14,7 @@ from matplotlib.image import imread
 import warpcloth as wc
 from warpcloth.chart import Scale, View, colour, draw, plot_percentiles, range_over
 from warpcloth.chart.colour import EXCLUDED
+from warpcloth.chart.figures import save
 from warpcloth.chart.view import brightness
 
 FRONT = View(azimuth=0.0, elevation=0.0)
@@ -280,6 +281,22 @@ def test_a_folder_that_does_not_exist_is_refused(tmp_path):
     for write in (lambda: plot_percentiles(path, []), lambda: draw(path, None, None, None, None)):
         with pytest.raises(FileNotFoundError, match=r"a\.png: the folder .*no does not exist"):
             write()
+
+
+def test_a_picture_that_cannot_be_finished_leaves_the_earlier_one(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    def fill_the_disk(figure, file, **options):
+        (file if hasattr(file, "write") else open(file, "wb")).write(b"the first bytes")
+        raise OSError("full")
+
+    path = tmp_path / "picture.png"
+    save(Figure(), path)
+    before = path.read_bytes()
+    monkeypatch.setattr(Figure, "savefig", fill_the_disk)
+    with pytest.raises(OSError, match="full"):
+        save(Figure(), path)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
 def test_what_is_missing_is_named(monkeypatch):

@@ -2,6 +2,8 @@
 
 import os
 import random
+import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -11,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 from test_usd import (
     EPS,
     PENTAGON,
@@ -28,6 +30,7 @@ from usd_validation import validate
 
 from warpcloth.mesh import Mesh, Surface
 from warpcloth.usd import FrameSequence, MeasureWriter, read_mesh, read_stage_mesh
+from warpcloth.usd.chunks import export
 
 # At no constant distance, and none of them 0, where float noise would hide; the third is a sample of no artist.
 CODES = (101.0, 102.5, 103.0 + 1 / 3, 104.0, 110.0, 111.3, 112.0)
@@ -587,6 +590,20 @@ def test_a_killed_writer_leaves_a_readable_result(tmp_path):
         for frame, values in enumerate(now):
             np.testing.assert_array_equal(values, np.float32(measured(mesh, frame, sign)[0]["stretch1"]))
         assert len(now) in (3, 6, 7) and validate(output, path) == []
+
+
+def test_a_layer_for_which_the_disk_has_no_room_is_named(tmp_path):
+    path, layer = tmp_path / "a.usdc", Sdf.Layer.CreateAnonymous(".usdc")
+    Sdf.AttributeSpec(Sdf.CreatePrimInLayer(layer, "/A"), "x", Sdf.ValueTypeNames.FloatArray)
+    layer.GetAttributeAtPath("/A.x").default = Vt.FloatArray.FromNumpy(np.random.default_rng(0).random(100_000, np.float32))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=re.escape(f"{path}: could not be written")) as raised:
+            export(layer, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "pxrInternal" not in str(raised.value) and not path.exists()
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="counts memory as Linux does")

@@ -312,7 +312,7 @@ class Mesh:
 
     @cached_property
     def vertex_areas(self):
-        """Lumped areas (n,) [m²]: a third of the adjacent triangles' areas, of those that are finite; zero without triangles."""
+        """Lumped areas (n,) [m²]: a third of the adjacent triangles' areas that are finite; zero without any."""
         third = np.repeat(np.where(np.isfinite(self.triangle_areas), self.triangle_areas, 0.0) / 3, 3)
         return _read_only(np.bincount(self.triangles.ravel(), weights=third, minlength=len(self.points)))
 

@@ -3,6 +3,8 @@
 import importlib.util
 from pathlib import Path
 
+from ..outputs import Output
+
 GREY = "0.35"
 PICTURES = (".png", ".svg", ".pdf")
 # Without the date the same figure has the same bytes.
@@ -39,5 +41,6 @@ def save(figure, path):
     """Writes a figure in the format of its ending: .png, .svg or .pdf."""
     from matplotlib import rc_context
 
-    with rc_context({"svg.hashsalt": "warpcloth"}):  # ids in an SVG are random without a salt
-        figure.savefig(path, dpi=150, facecolor="white", metadata=_METADATA[Path(path).suffix.lower()])
+    ending = Path(path).suffix.lower()
+    with rc_context({"svg.hashsalt": "warpcloth"}), Output(path, "xb") as output:  # ids in an SVG are random without a salt
+        figure.savefig(output.file, format=ending[1:], dpi=150, facecolor="white", metadata=_METADATA[ending])

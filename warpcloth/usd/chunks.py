@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdUtils
 
 from .layers import flatten, relative_path
 from .stage import METADATA_KEY, followed
@@ -234,7 +234,7 @@ class ChunkWriter:
         for attribute in self._attributes():
             flat.GetAttributeAtPath(attribute).ClearInfo("timeSamples")
         single = self._run / f"{self._output.stem}.usdc"
-        flat.Export(str(single))
+        _export(flat, single)
         self._copy_frames(single)
         finished = self._run / f"finished{self._output.suffix}"
         if packed:
@@ -302,6 +302,15 @@ def export(layer, path, unfinished_in=None):
     """Writes a layer under another name first, so that the path has either what was there or the whole layer."""
     path = Path(path)
     unfinished = Path(unfinished_in or path.parent) / f"unfinished{path.suffix}"
-    if not layer.Export(str(unfinished)):
-        raise OSError(f"{path}: could not be written")
+    _export(layer, unfinished, path)
     os.replace(unfinished, path)
+
+
+def _export(layer, file, meant=None):
+    """Writes a layer to a file that is ``meant`` for a path."""
+    try:
+        written, reason = layer.Export(str(file)), ""
+    except Tf.ErrorException as error:
+        written, reason = False, f": {error.args[0].commentary}"
+    if not written:
+        raise OSError(f"{meant or file}: could not be written{reason}")
