@@ -340,6 +340,42 @@ def test_a_failure_on_the_way_leaves_earlier_results(cloth, tmp_path, monkeypatc
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.parametrize(("frame", "kept"), [(1, True), (4, False)])
+def test_an_interruption_keeps_rows_and_without_any_what_was_there(frame, kept, cloth, tmp_path, monkeypatch, capsys):
+    outputs = ["--csv", str(tmp_path / "t.csv"), "--report", str(tmp_path / "t.json"), "--npz", str(tmp_path / "t.npz")]
+    assert main(["analyze", str(cloth), *outputs]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    sequence = wc.open_sequence(cloth)
+
+    def read(place):
+        if place >= frame:
+            raise KeyboardInterrupt
+        return sequence.read(place)
+
+    monkeypatch.setattr("warpcloth.sequences.open_sequence", lambda *_: replace(sequence, read=read))
+    assert main(["analyze", str(cloth), "--reference", "previous", *outputs]) == 130
+    after = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert after.keys() == before.keys() and (after == before) is kept
+    assert kept or len((tmp_path / "t.csv").read_text().splitlines()) == 1 + 2 * (frame - 1)
+
+
+def test_a_stage_of_frames_that_are_not_even_in_time(tmp_path):
+    """They stand at time codes that fit their times; a rest shape with a hole has none, and says what to do."""
+    mesh = wc.Mesh.grid(3, 3)
+    frames = np.stack([mesh.points * (1.0 + 0.1 * k) for k in range(4)])
+    times = np.array([0.0, 0.1, 0.4, 0.5])
+    path = str(tmp_path / "frames.npz")
+    np.savez(path, points=frames, triangles=mesh.triangles, times=times)
+    write_report(wc.Analyzer(None, path), usd=tmp_path / "out.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    codes = np.array(stage.GetPrimAtPath("/World/Cloth").GetAttribute("primvars:stretch1").GetTimeSamples())
+    np.testing.assert_allclose(codes / stage.GetTimeCodesPerSecond(), times, atol=1e-9)
+    frames[0, 3] = np.nan
+    np.savez(path, points=frames, triangles=mesh.triangles, times=times)
+    with pytest.raises(ValueError, match=r"frames.npz: frame 0, which is the rest shape, has vertex 3 in no finite place"):
+        write_report(wc.Analyzer(None, path), usd=tmp_path / "out.usdc")
+
+
 def test_a_layer_over_a_measured_stage(cloth, tmp_path):
     """A second analysis sees the animation through the first, and both sets of measures are there."""
     assert main(["analyze", str(cloth), "-o", str(tmp_path / "a.usdc")]) == 0

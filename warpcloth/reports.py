@@ -12,6 +12,8 @@ from .summaries import CsvWriter, JsonWriter, Summary, summarise
 
 # Length of a principal direction of stretch 1 beside the square root of the median area of a triangle.
 _SEGMENT = 0.7
+# Time codes that are nearer than this to the numbers of their frames are these.
+_EVEN = 1e-6
 
 
 @dataclass
@@ -107,32 +109,38 @@ def write_report(
         writers += [log] if log else []
         archive = stack.enter_context(_archive(analyzer, npz)) if npz else None
         shown = _Shown(analyzer, report, listed, usd, stills, curves, single_file, up_axis, stack) if usd or stills else None
-        for sample in analyzer:
-            values = {}
-            for measure in analyzer.measures:
-                values |= scalars(measure, sample.values[measure.name])
-            places = analyzer.places(sample.points)
-            about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
-            for name, numbers in values.items():
-                summary = summarise(name, listed[name].unit, numbers, places, analyzer.areas, **about)
-                report.extremes[name].add(summary)
-                if plot:
-                    kept.append(summary)
-                for writer in writers:
-                    writer.append(summary)
-            for exclusion in sample.excluded:
-                report.excluded += 1
-                if len(report.exclusions) < Report.SENTENCES:
-                    report.exclusions.append(str(exclusion))
-                if log:
-                    log.exclude(exclusion, exclusion.frame)
-            if archive:
-                archive.append(sample.frame, sample.reference, sample.time, sample.values)
-            if shown:
-                shown.append(sample, values, places)
-            report.rows += 1
-            if progress:
-                progress(report.rows, len(analyzer))
+        try:
+            for sample in analyzer:
+                values = {}
+                for measure in analyzer.measures:
+                    values |= scalars(measure, sample.values[measure.name])
+                places = analyzer.places(sample.points)
+                about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
+                for name, numbers in values.items():
+                    summary = summarise(name, listed[name].unit, numbers, places, analyzer.areas, **about)
+                    report.extremes[name].add(summary)
+                    if plot:
+                        kept.append(summary)
+                    for writer in writers:
+                        writer.append(summary)
+                for exclusion in sample.excluded:
+                    report.excluded += 1
+                    if len(report.exclusions) < Report.SENTENCES:
+                        report.exclusions.append(str(exclusion))
+                    if log:
+                        log.exclude(exclusion, exclusion.frame)
+                if archive:
+                    archive.append(sample.frame, sample.reference, sample.time, sample.values)
+                if shown:
+                    shown.append(sample, values, places)
+                report.rows += 1
+                if progress:
+                    progress(report.rows, len(analyzer))
+        except KeyboardInterrupt:
+            if not report.rows:  # earlier files are worth more than empty ones
+                for writer in filter(None, (*writers, archive)):
+                    writer.discard()
+            raise
         if log:
             log.facts |= {"rows": report.rows, "excluded": report.excluded}
     if plot:
@@ -265,9 +273,17 @@ class _Shown:
             places = {pair.frame for pair in analyzer.pairs if sequence.labels[pair.frame] in self.stills}
             up_axis = sequence.stage.up_axis if sequence.stage else up_axis
             self.view = View(up_axis=up_axis).fit(sequence[place] for place in sorted(places))
-        self.writer = None
+        self.writer, self.rate = None, _rate(sequence)
         if usd:
             from .usd import MeasureWriter
+
+            lost = np.flatnonzero(~np.isfinite(analyzer.mesh.points).all(axis=1))
+            if len(lost) and not self.over:
+                where = "the rest shape" if sequence.declared else f"frame {sequence.labels[0]:g}, which is the rest shape,"
+                raise ValueError(
+                    f"{sequence.path or 'mesh'}: {where} has vertex {lost[0]} in no finite place, and a stage needs all; "
+                    "give another rest shape (--rest), or write no stage"
+                )
 
             kind = "uniform" if analyzer.on == "triangle" else "vertex"
             names = [f"principal{k + 1}" for k in range(_count(analyzer, "stretch"))] if curves else []
@@ -278,7 +294,7 @@ class _Shown:
                 coloured=camel(self.name) if self.name else None,
                 directions=dict.fromkeys(names, kind),
                 source=sequence.stage,
-                fps=_rate(sequence),
+                fps=self.rate,
                 up_axis=up_axis,
                 metadata=metadata,
             )
@@ -291,7 +307,7 @@ class _Shown:
         if self.writer and (self.over or finite):  # without a stage below it a frame needs points
             primvars = {camel(name): _single(numbers) for name, numbers in values.items()}
             colours = self.scale.linear(values[self.name]) if self.scale else None
-            self.writer.append(sample.frame, primvars, colours, segments, None if self.over else sample.points)
+            self.writer.append(self._time_code(sample), primvars, colours, segments, None if self.over else sample.points)
         if sample.frame in self.stills:
             from .chart import draw
 
@@ -308,6 +324,14 @@ class _Shown:
                 view=self.view,
                 directions=segments,
             )
+
+    def _time_code(self, sample):
+        """That of the stage below; without one the number of the frame, or where frames are not even in time what fits it."""
+        sequence = self.analyzer.sequence
+        if self.over or sequence.times is None:
+            return sample.frame
+        code = sequence.labels[0] + self.rate * (sample.time - sequence.times[0])
+        return sample.frame if abs(code - sample.frame) < _EVEN else code
 
     def _segments(self, sample, places):
         """Principal directions as long as their stretches, by name: centres and vectors (E, 3) [m]."""
