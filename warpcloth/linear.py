@@ -1,6 +1,7 @@
 """The only thing that solves a sparse system: conjugate gradients on the device, or a factorisation."""
 
 import importlib.util
+import time
 
 import numpy as np
 import warp as wp
@@ -206,6 +207,9 @@ class CholeskyFactor:
         device: The Warp device of the vectors.
         dtype: Their scalar type, ``wp.float32`` or ``wp.float64``.
 
+    Attributes:
+        seconds: What factorising took [s].
+
     Raises:
         ValueError: If A is not finite or not positive definite.
     """
@@ -219,7 +223,9 @@ class CholeskyFactor:
         compressed = [wp.array(part, dtype=kind, device=device) for part, kind in parts]
         solver = {wp.float32: cholespy.CholeskySolverF, wp.float64: cholespy.CholeskySolverD}[dtype]
         try:
+            start = time.perf_counter()
             self.solver = solver(columns.shape[0], *compressed, cholespy.MatrixType.CSC)
+            self.seconds = time.perf_counter() - start
         except ValueError:
             raise ValueError(_INDEFINITE) from None
 
@@ -242,7 +248,9 @@ class LUFactor:
 
         options = {"SymmetricMode": True, "Equil": False}
         try:
+            start = time.perf_counter()
             self.factors = splu(_finite_columns(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            self.seconds = time.perf_counter() - start
         except RuntimeError:  # exactly singular
             raise ValueError(_INDEFINITE) from None
         if not (self.factors.U.diagonal() > 0.0).all():
@@ -262,6 +270,9 @@ class CopyFactors:
         model: The :class:`warpcloth.model.Model`.
         matrices: A of each copy, scipy matrices (n, n) of one pattern.
 
+    Attributes:
+        seconds: What factorising took [s].
+
     Raises:
         ValueError: If a matrix is not finite or not positive definite.
     """
@@ -274,6 +285,7 @@ class CopyFactors:
             if key not in found:
                 found[key] = constant_factor(matrix, model.device, model.dtype)
             self.factors.append(found[key])
+        self.seconds = sum(factor.seconds for factor in found.values())
         self._parts = {}
 
     def solve(self, b, x):
@@ -296,6 +308,8 @@ class DiagonalScaling:
         model: The :class:`warpcloth.model.Model`.
         diagonal: D of each copy, (B, n), above 0.
     """
+
+    seconds = 0.0  # there is nothing to factorise
 
     def __init__(self, model, diagonal):
         self.model, self._inverse = model, model.array(1.0 / diagonal.ravel(), model.dtype)

@@ -20,8 +20,8 @@ class Animation:
         velocities: The same shape [m/s].
         times: (frames+1,) [s].
         status: :class:`warpcloth.status.Status`.
-        timings: ``compile`` (building the model and binding the solver, with compiling what was not in the cache) and
-            ``frames`` (a list) [s].
+        timings: ``compile`` (building the model and binding the solver, with compiling what was not in the cache),
+            ``factorise`` (constant matrices, a part of it) and ``frames`` (a list) [s].
         worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame.
         output: Path of the USD file, or None.
     """
@@ -79,7 +79,7 @@ def simulate(
     start = time.perf_counter()
     model = scene.build(device=device, dtype=dtype, copies=copies, vary=vary)
     stepper = solver.bind(model)
-    timings = {"compile": time.perf_counter() - start, "frames": []}
+    timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds, "frames": []}
     recorder = recorder or _Memory(model, frames)
     watch = Watch(model, stepper.h)
     try:

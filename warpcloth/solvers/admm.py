@@ -84,6 +84,7 @@ class ADMMStepper(Stepper):
         self._scales = [self._scale_of(elements) for elements in model.terms]
         weighed = model.with_terms(map(_weighed, model.terms, self._scales))
         self._factors = CopyFactors(model, constant_matrices(weighed, self.s, options.weight))
+        self.factorise_seconds = self._factors.seconds
         self._sums, cuda = Sums(model), model.device.is_cuda
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
         self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)

@@ -88,6 +88,7 @@ class ProjectiveDynamicsStepper(Stepper):
         matrices = constant_matrices(model, self.s)
         self._sizes = np.stack([np.asarray(abs(matrix).sum(axis=1)).ravel() for matrix in matrices])
         self._linear = CopyFactors(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
+        self.factorise_seconds = self._linear.seconds
         self._sums, self._gradient_of = Sums(model), Gradient(model, corrected=True)
         self.correction, self._gradient, self._w = (model.vectors() for _ in range(3))
         self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
