@@ -1,38 +1,16 @@
 """How far a setup strays from the reference solution of a scene, and what a frame costs it."""
 
 import math
-import time
 import warnings
 
 import numpy as np
 
 from ..checks import number, whole
 from ..simulate import simulate
-from .reference import Reference, position_error, scene_digest, strain_error
+from .clock import Clock, TooSlow
+from .digest import scene_digest
+from .reference import Reference, position_error, strain_error
 from .tasks import SceneRef, Setup
-
-
-class _TooSlow(Exception):
-    """The time is up."""
-
-
-class _Clock:
-    """Ends a run once ``limit`` seconds have passed since its start was kept: what is compiled before does not count.
-
-    Attributes:
-        frames: What each frame took [s].
-    """
-
-    def __init__(self, limit):
-        self.limit, self.frames = limit, []
-
-    def __call__(self, frame, frames):
-        now = time.perf_counter()
-        if frame:
-            self.frames.append(now - self.last)
-        self.last = now
-        if frame < frames and sum(self.frames) > self.limit:
-            raise _TooSlow
 
 
 def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="float32", limit=60.0, repeats=1):
@@ -78,10 +56,10 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", UserWarning)
         for _ in range(repeats):
-            clock = _Clock(left)
+            clock = Clock(left)
             try:
                 runs.append(simulate(declared, record, device=device, dtype=dtype, frames=frames, progress=clock))
-            except _TooSlow:
+            except TooSlow:
                 if not runs:
                     reason = f"{len(clock.frames)} of {frames} frames took {sum(clock.frames):.3g} s, more than {limit:g} s"
                     found |= {"status": "slow", "reason": reason, "frames": len(clock.frames)}
