@@ -1,0 +1,379 @@
+"""Reference solutions and errors against them: bounds, orders, files, what is refused."""
+
+import json
+import warnings
+from dataclasses import asdict, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.integrate import solve_ivp
+
+import warpcloth as wc
+from warpcloth.chart import reference as module
+from warpcloth.chart.digest import scene_digest
+from warpcloth.chart.reference import Reference, cloth_size, position_error, reference, strain_error
+from warpcloth.chart.tasks import SceneRef
+from warpcloth.chart.trajectory import measure
+from warpcloth.kernels.terms import SPRING
+
+# Soft enough to be smooth in steps of 1/16 frame: ωh at most 0.1.
+CHAIN = SceneRef("chain", {"links": 5, "stiffness": 20.0})
+CLOTH = SceneRef("hanging", {"n": 8, "stiffness": 200.0, "density": 10.0})
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder for the references of all tests that do not look into it."""
+    return tmp_path_factory.mktemp("kept")
+
+
+@pytest.fixture
+def shared(kept, monkeypatch):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(kept))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where references are kept in this test alone."""
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    return tmp_path / "references"
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Substeps of all runs that references take."""
+    taken, simulate = [], module.simulate
+    monkeypatch.setattr(
+        module, "simulate", lambda scene, solver, **rest: taken.append(solver) or simulate(scene, solver, **rest)
+    )
+    return taken
+
+
+def written(path, body):
+    """A scene of two masses on a string, of a file."""
+    lines = [
+        "import numpy as np",
+        "import warpcloth as wc",
+        "def scene():",
+        "    mesh = wc.Mesh.chain(3, direction=(1.0, 0.0, 0.0))",
+    ]
+    path.write_text("\n".join([*lines, f"    return wc.Scene(mesh, masses=[0.1, 0.1, 0.1], pins=[0], {body})\n"]))
+    return SceneRef(str(path))
+
+
+@cache
+def true_chain():
+    """The motion of :data:`CHAIN` to 1e-11, without any of Warp, (FRAMES + 1, 6, 3)."""
+    scene = CHAIN.load()
+    k, lengths, masses = 20.0, scene.mesh.edge_lengths, scene.vertex_masses
+
+    def rate(t, state):
+        y, v = state.reshape(2, -1)
+        stretch = k * (np.diff(y) + lengths)  # y falls along the chain
+        force = -masses * 9.81
+        force[:-1] += stretch
+        force[1:] -= stretch
+        return np.concatenate([v, np.where(np.arange(6) > 0, force / masses, 0.0)])
+
+    start = np.concatenate([scene.positions[:, 1], np.zeros(6)])
+    times = np.arange(FRAMES + 1) / scene.fps
+    found = solve_ivp(rate, (0.0, times[-1]), start, method="DOP853", rtol=1e-12, atol=1e-13, t_eval=times)
+    points = np.zeros((FRAMES + 1, 6, 3))
+    points[..., 1] = found.y[:6].T
+    return points
+
+
+def errors(scene, solver, substeps, **options):
+    """Errors of position and strain against a reference known to 1e-10, and its own, (S, 2) and (2,)."""
+    exact = reference(scene, FRAMES, tolerance=1e-10)
+    found = []
+    for s in substeps:
+        setup = {"solver": solver, "options": {"substeps": s, **options}}
+        result = measure(asdict(scene), setup, reference=exact.path, dtype="float64")
+        assert (result["status"], result["reason"], result["frames"]) == ("ok", "", FRAMES)
+        found.append((result["error"], result["strain_error"]))
+    return np.array(found), np.array([exact.error, exact.strain_error])
+
+
+METHODS = {
+    "newton euler": ("newton", {"integrator": "euler", "tolerance": 1e-9}, 1),
+    "newton midpoint": ("newton", {"integrator": "midpoint", "tolerance": 1e-9}, 2),
+    "newton bdf2": ("newton", {"integrator": "bdf2", "tolerance": 1e-9}, 2),
+    "explicit": ("explicit", {}, 1),
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("scene", [CHAIN, CLOTH], ids=str)
+def test_errors_fall_with_the_order_of_the_method(scene, method, shared):
+    """As far as the reference is known, which no two methods agree on by chance: it is explicit and extrapolated."""
+    solver, options, order = METHODS[method]
+    found, floor = errors(scene, solver, (16, 32), **options)
+    assert (found[-1] > 10.0 * floor).all()
+    assert np.abs(np.log2(found[0] / found[1]) - order).max() < 0.15
+
+
+@wp.func
+def spring_gradient_by_a_hundredth_too_large(y: Any, rest: Any):
+    return y.dtype(1.01) * wp.static(SPRING.gradient)(y, rest)
+
+
+def test_a_wrong_gradient_is_exposed(shared, monkeypatch):
+    """Its error stays where it is, far above that of the reference; with the right one it falls by half."""
+    substeps = (1024, 2048, 4096)
+    right, floor = errors(CHAIN, "explicit", substeps)
+    monkeypatch.setattr(wc.Spring, "term", replace(SPRING, name="Wrong", gradient=spring_gradient_by_a_hundredth_too_large))
+    wrong, _ = errors(CHAIN, "explicit", substeps)
+    assert np.allclose(right[1:], 0.5 * right[:-1], rtol=0.05)
+    assert (wrong[-1] > 0.9 * wrong[-2]).all() and (wrong[-1] > 1e3 * floor).all() and (wrong[-1] > 10.0 * right[-1]).all()
+
+
+# What e(h) − e(2h) is of the error of e(h), which is of order q: 2^q − 1. Symplectic Euler 2; BDF2 3, or 4 where terms cancel.
+@pytest.mark.parametrize(("explicit", "least", "most"), [(4096, 2.8, 3.2), (0, 6.0, 16.0)], ids=["explicit", "newton"])
+def test_the_error_is_a_bound(explicit, least, most, folder, monkeypatch):
+    """Against an independent integration of the chain to 1e-11, and a reference of a hundredth of the error."""
+    monkeypatch.setattr(module, "_MOST_EXPLICIT", explicit)
+    for scene in (CHAIN, CLOTH):
+        coarse = reference(scene, FRAMES, tolerance=1e-6)
+        points = true_chain() if scene is CHAIN else reference(scene, FRAMES, tolerance=1e-2 * coarse.error).points
+        mesh = scene.load().mesh
+        for estimate, distance in ((coarse.error, position_error), (coarse.strain_error, strain_error)):
+            assert least < estimate / distance(coarse.points[1:], points[1:], mesh) < most
+
+
+def test_the_error_bounds_chaos_too(folder):
+    """What swings through: the order is lost at first, the bound is not."""
+    scene = SceneRef("hanging", {"n": 6})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        coarse, fine = (reference(scene, tolerance=tolerance) for tolerance in (1e-3, 1e-5))
+    assert coarse.substeps < fine.substeps
+    true = position_error(coarse.points[1:], fine.points[1:], scene.load().mesh)
+    assert fine.error < true < coarse.error
+
+
+def test_a_reference_is_found_again(folder, runs):
+    said = []
+    first = reference(CHAIN, 2, progress=lambda *state: said.append(state))
+    taken = len(runs)
+    assert taken >= 3 and said[0] == (runs[0].substeps, 0, 2) and said[-1] == (first.substeps, 2, 2)
+    again = reference(SceneRef(CHAIN.name, {**CHAIN.parameters, "duration": 2.0}), 2)
+    assert len(runs) == taken and again.path == first.path and again.seconds == first.seconds
+    assert np.array_equal(again.points, first.points) and np.allclose(again.times, [0.0, 1 / 60, 2 / 60])
+    assert first.points.dtype == np.float64 and np.array_equal(first.points[0], CHAIN.load().positions)
+    assert [path.name for path in folder.iterdir()] == [f"{first.key}.npz"]
+    reference(CHAIN, 2, tolerance=0.1 * first.error)
+    assert len(runs) > taken, "a smaller tolerance needs new runs"
+    taken = len(runs)
+    reference(CHAIN, 2, tolerance=0.1 * first.error)
+    assert len(runs) == taken and len(list(folder.iterdir())) == 1
+
+
+def test_another_reference_is_not_found(folder, runs, monkeypatch):
+    for scene, frames in ((CHAIN, 2), (SceneRef("chain", {"links": 5, "stiffness": 21.0}), 2), (CHAIN, 3), (CHAIN, 2)):
+        if len(list(folder.glob("*"))) == 3:
+            monkeypatch.setattr(module, "source_digest", lambda: "another")
+        runs.clear()
+        reference(scene, frames)
+        assert runs
+    assert len(list(folder.iterdir())) == 4
+
+
+@pytest.mark.parametrize("broken", ["cut", "text", "empty", "another"])
+def test_broken_files_are_replaced(broken, folder, runs):
+    first = reference(CHAIN, 2)
+    path = folder / f"{first.key}.npz"
+    content = path.read_bytes()
+    if broken == "another":
+        replace(first, key="0" * 24).save()
+    else:
+        path.write_bytes({"cut": content[: len(content) // 2], "text": b"nothing", "empty": b""}[broken])
+        with pytest.raises(ValueError, match=r"is no reference solution, or broken .*; remove it"):
+            Reference.load(path)
+    runs.clear()
+    assert np.array_equal(reference(CHAIN, 2).points, first.points) and runs
+    assert Reference.load(path).key == first.key
+    with pytest.raises(FileNotFoundError):
+        Reference.load(folder / "none.npz")
+
+
+@pytest.mark.parametrize("when", ["running", "writing"])
+def test_an_interrupt_leaves_nothing(when, folder, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    def half(file, **_):
+        file.write(b"half")
+        stop()
+
+    if when == "writing":
+        monkeypatch.setattr(np, "savez", half)
+    with pytest.raises(KeyboardInterrupt):
+        reference(CHAIN, 2, progress=stop if when == "running" else None)
+    assert not list(folder.glob("*"))
+
+
+def test_hard_constraints(folder, tmp_path):
+    """A pendulum of two hard strings: by constrained dynamics, whose steps keep them."""
+    string = "terms=[wc.Spring(stiffness=np.inf)], duration=0.2"
+    found = reference(written(tmp_path / "hard.py", string))
+    mesh = wc.Mesh.chain(3, direction=(1.0, 0.0, 0.0))
+    assert found.method == "ConstrainedDynamics" and found.error < 1e-3
+    # Each run keeps their length; of what is extrapolated the error is that of the rest.
+    assert strain_error(found.points[1:], np.tile(mesh.points, (12, 1, 1)), mesh) < 3.0 * found.strain_error
+    bodies = reference(SceneRef("mobile", {"n": 3}), 2)
+    assert bodies.method == "ConstrainedDynamics" and bodies.error < 1e-3
+
+
+def test_what_has_no_reference_says_so(folder, tmp_path):
+    limit = "terms=[wc.Spring(stiffness=10.0), wc.StrainLimit(most=1.1)], density=0.1, fps=60.0"
+    limited = tmp_path / "limit.py"
+    limited.write_text(
+        f"import warpcloth as wc\ndef scene():\n    return wc.Scene(wc.Mesh.grid(3, 3), name='limited', {limit})\n"
+    )
+    with pytest.raises(ValueError, match="no reference solution of limited: ConstrainedDynamics cannot take StrainLimit"):
+        reference(SceneRef(str(limited)))
+    with pytest.raises(ValueError, match="the reference of chain needs more than 1e-09 s; give it more time"):
+        reference(CHAIN, limit=1e-9)
+    with pytest.raises(ValueError, match="tolerance is 0"):
+        reference(CHAIN, tolerance=0)
+    with pytest.raises(ValueError, match="frames is 0"):
+        reference(CHAIN, 0)
+    assert not list(folder.glob("*"))
+
+
+def test_what_is_slow_or_not_known_warns(folder, tmp_path):
+    stiff = written(tmp_path / "stiff.py", "terms=[wc.RigidCluster(vertices=[[0, 1, 2]], stiffness=1e12)], duration=0.05")
+    with pytest.warns(
+        UserWarning, match=r"RigidCluster makes the reference of scene slow: .* below 4096 explicit steps a frame"
+    ):
+        assert reference(stiff).method == "Newton"
+    with pytest.warns(
+        UserWarning, match=r"reference of chain.* is known to .* only, not to 1e-20: give it more time, or fewer"
+    ):
+        found = reference(CHAIN, 1, tolerance=1e-20, limit=0.5)
+    assert found.limit == 0.5
+    with pytest.warns(UserWarning, match="is known to"):
+        assert reference(CHAIN, 1, tolerance=1e-20, limit=0.4).seconds == found.seconds
+
+
+def test_motion_that_no_step_resolves_ends_early(folder, monkeypatch):
+    """Runs that differ by as much however small the step, as those of chaotic motion do."""
+    scatter, simulate = np.random.default_rng(0), module.simulate
+
+    def scattered(*arguments, **options):
+        run = simulate(*arguments, **options)
+        return replace(run, points=run.points + 1e-2 * scatter.normal(size=run.points.shape))
+
+    monkeypatch.setattr(module, "simulate", scattered)
+    with pytest.warns(UserWarning, match=r"only, not to 1e-09: the motion is chaotic, take fewer frames"):
+        found = reference(CHAIN, 2, tolerance=1e-9)
+    assert found.limit == np.inf and found.error > 1e-3 and found.seconds < 60.0
+
+
+def test_runs_that_diverge_are_left_out(folder, runs, monkeypatch):
+    """4, 8 and 16 steps a frame are above the limit, 2/ω of about 0.7 ms; the next three runs are the first to count."""
+    monkeypatch.setattr(module, "step_limits", lambda model: (1.0, 1.0))
+    monkeypatch.setattr(module, "Explicit", lambda substeps: wc.Explicit(substeps=substeps, above_limit="allow"))
+    scene = SceneRef("chain", {"links": 5, "stiffness": 2e4})
+    found = reference(scene, FRAMES)
+    assert [run.substeps for run in runs] == [4, 8, 16, 32, 64, 128] and found.substeps == 128 and found.error < 1e-3
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"mesh": wc.Mesh.grid(3, 3, size=1.1)},
+        {"masses": np.full(9, 0.2)},
+        {"positions": wc.Mesh.grid(3, 3).points * 1.1},
+        {"velocities": np.full((9, 3), 0.1)},
+        {"terms": [wc.Spring(pairs="structural", stiffness=11.0)]},
+        {"terms": [wc.Spring(pairs=("structural",), stiffness=10.0, damping=0.1)]},
+        {"terms": [wc.Spring(pairs="edges", stiffness=10.0)]},
+        {"terms": [wc.SpringLimit(pairs="structural", stiffness=10.0, most=1.1)]},
+        {"terms": [wc.Spring(pairs="structural", stiffness=10.0)] * 2},
+        {"pins": [0]},
+        {"pins": wc.Pins([0, 2], np.tile(wc.Mesh.grid(3, 3).points[[0, 2]], (1, 1, 1)))},
+        {"gravity": (0.0, -9.0, 0.0)},
+        {"fps": 30.0},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_all_that_motion_depends_on_is_in_the_key(change):
+    terms = [wc.Spring(pairs="structural", stiffness=10.0)]
+    scene = wc.Scene(wc.Mesh.grid(3, 3), masses=np.full(9, 0.1), terms=terms, pins=[0, 2])
+    assert scene_digest(scene) == scene_digest(replace(scene, name="another", duration=2.0))
+    assert scene_digest(scene) != scene_digest(replace(scene, **change))
+
+
+def test_a_key_is_of_data():
+    term = wc.Spring(pairs="structural", stiffness=10.0)
+    object.__setattr__(term, "stiffness", object())
+    scene = wc.Scene(wc.Mesh.grid(3, 3), density=0.1)
+    object.__setattr__(scene, "terms", (term,))
+    with pytest.raises(ValueError, match="a key needs numbers"):
+        scene_digest(scene)
+
+
+def test_errors_in_closed_form():
+    """A chain of length 2 whose end is displaced by 0.3 along it in one frame of two."""
+    mesh = wc.Mesh.chain(3, length=2.0)
+    points = np.stack([mesh.points, mesh.points])
+    others = points.copy()
+    along = mesh.points[2] - mesh.points[1]
+    others[1, 2] += 0.3 * along
+    assert cloth_size(mesh) == 2.0
+    assert position_error(points, others, mesh) == pytest.approx(0.3 / np.sqrt(6.0) / 2.0, rel=1e-12)
+    assert strain_error(points, others, mesh) == pytest.approx(np.percentile([0.0, 0.0, 0.0, 0.3], 99), rel=1e-12)
+
+
+def measured(solver, frames=3, **options):
+    limits = {name: options.pop(name) for name in ("limit", "repeats", "reference") if name in options}
+    found = measure(asdict(SceneRef("hanging", {"n": 4})), {"solver": solver, "options": options}, frames, **limits)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    return found
+
+
+def test_how_a_measurement_ends(device):
+    well = measured("newton", substeps=2, repeats=3)
+    assert (well["status"], well["reason"], well["frames"], well["error"]) == ("ok", "", 3, None)
+    assert 0.0 < well["spread"][0] <= well["ms"] <= well["spread"][1] and well["ms_per_second"] == 60.0 * well["ms"]
+    assert well["compile_s"] > 0.0 and well["factorise_s"] == 0.0 and well["residual"] > 0.0 and "converged" in well["message"]
+    assert measured("projective-dynamics", substeps=2)["factorise_s"] > 0.0 < measured("admm", substeps=2)["factorise_s"]
+    slow = measured("newton", substeps=64, frames=60, limit=1e-3)
+    assert slow["status"] == "slow" and slow["frames"] < 60 and slow["error"] is None and slow["ms"] > 0.0
+    assert f"{slow['frames']} of 60 frames took" in slow["reason"] and "more than 0.001 s" in slow["reason"]
+    refused = measured("explicit", substeps=1)
+    assert refused["status"] == "refused" and "stable below" in refused["reason"] and refused["ms"] is None
+    diverged = measured("explicit", substeps=4, above_limit="allow", frames=20)
+    assert diverged["status"] == "diverged" and "diverged in frame" in diverged["reason"] and diverged["error"] is None
+    assert diverged["frames"] < 20
+    assert "in motion" in measured("explicit", substeps=10)["message"], "warnings are part of it"
+
+
+def test_a_second_run_may_be_left_out():
+    """The time is up amid the second: what the first gave is kept."""
+    once = measured("newton", substeps=32, frames=10)
+    total = 1e-3 * once["ms"] * 10
+    assert measured("newton", substeps=32, frames=10, limit=3.0 * total, repeats=1000)["status"] == "ok"
+
+
+def test_a_measurement_needs_its_reference(shared):
+    exact = reference(CHAIN, 3)
+    setup = {"solver": "newton", "options": {"substeps": 4}}
+    assert measure(asdict(CHAIN), setup, reference=exact.path)["frames"] == 3
+    fewer = measure(asdict(CHAIN), setup, 2, exact.path)
+    assert fewer["frames"] == 2 and 0.0 < fewer["error"] < 1e-2
+    for wrong, words in (
+        (lambda: measure(asdict(CLOTH), setup, reference=exact.path), "is the reference of another scene than hanging"),
+        (lambda: measure(asdict(CHAIN), setup, 4, exact.path), "frames is 4; .* has 3"),
+        (lambda: measure(asdict(CHAIN), setup, limit=0.0), "limit is 0"),
+        (lambda: measure(asdict(CHAIN), setup, repeats=0), "repeats is 0"),
+        (lambda: measure(asdict(CHAIN), {"solver": "newton", "options": {"steps": 1}}), "steps"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            wrong()
