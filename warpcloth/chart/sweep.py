@@ -8,6 +8,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+from ..quiet import initialise_warp
 from .tasks import run
 
 # One thread a process: more would take the cores of the others, and Warp's CPU kernels use one as it is.
@@ -114,7 +115,7 @@ def _processes(workers):
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
     try:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=initialise_warp) as pool:
             try:
                 yield pool
             except BaseException:

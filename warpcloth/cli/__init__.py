@@ -12,7 +12,7 @@ import warnings
 
 import numpy as np
 
-from . import analyze, compare, deform, run
+from . import analyze, chart, compare, deform, run
 from .terminal import Interrupted, say, show_warning
 
 
@@ -92,6 +92,8 @@ def _parser():
     analyze.add_arguments(analyzes)
     compares = add("compare", compare.compare, "Say how far two animations are apart.", epilog=compare.EPILOG)
     compare.add_arguments(compares)
+    charts = commands.add_parser("chart", help=chart.TEXT, description=chart.TEXT, allow_abbrev=False)
+    chart.add_arguments(charts)
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")

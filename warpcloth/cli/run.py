@@ -11,7 +11,6 @@ from .terminal import Interrupted, Progress, as_json, check_writable, find_devic
 
 # A step that all solvers but the explicit ones take well; where no step is given the substeps come nearest to it.
 _STEPS_A_SECOND = 240
-_EXPLICIT_MARGIN = 1.1
 # More substeps a frame than this, and the implicit solver is worth a hint.
 _MANY_SUBSTEPS = 1000
 
@@ -212,14 +211,14 @@ def solver_setup(arguments, scene, device, limits=False):
         return _Setup(solver, solver, "by default about 1/240 s")
     if step_given and not limits:
         return _Setup(solver, solver)
-    from ..solvers.explicit import step_limits
+    from ..solvers.explicit import fewest_substeps, step_limits
 
     began = time.perf_counter()
     model = scene.build(device=device, dtype=arguments.dtype)
     rest, motion = step_limits(model)
     setup = _Setup(solver, solver, None, model, (rest, motion), time.perf_counter() - began)
     if not step_given:
-        setup.solver = replace(solver, substeps=_fewest(scene.fps, min(rest / _EXPLICIT_MARGIN, motion)))
+        setup.solver = replace(solver, substeps=fewest_substeps(scene.fps, rest, motion))
         setup.chosen = f"by default the fewest stable ones, limits {rest:.3g} and {motion:.3g} s"
     setup.checked = setup.solver
     if solver.scheme == "symplectic" and 1.0 / (scene.fps * setup.solver.per_frame(scene.fps)) < min(rest, motion):

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..quiet import initialise_warp
+
 
 class Interrupted(Exception):
     """A run was interrupted; the message says what is saved."""
@@ -19,28 +21,11 @@ def find_device(name):
     """The Warp device of a name, with Warp's greeting left out."""
     import warp as wp
 
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    _initialise_warp(wp)
+    initialise_warp()
     devices = [device.alias for device in wp.get_devices()]
     if name not in devices and not (name == "cuda" and len(devices) > 1):
         raise ValueError(f"device is {name!r}; on this machine there are {', '.join(devices)}")
     return wp.get_device(name)
-
-
-def _initialise_warp(wp):
-    """Initialises Warp without its native line about a missing CUDA driver, which is no news where only a CPU is asked for."""
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as said:
-        before = os.dup(2)
-        try:
-            os.dup2(said.fileno(), 2)
-            wp.init()
-        finally:
-            os.dup2(before, 2)
-            os.close(before)
-            said.seek(0)
-            lines = said.read().decode(errors="replace").splitlines(keepends=True)
-    sys.stderr.write("".join(line for line in lines if "load the NVIDIA CUDA driver" not in line))
 
 
 def frames_folder_of(arguments):
@@ -69,19 +54,25 @@ def check_writable(output):
         raise ValueError(f"output = {output}: the folder {folder} cannot be written ({error.strerror})") from None
 
 
+def open_bar(total, text, counts):
+    """A bar of tqdm on a terminal, elsewhere None; ``counts`` is what stands after it."""
+    if not sys.stderr.isatty():
+        return None
+    from tqdm import tqdm
+
+    # tqdm hides the bar on a terminal that does not know its size.
+    size = shutil.get_terminal_size()
+    shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
+    form = "{desc}{percentage:3.0f}%|{bar}| " + counts
+    return tqdm(total=total, desc=f"{text}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
+
+
 class Progress:
     """Counts frames, and shows them on a terminal."""
 
     def __init__(self, frames=None, hint=None, first="compiling"):
-        self.frame, self.frames, self.hint, self.bar = None, frames, hint, None
-        if sys.stderr.isatty():
-            from tqdm import tqdm
-
-            form = "{desc}{percentage:3.0f}%|{bar}| {n_fmt} of {total_fmt} frames{postfix}, {remaining} left"
-            # tqdm hides the bar on a terminal that does not know its size.
-            size = shutil.get_terminal_size()
-            shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
-            self.bar = tqdm(total=frames, desc=f"{first}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
+        self.frame, self.frames, self.hint = None, frames, hint
+        self.bar = open_bar(frames, first, "{n_fmt} of {total_fmt} frames{postfix}, {remaining} left")
 
     def __call__(self, frame, frames):
         self.frame = frame

@@ -1,5 +1,6 @@
 """Explicit integration: symplectic and forward Euler, and the largest step that the first may take."""
 
+import math
 import warnings
 from dataclasses import dataclass
 
@@ -107,6 +108,11 @@ def step_limits(model):
         if abs(h - before) <= 1e-6 * h:
             break
     return float(h), float(_root(k, c).min(initial=np.inf))
+
+
+def fewest_substeps(fps, rest, motion):
+    """The fewest steps a frame that are 10 % below the limit about the rest shape and below that in motion [s]."""
+    return math.floor(1.0 / (fps * min(rest / 1.1, motion))) + 1
 
 
 def _root(k, c):

@@ -1,0 +1,161 @@
+"""The command ``chart``: measurements of many settings, as pictures and tables; each chart is a command of its own."""
+
+import argparse
+import sys
+
+from ..chart.figures import PICTURES, check_path
+from ..checks import whole
+from ..scene_files import assignments
+from .run import named_scene
+from .terminal import Interrupted, as_json, check_writable, find_device, open_bar
+
+TEXT = "Chart speed against accuracy."
+
+EPILOG = """\
+time: the error of a trajectory, RMS over vertices and frames against a reference solution of the same mesh, over the time of a
+second of motion, for steps and iterations of all solvers. solver: what methods that minimise one and the same step leave of its
+objective, over iterations and time. What diverges, is refused or takes too long is listed with the reason.
+
+Settings that are measured are kept in WARPCLOTH_CACHE, or ~/.cache/warpcloth, and not measured again by the same code; after an
+interruption the same command goes on. Times are those of processes side by side, one thread each; compare them within a chart.
+
+  warpcloth chart work-precision hanging -p n=16 --solvers newton xpbd -o chart.png --csv chart.csv
+"""
+
+
+def add_arguments(parser):
+    """Adds the commands of all charts."""
+    parser.set_defaults(command=lambda arguments: parser.print_help(sys.stderr) or 2, debug=False)
+    charts = parser.add_subparsers(title="charts", metavar="CHART")
+    _add_work_precision(charts)
+
+
+def add(charts, name, command, text, epilog):
+    """A command of a chart, with what all of them take."""
+    form = argparse.RawDescriptionHelpFormatter
+    sub = charts.add_parser(name, help=text, description=text, epilog=epilog, allow_abbrev=False, formatter_class=form)
+    sub.set_defaults(command=command)
+    sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
+    sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+    sub.add_argument("--workers", type=int, metavar="N", help="processes side by side: by default the cores, on a GPU one")
+    sub.add_argument("-o", "--output", metavar="FILE", help=f"draw it, as {', '.join(PICTURES)}")
+    sub.add_argument("--csv", metavar="FILE", help="write a table")
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
+    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return sub
+
+
+def _add_work_precision(charts):
+    from ..model import DTYPES
+    from ..solvers import SOLVERS
+
+    sub = add(charts, "work-precision", work_precision, "Error over time, of settings of all solvers.", EPILOG)
+    sub.add_argument("--diagram", choices=("time", "solver"), default="time", help="of motion (default), or of one step")
+    sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=SOLVERS, help="those alone")
+    sub.add_argument("--frames", type=int, metavar="N", help="to run, if not the scene's; of one step, before it")
+    sub.add_argument("--dtype", choices=DTYPES, help="by default float32, of one step float64")
+    sub.add_argument("--limit", type=float, default=20.0, metavar="SECONDS", help="that a setting may take (20)")
+
+
+def work_precision(arguments):
+    from ..chart.tasks import SceneRef
+    from ..chart.work_precision import DIAGRAMS, write_csv
+
+    for name in ("frames", "workers"):
+        if getattr(arguments, name) is not None:
+            whole(name, getattr(arguments, name), least=1)
+    _check_outputs(arguments)
+    device = find_device(arguments.device)
+    _source, values, _scene = named_scene(arguments)
+    given = {name: values[name] for name in assignments(arguments.p)}
+    progress = Settings()
+    try:
+        found = DIAGRAMS[arguments.diagram](
+            SceneRef(arguments.scene, given),
+            solvers=arguments.solvers,
+            frames=arguments.frames,
+            device=str(device),
+            dtype=arguments.dtype or ("float64" if arguments.diagram == "solver" else "float32"),
+            limit=arguments.limit,
+            workers=arguments.workers or (1 if device.is_cuda else None),
+            progress=progress,
+        )
+    except KeyboardInterrupt:
+        raise Interrupted(progress.interrupted()) from None
+    finally:
+        progress.close()
+    if arguments.output:
+        from ..chart.fronts import PLOTS
+
+        PLOTS[arguments.diagram](arguments.output, found)
+    if arguments.csv:
+        write_csv(arguments.csv, found)
+    print(as_json(found) if arguments.json else _summary(found))
+    return 0
+
+
+def _check_outputs(arguments):
+    if arguments.output:
+        check_path(arguments.output, PICTURES)
+    for output in filter(None, (arguments.output, arguments.csv)):
+        check_writable(output)
+
+
+class Settings:
+    """Counts settings, and shows them on a terminal with the time that is left."""
+
+    def __init__(self):
+        self.done, self.total, self.bar = 0, None, None
+
+    def __call__(self, done, total, seconds):
+        if self.total is None:
+            self.bar = open_bar(total, "measuring", "{n_fmt} of {total_fmt} settings{postfix}")
+        self.done, self.total = done, total
+        if self.bar is not None:
+            if seconds is not None:
+                self.bar.set_postfix_str(f"{seconds // 60:.0f}:{seconds % 60:02.0f} left", refresh=False)
+            self.bar.update(done - self.bar.n)
+
+    def close(self):
+        if self.bar is not None:
+            self.bar.close()
+
+    def interrupted(self):
+        """What is kept."""
+        if self.total is None:
+            return "interrupted before the first setting; nothing was measured"
+        return f"interrupted after {self.done} of {self.total} settings, which are kept; the same command goes on from there"
+
+
+def _summary(found):
+    rows, device = found["rows"], found["machine"]["device"]
+    counts = {status: sum(row["status"] == status for row in rows) for status in ("ok", "diverged", "slow", "refused")}
+    said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+    lines = [f"{found['scene']}: {len(rows)} settings, {said}", f"  device        {device}, {found['dtype']}"]
+    lines += (_solver_lines if found["diagram"] == "solver" else _time_lines)(found)
+    return "\n".join([*lines, *(f"  {row['status']:<12}  {row['label']}: {row['reason']}" for row in rows if row["reason"])])
+
+
+def _time_lines(found):
+    """Of settings that nothing beats."""
+    exact = found["reference"]
+    lines = [f"  reference     known to {100.0 * exact['error']:.2g} %, {exact['substeps']} steps a frame"]
+    best = sorted((row for row in found["rows"] if row.get("front")), key=lambda row: row["ms_per_second"])
+    for row in best:
+        error, strain = 100.0 * row["error"], 100.0 * row["strain_error"]
+        lines.append(
+            f"  front         {row['ms_per_second']:.3g} ms a second, {error:.2g} %, strain {strain:.2g} %: {row['label']}"
+        )
+    return lines
+
+
+def _solver_lines(found):
+    """Of each method how near it came."""
+    lines = [f"  step          1/{found['rate']:g} s after frame {found['frame']}"]
+    for row in found["rows"]:
+        if row["points"]:
+            last = min(row["points"], key=lambda point: point["gap"])
+            gap = f"{last['gap']:.1e} after {last['iterations']} iterations, {last['ms']:.3g} ms"
+            lines.append(f"  gap           {gap}: {row['label']}")
+    return lines
