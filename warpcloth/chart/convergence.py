@@ -37,6 +37,7 @@ class OneStep:
 
     Attributes:
         h: Step [s].
+        base: x̃ (n) vectors on the device [m].
         best: d where φ is least (n, 3) [m].
         lowest, first: φ there and at d = 0 [J].
         floor: What rounding makes of (φ − lowest)/(first − lowest).
@@ -65,7 +66,7 @@ class OneStep:
         self.free = model.inverse_mass.numpy() > 0.0
         self._mass = model.mass.numpy() * self.free
         self.best = np.array(stepper.minimiser.correction.numpy())
-        self._base = model.array(stepper.state.x.numpy() - self.best, model.vec3)
+        self.base = model.array(stepper.state.x.numpy() - self.best, model.vec3)
         self._energy_of = Energy(self.model, Sums(self.model), corrected=True)
         self.lowest, self.first = self.objective(self.best), self.objective(np.zeros_like(self.best))
         self.floor = self._rounding() / (self.first - self.lowest) if self.first > self.lowest else np.inf
@@ -89,7 +90,7 @@ class OneStep:
         """φ(d) [J]."""
         model = self.model
         energy = wp.zeros(1, dtype=wp.float64, device=model.device)
-        self._energy_of.add(self._base, energy, model.array(d, model.vec3))
+        self._energy_of.add(self.base, energy, model.array(d, model.vec3))
         return float(0.5 * (self._mass[:, None] * d**2).sum() / self.h**2 + energy.numpy()[0])
 
     def gap(self, d):
@@ -99,18 +100,22 @@ class OneStep:
     def _rounding(self):
         """The largest change of φ about the minimiser, where it has no slope, as every coordinate is changed by a rounding."""
         random = np.random.default_rng(SEED)
-        epsilon = np.finfo(np.float64).eps * np.abs(self._base.numpy()).max()
+        epsilon = np.finfo(np.float64).eps * np.abs(self.base.numpy()).max()
         moves = epsilon * random.uniform(-1.0, 1.0, size=(8, *self.best.shape)) * self.free[:, None]
         return max(abs(self.objective(self.best + move) - self.lowest) for move in moves)
 
 
-@cache
 def one_step(scene, digest, frame, substeps, device):
-    """The :class:`OneStep` of a scene as JSON; all tasks of a process share it.
+    """The :class:`OneStep` of a scene, the fields of a :class:`SceneRef`; all tasks of a process share it.
 
     Raises:
         ValueError: The scene is another than ``digest`` says.
     """
+    return _one_step(json.dumps(scene, sort_keys=True), digest, frame, substeps, device)
+
+
+@cache
+def _one_step(scene, digest, frame, substeps, device):
     declared = SceneRef(**json.loads(scene)).load()
     if scene_digest(declared) != digest:
         raise ValueError(f"{declared.name} is another scene now than when its measurements were listed; start again")
@@ -138,7 +143,7 @@ def measure(scene, digest, setup, frame, substeps, device="cpu", dtype="float64"
     Raises:
         ValueError: The scene has no such step, see :class:`OneStep`.
     """
-    step = one_step(json.dumps(scene, sort_keys=True), digest, frame, substeps, device)
+    step = one_step(scene, digest, frame, substeps, device)
     result = {"status": "ok", "reason": "", "message": "", "points": [], "floor": step.floor}
     result |= {"compile_s": None, "factorise_s": None}
     began = None
