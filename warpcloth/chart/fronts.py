@@ -3,7 +3,7 @@
 import textwrap
 
 from .figures import GREY, PICTURES, check_path, save
-from .work_precision import left_out
+from .work_precision import WITHIN, cheapest, left_out
 
 # Each solver has its colour and marker in every picture.
 _STYLES = {
@@ -35,7 +35,11 @@ def plot_time(path, found):
         ImportError: matplotlib is not installed.
         ValueError: The path has another ending.
     """
-    figure, (axes,), notes = _figure(path, found, 1)
+    best = sorted((row for row in found["rows"] if row.get("front")), key=lambda row: row["ms_per_second"])
+    texts = [f"{number}  {row['label']}" for number, row in enumerate(best, 1)]
+    texts += ["", f"cheapest within {100.0 * WITHIN:g} %:", *(row["label"] for row in cheapest(found["rows"]))]
+    texts += _missing("not drawn:", found)
+    figure, (axes,), notes = _figure(path, 1, texts)
     lines = {}
     for row in found["rows"]:
         if row["status"] == "ok":
@@ -46,7 +50,6 @@ def plot_time(path, found):
         x, y = ([row[name] for row in rows] for name in ("ms_per_second", "error"))
         axes.plot(x, y, color=colour, linewidth=0.5, alpha=0.6)
         axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none", label=solver)
-    best = sorted((row for row in found["rows"] if row.get("front")), key=lambda row: row["ms_per_second"])
     x, y = ([row[name] for row in best] for name in ("ms_per_second", "error"))
     axes.plot(x, y, color="gold", linewidth=4.0, zorder=0, label="nothing is better in both")
     for number, row in enumerate(best, 1):
@@ -55,8 +58,7 @@ def plot_time(path, found):
     axes.axhline(found["reference"]["error"], color=GREY, linestyle="--", linewidth=0.8, label="error of the reference")
     axes.set(xlabel="ms for a second of motion", ylabel="error: RMS of all vertices and frames, over the size")
     title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}, {found['machine']['device']}"
-    names = [f"{number}  {row['label']}" for number, row in enumerate(best, 1)]
-    _finish(figure, [axes], notes, title, names, found)
+    _finish(figure, [axes], notes, title, texts)
     save(figure, path)
 
 
@@ -72,7 +74,8 @@ def plot_solver(path, found):
         ImportError: matplotlib is not installed.
         ValueError: The path has another ending.
     """
-    figure, panels, notes = _figure(path, found, 2)
+    texts = _missing("ended early:", found)
+    figure, panels, notes = _figure(path, 2, texts)
     seen, floor = {}, max((row["floor"] for row in found["rows"]), default=None)
     for row in found["rows"]:
         colour, marker = _STYLES[row["solver"]]
@@ -88,22 +91,60 @@ def plot_solver(path, found):
     panels[0].set_ylabel("gap of the objective, 1 at x̃")
     step = f"a step of 1/{found['rate']:g} s after {found['frame']} frames"
     title = f"{found['scene']}, {step}, {found['dtype']}, {found['machine']['device']}"
-    _finish(figure, panels, notes, title, [], found)
+    _finish(figure, panels, notes, title, texts)
     save(figure, path)
 
 
-PLOTS = {"solver": plot_solver, "time": plot_time}
+def plot_spectrum(path, found):
+    """Draws 1 − μ over its rank, and beside it errors as points on the lines that the spectrum predicts.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        found: As :func:`warpcloth.chart.work_precision.spectrum_diagram` returns it.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    texts = _missing("not drawn:", found)
+    figure, panels, notes = _figure(path, 2, texts)
+    for k, row in enumerate(row for row in found["rows"] if row["points"]):
+        mu, colour, points = row["eigenvalues"], f"C{k}", row["points"]
+        panels[0].plot(range(1, len(mu) + 1), mu, color=colour, linewidth=1.2)
+        at, errors = ([point[name] for point in points] for name in ("iterations", "error"))
+        panels[1].plot(
+            at, errors, "o", color=colour, markersize=3, label=f"{row['label']}: max |1 − μ| = {row['contraction']:.4f}"
+        )
+        known = [point for point in points if point["predicted"] is not None]
+        at, errors = ([point[name] for point in known] for name in ("iterations", "predicted"))
+        panels[1].plot(at, errors, color=colour, linewidth=0.8)
+    panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
+    panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
+    title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
+    _finish(figure, panels, notes, title, texts)
+    save(figure, path)
 
 
-def _figure(path, found, panels):
+PLOTS = {"solver": plot_solver, "time": plot_time, "spectrum": plot_spectrum}
+
+
+def _missing(head, found):
+    """Lines that say what is left out, and why."""
+    lines = [line for each in left_out(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]
+    return ["", head, *lines] if lines else []
+
+
+def _figure(path, panels, texts):
     """A figure with panels on logarithmic scales, and one for texts."""
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 
-    lines = len(found["rows"]) + sum(len(_wrapped(*each)) for each in left_out(found))
-    figure = Figure(figsize=(4.6 * panels + (4.0 if panels == 1 else 3.4), min(max(5.0, 0.12 * lines + 2.0), 10.0)))
-    figure.set_layout_engine("constrained")
-    *axes, notes = figure.subplots(1, panels + 1, sharey=False, width_ratios=[1.6] * panels + [1.0])
+    if len(texts) > _LINES:
+        texts[_LINES:] = [f"… {len(texts) - _LINES} lines more in the table"]
+    height = max(5.0, 0.155 * (len(texts) + 14))
+    figure = Figure(figsize=(4.6 * panels + (4.0 if panels == 1 else 3.4), height), layout="constrained")
+    *axes, notes = figure.subplots(1, panels + 1, width_ratios=[1.6] * panels + [1.0])
     for each in axes:
         each.set(xscale="log", yscale="log")
         each.grid(True, which="major", linewidth=0.3, color="0.8")
@@ -113,25 +154,12 @@ def _figure(path, found, panels):
     return figure, axes, notes
 
 
-def _finish(figure, axes, notes, title, names, found):
-    """Legend, names and what is left out, beside the picture."""
+def _finish(figure, axes, notes, title, texts):
+    """Title, legend, and the texts below it."""
     known = {}
     for each in axes:
         known.update(zip(*reversed(each.get_legend_handles_labels()), strict=True))
-    shown = {"loc": "upper left", "frameon": False, "fontsize": 7, "borderaxespad": 0.0, "ncols": 1}
-    notes.legend(known.values(), known, **shown)
-    texts = list(names)
-    missing = left_out(found)
-    if missing:
-        texts += ["", "not drawn:" if len(axes) == 1 else "ended early:"]
-        for each in missing:
-            texts += _wrapped(*each)
-    if len(texts) > _LINES:
-        texts = [*texts[:_LINES], f"… {len(texts) - _LINES} lines more in the table"]
+    notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=7, borderaxespad=0.0)
     top = 1.0 - 0.155 * (len(known) + 1) / figure.get_size_inches()[1]
     notes.text(0.0, top, "\n".join(texts), fontsize=7, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
     figure.suptitle(title, fontsize=9, color=GREY)
-
-
-def _wrapped(name, reason):
-    return textwrap.wrap(f"{name}: {reason}", _WIDTH, subsequent_indent="  ")

@@ -95,9 +95,7 @@ def measure(scene, digest, frame, substeps, device="cpu", limit=20.0):
     if len(known) > 1:
         before, last = known[-2:]
         power = 1.0 / (last["iterations"] - before["iterations"])
-        result |= {
-            name: (last[of] / before[of]) ** power for name, of in (("measured", "error"), ("expected", "predicted"))
-        }
+        result |= {name: (last[of] / before[of]) ** power for name, of in (("measured", "error"), ("expected", "predicted"))}
     return result
 
 

@@ -8,15 +8,21 @@ import csv
 import json
 
 from ..outputs import TEXT, Output
-from . import convergence, reference, trajectory
+from . import convergence, spectrum, trajectory
 from .digest import scene_digest
 from .machine import machine
+from .reference import reference
 from .setups import label, setups_of_runs, setups_of_steps
 from .sweep import Store, cache_folder, sweep
 from .tasks import task
 
-# Frames before the one step of the diagram "solver", as part of those of the scene, and its steps a frame.
-_PART, SUBSTEPS = 3, 4
+# The part of a scene's frames before the one step of "solver" and "spectrum", and the part that is run in "time": later motion
+# is chaotic, so that its error says little of a method.
+_BEFORE, _RUN = 3, 2
+SUBSTEPS = 4  # steps a frame of the one step
+WITHIN = 0.01  # the error of which the cheapest setting is named
+# How well the reference solution is to be known, relative to the size of the cloth, and seconds that it may take.
+_KNOWN, _SECONDS = 1e-4, 120.0
 # What a CSV has of a setting, in this order; what it does not know is empty.
 COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
 COLUMNS += ("ms_per_second", "iterations", "gap", "compile_s", "factorise_s", "residual", "frames", "message")
@@ -42,7 +48,7 @@ def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float6
     """
     setups = setups_of_steps(solvers)
     declared = scene.load()
-    frame = max(declared.frames // _PART, 1) if frames is None else frames
+    frame = frames or max(declared.frames // _BEFORE, 1)
     given = {
         "digest": scene_digest(declared),
         "frame": frame,
@@ -56,17 +62,17 @@ def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float6
     return {**_facts("solver", scene, device, dtype), **facts, "rows": rows}
 
 
-def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32", limit=20.0, tolerance=1e-3, **run):
+def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32", limit=20.0, watch=None, **run):
     """The error of a trajectory against the time it takes, over steps and iterations, see :func:`trajectory.measure`.
 
     Args:
         scene: A :class:`SceneRef`.
         solvers: Names as on the command line; None is all.
-        frames: Frames that are run, those of the scene where not given.
+        frames: Frames that are run, half of the scene's where not given.
         device: A Warp device.
         dtype: Of the runs; the reference solution has float64.
         limit: Seconds a setting.
-        tolerance: Error of the reference solution, relative to the size of the cloth.
+        watch: Function that says how far the reference solution is, see :func:`reference`, or None.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
 
     Returns:
@@ -76,22 +82,62 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
         ValueError: A name is no solver's, or the scene has no reference solution.
     """
     setups = setups_of_runs(scene, solvers, device, dtype)
-    exact = reference.reference(scene, frames=frames, tolerance=tolerance)
+    frames = frames or max(scene.load().frames // _RUN, 1)
+    exact = reference(scene, frames=frames, tolerance=_KNOWN, limit=_SECONDS, progress=watch)
     given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}
     rows = _measured(trajectory.measure, scene, setups, given, run)
     for place in front(rows):
         rows[place]["front"] = True
     known = {name: getattr(exact, name) for name in ("error", "strain_error", "substeps", "seconds", "key")}
-    facts = {"seed": None, "frames": len(exact.points) - 1, "reference": known}  # nothing is drawn at random
+    facts = {"seed": None, "frames": frames, "reference": known}  # nothing is drawn at random
     return {**_facts("time", scene, device, dtype), **facts, "rows": rows}
 
 
-DIAGRAMS = {"solver": solver_diagram, "time": time_diagram}
+def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):
+    """Errors of plain projective dynamics of a step, for several of its lengths, beside what the spectrum predicts.
+
+    Args:
+        scene: A :class:`SceneRef`, of few vertices.
+        frames: Frames before the step; a third of the scene's where not given.
+        device: A Warp device.
+        limit: Seconds a length.
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+
+    Returns:
+        dict: See the module, and for the rows :func:`spectrum.measure`.
+
+    Raises:
+        ValueError: The mesh is too fine.
+    """
+    declared = scene.load()
+    frame = frames or max(declared.frames // _BEFORE, 1)
+    given = {"scene": scene, "digest": scene_digest(declared), "frame": frame, "device": str(device), "limit": limit}
+    tasks = [task(spectrum.measure, **given, substeps=substeps) for substeps in (1, 2, 4, 8, 16)]
+    rows = [
+        {
+            "solver": "projective-dynamics",
+            "options": {},
+            "label": f"1/{declared.fps * each.arguments['substeps']:g} s",
+            **result,
+        }
+        for each, result in zip(tasks, _results(tasks, run), strict=True)
+    ]
+    facts = {"seed": convergence.SEED, "frame": frame}
+    return {**_facts("spectrum", scene, device, "float64"), **facts, "rows": rows}
+
+
+def cheapest(rows):
+    """Of each solver the row of least time with an error of no more than :data:`WITHIN`, the fastest first."""
+    found = {}
+    for row in sorted(filter(_has_error, rows), key=lambda row: row["ms_per_second"]):
+        if row["error"] <= WITHIN:
+            found.setdefault(row["solver"], row)
+    return list(found.values())
 
 
 def front(rows):
     """Places of the rows that no other beats in both time and error, the fastest first."""
-    places = [i for i, row in enumerate(rows) if row["status"] == "ok" and row["error"] is not None]
+    places = [i for i, row in enumerate(rows) if _has_error(row)]
     found, least = [], float("inf")
     for i in sorted(places, key=lambda i: (rows[i]["ms_per_second"], rows[i]["error"])):
         if rows[i]["error"] < least:
@@ -131,12 +177,21 @@ def _facts(kind, scene, device, dtype):
     }
 
 
+def _has_error(row):
+    return row["status"] == "ok" and row["error"] is not None
+
+
 def _measured(function, scene, setups, given, run):
     """A row for each setup, in their order."""
-    run = {"store": Store(cache_folder() / "work-precision.jsonl"), **run}
     tasks = [task(function, scene=scene, setup=setup, **given) for setup in setups]
-    results = {each.key: result for each, result in sweep(tasks, **run)}
     return [
-        {"solver": setup.solver, "options": setup.options, "label": label(setup), **results[each.key]}
-        for setup, each in zip(setups, tasks, strict=True)
+        {"solver": setup.solver, "options": setup.options, "label": label(setup), **result}
+        for setup, result in zip(setups, _results(tasks, run), strict=True)
     ]
+
+
+def _results(tasks, run):
+    """The result of each task, in their order."""
+    run = {"store": Store(cache_folder() / "work-precision.jsonl"), **run}
+    results = {each.key: result for each, result in sweep(tasks, **run)}
+    return [results[each.key] for each in tasks]

@@ -10,11 +10,14 @@ from .run import named_scene
 from .terminal import Interrupted, as_json, check_writable, find_device, open_bar
 
 TEXT = "Chart speed against accuracy."
+DIAGRAMS = ("time", "solver", "spectrum")
 
 EPILOG = """\
+Diagrams, each by itself:
 time: the error of a trajectory, RMS over vertices and frames against a reference solution of the same mesh, over the time of a
 second of motion, for steps and iterations of all solvers. solver: what methods that minimise one and the same step leave of its
-objective, over iterations and time. What diverges, is refused or takes too long is listed with the reason.
+objective, over iterations and time. spectrum: errors of projective dynamics beside those that the spectrum of its matrix
+relative to the true Hessian predicts, for few vertices. What diverges, is refused or takes too long is listed with the reason.
 
 Settings that are measured are kept in WARPCLOTH_CACHE, or ~/.cache/warpcloth, and not measured again by the same code; after an
 interruption the same command goes on. Times are those of processes side by side, one thread each; compare them within a chart.
@@ -51,16 +54,16 @@ def _add_work_precision(charts):
     from ..solvers import SOLVERS
 
     sub = add(charts, "work-precision", work_precision, "Error over time, of settings of all solvers.", EPILOG)
-    sub.add_argument("--diagram", choices=("time", "solver"), default="time", help="of motion (default), or of one step")
+    sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="time where not given")
     sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=SOLVERS, help="those alone")
-    sub.add_argument("--frames", type=int, metavar="N", help="to run, if not the scene's; of one step, before it")
-    sub.add_argument("--dtype", choices=DTYPES, help="by default float32, of one step float64")
+    sub.add_argument("--frames", type=int, metavar="N", help="to run, by default half; before a step, by default a third")
+    sub.add_argument("--dtype", choices=DTYPES, help="by default float32 of motion, float64 of a step")
     sub.add_argument("--limit", type=float, default=20.0, metavar="SECONDS", help="that a setting may take (20)")
 
 
 def work_precision(arguments):
+    from ..chart import work_precision as module
     from ..chart.tasks import SceneRef
-    from ..chart.work_precision import DIAGRAMS, write_csv
 
     for name in ("frames", "workers"):
         if getattr(arguments, name) is not None:
@@ -70,16 +73,21 @@ def work_precision(arguments):
     _source, values, _scene = named_scene(arguments)
     given = {name: values[name] for name in assignments(arguments.p)}
     progress = Settings()
+    options = {
+        name: getattr(arguments, name) for name in ("solvers", "frames", "dtype") if getattr(arguments, name) is not None
+    }
+    if arguments.diagram == "time":
+        options["watch"] = progress.watch
+    elif arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
+        raise ValueError("the diagram spectrum is of projective dynamics in float64; --solvers and --dtype are for the others")
     try:
-        found = DIAGRAMS[arguments.diagram](
+        found = getattr(module, f"{arguments.diagram}_diagram")(
             SceneRef(arguments.scene, given),
-            solvers=arguments.solvers,
-            frames=arguments.frames,
             device=str(device),
-            dtype=arguments.dtype or ("float64" if arguments.diagram == "solver" else "float32"),
             limit=arguments.limit,
             workers=arguments.workers or (1 if device.is_cuda else None),
             progress=progress,
+            **options,
         )
     except KeyboardInterrupt:
         raise Interrupted(progress.interrupted()) from None
@@ -90,7 +98,7 @@ def work_precision(arguments):
 
         PLOTS[arguments.diagram](arguments.output, found)
     if arguments.csv:
-        write_csv(arguments.csv, found)
+        module.write_csv(arguments.csv, found)
     print(as_json(found) if arguments.json else _summary(found))
     return 0
 
@@ -103,13 +111,22 @@ def _check_outputs(arguments):
 
 
 class Settings:
-    """Counts settings, and shows them on a terminal with the time that is left."""
+    """Counts settings, and shows them on a terminal with the time that is left; before them, how far the reference is."""
 
     def __init__(self):
-        self.done, self.total, self.bar = 0, None, None
+        self.done, self.total, self.substeps, self.bar = 0, None, None, None
+
+    def watch(self, substeps, frame, frames):
+        if substeps != self.substeps:
+            self.close()
+            text = f"reference by {substeps} steps a frame"
+            self.bar, self.substeps = open_bar(frames, text, "{n_fmt} of {total_fmt} frames, {remaining} left"), substeps
+        if self.bar is not None:
+            self.bar.update(frame - self.bar.n)
 
     def __call__(self, done, total, seconds):
         if self.total is None:
+            self.close()
             self.bar = open_bar(total, "measuring", "{n_fmt} of {total_fmt} settings{postfix}")
         self.done, self.total = done, total
         if self.bar is not None:
@@ -133,20 +150,22 @@ def _summary(found):
     counts = {status: sum(row["status"] == status for row in rows) for status in ("ok", "diverged", "slow", "refused")}
     said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
     lines = [f"{found['scene']}: {len(rows)} settings, {said}", f"  device        {device}, {found['dtype']}"]
-    lines += (_solver_lines if found["diagram"] == "solver" else _time_lines)(found)
+    lines += {"time": _time_lines, "solver": _solver_lines, "spectrum": _spectrum_lines}[found["diagram"]](found)
     return "\n".join([*lines, *(f"  {row['status']:<12}  {row['label']}: {row['reason']}" for row in rows if row["reason"])])
 
 
 def _time_lines(found):
-    """Of settings that nothing beats."""
-    exact = found["reference"]
+    """The settings that nothing beats, and the cheapest of each solver."""
+    from ..chart.work_precision import WITHIN, cheapest
+
+    exact, rows = found["reference"], found["rows"]
     lines = [f"  reference     known to {100.0 * exact['error']:.2g} %, {exact['substeps']} steps a frame"]
-    best = sorted((row for row in found["rows"] if row.get("front")), key=lambda row: row["ms_per_second"])
-    for row in best:
-        error, strain = 100.0 * row["error"], 100.0 * row["strain_error"]
-        lines.append(
-            f"  front         {row['ms_per_second']:.3g} ms a second, {error:.2g} %, strain {strain:.2g} %: {row['label']}"
-        )
+    best = sorted((row for row in rows if row.get("front")), key=lambda row: row["ms_per_second"])
+    for head, chosen in (("nothing beats", best), (f"within {100.0 * WITHIN:g} %", cheapest(rows))):
+        for row in chosen:
+            error, strain = 100.0 * row["error"], 100.0 * row["strain_error"]
+            numbers = f"{row['ms_per_second']:.3g} ms a second, {error:.2g} %, strain {strain:.2g} %"
+            lines.append(f"  {head:<13} {numbers}: {row['label']}")
     return lines
 
 
@@ -156,6 +175,16 @@ def _solver_lines(found):
     for row in found["rows"]:
         if row["points"]:
             last = min(row["points"], key=lambda point: point["gap"])
-            gap = f"{last['gap']:.1e} after {last['iterations']} iterations, {last['ms']:.3g} ms"
+            gap = f"{max(last['gap'], row['floor']):.1e} after {last['iterations']} iterations, {last['ms']:.3g} ms"
             lines.append(f"  gap           {gap}: {row['label']}")
+    return lines
+
+
+def _spectrum_lines(found):
+    """Of each step its slowest part, and the last factor of an iteration."""
+    lines = []
+    for row in found["rows"]:
+        if row["measured"] is not None:
+            numbers = f"slowest {row['contraction']:.6f}, measured {row['measured']:.6f}, expected {row['expected']:.6f}"
+            lines.append(f"  contraction   {numbers}: {row['label']}")
     return lines
