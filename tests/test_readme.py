@@ -81,6 +81,7 @@ def test_the_rotations():
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands(command, animations, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
     (tmp_path / "curtain.py").write_text(CURTAIN, encoding="utf-8")
     (tmp_path / "cloth.usda").write_text(STAGE, encoding="utf-8")
     arguments = shlex.split(command)[1:]

@@ -69,9 +69,9 @@ class OneStep:
         self.base = model.array(stepper.state.x.numpy() - self.best, model.vec3)
         self._energy_of = Energy(self.model, Sums(self.model), corrected=True)
         self.lowest, self.first = self.objective(self.best), self.objective(np.zeros_like(self.best))
-        self.floor = self._rounding() / (self.first - self.lowest) if self.first > self.lowest else np.inf
-        if not self.floor < 1.0:
+        if not np.abs(self.best).max() > 1e3 * self._resolution:
             raise ValueError(f"the step after frame {frame} of {scene.name} has nothing to minimise; take another frame")
+        self.floor = self._rounding() / (self.first - self.lowest)
 
     def place(self, stepper):
         """Sets a bound solver to the state."""
@@ -97,11 +97,15 @@ class OneStep:
         """(φ(d) − lowest)/(first − lowest): 1 at x̃, 0 where φ is least."""
         return (self.objective(d) - self.lowest) / (self.first - self.lowest)
 
+    @property
+    def _resolution(self):
+        """What float64 resolves of places [m]."""
+        return np.finfo(np.float64).eps * np.abs(self.base.numpy()).max()
+
     def _rounding(self):
         """The largest change of φ about the minimiser, where it has no slope, as every coordinate is changed by a rounding."""
         random = np.random.default_rng(SEED)
-        epsilon = np.finfo(np.float64).eps * np.abs(self.base.numpy()).max()
-        moves = epsilon * random.uniform(-1.0, 1.0, size=(8, *self.best.shape)) * self.free[:, None]
+        moves = self._resolution * random.uniform(-1.0, 1.0, size=(8, *self.best.shape)) * self.free[:, None]
         return max(abs(self.objective(self.best + move) - self.lowest) for move in moves)
 
 

@@ -126,9 +126,6 @@ def plot_spectrum(path, found):
     save(figure, path)
 
 
-PLOTS = {"solver": plot_solver, "time": plot_time, "spectrum": plot_spectrum}
-
-
 def _missing(head, found):
     """Lines that say what is left out, and why."""
     lines = [line for each in left_out(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]

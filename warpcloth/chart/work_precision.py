@@ -25,7 +25,7 @@ WITHIN = 0.01  # the error of which the cheapest setting is named
 _KNOWN, _SECONDS = 1e-4, 120.0
 # What a CSV has of a setting, in this order; what it does not know is empty.
 COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
-COLUMNS += ("ms_per_second", "iterations", "gap", "compile_s", "factorise_s", "residual", "frames", "message")
+COLUMNS += ("ms_per_second", "iterations", "gap", "predicted", "compile_s", "factorise_s", "residual", "frames", "message")
 
 
 def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float64", limit=20.0, **run):

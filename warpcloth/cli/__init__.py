@@ -1,4 +1,5 @@
-"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures and compares animations.
+"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures and compares
+animations, charts methods.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
 saved), 2 wrong use (one line on stderr), 130 interrupted. Any other error ends with 2 and one line as well, for most come of

@@ -5,6 +5,7 @@ import sys
 
 from ..chart.figures import PICTURES, check_path
 from ..checks import whole
+from ..outputs import Output, check_apart
 from ..scene_files import assignments
 from .run import named_scene
 from .terminal import Interrupted, as_json, check_writable, find_device, open_bar
@@ -62,8 +63,8 @@ def _add_work_precision(charts):
 
 
 def work_precision(arguments):
-    from ..chart import work_precision as module
     from ..chart.tasks import SceneRef
+    from ..chart.work_precision import write_csv
 
     for name in ("frames", "workers"):
         if getattr(arguments, name) is not None:
@@ -80,8 +81,9 @@ def work_precision(arguments):
         options["watch"] = progress.watch
     elif arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
         raise ValueError("the diagram spectrum is of projective dynamics in float64; --solvers and --dtype are for the others")
+    measure, plot, lines = _parts(arguments.diagram)
     try:
-        found = getattr(module, f"{arguments.diagram}_diagram")(
+        found = measure(
             SceneRef(arguments.scene, given),
             device=str(device),
             limit=arguments.limit,
@@ -94,18 +96,32 @@ def work_precision(arguments):
     finally:
         progress.close()
     if arguments.output:
-        from ..chart.fronts import PLOTS
-
-        PLOTS[arguments.diagram](arguments.output, found)
+        plot(arguments.output, found)
     if arguments.csv:
-        module.write_csv(arguments.csv, found)
-    print(as_json(found) if arguments.json else _summary(found))
+        write_csv(arguments.csv, found)
+    print(as_json(found) if arguments.json else _summary(found, lines))
     return 0
 
 
+def _parts(diagram):
+    """What measures a diagram, what draws it and what says the most of it; another diagram is another row."""
+    from ..chart import fronts
+    from ..chart import work_precision as measured
+
+    return {
+        "time": (measured.time_diagram, fronts.plot_time, _time_lines),
+        "solver": (measured.solver_diagram, fronts.plot_solver, _solver_lines),
+        "spectrum": (measured.spectrum_diagram, fronts.plot_spectrum, _spectrum_lines),
+    }[diagram]
+
+
 def _check_outputs(arguments):
+    """Finds out before minutes of measurements that a result cannot be written."""
+    check_apart([arguments.output, arguments.csv], [arguments.scene])
     if arguments.output:
         check_path(arguments.output, PICTURES)
+    if arguments.csv:
+        Output(arguments.csv, "x").discard()
     for output in filter(None, (arguments.output, arguments.csv)):
         check_writable(output)
 
@@ -145,12 +161,12 @@ class Settings:
         return f"interrupted after {self.done} of {self.total} settings, which are kept; the same command goes on from there"
 
 
-def _summary(found):
+def _summary(found, lines_of):
     rows, device = found["rows"], found["machine"]["device"]
     counts = {status: sum(row["status"] == status for row in rows) for status in ("ok", "diverged", "slow", "refused")}
     said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
     lines = [f"{found['scene']}: {len(rows)} settings, {said}", f"  device        {device}, {found['dtype']}"]
-    lines += {"time": _time_lines, "solver": _solver_lines, "spectrum": _spectrum_lines}[found["diagram"]](found)
+    lines += lines_of(found)
     return "\n".join([*lines, *(f"  {row['status']:<12}  {row['label']}: {row['reason']}" for row in rows if row["reason"])])
 
 

@@ -1,0 +1,342 @@
+"""Charts of speed against accuracy: the gap of one step, the error of a motion, the spectrum, and what is made of them."""
+
+import csv
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.chart import convergence, fronts, spectrum, work_precision
+from warpcloth.chart.convergence import OneStep
+from warpcloth.chart.digest import scene_digest
+from warpcloth.chart.setups import RUNS, STEPS, label, setups_of_runs, setups_of_steps
+from warpcloth.chart.sweep import Store
+from warpcloth.chart.tasks import SceneRef, Setup
+from warpcloth.chart.work_precision import cheapest, front, left_out, solver_diagram, spectrum_diagram, time_diagram, write_csv
+from warpcloth.cli import main
+from warpcloth.solvers import SOLVERS
+from warpcloth.solvers.explicit import step_limits
+
+SMALL = SceneRef("hanging", {"n": 6})
+FRAME, SUBSTEPS = 12, 4
+
+
+def measure(setup, device, scene=SMALL, **options):
+    given = {"frame": FRAME, "substeps": SUBSTEPS, "device": device, "limit": 5.0, "repeats": 1} | options
+    return convergence.measure(asdict(scene), scene_digest(scene.load()), asdict(setup), **given)
+
+
+@pytest.fixture(autouse=True)
+def cache_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
+
+
+# --- one step
+
+
+def test_gap_is_that_of_the_objective_of_implicit_euler(device):
+    """By φ of springs written out, at places between x̃ and the minimiser, where ∇φ vanishes."""
+    scene = replace(SMALL.load(), terms=SMALL.load().terms[:1])
+    step = OneStep(scene, FRAME, SUBSTEPS, device)
+    assert step.gap(np.zeros_like(step.best)) == 1.0 and abs(step.gap(step.best)) <= step.floor
+    (springs,) = step.model.terms
+    base, ends, rest = step.base.numpy(), springs.stencil.numpy(), springs.rest.numpy().ravel()
+
+    def objective(d):
+        lengths = np.linalg.norm(np.diff((base + d)[ends], axis=1)[:, 0], axis=1)
+        inertia = (scene.vertex_masses[step.free, None] * d[step.free] ** 2).sum() / (2.0 * step.h**2)
+        return inertia + 0.5 * 1e3 * ((lengths - rest) ** 2).sum()
+
+    parts = np.array([0.0, 0.5, 1.0, 1.5])
+    found = np.array([step.objective(part * step.best) for part in parts])
+    assert found == pytest.approx([objective(part * step.best) for part in parts], rel=1e-12)
+    # A minimum: φ at ½ and 3/2 is above it, by the same but for third derivatives.
+    assert found[2] < found[1] < found[0] and found[3] - found[2] == pytest.approx(found[1] - found[2], rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["hanging", "flag"])
+def test_state_is_that_of_the_run(name, device):
+    """The next frame, with pins that move, is that of a run that goes on; rounded to float32 where the step begins."""
+    scene = SceneRef(name, {"n": 6} if name == "hanging" else {}).load()
+    newton = wc.Newton(substeps=2, tolerance=1e-9)
+    step = OneStep(scene, 3, 2, device)
+    stepper = wc.Newton(substeps=2, tolerance=1e-9).bind(scene.build(device=device, dtype="float64"))
+    step.place(stepper)
+    for _ in range(2):
+        stepper.step()
+    run = wc.simulate(scene, newton, frames=4, dtype="float64", device=device).points
+    moved = np.abs(run[4] - run[3]).max()
+    # The start is that of Newton at its default tolerance of 1e-3 g a step of 1/120 s: 7e-7 m a step, and float32's 1e-7 m.
+    assert np.abs(stepper.state.x.numpy() - run[4]).max() < 1e-3 * moved
+
+
+@pytest.mark.parametrize("setup", STEPS, ids=label)
+def test_all_that_minimise_close_the_gap(setup, device):
+    """Down to the rounding of φ in float64, or nearly so; no iteration of Newton or plain projective dynamics raises φ."""
+    found = measure(setup, device, dtype="float64")
+    gaps = [point["gap"] for point in found["points"]]
+    print(label(setup), found["message"], len(gaps), gaps[0], gaps[-1], found["floor"])
+    assert found["status"] == "ok" and found["floor"] < 1e-10
+    assert min(gaps) < 1e-6 and gaps[0] > 1e3 * found["floor"] and found["compile_s"] > 0.0
+    assert min(gaps) > -2.0 * found["floor"], "nothing is below the minimum"
+    assert [point["iterations"] for point in found["points"]] == convergence.LADDER[: len(gaps)]
+    if setup.solver in ("newton", "projective-dynamics") and "chebyshev" not in label(setup):
+        assert all(later <= before + found["floor"] for before, later in pairwise(gaps))
+
+
+def test_float32_ends_where_its_rounding_is(device):
+    """The same first iterations, and an end that more of them do not change."""
+    single, double = (measure(STEPS[0], device, dtype=dtype) for dtype in ("float32", "float64"))
+    gaps = [[point["gap"] for point in found["points"]] for found in (single, double)]
+    assert gaps[0][0] == pytest.approx(gaps[1][0], rel=0.05)  # conjugate gradients end where they may
+    assert single["message"].startswith("no nearer") and 0.0 < gaps[0][-1] < 1e-4
+
+
+def test_what_cannot_be_measured_says_why(device, monkeypatch, tmp_path):
+    (tmp_path / "stiff.py").write_text(
+        "import warpcloth as wc\n\ndef scene():\n    mesh = wc.Mesh.grid(3, 3)\n"
+        "    term = wc.StVKMembrane(stiffness=100.0, poisson_ratio=0.3)\n"
+        "    return wc.Scene(mesh, density=0.1, terms=[term], pins=[0])\n"
+    )
+    stiff = SceneRef(str(tmp_path / "stiff.py"))
+    refused = measure(Setup("xpbd"), device, stiff)
+    assert refused["status"] == "refused" and "XPBD cannot project" in refused["reason"] and not refused["points"]
+    slow = measure(Setup("xpbd"), device, limit=1e-9)
+    assert slow["status"] == "slow" and "more than 1e-09 s" in slow["reason"] and len(slow["points"]) == 1
+    monkeypatch.setattr(convergence, "LOST", 0.5)
+    lost = measure(Setup("xpbd"), device)
+    assert lost["status"] == "diverged" and "a gap of" in lost["reason"]
+    with pytest.raises(ValueError, match="is another scene now"):
+        convergence.measure(asdict(SMALL), "another", asdict(STEPS[0]), FRAME, SUBSTEPS, device)
+    falling = replace(SMALL.load(), pins=None)
+    with pytest.raises(ValueError, match="nothing to minimise"):
+        OneStep(falling, 0, 1, device)
+
+
+# --- the spectrum
+
+
+def test_spectrum_of_one_spring(device):
+    """Along it an iteration leaves nothing, across it k(L/l)/(m/h² + k) of the error (Bouaziz et al. 2014 for the matrix)."""
+    mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), edges=[[0, 1]])
+    k, m = 300.0, 0.7
+    scene = wc.Scene(mesh, masses=[m, m], positions=[[0, 0, 0], [0.6, -0.9, 0]], terms=[wc.Spring(stiffness=k)], pins=[0])
+    step = OneStep(scene, 0, 1, device)
+    length = np.linalg.norm((step.base.numpy() + step.best)[1])
+    mu, V, A = spectrum.relative_spectrum(step)
+    across = k / length / (m / step.h**2 + k)
+    assert 1.0 - mu == pytest.approx([across, across, 0.0], rel=1e-12, abs=1e-12)
+    assert V.T @ A @ V == pytest.approx(np.eye(3), abs=1e-12)
+
+
+@pytest.mark.parametrize("substeps", [4, 16])
+def test_projective_dynamics_converges_as_its_spectrum_says(substeps, device):
+    """What is neglected is of second order in the error: from 1e-2 on the prediction is off by less than 1e-2 of itself, and
+    the last factor of an iteration, at errors of 1e-4 or less, by less than 1e-4 of 1 less it."""
+    found = spectrum.measure(asdict(SMALL), scene_digest(SMALL.load()), FRAME, substeps, device)
+    mu = np.array(found["eigenvalues"])
+    assert 0.0 < mu[0] and mu[-1] <= 1.0 + 1e-12, "the matrix is never below the Hessian"
+    known = [point for point in found["points"] if point["predicted"] is not None and point["error"] > spectrum.RESOLVED]
+    assert len(known) >= 4 and known[-1]["error"] < 1e-5
+    for point in known:
+        assert point["predicted"] == pytest.approx(point["error"], rel=spectrum.LINEAR)
+    assert 1.0 - found["measured"] == pytest.approx(1.0 - found["expected"], rel=1e-4)
+    # Of the parts of the error the slowest is left in the end.
+    assert found["measured"] == pytest.approx(found["contraction"], rel=0.05) and found["measured"] < found["contraction"]
+    for before, last in pairwise(known):
+        most = found["contraction"] ** (last["iterations"] - before["iterations"])
+        assert last["error"] <= most * (1.0 + spectrum.LINEAR) * before["error"]
+
+
+def test_spectrum_of_too_many_unknowns_is_refused(device):
+    with pytest.raises(ValueError, match=r"hanging has 2694 unknowns; a spectrum takes 2000 at most"):
+        spectrum.relative_spectrum(OneStep(SceneRef("hanging", {"n": 30}).load(), 1, 1, device))
+
+
+# --- settings
+
+
+def test_settings_are_of_all_solvers_and_differ(device):
+    assert set(RUNS) == set(SOLVERS)
+    setups = setups_of_runs(SMALL, device=device)
+    assert len({label(setup) for setup in setups}) == len(setups) and len({label(setup) for setup in STEPS}) == len(STEPS)
+    assert all(setup.record().per_frame(60.0) for setup in setups)
+    assert {setup.solver for setup in setups_of_runs(SMALL, ["pbd", "xpbd"])} == {"pbd", "xpbd"}
+    assert [setup.solver for setup in setups_of_steps(["admm"])] == ["admm", "admm"]
+    with pytest.raises(ValueError, match="solvers has 'pbd'; this diagram takes newton, projective-dynamics"):
+        setups_of_steps(["pbd"])
+    assert label(Setup("xpbd", {"substeps": 80, "iterations": 1, "integrator": "bdf2"})) == "xpbd bdf2 80×1"
+    assert label(Setup("admm", {"substeps": 4, "weight": 0.1, "tolerance": 1e-9})) == "admm 4 weight=0.1"
+
+
+def test_explicit_starts_at_the_fewest_stable_substeps(device):
+    """10 % below the limit about the rest shape, and no more than a substep below that or the limit in motion."""
+    first, *more = (setup.options["substeps"] for setup in setups_of_runs(SMALL, ["explicit"], device))
+    rest, motion = step_limits(SMALL.load().build(device=device))
+    limit = 60.0 * min(rest / 1.1, motion)
+    assert 1.0 / first < limit <= 1.0 / (first - 1) and more == [round(1.5 * first), 2 * first]
+
+
+def test_nothing_beats_the_front():
+    """By the definition, among random rows with ties, and rows without an error."""
+    random = np.random.default_rng(0)
+    values = random.integers(1, 12, size=(60, 2)).tolist()
+    rows = [{"status": "ok", "ms_per_second": ms, "error": error, "solver": f"s{ms % 3}"} for ms, error in values]
+    rows += [{"status": "diverged", "ms_per_second": 0.5, "error": None, "solver": "s0"}]
+    found = [values[i] for i in front(rows)]
+    beaten = [any(a <= x and b <= y and [a, b] != [x, y] for a, b in values) for x, y in values]
+    assert {tuple(v) for v in found} == {tuple(v) for v, lost in zip(values, beaten, strict=True) if not lost}
+    assert len(found) == len({tuple(v) for v in found}) and found == sorted(found)
+    near = [row | {"error": 0.001 * row["error"]} for row in rows[:-1]]
+    for row in cheapest(near):
+        others = [each["ms_per_second"] for each in near if each["solver"] == row["solver"] and each["error"] <= 0.01]
+        assert row["error"] <= 0.01 and row["ms_per_second"] == min(others)
+
+
+# --- whole diagrams
+
+
+class Nobody:
+    """An executor that must not be asked."""
+
+    def submit(self, *_):
+        raise AssertionError("measured again")
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Figures that are saved."""
+    figures = []
+    save = fronts.save
+    monkeypatch.setattr(fronts, "save", lambda figure, path: (figures.append(figure), save(figure, path)))
+    return figures
+
+
+def table(path):
+    with open(path, encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def text_of(figure):
+    return "\n".join(text.get_text() for axes in figure.axes for text in axes.texts)
+
+
+def test_time_diagram(device, tmp_path, drawn):
+    """Errors of first and second order, the front, what diverges; the second time nothing is measured."""
+    store, said = tmp_path / "store.jsonl", []
+    options = {"solvers": ["explicit", "newton", "constrained-dynamics"], "frames": 12, "device": device}
+    with ThreadPoolExecutor(1) as executor:
+        found = time_diagram(SMALL, executor=executor, store=Store(store), progress=lambda *at: said.append(at), **options)
+    again = time_diagram(SMALL, executor=Nobody(), store=Store(store), **options)
+    assert again == json.loads(json.dumps(found, allow_nan=False)) and said[-1][0] == len(found["rows"]) == said[-1][1]
+    rows = {row["label"]: row for row in found["rows"]}
+    floor = found["reference"]["error"]
+    assert floor < 1e-4 and found["machine"]["warp"] and found["seed"] is None
+    # Of first order, 16 times the steps leave a sixteenth; of second, twice the steps a quarter.
+    assert rows["newton 1"]["error"] / rows["newton 16"]["error"] == pytest.approx(16.0, rel=0.5)
+    assert rows["newton bdf2 1"]["error"] > 2.0 * rows["newton bdf2 2"]["error"] > floor
+    best = [row for row in found["rows"] if row.get("front")]
+    assert best and all(row["status"] == "ok" for row in best)
+    found["rows"][-1] |= {"status": "diverged", "reason": "diverged in frame 3", "error": None}
+    found["rows"][-1].pop("front", None)
+    name = found["rows"][-1]["label"]
+    assert (name, "diverged: diverged in frame 3") in left_out(found)
+    for ending in ("png", "svg"):
+        fronts.plot_time(tmp_path / f"chart.{ending}", found)
+    write_csv(tmp_path / "chart.csv", found)
+    lines = table(tmp_path / "chart.csv")
+    assert [line["label"] for line in lines] == list(rows) and lines[-1]["error"] == ""
+    assert float(lines[0]["error"]) == found["rows"][0]["error"] and float(lines[0]["strain_error"]) > 0.0
+    axes, _notes = drawn[0].axes
+    text = text_of(drawn[0])
+    numbered = front(found["rows"])
+    assert all(f"{i}  {found['rows'][place]['label']}" in text for i, place in enumerate(numbered, 1))
+    assert name + ": diverged" in text
+    shown = {label for _, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    assert {"explicit", "newton", "error of the reference", "nothing is better in both"} <= shown
+    points = np.concatenate([line.get_xydata() for line in axes.lines if line.get_marker() not in ("None", "")])
+    assert len(points) == sum(row["status"] == "ok" for row in found["rows"])
+
+
+def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
+    with ThreadPoolExecutor(1) as executor:
+        run = {"executor": executor, "device": device, "limit": 0.5, "frames": 12}
+        one = solver_diagram(SMALL, solvers=["newton", "admm"], **run)
+        other = spectrum_diagram(SceneRef("hanging", {"n": 4}), **run)
+    assert [row["label"] for row in one["rows"]] == ["newton", "admm weight=1", "admm weight=0.1"]
+    assert one["rate"] == 240.0 and one["frame"] == 12 and one["seed"] == 0 and len(other["rows"]) == 5
+    # Smaller steps are nearer to their matrix.
+    assert np.all(np.diff([row["contraction"] for row in other["rows"]]) < 0.0)
+    one["rows"][1] |= {"status": "diverged", "reason": "a gap of 1e+07 after 8 iterations"}
+    fronts.plot_solver(tmp_path / "solver.png", one)
+    fronts.plot_spectrum(tmp_path / "spectrum.png", other)
+    iterations, ms, _ = drawn[0].axes
+    for axes, name in ((iterations, "iterations"), (ms, "ms")):
+        for line, row in zip(axes.lines, one["rows"], strict=False):
+            gaps = [max(point["gap"], row["floor"]) for point in row["points"]]
+            assert np.array_equal(line.get_xydata(), np.transpose([[point[name] for point in row["points"]], gaps]))
+    assert "admm weight=1: diverged: a gap of 1e+07" in text_of(drawn[0]).replace("\n  ", " ")
+    assert [list(line.get_ydata()) for line in drawn[1].axes[0].lines] == [row["eigenvalues"] for row in other["rows"]]
+    write_csv(tmp_path / "solver.csv", one)
+    lines = table(tmp_path / "solver.csv")
+    assert len(lines) == sum(len(row["points"]) for row in one["rows"]) and float(lines[0]["gap"]) > 0.0
+
+
+# --- the command
+
+
+def test_command(tmp_path, monkeypatch, capsys):
+    """Interrupted after two settings it says so and keeps them; the same command goes on."""
+    monkeypatch.chdir(tmp_path)
+    command = ["chart", "work-precision", "hanging", "-p", "n=4", "--frames", "2", "--solvers", "pbd", "--workers", "1"]
+    real = work_precision.sweep
+
+    def interrupted(*given, **options):
+        for done, each in enumerate(real(*given, **options), 1):
+            yield each
+            if done == 2:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(work_precision, "sweep", interrupted)
+    assert main(command) == 130
+    assert "interrupted after 2 of 4 settings, which are kept" in capsys.readouterr().err
+    assert len(Store(tmp_path / "cache" / "work-precision.jsonl")) == 2
+    monkeypatch.setattr(work_precision, "sweep", real)
+    assert main([*command, "-o", "chart.png", "--csv", "chart.csv"]) == 0
+    said = capsys.readouterr().out
+    assert "hanging(n=4): 4 settings, 4 ok" in said and "nothing beats" in said and "known to" in said
+    assert (tmp_path / "chart.png").stat().st_size > 10_000 and len(table("chart.csv")) == 4
+    assert main([*command, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["diagram"] == "time" and len(facts["rows"]) == 4 and facts["machine"]["source"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["hanging", "--solvers", "pbd", "--diagram", "solver"], "solvers has 'pbd'"),
+        (["hanging", "--solvers", "newtons"], "invalid choice: 'newtons'"),
+        (["hanging", "--frames", "0"], "frames is 0"),
+        (["hanging", "--workers", "0"], "workers is 0"),
+        (["hanging", "--diagram", "spectrum", "--dtype", "float32"], "--solvers and --dtype are for the others"),
+        (["hanging", "-o", "chart.gif"], "ending is '.gif'"),
+        (["hanging", "--csv", "none/chart.csv"], "does not exist"),
+        (["hanged"], "there is no scene 'hanged'"),
+        (["hanging", "-p", "m=3"], "no parameter 'm'"),
+    ],
+)
+def test_wrong_use_is_said_before_anything_is_measured(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(work_precision, "sweep", lambda *_, **__: pytest.fail("measured"))
+    monkeypatch.setattr(work_precision, "reference", lambda *_, **__: pytest.fail("measured"))
+    assert main(["chart", "work-precision", *arguments]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_charts_are_listed(capsys):
+    assert main(["chart"]) == 2
+    assert "work-precision" in capsys.readouterr().err
