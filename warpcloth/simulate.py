@@ -126,6 +126,8 @@ class Watch:
 
     Attributes:
         good: The last good frame of each copy (B,).
+        alive: Whether a copy is still good (B,).
+        energy: Of motion at the speed that the start can have made, without the l a second (B,) [J].
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame.
     """
 
@@ -143,6 +145,7 @@ class Watch:
         self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         size = np.linalg.norm(np.ptp(points.reshape(model.copies, -1, 3), axis=1), axis=1)
         self.start = self._speed(velocities) + np.sqrt(2.0 * self.gravity * size) + self._stored_speed(h)
+        self.energy = 0.5 * self.total * self.start**2
         self.start += size
         self.pins = 0.0
         if scene.pins.keyframes is not None and len(scene.pins.keyframes) > 1:

@@ -17,7 +17,7 @@ class SceneRef:
 
     Attributes:
         name: A known name, a .py file or a USD stage.
-        parameters: Of its function, by name.
+        parameters: Of its function, by name; texts are converted, so that "inf" is a number too, which JSON has not.
     """
 
     name: str
@@ -31,11 +31,11 @@ class SceneRef:
             ValueError: It takes no such parameter.
         """
         source = scene_files.find_source(self.name)
-        values = source.values({})
         for name in self.parameters:
             if name not in source.parameters:
                 raise ValueError(f"{source.path} has no parameter {name!r}, only {', '.join(source.parameters) or 'none'}")
-        return source.scene(values | self.parameters)
+        texts = {name: value for name, value in self.parameters.items() if isinstance(value, str)}
+        return source.scene(source.values(texts) | {k: v for k, v in self.parameters.items() if k not in texts})
 
     def __str__(self):
         shown = ", ".join(f"{name}={value}" for name, value in self.parameters.items())

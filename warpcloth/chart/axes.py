@@ -1,0 +1,158 @@
+"""Axes of a map: what a value of each makes of a scene and of a solver."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from ..checks import number, whole
+from ..solvers import Explicit
+from .tasks import SceneRef, Setup
+
+STEPS_PER_FRAME = 4
+# Noise of the start, over the median edge: what is unstable grows out of it, a hundredfold in energy while springs are linear.
+NOISE = 1e-6
+# Parameters of scenes that say how fine they are.
+_RESOLUTIONS = ("n", "links", "elements")
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One direction of a map.
+
+    Attributes:
+        label: What is written along it.
+        low, high: The range where none is given.
+        whole: Whether its values are whole numbers.
+        logarithmic: Whether they are spaced by a factor.
+    """
+
+    label: str
+    low: float
+    high: float
+    whole: bool = False
+    logarithmic: bool = True
+
+    def values(self, low, high, count):
+        """``count`` values from low to high, fewer where whole numbers coincide.
+
+        Raises:
+            ValueError: The ends are no range of this axis.
+        """
+        whole("count", count, 1)
+        number("low", low, **({"above": 0.0} if self.logarithmic else {}))
+        number("high", high, least=low)
+        spaced = (np.geomspace if self.logarithmic else np.linspace)(low, high, count)
+        return list(dict.fromkeys(int(round(value)) for value in spaced)) if self.whole else [float(f"{v:.6g}") for v in spaced]
+
+
+AXES = {
+    "dt": Axis("step h [s]", 1e-4, 1e-1),
+    "stiffness": Axis("stiffness, times the scene's", 1e-2, 1e4),
+    "resolution": Axis("resolution", 4, 24, whole=True),
+    "iterations": Axis("iterations a step", 1, 100, whole=True),
+    "relaxation": Axis("relaxation ω", 0.1, 4.0),
+    "weight": Axis("weight r = W²/(kA)", 1e-3, 1e3),
+    "mass-ratio": Axis("mass of the vertex furthest from the pins, times the scene's", 1e-2, 1e4),
+    "compression": Axis("compression of the start, 1 − l/L", 0.0, 0.9, logarithmic=False),
+}
+# What copies of one model differ in; a row along such an axis is one run.
+VARIED = ("stiffness", "mass-ratio", "compression")
+OPTIONS = ("iterations", "relaxation", "weight")
+# Where the map has no axis of that name.
+FIXED = {"dt": 1 / 60}
+
+
+def scene_at(ref, values, steps):
+    """The scene of a cell: frames of a few steps each, and a start with noise.
+
+    Args:
+        ref: :class:`warpcloth.chart.tasks.SceneRef`.
+        values: By name of the axis; ``dt`` among them.
+        steps: Number of steps, rounded up to whole frames.
+
+    Raises:
+        ValueError: The scene cannot have such a value.
+    """
+    if "resolution" in values:
+        ref = _refined(ref, values["resolution"])
+    scene = ref.load()
+    if scene.pins.keyframes is not None:
+        raise ValueError(f"{scene.name}: its pins move, frame by frame; a map needs pins at rest, for it changes the frame rate")
+    for name in VARIED:
+        if name in values:
+            scene = applied(scene, name, values[name])
+    frame = STEPS_PER_FRAME * values["dt"]
+    noise = np.random.default_rng(0).normal(size=scene.positions.shape)
+    noise *= NOISE * np.median(scene.mesh.edge_lengths)
+    noise[scene.pins.vertices] = 0.0
+    frames = -(-steps // STEPS_PER_FRAME)
+    return replace(scene, positions=scene.positions + noise, fps=1.0 / frame, duration=frames * frame)
+
+
+def _refined(ref, value):
+    from ..scene_files import find_source
+
+    known = find_source(ref.name).parameters
+    for name in _RESOLUTIONS:
+        if name in known:
+            return SceneRef(ref.name, {**ref.parameters, name: int(value)})
+    raise ValueError(f"{ref.name} has no resolution to vary; its scene() must take {' or '.join(_RESOLUTIONS)}")
+
+
+def applied(scene, name, value):
+    """The scene with a value of one of :data:`VARIED`."""
+    if name == "stiffness":
+        return replace(scene, terms=[replace(term, stiffness=value * np.asarray(term.stiffness)) for term in scene.terms])
+    if name == "compression":
+        # About the middle of the pins, so that a cloth that hangs stays where it is held.
+        held = scene.positions[scene.pins.vertices] if len(scene.pins.vertices) else scene.positions
+        middle = held.mean(axis=0)
+        return replace(scene, positions=middle + (1.0 - value) * (scene.positions - middle))
+    masses = scene.vertex_masses.copy()
+    masses[_furthest(scene)] *= value
+    return replace(scene, density=None, masses=masses)
+
+
+def vary(scene, name, values):
+    """``vary`` of a model whose copies differ in one of :data:`VARIED`, from the scene of :func:`scene_at` without it."""
+    each = [applied(scene, name, value) for value in values]
+    if name == "stiffness":
+        stiffness = [[np.asarray(term.stiffness) for term in one.terms] for one in each]
+        return {
+            f"{term.label}.stiffness": np.array(column)
+            for term, column in zip(scene.terms, zip(*stiffness, strict=True), strict=True)
+        }
+    if name == "compression":
+        return {"positions": np.array([one.positions for one in each])}
+    return {"masses": np.array([one.vertex_masses for one in each])}
+
+
+def together(scene, name):
+    """Whether copies of one model can differ in it: terms of one name cannot be told apart."""
+    labels = [term.label for term in scene.terms]
+    return name in VARIED and (name != "stiffness" or len(set(labels)) == len(labels))
+
+
+def record_at(setup, values):
+    """The options record of a cell.
+
+    Raises:
+        ValueError: The solver has no option of that name, or a value breaks its rule.
+    """
+    if {"dt", "substeps"} & set(setup.options):
+        raise ValueError(f"{setup}: the map sets the step; leave dt and substeps out")
+    record = Setup(setup.solver, {**setup.options, "substeps": STEPS_PER_FRAME}).record()
+    known = {field.name for field in fields(record)}
+    for name in OPTIONS:
+        if name in values:
+            if name not in known:
+                raise ValueError(f"{setup.solver} has no {name}")
+            record = replace(record, **{name: values[name]})
+    return replace(record, above_limit="allow") if isinstance(record, Explicit) else record
+
+
+def _furthest(scene):
+    """The vertex furthest from the pins, or without pins from the middle."""
+    points = scene.mesh.points
+    pins = points[scene.pins.vertices] if len(scene.pins.vertices) else points.mean(axis=0)[None]
+    return int(np.linalg.norm(points[:, None] - pins, axis=-1).min(axis=1).argmax())

@@ -1,0 +1,288 @@
+"""Where each method is stable, inaccurate or diverges: cells of a map over two axes, measured row by row."""
+
+import math
+import time
+import warnings
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import warp as wp
+
+from ..checks import choice
+from ..operators import Energy, Sums
+from ..simulate import Watch
+from ..solvers import Newton
+from ..status import Result
+from .axes import AXES, FIXED, STEPS_PER_FRAME, record_at, scene_at, together, vary
+from .rules import GROWTH, rules
+from .tasks import SceneRef, Setup, task
+
+VERDICTS = ("stable", "inaccurate", "diverged", "refused", "slow")
+# RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
+ACCURACY = 0.01
+# Steps of the reference in one of the map.
+_FINER = 4
+_FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a run of B copies left; a copy that diverged is NaN from there.
+
+    Attributes:
+        points: (frames+1, B, n, 3) [m].
+        good: The last good frame of each copy (B,).
+        growth: Largest rise of energy above the start, over what the start can give to motion (B,).
+        reasons: A sentence for each copy, "" if nothing is to be said.
+        results: :class:`warpcloth.status.Result` of each copy.
+    """
+
+    points: np.ndarray
+    good: np.ndarray
+    growth: np.ndarray
+    reasons: list
+    results: list
+
+
+class Slow(Exception):
+    """A run took longer than its limit."""
+
+
+def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", limit=60.0):
+    """Runs a scene, as `simulate` does, and looks at its energy: what gains :data:`GROWTH` times what it has counts as diverged.
+
+    Raises:
+        Slow: After ``limit`` seconds, looked at each frame.
+        ValueError: The solver refuses the scene.
+    """
+    began = time.perf_counter()
+    model = scene.build(device=device, dtype=dtype, copies=copies, vary=varied)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of steps too large, which are the subject
+        stepper = record.bind(model)
+    watch, energy = Watch(model, stepper.h), _Total(model)
+    frames, B = scene.frames, copies
+    points = np.full((frames + 1, B, model.per_copy, 3), np.nan)
+    points[0] = model.positions.numpy().reshape(B, -1, 3)
+    start, growth = energy(model.positions, model.velocities.numpy()), np.zeros(B)
+    reasons = [""] * B
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for frame in range(1, frames + 1):
+            for _ in range(stepper.steps_per_frame):
+                stepper.step()
+            x, v = (np.array(array.numpy(), dtype=np.float64) for array in stepper.state)
+            rise = (energy(stepper.state.x, v) - start) / watch.energy
+            watch.passes(frame, x, v, stepper.results)
+            for copy in np.flatnonzero(watch.alive):
+                growth[copy] = max(growth[copy], rise[copy])
+                if rise[copy] > GROWTH:
+                    watch.alive[copy] = False
+                    watch.messages[copy] = f"its energy grew by {rise[copy]:.3g} times what the start gives, in frame {frame}"
+                    watch.good[copy] = frame - 1
+            points[frame, watch.alive] = x.reshape(B, -1, 3)[watch.alive]
+            if not watch.alive.any():
+                break
+            if time.perf_counter() - began > limit:
+                raise Slow(f"stopped after {limit:g} s, in frame {frame} of {frames}")
+    for copy, result in enumerate(stepper.results):
+        reasons[copy] = watch.messages.get(copy, result.value if result in _FAILED else "")
+    return Trial(points, watch.good, growth, reasons, list(stepper.results))
+
+
+class _Total:
+    """Energy of motion, elastic energy of finite stiffness, and that of gravity, of each copy (B,) [J]."""
+
+    def __init__(self, model):
+        self.model, self.B = model, model.copies
+        self.elastic = Energy(model, Sums(model), terms=tuple(elements for elements in model.terms if not elements.hard))
+        self.out = wp.zeros(self.B, dtype=wp.float64, device=model.device)
+        mass, inverse = (array.numpy().astype(np.float64).reshape(self.B, -1) for array in (model.mass, model.inverse_mass))
+        self.mass = np.where(inverse > 0.0, mass, 0.0)
+        self.gravity = model.gravity.numpy().astype(np.float64)
+
+    def __call__(self, x, v):
+        self.out.zero_()
+        self.elastic.add(x, self.out)
+        places = x.numpy().astype(np.float64).reshape(self.B, -1, 3)
+        squares = (v.astype(np.float64) ** 2).sum(axis=-1).reshape(self.B, -1)
+        heights = np.einsum("bni,bi->bn", places, self.gravity)
+        return self.out.numpy() + (self.mass * (0.5 * squares - heights)).sum(axis=1)
+
+
+def measure(
+    scene, setups, fixed, axis, values, steps, accuracy=ACCURACY, device="cpu", dtype="float64", limit=60.0, reference=True
+):
+    """Cells that differ in one value, of each setup: a row of copies where one run can have them, else a run each.
+
+    Args:
+        scene: A dictionary of :class:`warpcloth.chart.tasks.SceneRef`.
+        setups: Dictionaries of :class:`warpcloth.chart.tasks.Setup`.
+        fixed: Values by axis that all cells share; ``dt`` is among them or ``axis``.
+        axis: The axis along which they differ.
+        values: Of that axis.
+        steps: Length of each run in steps.
+        accuracy: RMS distance to the reference, over vertices and frames and over the size of the cloth, that is inaccurate.
+        device, dtype: Of the run; the reference has float64.
+        limit: Seconds for each run.
+        reference: Whether to compare with Newton, BDF2, of a quarter of the step.
+
+    Returns:
+        list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS`, ``status`` ("ok", "diverged",
+        "slow" or "refused"), ``reason``, ``step`` (that of divergence, or None), ``growth`` and ``error`` (or None), ``rules``.
+    """
+    ref, setups = SceneRef(**scene), [Setup(**setup) for setup in setups]
+    groups = [values]
+    if not together(scene_at(ref, {"dt": FIXED["dt"], **fixed}, steps), axis):
+        groups = [[value] for value in values]
+    rows = [[] for _ in setups]
+    for group in groups:
+        answer = None
+        if reference:
+            exact = Newton(substeps=_FINER * STEPS_PER_FRAME, integrator="bdf2", tolerance=1e-6)
+            answer = _attempt(ref, exact, fixed, axis, group, steps, device, "float64", limit)
+        for row, setup in zip(rows, setups, strict=True):
+            try:
+                record = record_at(setup, fixed if len(group) > 1 else {**fixed, axis: group[0]})
+            except ValueError as error:
+                row += [_cell("refused", str(error)) for _ in group]
+                continue
+            found = _attempt(ref, record, fixed, axis, group, steps, device, dtype, limit)
+            for copy, value in enumerate(group):
+                cell = found if isinstance(found, dict) else _judge(found, copy, answer, accuracy, record)
+                if cell["status"] != "refused":
+                    of_cell = scene_at(ref, {**fixed, axis: value}, steps)
+                    cell = cell | {"rules": {name: _finite(ratio) for name, ratio in rules(of_cell, record, steps).items()}}
+                row.append(cell)
+    return rows
+
+
+def _attempt(ref, record, fixed, axis, group, steps, device, dtype, limit):
+    """The :class:`Trial` of a group, or the cell of all its copies."""
+    try:
+        if len(group) == 1:
+            return run(scene_at(ref, {**fixed, axis: group[0]}, steps), record, device=device, dtype=dtype, limit=limit)
+        scene = scene_at(ref, fixed, steps)
+        return run(scene, record, len(group), vary(scene, axis, group), device, dtype, limit)
+    except Slow as slow:
+        return _cell("slow", str(slow))
+    except ValueError as error:
+        return _cell("refused", str(error))
+
+
+def _judge(trial, copy, answer, accuracy, record):
+    """The cell of one copy."""
+    growth, reason = _finite(trial.growth[copy]), trial.reasons[copy]
+    if trial.good[copy] < len(trial.points) - 1:
+        step = int(trial.good[copy] + 1) * record.per_frame(1.0)
+        return _cell("diverged", reason, step=step, growth=growth)
+    error = None
+    if isinstance(answer, Trial) and answer.good[copy] == len(answer.points) - 1:
+        apart = trial.points[:, copy] - answer.points[:, copy]
+        size = np.ptp(answer.points[0, copy], axis=0).max()
+        error = _finite(math.sqrt((apart**2).sum(axis=-1).mean()) / size)
+    if trial.results[copy] in _FAILED or (error is not None and error > accuracy):
+        reason = reason or f"RMS distance to the reference {100.0 * error:.3g} % of the size"
+        return _cell("inaccurate", reason, growth=growth, error=error)
+    return _cell("stable", "", growth=growth, error=error)
+
+
+def _cell(verdict, reason, **more):
+    status = "ok" if verdict in VERDICTS[:2] else verdict
+    return {"verdict": verdict, "status": status, "reason": reason, "step": None, "growth": None, "error": None, "rules": {}} | more
+
+
+def _finite(value):
+    return float(value) if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A map to be measured.
+
+    Attributes:
+        scene: :class:`warpcloth.chart.tasks.SceneRef`.
+        setups: The methods, :class:`warpcloth.chart.tasks.Setup`, without steps.
+        x, y: Names of the two axes, of :data:`warpcloth.chart.axes.AXES`.
+        xs, ys: Their values.
+        fixed: Values of other axes.
+        steps: Length of each run.
+
+    Raises:
+        ValueError: The axes are not two, or unknown.
+    """
+
+    scene: SceneRef
+    setups: tuple
+    x: str
+    y: str
+    xs: tuple
+    ys: tuple
+    fixed: dict
+    steps: int = 120
+
+    def __post_init__(self):
+        for name in (self.x, self.y, *self.fixed):
+            choice("axis", name, tuple(AXES))
+        if self.x == self.y or {self.x, self.y} & set(self.fixed):
+            raise ValueError(f"axes are {self.x}, {self.y} and at fixed values {', '.join(self.fixed)}; each must be another")
+
+    def tasks(self, **options):
+        """One :class:`warpcloth.chart.tasks.Task` a row, along the axis that copies can differ in, if one can.
+
+        Args:
+            options: Of :func:`measure`.
+        """
+        scene = scene_at(self.scene, {**FIXED, **self.fixed} | self._first(), self.steps)
+        along = self.y if together(scene, self.y) and not together(scene, self.x) else self.x
+        other, others = (self.x, self.xs) if along == self.y else (self.y, self.ys)
+        values = self.ys if along == self.y else self.xs
+        rest = {name: value for name, value in {**FIXED, **self.fixed}.items() if name != along}
+        setups = [asdict(setup) for setup in self.setups]
+        given = {"setups": setups, "axis": along, "values": list(values), "steps": self.steps, **options}
+        return [task(measure, scene=self.scene, fixed={**rest, other: value}, **given) for value in others]
+
+    def _first(self):
+        return {self.x: self.xs[0], self.y: self.ys[0]}
+
+    def table(self, results):
+        """Cells (setup, y, x) as nested lists, from (task, result) in any order; None where there is none."""
+        cells = [[[None] * len(self.xs) for _ in self.ys] for _ in self.setups]
+        for done, rows in results:
+            axis, fixed = done.arguments["axis"], done.arguments["fixed"]
+            for row, of_setup in zip(rows, cells, strict=True):
+                for k, cell in enumerate(row):
+                    if axis == self.x:
+                        of_setup[self.ys.index(fixed[self.y])][k] = cell
+                    else:
+                        of_setup[k][self.xs.index(fixed[self.x])] = cell
+        return cells
+
+
+def boundary(scene, setup, axis, low, high, steps=200, fixed=None, accuracy=1e-3, **options):
+    """The value of an axis between a run that holds and one that diverges, by bisection of its logarithm.
+
+    Args:
+        scene, setup: :class:`warpcloth.chart.tasks.SceneRef` and :class:`warpcloth.chart.tasks.Setup`.
+        axis: Its name.
+        low, high: Values that hold and that do not, or the other way round.
+        steps: Length of each run.
+        fixed: Values of other axes.
+        accuracy: Relative width at which to stop.
+        options: Of :func:`run`.
+
+    Raises:
+        ValueError: Both ends hold, or both diverge.
+    """
+
+    def diverges(value):
+        values = {**FIXED, **(fixed or {}), axis: value}
+        found = run(scene_at(scene, values, steps), record_at(setup, values), **options)
+        return bool(found.good[0] < len(found.points) - 1)
+
+    before = diverges(low)
+    if diverges(high) == before:
+        raise ValueError(f"{axis} from {low:g} to {high:g}: both ends {'diverge' if before else 'hold'}")
+    while high / low > 1.0 + accuracy:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if diverges(middle) == before else (low, middle)
+    return math.sqrt(low * high)
