@@ -123,20 +123,22 @@ class Watch:
     Args:
         model: The :class:`warpcloth.model.Model`.
         h: Step of the solver [s].
+        slowest: What is never called fast, in l a second; 0 for what starts as noise.
 
     Attributes:
         good: The last good frame of each copy (B,).
         alive: Whether a copy is still good (B,).
-        energy: Of motion at the speed that the start can have made, without the l a second (B,) [J].
+        fastest: Largest speed in a good frame, over what can have made it (B,).
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame.
     """
 
-    def __init__(self, model, h):
+    def __init__(self, model, h, slowest=1.0):
         scene = model.scene
         self.model, self.edges = model, scene.mesh.edges
         self.rest = scene.mesh.edge_lengths
         self.worst_strain, self.messages = 0.0, {}
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
+        self.fastest = np.zeros(model.copies)
         points, velocities = (array.numpy().astype(np.float64) for array in (model.positions, model.velocities))
         self.mass = (
             np.where(model.inverse_mass.numpy() > 0.0, model.mass.numpy(), 0.0).reshape(model.copies, -1).astype(np.float64)
@@ -145,8 +147,7 @@ class Watch:
         self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         size = np.linalg.norm(np.ptp(points.reshape(model.copies, -1, 3), axis=1), axis=1)
         self.start = self._speed(velocities) + np.sqrt(2.0 * self.gravity * size) + self._stored_speed(h)
-        self.energy = 0.5 * self.total * self.start**2
-        self.start += size
+        self.start += slowest * size
         self.pins = 0.0
         if scene.pins.keyframes is not None and len(scene.pins.keyframes) > 1:
             moves = np.linalg.norm(np.diff(scene.pins.keyframes, axis=0), axis=-1)
@@ -193,6 +194,8 @@ class Watch:
                     f"{where}: a mean speed of {speed[copy]:.3g} m/s, above the {limit[copy]:.3g} m/s that its energy allows"
                 )
         self.good[self.alive] = frame
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self.fastest = np.where(self.alive, np.fmax(self.fastest, speed / (0.1 * limit)), self.fastest)
         for array in (points, velocities):
             array.reshape(B, n, 3)[~self.alive] = np.nan
         if not self.alive.any():

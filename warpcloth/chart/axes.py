@@ -42,7 +42,9 @@ class Axis:
         number("low", low, **({"above": 0.0} if self.logarithmic else {}))
         number("high", high, least=low)
         spaced = (np.geomspace if self.logarithmic else np.linspace)(low, high, count)
-        return list(dict.fromkeys(int(round(value)) for value in spaced)) if self.whole else [float(f"{v:.6g}") for v in spaced]
+        return (
+            list(dict.fromkeys(round(float(value)) for value in spaced)) if self.whole else [float(f"{v:.6g}") for v in spaced]
+        )
 
 
 AXES = {
@@ -77,7 +79,9 @@ def scene_at(ref, values, steps):
         ref = _refined(ref, values["resolution"])
     scene = ref.load()
     if scene.pins.keyframes is not None:
-        raise ValueError(f"{scene.name}: its pins move, frame by frame; a map needs pins at rest, for it changes the frame rate")
+        raise ValueError(
+            f"{scene.name}: its pins move, frame by frame; a map needs pins at rest, for it changes the frame rate"
+        )
     for name in VARIED:
         if name in values:
             scene = applied(scene, name, values[name])

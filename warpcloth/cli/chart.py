@@ -7,6 +7,7 @@ from ..chart.figures import PICTURES, check_path
 from ..checks import whole
 from ..outputs import Output, check_apart
 from ..scene_files import assignments
+from . import stability
 from .run import named_scene
 from .terminal import Interrupted, as_json, check_writable, find_device, open_bar
 
@@ -32,6 +33,14 @@ def add_arguments(parser):
     parser.set_defaults(command=lambda arguments: parser.print_help(sys.stderr) or 2, debug=False)
     charts = parser.add_subparsers(title="charts", metavar="CHART")
     _add_work_precision(charts)
+    form = argparse.RawDescriptionHelpFormatter
+    text = "Map where methods are stable, inaccurate or diverge."
+    maps = charts.add_parser(
+        "stability", help=text, description=text, epilog=stability.EPILOG, allow_abbrev=False, formatter_class=form
+    )
+    maps.set_defaults(command=stability.chart)
+    maps.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    stability.add_arguments(maps)
 
 
 def add(charts, name, command, text, epilog):

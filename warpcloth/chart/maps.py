@@ -1,0 +1,138 @@
+"""Maps of stability: a panel for each method, with the limits that theory gives, and the same as a table."""
+
+import csv
+import math
+
+import numpy as np
+
+from ..outputs import TEXT, Output
+from .axes import AXES
+from .figures import GREY, PICTURES, check_path, save
+from .rules import DIVERGES
+from .stability import VERDICTS
+
+# sRGB. What diverged goes from the dark, at once, to the light, in the last frame; light blue, yellow and dark red differ in
+# lightness too, for those who do not see red.
+_STABLE, _INACCURATE, _REFUSED, _SLOW = (0.66, 0.83, 0.93), (0.98, 0.86, 0.45), (1.0, 1.0, 1.0), (0.72, 0.72, 0.72)
+_EARLY, _LATE = np.array([0.42, 0.02, 0.11]), np.array([0.87, 0.47, 0.40])
+_DASHES = ("-", "--", ":", "-.")
+_TICKS = 7
+
+
+def plot_maps(path, survey, cells):
+    """Draws what became of each cell, a panel for each method, and where the rules of :mod:`warpcloth.chart.rules` are 1.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        survey: The :class:`warpcloth.chart.stability.Survey`.
+        cells: (setup, y, x) as :meth:`warpcloth.chart.stability.Survey.table` gives them.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    check_path(path, PICTURES)
+    from matplotlib.figure import Figure
+
+    count = len(survey.setups)
+    columns = min(count, 4)
+    lines = math.ceil(count / columns)
+    figure = Figure(figsize=(max(3.1 * columns, 5.5), 2.7 * lines + 1.3), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    places = [_places(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
+    found = list(dict.fromkeys(name for rows in cells for row in rows for cell in row if cell for name in cell["rules"]))
+    shown = {}
+    for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
+        axes.pcolormesh(*map(_edges, places), _colours(rows, survey.steps), edgecolors="white", linewidth=0.4)
+        for n, name in enumerate(found):
+            style = {"colors": "black" if name in DIVERGES else "0.35", "linestyles": _DASHES[n % 4], "linewidths": 1.5}
+            if _line(axes, places, rows, name, style):
+                shown[name] = style
+        axes.set_title(str(setup), fontsize=9, color=GREY)
+        for of, name, values, at in zip("xy", (survey.x, survey.y), (survey.xs, survey.ys), places, strict=True):
+            few = np.unique(np.linspace(0, len(values) - 1, min(len(values), _TICKS)).round().astype(int))
+            axes.set(**{f"{of}ticks": at[few], f"{of}ticklabels": [f"{values[i]:.3g}" for i in few]})
+            if (of == "x" and k >= count - columns) or (of == "y" and k % columns == 0):
+                getattr(axes, f"set_{of}label")(AXES[name].label, color=GREY, fontsize=9)
+        axes.tick_params(colors=GREY, labelsize=8, labelbottom=k >= count - columns)
+    for axes in panels[count:]:
+        axes.remove()
+    _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row if cell})
+    rest = ", ".join(f"{name} {value:.4g}" for name, value in survey.fixed.items())
+    figure.suptitle(f"{survey.scene}, {survey.steps} steps" + (f", {rest}" if rest else ""), fontsize=10, color=GREY)
+    save(figure, path)
+
+
+def _places(name, values):
+    """Where the values stand along an axis."""
+    return np.log10(values) if AXES[name].logarithmic else np.asarray(values, dtype=np.float64)
+
+
+def _edges(at):
+    """Ends of cells about places (n,), (n+1,)."""
+    if len(at) == 1:
+        return np.array([at[0] - 0.5, at[0] + 0.5])
+    middle = 0.5 * (at[1:] + at[:-1])
+    return np.concatenate([[2.0 * at[0] - middle[0]], middle, [2.0 * at[-1] - middle[-1]]])
+
+
+def _colours(rows, steps):
+    """sRGB of cells (y, x, 3)."""
+    plain = dict(zip(VERDICTS, (_STABLE, _INACCURATE, None, _REFUSED, _SLOW), strict=True))
+
+    def colour(cell):
+        if cell is None or cell["verdict"] != "diverged":
+            return _REFUSED if cell is None else plain[cell["verdict"]]
+        part = math.log(max(cell["step"], 1)) / math.log(max(steps, 2))
+        return _EARLY + min(part, 1.0) * (_LATE - _EARLY)
+
+    return np.array([[colour(cell) for cell in row] for row in rows])
+
+
+def _line(axes, places, rows, name, style):
+    """The line where a rule is 1, between the cells; whether there is one."""
+    ratios = np.array([[(cell or {"rules": {}})["rules"].get(name) or np.nan for cell in row] for row in rows], dtype=float)
+    if min(ratios.shape) < 2:
+        return False
+    heights = np.log10(ratios)
+    if not (np.nanmin(heights, initial=np.inf) < 0.0 < np.nanmax(heights, initial=-np.inf)):
+        return False
+    axes.contour(*places, np.ma.masked_invalid(heights), levels=[0.0], **style)
+    return True
+
+
+def _legend(figure, shown, verdicts):
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    colours = {"stable": _STABLE, "inaccurate": _INACCURATE, "slow": _SLOW, "refused": _REFUSED}
+    entries = [
+        Patch(color=c, label=v) if v != "refused" else Patch(fc=c, ec=GREY, label=v)
+        for v, c in colours.items()
+        if v in verdicts
+    ]
+    if "diverged" in verdicts:
+        entries += [Patch(color=_EARLY, label="diverged at once"), Patch(color=_LATE, label="in the end")]
+    entries += [
+        Line2D([], [], color=style["colors"], linestyle=style["linestyles"], label=name) for name, style in shown.items()
+    ]
+    figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8, labelcolor=GREY)
+
+
+def write_table(path, survey, cells):
+    """A line of CSV for each cell: method, values of the axes, verdict, step of divergence, growth, error, rules, reason.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+    """
+    names = list(dict.fromkeys(name for rows in cells for row in rows for cell in row for name in cell["rules"]))
+    plain = ("verdict", "step", "growth", "error")
+    with Output(path, "x", **TEXT) as output:
+        table = csv.writer(output.file, lineterminator="\n")
+        table.writerow(["method", survey.x, survey.y, *plain, *names, "reason"])
+        for setup, rows in zip(survey.setups, cells, strict=True):
+            for y, row in zip(survey.ys, rows, strict=True):
+                for x, cell in zip(survey.xs, row, strict=True):
+                    values = [cell[name] for name in plain] + [cell["rules"].get(name) for name in names]
+                    table.writerow([str(setup), x, y, *("" if v is None else v for v in values), cell["reason"]])

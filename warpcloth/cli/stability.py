@@ -1,0 +1,136 @@
+"""The command ``chart stability``: a map for each method over two axes."""
+
+import sys
+from collections import Counter
+from contextlib import contextmanager
+
+from ..chart.axes import AXES, FIXED
+from ..chart.figures import PICTURES, check_path
+from ..chart.stability import ACCURACY, VERDICTS, Survey
+from ..chart.sweep import Store, cache_folder, sweep
+from ..chart.tasks import SceneRef, Setup
+from ..checks import number, whole
+from ..model import DTYPES
+from ..scene_files import assignments, convert, options
+from ..solvers import SOLVERS
+from .terminal import Interrupted, as_json, check_writable
+
+_COUNT = 9
+
+EPILOG = f"""\
+Axes: {", ".join(AXES)}. Stiffness and mass-ratio are factors of what the scene has, compression is 1 − l/L of the start,
+resolution a parameter n, links or elements of the scene. A method is NAME or NAME:option=value,option=value. Every run has the
+same number of steps. Diverged is what gets ten times as fast as start, gravity and time allow; inaccurate is what ends further
+than --accuracy, over vertices and frames and over the size of the cloth, from Newton's method with BDF2 and a quarter of the
+step, in float64. Rows that are measured are kept, and not measured again.
+
+  warpcloth chart stability hanging -p n=8 --x stiffness --y dt -o map.png
+  warpcloth chart stability net -p n=12 stiffness=inf --x resolution --y relaxation --solvers pbd:sweep=jacobi -o jacobi.png
+"""
+
+
+def add_arguments(parser):
+    """Adds what the command takes but for what all charts do."""
+    parser.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
+    parser.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    for of in "xy":
+        parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"the axis {of}, see below")
+        parser.add_argument(
+            f"--{of}-range", nargs=3, metavar=("LOW", "HIGH", "N"), help="its ends and number of values, at equal factors"
+        )
+    parser.add_argument("--at", nargs="+", action="extend", default=[], metavar="axis=value", help="of other axes; dt=1/60")
+    parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), metavar="METHOD", help="the methods, all if not given")
+    parser.add_argument("--steps", type=int, default=120, metavar="N", help="length of each run, 120 if not given")
+    parser.add_argument(
+        "--accuracy", type=float, default=ACCURACY, metavar="SHARE", help=f"{ACCURACY:g} if not given, 0 for none"
+    )
+    parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="of each run, 60 if not given")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes side by side, as many as cores if not given")
+    parser.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+    parser.add_argument("--dtype", choices=DTYPES, default="float64")
+    parser.add_argument("-o", "--output", metavar="FILE", help=f"draw the maps, as {', '.join(PICTURES)}")
+    parser.add_argument("--csv", metavar="FILE", help="write a line for each cell")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def chart(arguments):
+    if arguments.output:
+        check_path(arguments.output, PICTURES)
+    for output in filter(None, (arguments.output, arguments.csv)):
+        check_writable(output)
+    survey = _survey(arguments)
+    for name in ("limit", "accuracy"):
+        number(name, getattr(arguments, name), **({"above": 0.0} if name == "limit" else {"least": 0.0}))
+    given = {"device": arguments.device, "dtype": arguments.dtype, "limit": arguments.limit, "accuracy": arguments.accuracy}
+    tasks = survey.tasks(reference=arguments.accuracy > 0.0, **given)
+    store = Store(cache_folder() / "stability.jsonl")
+    try:
+        with _progress() as progress:
+            cells = survey.table(sweep(tasks, store=store, progress=progress, workers=arguments.workers))
+    except KeyboardInterrupt:
+        done = sum(task in store for task in tasks)
+        raise Interrupted(f"interrupted; {done} of {len(tasks)} rows are kept, run it again to go on") from None
+    if arguments.output or arguments.csv:
+        from ..chart.maps import plot_maps, write_table
+
+        if arguments.csv:
+            write_table(arguments.csv, survey, cells)
+        if arguments.output:
+            plot_maps(arguments.output, survey, cells)
+    methods = [str(setup) for setup in survey.setups]
+    if arguments.json:
+        axes = {survey.x: survey.xs, survey.y: survey.ys}
+        facts = {"scene": str(survey.scene), "x": survey.x, "y": survey.y, "axes": axes, "fixed": FIXED | survey.fixed}
+        print(as_json(facts | {"steps": survey.steps, "maps": dict(zip(methods, cells, strict=True))}))
+        return 0
+    for method, rows in zip(methods, cells, strict=True):
+        counts = Counter(cell["verdict"] for row in rows for cell in row)
+        print(f"{method}: " + ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS if counts[verdict]))
+        if counts["refused"]:
+            print("  refused: " + next(cell["reason"] for row in rows for cell in row if cell["verdict"] == "refused"))
+    return 0
+
+
+def _survey(arguments):
+    """What the arguments name."""
+    setups = []
+    for text in arguments.solvers:
+        name, _, given = text.partition(":")
+        if name not in SOLVERS:
+            raise ValueError(f"solver is {name!r}; it must be one of {', '.join(SOLVERS)}")
+        setups.append(Setup(name, options(SOLVERS[name], assignments(given.split(",") if given else []))))
+    if len({str(setup) for setup in setups}) < len(setups):
+        raise ValueError("a method stands twice after --solvers; each must be another")
+    whole("steps", arguments.steps, 1)
+    fixed = {}
+    for name, text in assignments(arguments.at).items():
+        if name not in AXES:
+            raise ValueError(f"--at has no axis {name!r}; allowed are {', '.join(AXES)}")
+        fixed[name] = convert(name, text, (int,) if AXES[name].whole else (float,))
+    values = [_values(of, getattr(arguments, of), getattr(arguments, f"{of}_range")) for of in "xy"]
+    scene = SceneRef(arguments.scene, assignments(arguments.p))
+    return Survey(scene, tuple(setups), arguments.x, arguments.y, *map(tuple, values), fixed, arguments.steps)
+
+
+def _values(of, name, texts):
+    axis = AXES[name]
+    low, high, count = texts or (str(axis.low), str(axis.high), str(_COUNT))
+    ends = [convert(f"--{of}-range", text, (float,)) for text in (low, high)]
+    return axis.values(*ends, convert(f"--{of}-range", count, (int,)))
+
+
+@contextmanager
+def _progress():
+    """A function for `sweep` that shows rows on a terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from tqdm import tqdm
+
+    with tqdm(desc="measuring", unit="row", leave=False, file=sys.stderr) as bar:
+
+        def show(done, total, _seconds):
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
