@@ -9,14 +9,29 @@ from ..outputs import TEXT, Output
 from .axes import AXES
 from .figures import GREY, PICTURES, check_path, save
 from .rules import DIVERGES
-from .stability import VERDICTS
 
-# sRGB. What diverged goes from the dark, at once, to the light, in the last frame; light blue, yellow and dark red differ in
-# lightness too, for those who do not see red.
-_STABLE, _INACCURATE, _REFUSED, _SLOW = (0.66, 0.83, 0.93), (0.98, 0.86, 0.45), (1.0, 1.0, 1.0), (0.72, 0.72, 0.72)
+# sRGB. What diverged goes from the dark, at once, to the light, in the last frame; all differ in lightness too, for those who
+# do not see red.
+_PLAIN = {
+    "stable": (0.66, 0.83, 0.93),
+    "inaccurate": (0.98, 0.88, 0.50),
+    "stalled": (0.93, 0.62, 0.20),
+    "slow": (0.72, 0.72, 0.72),
+    "refused": (1.0, 1.0, 1.0),
+}
 _EARLY, _LATE = np.array([0.42, 0.02, 0.11]), np.array([0.87, 0.47, 0.40])
-_DASHES = ("-", "--", ":", "-.")
-_TICKS = 7
+# Of each rule; black where beyond it a run diverges.
+_STYLES = {
+    "2/ω_max": "-",
+    "2/√(2 Σk/m)": "--",
+    "forward Euler": "-.",
+    "ω λ_max = 2": (0, (1, 1)),
+    "ω = 1 + 3^(−1/n)": (0, (4, 1, 1, 1, 1, 1)),
+    "h² = m/(k(L/l − 1))": "-",
+    "1 + Σk h²/m iterations": "--",
+    "a ring an iteration": "-.",
+}
+_TICKS = 5
 
 
 def plot_maps(path, survey, cells):
@@ -41,24 +56,23 @@ def plot_maps(path, survey, cells):
     figure = Figure(figsize=(max(3.1 * columns, 5.5), 2.7 * lines + 1.3), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
     places = [_places(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
-    found = list(dict.fromkeys(name for rows in cells for row in rows for cell in row if cell for name in cell["rules"]))
     shown = {}
     for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
         axes.pcolormesh(*map(_edges, places), _colours(rows, survey.steps), edgecolors="white", linewidth=0.4)
-        for n, name in enumerate(found):
-            style = {"colors": "black" if name in DIVERGES else "0.35", "linestyles": _DASHES[n % 4], "linewidths": 1.5}
+        for name, dashes in _STYLES.items():
+            style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
             if _line(axes, places, rows, name, style):
                 shown[name] = style
         axes.set_title(str(setup), fontsize=9, color=GREY)
         for of, name, values, at in zip("xy", (survey.x, survey.y), (survey.xs, survey.ys), places, strict=True):
-            few = np.unique(np.linspace(0, len(values) - 1, min(len(values), _TICKS)).round().astype(int))
-            axes.set(**{f"{of}ticks": at[few], f"{of}ticklabels": [f"{values[i]:.3g}" for i in few]})
+            few = slice(0, None, math.ceil(len(values) / _TICKS))
+            axes.set(**{f"{of}ticks": at[few], f"{of}ticklabels": [f"{value:.2g}" for value in values[few]]})
             if (of == "x" and k >= count - columns) or (of == "y" and k % columns == 0):
                 getattr(axes, f"set_{of}label")(AXES[name].label, color=GREY, fontsize=9)
         axes.tick_params(colors=GREY, labelsize=8, labelbottom=k >= count - columns)
     for axes in panels[count:]:
         axes.remove()
-    _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row if cell})
+    _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row})
     rest = ", ".join(f"{name} {value:.4g}" for name, value in survey.fixed.items())
     figure.suptitle(f"{survey.scene}, {survey.steps} steps" + (f", {rest}" if rest else ""), fontsize=10, color=GREY)
     save(figure, path)
@@ -79,20 +93,19 @@ def _edges(at):
 
 def _colours(rows, steps):
     """sRGB of cells (y, x, 3)."""
-    plain = dict(zip(VERDICTS, (_STABLE, _INACCURATE, None, _REFUSED, _SLOW), strict=True))
+    return np.array([[_colour(cell, steps) for cell in row] for row in rows])
 
-    def colour(cell):
-        if cell is None or cell["verdict"] != "diverged":
-            return _REFUSED if cell is None else plain[cell["verdict"]]
-        part = math.log(max(cell["step"], 1)) / math.log(max(steps, 2))
-        return _EARLY + min(part, 1.0) * (_LATE - _EARLY)
 
-    return np.array([[colour(cell) for cell in row] for row in rows])
+def _colour(cell, steps):
+    if cell["verdict"] != "diverged":
+        return _PLAIN[cell["verdict"]]
+    part = math.log(cell["step"]) / math.log(max(steps, 2))
+    return _EARLY + min(part, 1.0) * (_LATE - _EARLY)
 
 
 def _line(axes, places, rows, name, style):
     """The line where a rule is 1, between the cells; whether there is one."""
-    ratios = np.array([[(cell or {"rules": {}})["rules"].get(name) or np.nan for cell in row] for row in rows], dtype=float)
+    ratios = np.array([[cell["rules"].get(name) or np.nan for cell in row] for row in rows], dtype=float)
     if min(ratios.shape) < 2:
         return False
     heights = np.log10(ratios)
@@ -106,16 +119,11 @@ def _legend(figure, shown, verdicts):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    colours = {"stable": _STABLE, "inaccurate": _INACCURATE, "slow": _SLOW, "refused": _REFUSED}
-    entries = [
-        Patch(color=c, label=v) if v != "refused" else Patch(fc=c, ec=GREY, label=v)
-        for v, c in colours.items()
-        if v in verdicts
-    ]
+    entries = [Patch(fc=colour, ec=GREY, lw=0.5, label=verdict) for verdict, colour in _PLAIN.items() if verdict in verdicts]
     if "diverged" in verdicts:
         entries += [Patch(color=_EARLY, label="diverged at once"), Patch(color=_LATE, label="in the end")]
     entries += [
-        Line2D([], [], color=style["colors"], linestyle=style["linestyles"], label=name) for name, style in shown.items()
+        Line2D([], [], color=style["colors"], linestyle=style["linestyles"][0], label=name) for name, style in shown.items()
     ]
     figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8, labelcolor=GREY)
 

@@ -15,7 +15,7 @@ from .axes import AXES, FIXED, STEPS_PER_FRAME, record_at, scene_at, together, v
 from .rules import rules
 from .tasks import SceneRef, Setup, task
 
-VERDICTS = ("stable", "inaccurate", "diverged", "refused", "slow")
+VERDICTS = ("stable", "inaccurate", "stalled", "diverged", "refused", "slow")
 # RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
 ACCURACY = 0.01
 # Steps of the reference in one of the map.
@@ -95,8 +95,9 @@ def measure(
         reference: Whether to compare with Newton, BDF2, of a quarter of the step.
 
     Returns:
-        list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS`, ``status`` ("ok", "diverged",
-        "slow" or "refused"), ``reason``, ``step`` (that of divergence, or None), ``growth`` and ``error`` (or None), ``rules``.
+        list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS` ("stalled": a step ended in
+        no minimum), ``status`` ("ok", "diverged", "slow" or "refused"), ``reason``, ``step`` (that of divergence, or None),
+        ``growth`` (see :class:`Trial`) and ``error`` (or None), and ``rules`` (see :func:`warpcloth.chart.rules.rules`).
     """
     ref, setups = SceneRef(**scene), [Setup(**setup) for setup in setups]
     groups = [values]
@@ -148,14 +149,16 @@ def _judge(trial, copy, answer, accuracy, record):
         apart = trial.points[:, copy] - answer.points[:, copy]
         size = np.ptp(answer.points[0, copy], axis=0).max()
         error = _finite(math.sqrt((apart**2).sum(axis=-1).mean()) / size)
-    if trial.results[copy] in _FAILED or (error is not None and error > accuracy):
-        reason = reason or f"RMS distance to the reference {100.0 * error:.3g} % of the size"
+    if trial.results[copy] in _FAILED:
+        return _cell("stalled", reason, growth=growth, error=error)
+    if error is not None and error > accuracy:
+        reason = f"RMS distance to the reference {100.0 * error:.3g} % of the size"
         return _cell("inaccurate", reason, growth=growth, error=error)
     return _cell("stable", "", growth=growth, error=error)
 
 
 def _cell(verdict, reason, **more):
-    status = "ok" if verdict in VERDICTS[:2] else verdict
+    status = "ok" if verdict in VERDICTS[:3] else verdict
     return {
         "verdict": verdict,
         "status": status,
