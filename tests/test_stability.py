@@ -200,7 +200,7 @@ def test_02_a_raw_hessian_stalls_in_compression(device):
     cells = mapped(soft, setups, "compression", [0.0, 0.2, 0.4, 0.8], "dt", [1e-3, 1e-2, 1e-1], 20, device=device)
     raw, clamped = (flat([rows]) for rows in cells)
     stalled = [cell for cell in raw if cell["verdict"] == "stalled"]
-    assert len(stalled) > 3 and all(cell["rules"]["h² = m/(k(L/l − 1))"] > 1.0 for cell in stalled)
+    assert len(stalled) >= 3 and all(cell["rules"]["h² = m/(k(L/l − 1))"] > 1.0 for cell in stalled)
     assert all("energy" in cell["reason"] or "balance" in cell["reason"] for cell in stalled)
     assert "stalled" not in {cell["verdict"] for cell in clamped}
 
@@ -210,7 +210,7 @@ def test_03_stiffness_of_pbd_depends_on_iterations(device):
     spring = SceneRef("chain", {"links": 1, "stiffness": 1.0, "mass": 0.01})
     cells = mapped(
         spring,
-        [Setup("pbd"), Setup("xpbd"), Setup("newton")],
+        [Setup("pbd"), Setup("xpbd")],
         "stiffness",
         [0.3, 1.0],
         "iterations",
@@ -218,16 +218,15 @@ def test_03_stiffness_of_pbd_depends_on_iterations(device):
         200,
         {"dt": 1 / 240},
         device=device,
-        accuracy=0.1,
+        accuracy=0.05,
     )
-    pbd, xpbd, newton = (np.array([[cell["error"] for cell in row] for row in rows]) for rows in cells[:2] + [cells[1]])
+    pbd, xpbd = (np.array([[cell["error"] for cell in row] for row in rows]) for rows in cells)
     assert (pbd[2] > 5.0 * pbd[0]).all() and verdicts(cells[0])[2] == ["inaccurate"] * 2
     assert np.ptp(xpbd, axis=0).max() < 1e-6 and verdicts(cells[1]) == [["stable"] * 2] * 3
-    assert newton is not None and {cell["verdict"] for cell in flat(cells[2:3])} <= {"stable", "inaccurate", "refused"}
 
 
 def test_06_and_08_few_iterations_fall_behind_as_stiffness_grows(device):
-    """Of 8 iterations projective dynamics, plain and accelerated, stays behind by far where Σk h²/m is above them; so does ADMM."""
+    """Of 8 iterations projective dynamics, plain and accelerated, stays behind by far where Σk h²/m is above them; so ADMM."""
     plain = Setup("projective-dynamics", {"acceleration": "none"})
     setups = [plain, Setup("projective-dynamics"), Setup("admm")]
     cells = mapped(HANGING, setups, "stiffness", [1e-3, 1.0, 1e3], "iterations", [8, 64], 60, device=device, accuracy=0.25)
@@ -329,17 +328,14 @@ def test_refused_and_slow_cells_say_why(device):
         (lambda: Survey(HANGING, (), "dt", "dt", (1,), (1,), {}), "each must be another"),
         (lambda: Survey(HANGING, (), "dt", "weight", (1,), (1,), {"dt": 1.0}), "each must be another"),
         (lambda: Survey(HANGING, (), "dt", "height", (1,), (1,), {}), "axis is 'height'; it must be one of"),
-        (lambda: record_at(Setup("newton", {"dt": 0.1}), {}), "the map sets the step"),
+        (lambda: Survey(HANGING, (Setup("newton", {"dt": 1.0}),), "dt", "weight", (1,), (1,), {}), "the map sets the step"),
         (lambda: scene_at(SceneRef("flag"), {"dt": 0.1}, 4), "its pins move"),
-        (lambda: scene_at(SceneRef("mobile"), {"dt": 0.1, "compression": 0.1, "resolution": 4}, 4), None),
+        (lambda: scene_at(SceneRef("net.txt"), {"dt": 0.1, "resolution": 4}, 4), "net.txt"),
         (lambda: boundary(HANGING, Setup("newton"), "dt", 1e-3, 1e-2, steps=4), "both ends hold"),
     ],
 )
 def test_wrong_values_are_refused(make, words):
-    if words is None:
-        assert len(make().mesh.points)
-        return
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((ValueError, FileNotFoundError), match=words):
         make()
 
 

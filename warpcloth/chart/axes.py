@@ -143,8 +143,6 @@ def record_at(setup, values):
     Raises:
         ValueError: The solver has no option of that name, or a value breaks its rule.
     """
-    if {"dt", "substeps"} & set(setup.options):
-        raise ValueError(f"{setup}: the map sets the step; leave dt and substeps out")
     record = Setup(setup.solver, {**setup.options, "substeps": STEPS_PER_FRAME}).record()
     known = {field.name for field in fields(record)}
     for name in OPTIONS:

@@ -187,7 +187,7 @@ class Survey:
         steps: Length of each run.
 
     Raises:
-        ValueError: The axes are not two, or unknown.
+        ValueError: The axes are not two, or unknown, or a method has a step of its own.
     """
 
     scene: SceneRef
@@ -204,6 +204,9 @@ class Survey:
             choice("axis", name, tuple(AXES))
         if self.x == self.y or {self.x, self.y} & set(self.fixed):
             raise ValueError(f"axes are {self.x}, {self.y} and at fixed values {', '.join(self.fixed)}; each must be another")
+        for setup in self.setups:
+            if {"dt", "substeps"} & set(setup.options):
+                raise ValueError(f"{setup}: the map sets the step; leave dt and substeps out")
 
     def tasks(self, **options):
         """One :class:`warpcloth.chart.tasks.Task` a row, along the axis that copies can differ in, if one can.
