@@ -167,11 +167,11 @@ def test_implicit_euler_never_diverges(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hanging", "net"])
 def test_implicit_euler_never_diverges_on_full_maps(name, device):
-    """The same with all steps, 120 of each, and the start compressed too."""
-    scene = SceneRef(name, {"n": 8, **({"stiffness": 1e3} if name == "net" else {})})
+    """The same with steps up to 1 s, 60 of each, and the start compressed too."""
+    scene = SceneRef(name, {"n": 6, **({"stiffness": 1e3} if name == "net" else {})})
     for fixed in ({}, {"compression": 0.3}):
-        steps = tuple(np.geomspace(1e-4, 1.0, 9).tolist())
-        cells = mapped(scene, IMPLICIT + OTHERS, "stiffness", DECADES, "dt", steps, 120, fixed, device=device, reference=False)
+        steps = tuple(np.geomspace(1e-4, 1.0, 5).tolist())
+        cells = mapped(scene, IMPLICIT + OTHERS, "stiffness", DECADES, "dt", steps, 60, fixed, device=device, reference=False)
         assert {cell["verdict"] for cell in flat(cells[:3])} <= {"stable", "stalled"}
         assert not unexplained(cells)
 
