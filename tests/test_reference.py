@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import warpcloth as wc
 from warpcloth.chart import reference as module
+from warpcloth.chart import trajectory
 from warpcloth.chart.digest import scene_digest
 from warpcloth.chart.reference import Reference, cloth_size, position_error, reference, strain_error
 from warpcloth.chart.tasks import SceneRef
@@ -310,6 +311,13 @@ def test_all_that_motion_depends_on_is_in_the_key(change):
     assert scene_digest(scene) != scene_digest(replace(scene, **change))
 
 
+def test_terms_of_the_same_numbers_have_keys_of_their_own():
+    mesh = wc.Mesh.grid(3, 3)
+    kinds = (wc.StVKMembrane, wc.NeoHookeanMembrane)
+    scenes = [wc.Scene(mesh, density=0.1, terms=[kind(stiffness=10.0, poisson_ratio=0.3)]) for kind in kinds]
+    assert scene_digest(scenes[0]) != scene_digest(scenes[1])
+
+
 def test_a_key_is_of_data():
     term = wc.Spring(pairs="structural", stiffness=10.0)
     object.__setattr__(term, "stiffness", object())
@@ -353,6 +361,12 @@ def test_how_a_measurement_ends(device):
     assert diverged["status"] == "diverged" and "diverged in frame" in diverged["reason"] and diverged["error"] is None
     assert diverged["frames"] < 20
     assert "in motion" in measured("explicit", substeps=10)["message"], "warnings are part of it"
+
+
+def test_the_first_frame_of_a_run_is_not_timed():
+    found = trajectory._times([[9.0, 0.1, 0.2], [7.0, 0.3, 0.4, 0.5]], 50.0)
+    assert found == {"ms": 300.0, "spread": [200.0, 400.0], "ms_per_second": 15000.0}
+    assert trajectory._times([[0.2]], 50.0)["ms"] == 200.0, "unless there is no other"
 
 
 def test_a_second_run_may_be_left_out():
