@@ -4,6 +4,7 @@ import contextlib
 import json
 import multiprocessing
 import os
+import signal
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -115,7 +116,7 @@ def _processes(workers):
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
     try:
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=initialise_warp) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin) as pool:
             try:
                 yield pool
             except BaseException:
@@ -127,6 +128,12 @@ def _processes(workers):
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def _begin():
+    """In each process: an interruption ends it without a word, as the first process says what there is to say."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    initialise_warp()
 
 
 def cache_folder():
