@@ -1,6 +1,5 @@
 """Makes the pictures of the README from animations and rest shapes: python docs/pictures.py"""
 
-import sys
 from pathlib import Path
 
 import matplotlib
@@ -12,15 +11,13 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 
 import warpcloth as wc
+from warpcloth.chart import elastica
 from warpcloth.chart.picture import paint
 from warpcloth.chart.view import View, brightness
 from warpcloth.reports import write_report
 from warpcloth.scenes import bar_twist, bunny, cantilever, hanging, mobile
 
 DOCS = Path(__file__).parent
-sys.path.insert(0, str(DOCS.parent / "tests"))
-import elastica  # noqa: E402 it stands among the tests
-
 GREY = "0.35"
 COLOURS = ListedColormap(plt.get_cmap("viridis")(np.linspace(0.25, 1.0, 256)))
 

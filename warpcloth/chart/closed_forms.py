@@ -1,0 +1,83 @@
+"""The physics diagram: errors to closed forms against mesh size and cost."""
+
+import math
+
+from .figures import GREY, PICTURES, check_path, save
+
+_MARKS = "os^Dv"
+
+
+def plot_physics(path, results):
+    """Plots the error against h and against the time, one row a case, pattern and angle, one line each other setting.
+
+    Dashed: what the free sides of a cantilever cost, below which no mesh comes. What did not end well is named beside.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        results: Pairs of the arguments of :func:`physics.measure` and what it gave, in any order.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: There is nothing to plot, or the path has another ending.
+    """
+    check_path(path, PICTURES)
+    rows = {}
+    for arguments, found in results:
+        rows.setdefault(_title(arguments), {}).setdefault(_label(arguments), []).append((arguments, found))
+    if not rows:
+        raise ValueError(f"{path}: there are no results; a plot must have one or more")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 2.8 * len(rows) + 0.3), layout="constrained")
+    panels = figure.subplots(len(rows), 2, squeeze=False, sharey=True, sharex="col")
+    for (left, right), (title, lines) in zip(panels, rows.items(), strict=True):
+        for k, (label, points) in enumerate(lines.items()):
+            good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if _has_error(found))
+            style = {"marker": _MARKS[k % len(_MARKS)], "markersize": 4, "linewidth": 1.0, "color": f"C{k}"}
+            left.plot([h for h, _, _ in good], [error for _, error, _ in good], label=label, **style)
+            timed = sorted((ms, error) for _, error, ms in good if ms is not None)
+            right.plot([ms for ms, _ in timed], [error for _, error in timed], **style)
+            for side in {found["sides"] for _, found in points if found["sides"] is not None}:
+                for axes in (left, right):
+                    axes.axhline(side, color=f"C{k}", linewidth=0.8, linestyle=(0, (4, 3)))
+        _finish(left, right, title, [pair for points in lines.values() for pair in points])
+    panels[-1, 0].set_xlabel("h / L", color=GREY)
+    panels[-1, 1].set_xlabel("time [ms]", color=GREY)
+    save(figure, path)
+
+
+def _finish(left, right, title, points):
+    left.set_title(title, fontsize=9, loc="left", color=GREY)
+    left.set_ylabel("relative error", color=GREY)
+    for axes in (left, right):
+        axes.set(xscale="log", yscale="log")
+        axes.tick_params(colors=GREY, labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set_color("0.7")
+    if left.get_legend_handles_labels()[1]:
+        left.legend(frameon=False, fontsize=7, labelcolor=GREY)
+    failed = [f"{_label(a)}, {a['resolution']}: {found['status']}" for a, found in points if found["status"] != "ok"]
+    right.set_title("\n".join(failed), fontsize=7, loc="right", color=GREY, parse_math=False)
+
+
+def _has_error(found):
+    """Whether a result has a place on logarithmic axes; one that is exact to the last bit has none."""
+    return found["status"] == "ok" and bool(found["error"])
+
+
+def _title(arguments):
+    if arguments["case"] in ("chain", "catenary"):
+        return arguments["case"]
+    angle = math.degrees(arguments.get("angle", 0.0))
+    return f"{arguments['case']}, {arguments.get('pattern', 'equilateral')} turned by {angle:.3g}°"
+
+
+def _label(arguments):
+    """The settings of a line, those that are not at their default or that vary as a rule."""
+    words = [] if arguments["case"] in ("chain", "catenary", "patch") else [arguments.get("bending", "quadratic")]
+    if arguments["case"] == "cantilever":
+        words.append(f"Γ = {arguments.get('gamma', 1.0):g}")
+    names = {"stretching": "stretching {:g}", "width": "width {:g}", "dtype": "{}", "device": "{}"}
+    words += [text.format(arguments[name]) for name, text in names.items() if name in arguments]
+    return ", ".join(words) or arguments["case"]

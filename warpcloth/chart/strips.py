@@ -1,0 +1,145 @@
+"""Strips cut from nets that are turned by any angle, and what a net makes of the bending stiffness."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import Delaunay
+
+from ..checks import choice, number
+from ..kernels.terms.quadratic_bending import rest_state
+from ..mesh import Mesh
+
+PATTERNS = ("equilateral", "diagonal", "alternating", "jittered")
+# Of the spacing, by which a vertex of a jittered net is moved at most in either direction: as far as triangles stay well shaped.
+JITTER = 0.4
+# Rows of a clamp, in spacings: more than the longest hinge, so that each one that bends is whole.
+_CLAMP = 3.0
+
+
+class Strip(NamedTuple):
+    """A flat strip along x in the plane y = 0.
+
+    Attributes:
+        mesh: The :class:`warpcloth.Mesh`.
+        pins: Vertices of the clamp.
+        clamp: Where along x the part that bends begins [m].
+        end: Where it ends [m].
+    """
+
+    mesh: Mesh
+    pins: np.ndarray
+    clamp: float
+    end: float
+
+    @property
+    def length(self):
+        """Free length [m]."""
+        return self.end - self.clamp
+
+
+def strip(pattern, angle, spacing, length=1.0, width=1.0):
+    """A strip whose vertices up to x = 0 are clamped.
+
+    It has the whole triangles of the net that lie within length and width. Clipped ones would be slivers and would make a
+    regular net irregular, which locks; so the sides are jagged, and what a side lacks is of first order in the spacing.
+
+    The clamp begins where the strip of a smooth cylinder that is flat as far as the pins hold it would. A hinge bends as soon
+    as one of its vertices is free, so on average half its length before the last pin: the mean over hinges, weighted by their
+    share in the bending energy. The end is that of the rectangle with the same area, centre and second moment.
+
+    Args:
+        pattern: "equilateral", "diagonal" or "alternating" as of :meth:`warpcloth.Mesh.grid`, or "jittered": a Delaunay
+            triangulation of the equilateral net after its vertices are moved at random, the same at every call.
+        angle: By which the net is turned about +y [rad]; at 45° the diagonals of "diagonal" run along the strip.
+        spacing: Edge of the net [m]; of right triangles the shorter ones.
+        length: Of what is not pinned [m].
+        width: [m].
+
+    Raises:
+        ValueError: The pattern is unknown, or nothing fits in.
+    """
+    points, triangles = _net(pattern, angle, spacing, length, width)
+    near = 1e-9 * length
+    low, high = np.array([-_CLAMP * spacing, -width / 2]), np.array([length, width / 2])
+    inside = ((points > low - near) & (points < high + near)).all(axis=1)
+    triangles = _largest_piece(triangles[inside[triangles].all(axis=1)])
+    if not len(triangles):
+        raise ValueError(f"spacing is {spacing:g}; at most a third of length {length:g} and width {width:g} fits")
+    used, triangles = np.unique(triangles, return_inverse=True)
+    x, z = points[used].T
+    mesh = Mesh(np.stack([x, np.zeros_like(x), z], axis=1), triangles.reshape(-1, 3))
+    pinned = x <= near
+    if pinned.all() or not pinned.any():
+        raise ValueError(f"spacing is {spacing:g}; at most a third of length {length:g} fits")
+    energy = roll(mesh)
+    reach = np.ptp(x[mesh.hinges], axis=1)
+    clamp = (x[pinned].max() + x[~pinned].min()) / 2.0 - (energy * reach).sum() / energy.sum() / 2.0
+    return Strip(mesh, np.flatnonzero(pinned), clamp, _end(mesh))
+
+
+def rolled(pattern, angle):
+    """Stiffness over D of a net that is rolled to a cylinder, however fine it is.
+
+    With c, s of the angle the curvature has the parts c², s² and cs in the net's own axes. Hinges of "diagonal" measure
+    κ₁₁ + κ₁₂, κ₂₂ + κ₁₂ and 2κ₁₂, those of "alternating" κ₁₁, κ₂₂ and ±2κ₁₂; squares and sum, over a cell, are these.
+    At rest a sheet may find a softer shape: one that also twists, or whose two kinds of vertices of "alternating" part.
+    """
+    choice("pattern", pattern, PATTERNS[:3])
+    twist = np.sin(2.0 * angle)
+    return float({"equilateral": 1.0, "diagonal": 1.0 + twist + twist**2, "alternating": 1.0 + 0.5 * twist**2}[pattern])
+
+
+def roll(mesh):
+    """Bending energy of each hinge of a flat mesh (H,) over D where it is curved by 1 along x."""
+    rest = rest_state(mesh.points, mesh.hinges)
+    height = 0.5 * mesh.points[:, 0] ** 2
+    return 0.5 * np.einsum("ij,ij->i", rest[:, :4], height[mesh.hinges]) ** 2 * rest[:, 4]
+
+
+def inner_shares(mesh):
+    """Of each hinge (H,) how many of its two triangles have three hinges, by half; and the area of all these [m²]."""
+    both = np.sort(mesh.hinges[:, [[0, 1, 2], [0, 1, 3]]], axis=2).reshape(-1, 3)
+    triangles, of, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
+    inner = count == 3
+    return inner[of.reshape(-1, 2)].mean(axis=1), Mesh(mesh.points, triangles[inner]).triangle_areas.sum()
+
+
+def _net(pattern, angle, spacing, length, width):
+    """Points (n, 2) in x and z and triangles of a net that covers the strip, a vertex at the origin."""
+    choice("pattern", pattern, PATTERNS)
+    number("angle", angle)
+    number("spacing", spacing, above=0.0)
+    number("length", length, above=0.0)
+    number("width", width, above=0.0)
+    rows = int(np.ceil(np.hypot(length, width) / (np.sqrt(0.75) * spacing))) + 4
+    size = 2 * rows * spacing
+    grid = Mesh.grid(2 * rows + 1, 2 * rows + 1, size, "equilateral" if pattern == "jittered" else pattern)
+    points = (grid.points - grid.points[rows * (2 * rows + 2)])[:, [0, 2]]
+    c, s = np.cos(angle), np.sin(angle)
+    points = points @ np.array([[c, -s], [s, c]])
+    if pattern != "jittered":
+        return points, grid.triangles
+    points = points + spacing * np.random.default_rng(0).uniform(-JITTER, JITTER, points.shape)
+    return points, Delaunay(points).simplices[:, ::-1]
+
+
+def _largest_piece(triangles):
+    """Those that hang together by edges; what holds by a vertex alone would swing."""
+    if not len(triangles):
+        return triangles
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    _, edge = np.unique(edges, axis=0, return_inverse=True)
+    of = np.repeat(np.arange(len(triangles)), 3)
+    shared = csr_array((np.ones(len(of)), (of, edge.ravel())))
+    _, piece = connected_components(shared @ shared.T, directed=False)
+    return triangles[piece == np.bincount(piece).argmax()]
+
+
+def _end(mesh):
+    """Far end of the rectangle along x that has the area, centre and second moment of a mesh."""
+    x, areas = mesh.points[mesh.triangles, 0], mesh.triangle_areas / mesh.triangle_areas.sum()
+    centre = areas @ x.mean(axis=1)
+    second = areas @ ((x**2).sum(axis=1) + x.sum(axis=1) ** 2) / 12.0 - centre**2
+    return float(centre + np.sqrt(3.0 * second))
