@@ -8,7 +8,7 @@ _MARKS = "os^Dv"
 
 
 def plot_physics(path, results):
-    """Plots the error against h and against the time, one row a case, pattern and angle, one line each other setting.
+    """Plots the error against h and against the time, two panels a case, pattern and angle.
 
     Dashed: what the free sides of a cantilever cost, below which no mesh comes. What did not end well is named beside.
 
@@ -29,9 +29,11 @@ def plot_physics(path, results):
         raise ValueError(f"{path}: there are no results; a plot must have one or more")
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 2.8 * len(rows) + 0.3), layout="constrained")
-    panels = figure.subplots(len(rows), 2, squeeze=False, sharey=True, sharex="col")
-    for (left, right), (title, lines) in zip(panels, rows.items(), strict=True):
+    across = min(math.ceil(math.sqrt(len(rows) / 2)), 3)
+    down = math.ceil(len(rows) / across)
+    figure = Figure(figsize=(6.0 * across, 2.4 * down + 0.3), layout="constrained")
+    panels = figure.subplots(down, 2 * across, squeeze=False, sharey=True).reshape(-1, 2)
+    for (left, right), (title, lines) in zip(panels, rows.items(), strict=False):
         for k, (label, points) in enumerate(lines.items()):
             good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if _has_error(found))
             style = {"marker": _MARKS[k % len(_MARKS)], "markersize": 4, "linewidth": 1.0, "color": f"C{k}"}
@@ -42,14 +44,16 @@ def plot_physics(path, results):
                 for axes in (left, right):
                     axes.axhline(side, color=f"C{k}", linewidth=0.8, linestyle=(0, (4, 3)))
         _finish(left, right, title, [pair for points in lines.values() for pair in points])
-    panels[-1, 0].set_xlabel("h / L", color=GREY)
-    panels[-1, 1].set_xlabel("time [ms]", color=GREY)
+    for axes in panels[len(rows) :].ravel():
+        axes.remove()
     save(figure, path)
 
 
 def _finish(left, right, title, points):
     left.set_title(title, fontsize=9, loc="left", color=GREY)
     left.set_ylabel("relative error", color=GREY)
+    left.set_xlabel("h / L", color=GREY)
+    right.set_xlabel("time [ms]", color=GREY)
     for axes in (left, right):
         axes.set(xscale="log", yscale="log")
         axes.tick_params(colors=GREY, labelsize=8)
@@ -74,7 +78,7 @@ def _title(arguments):
 
 
 def _label(arguments):
-    """The settings of a line, those that are not at their default or that vary as a rule."""
+    """The settings of a line, beside what is in the title."""
     words = [] if arguments["case"] in ("chain", "catenary", "patch") else [arguments.get("bending", "quadratic")]
     if arguments["case"] == "cantilever":
         words.append(f"Γ = {arguments.get('gamma', 1.0):g}")

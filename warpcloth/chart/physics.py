@@ -11,13 +11,14 @@
 Bending is calibrated on equilateral nets; on others what is wrong stays as the mesh is refined (:func:`strips.rolled`). What
 makes a cantilever something else than the elastica:
 
-- One row of triangles, or any strip much narrower than long, bends with 8/9 of D, as Poisson's ratio of both energies is 1/3: it
-  is the elastica of 9Γ/8. This one is twice as wide as it is long.
+- One row of triangles, or any strip much narrower than long, bends with 8/9 of D, as Poisson's ratio of both energies is 1/3:
+  it is the elastica of 9Γ/8. This one is twice as wide as it is long.
 - Its sides curl as those of a narrow strip do, as far in as its membrane lets them: `sides` is what that takes of D, and the
   error cannot be much less. The stiffer the membrane the smaller it is.
 - A stiff membrane locks: the mesh cannot bend without stretching, and an irregular one does so most, by κ²h²/24 a triangle,
   which costs more than bending where h⁴ > 576D/(Kκ²). That goes away with h.
-- The clamp is half a row before the last pinned one, as a hinge bends when any of its vertices is free; Γ has the length from there.
+- The clamp is half a row before the last pinned one, as a hinge bends when any of its vertices is free; the L of Γ begins
+  there.
 - Quadratic bending is for small Γ or stiff membranes: it resists stretching that varies, which dihedral angles do not.
 """
 
@@ -103,7 +104,9 @@ def measure(
         found = _chain(settle, resolution) if case == "chain" else _catenary(settle, resolution, stretching)
     if settle.status != "ok":
         found |= {"error": None, "stiffness": None}
-    return nothing | found | {"status": settle.status, "reason": settle.reason, "ms": settle.ms, "iterations": settle.iterations}
+    return (
+        nothing | found | {"status": settle.status, "reason": settle.reason, "ms": settle.ms, "iterations": settle.iterations}
+    )
 
 
 class _Settling:

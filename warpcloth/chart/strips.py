@@ -12,7 +12,7 @@ from ..kernels.terms.quadratic_bending import rest_state
 from ..mesh import Mesh
 
 PATTERNS = ("equilateral", "diagonal", "alternating", "jittered")
-# Of the spacing, by which a vertex of a jittered net is moved at most in either direction: as far as triangles stay well shaped.
+# Of the spacing: how far a vertex of a jittered net is moved at most, along either axis.
 JITTER = 0.4
 # Rows of a clamp, in spacings: more than the longest hinge, so that each one that bends is whole.
 _CLAMP = 3.0

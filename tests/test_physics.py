@@ -1,0 +1,292 @@
+"""The physics diagram: bending of nets that are turned, and errors to closed forms that finer meshes cure or do not."""
+
+import json
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.chart import physics
+from warpcloth.chart.closed_forms import plot_physics
+from warpcloth.chart.elastica import aspect, gamma_of
+from warpcloth.chart.physics import measure, side_loss
+from warpcloth.chart.strips import PATTERNS, inner_shares, rolled, strip
+from warpcloth.chart.sweep import Store, sweep
+from warpcloth.chart.tasks import task
+
+ANGLES = (0.0, 13.0, 30.0, 45.0, -15.0, -45.0)
+BENDING = ("dihedral", "quadratic")
+
+
+def measured(*arguments, **options):
+    found = measure(*arguments, **options)
+    assert found["status"] == "ok", found
+    return found
+
+
+def cantilevers(resolutions, device, angle=0.0, **options):
+    found = [measured("cantilever", n, angle=np.radians(angle), device=device, **options) for n in resolutions]
+    print(options, angle, [(round(each["stiffness"], 4), round(each["error"], 4)) for each in found])
+    return found
+
+
+@pytest.mark.parametrize("gamma", [0.1, 1.0, 10.0, 90.0])
+@pytest.mark.parametrize("at", [1.0, 0.9])
+def test_the_elastica_of_a_shape(gamma, at):
+    assert gamma_of(aspect(gamma, at), at, 1.5 * gamma) == pytest.approx(gamma, rel=1e-6)
+
+
+def test_the_elastica_for_small_and_unknown_shapes():
+    """H/W = Γ/8 for small Γ, to a part of about Γ²: W is shorter than 1 by about H²."""
+    assert aspect(0.01) == pytest.approx(0.01 / 8, rel=0.01**2)
+    assert gamma_of(100.0, 1.0, 1.0) is None and gamma_of(1e-6, 1.0, 1.0) is None
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_strip_of_whole_triangles(pattern, angle):
+    """Inside, of the orientation of a grid, in one piece, with a clamp of one hinge at least."""
+    h = 0.1
+    cut = strip(pattern, np.radians(angle), h, width=0.7)
+    x, y, z = cut.mesh.points.T
+    assert abs(z).max() <= 0.35 + 1e-9 and x.max() <= 1.0 + 1e-9 and x.min() >= -3.0 * h - 1e-9 and not y.any()
+    corners = cut.mesh.points[cut.mesh.triangles]
+    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 1] > 0.0).all()
+    assert len(np.unique(cut.mesh.triangles)) == len(x)
+    assert len(cut.mesh.boundary_edges) == len(cut.mesh.boundary)  # one loop: no hole, and no vertex in two pieces
+    assert set(cut.pins) == set(np.flatnonzero(x < 1e-6))
+    # A hinge is at most √5 spacings long, of a jittered net 0.8 more on either side.
+    assert -1.6 * h < cut.clamp < 0.0 and 1.0 - h < cut.end <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("pattern", ["equilateral", "diagonal", "alternating"])
+def test_a_clamp_is_half_a_row_before_its_last_pin(pattern):
+    """Rows across, of which the one at 0 is the last that is pinned."""
+    turned, row = (np.pi / 6, np.sqrt(0.75)) if pattern == "equilateral" else (0.0, 1.0)
+    cut = strip(pattern, turned, 0.1)
+    assert cut.clamp == pytest.approx(-0.05 * row, abs=1e-12)
+    length = 0.1 * row * np.floor(1.0 / (0.1 * row))
+    # The sides of the equilateral net are jagged, and so lack a corner.
+    assert cut.end == pytest.approx(length, abs=0.1**2 / 4.0 if turned else 1e-12)
+
+
+def test_inner_triangles():
+    mesh = wc.Mesh.grid(4, 4, size=3.0)
+    shares, area = inner_shares(mesh)
+    # 18 triangles, 10 of which have a side at the boundary: 12 sides, two of them in each of two corners.
+    assert area == 4.0 and shares.sum() == pytest.approx(8 * 3 / 2)
+
+
+@pytest.mark.parametrize("bending", BENDING)
+@pytest.mark.parametrize("pattern", ["equilateral", "diagonal", "alternating"])
+def test_a_net_that_is_rolled_bends_as_its_directions_say(pattern, bending, device):
+    """D at every angle of an equilateral net; of others what is wrong stays. To κ²h²/4 of its stiffness, a quarter a half."""
+    for angle in np.radians(ANGLES):
+        known = rolled(pattern, angle)
+        for n in (8, 16):
+            found = measured("cylinder", n, bending, pattern, angle, device=device)
+            assert found["stiffness"] == pytest.approx(known, rel=1.0 / (4.0 * n * n)), (np.degrees(angle), n)
+            assert found["error"] == pytest.approx(abs(found["stiffness"] - 1.0), abs=1e-15)
+    assert rolled("equilateral", 1.0) == 1.0
+    named = {"diagonal": (1.0, 3.0, 0.75), "alternating": (1.0, 1.5, 1.125)}.get(pattern)
+    if named:
+        np.testing.assert_allclose([rolled(pattern, a) for a in np.radians([0.0, 45.0, -15.0])], named, rtol=1e-12)
+
+
+@pytest.mark.parametrize("bending", BENDING)
+def test_an_irregular_net_that_is_rolled_is_too_stiff(bending, device):
+    """By a fifth or more, and no less so when it is finer."""
+    found = [measured("cylinder", n, bending, "jittered", device=device)["stiffness"] for n in (12, 24)]
+    assert min(found) > 1.2 and max(found) < 1.4, found
+
+
+def converges(found, order=1.0):
+    """Whether errors fall by an order, to what the free sides take: what is left then is no more than the last change."""
+    signed = np.array([each["stiffness"] - 1.0 for each in found])
+    changes = np.abs(np.diff(signed))
+    return (changes[1:] < changes[:-1] / 2.0**order).all() and abs(signed[-1]) < changes[-1] + found[-1]["sides"]
+
+
+# Turned by 30° it has rows across, whose sides alone are jagged.
+@pytest.mark.parametrize(("angle", "bending"), [(0.0, "dihedral"), (13.0, "quadratic"), (30.0, "dihedral")])
+def test_a_cantilever_of_an_equilateral_net_converges(angle, bending, device):
+    """At any angle, by first order or more."""
+    assert converges(cantilevers((6, 12, 24), device, angle, bending=bending))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("bending", BENDING)
+@pytest.mark.parametrize("gamma", [0.5, 1.0])
+def test_cantilevers_of_equilateral_nets_converge(angle, bending, gamma, device):
+    assert converges(cantilevers((8, 16, 32), device, angle, bending=bending, gamma=gamma))
+
+
+def least(pattern, angle):
+    """Stiffness over D of a narrow strip of a net, curved along x, whose other curvatures are free: 1/(C⁻¹)₁₁.
+
+    ½κᵀCκ is the sum of the squares of what the hinges measure, less what the relative shift of the two kinds of vertices of
+    "alternating" saves: (κ₁₁ + κ₂₂)²/6.
+    """
+    rows = {
+        "equilateral": [
+            [np.sqrt(1 / 3), np.sqrt(1 / 3), 0],
+            [np.sqrt(2 / 3), 0, 0],
+            [0, np.sqrt(2 / 3), 0],
+            [0, 0, np.sqrt(4 / 3)],
+        ],
+        "diagonal": [[1, 0, 1], [0, 1, 1], [0, 0, 2]],
+        "alternating": [[1, 0, 0], [0, 1, 0], [0, 0, 2]],
+    }[pattern]
+    C = np.transpose(rows) @ np.array(rows, dtype=float)
+    if pattern == "alternating":
+        C[:2, :2] -= 1 / 6
+    c, s = np.cos(angle), np.sin(angle)
+    moment = np.array([c * c, s * s, 2 * c * s])
+    return 1.0 / (moment @ np.linalg.solve(C, moment))
+
+
+def test_least_stiffness():
+    assert least("equilateral", 0.4) == pytest.approx(8 / 9) and least("diagonal", 0.0) == pytest.approx(0.8)
+    assert least("diagonal", np.pi / 4) == pytest.approx(2.0)
+
+
+def stays_wrong(pattern, angle, found):
+    """Whether the stiffness is between those of a narrow strip and of a cylinder and finer meshes do not come nearer to D.
+
+    What the jagged sides change is a spacing or less of either side of the width of 2.
+    """
+    h, stiffness = found[-1]["h"], [each["stiffness"] for each in found]
+    known = rolled(pattern, np.radians(angle))
+    between = least(pattern, np.radians(angle)) * (1.0 - h) < stiffness[-1] < known * (1.0 + h)
+    return between and abs(stiffness[-1] - 1.0) > 0.5 * abs(stiffness[0] - 1.0) > 0.02
+
+
+# The stiffness at rest by the side: what a net has where it curves along its rows and along its diagonals.
+@pytest.mark.parametrize(
+    ("pattern", "angle", "near"),
+    [
+        ("diagonal", 0.0, (0.9, 1.0)),  # it twists, and so is softer than the cylinder
+        ("diagonal", 45.0, (2.85, 3.15)),
+        ("diagonal", -15.0, (0.7, 0.8)),
+        ("alternating", 0.0, (0.8, 0.9)),  # its vertices part: 5/6 of D
+        ("alternating", 45.0, (1.2, 1.35)),  # 4/3
+    ],
+)
+def test_refinement_does_not_cure_other_nets(pattern, angle, near, device):
+    found = cantilevers((8, 16), device, angle, pattern=pattern)
+    assert stays_wrong(pattern, angle, found) and near[0] < found[-1]["stiffness"] < near[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bending", BENDING)
+@pytest.mark.parametrize("angle", [0.0, 22.5, 45.0, -15.0])
+@pytest.mark.parametrize("pattern", ["diagonal", "alternating"])
+def test_fine_meshes_of_other_nets_stay_wrong(pattern, angle, bending, device):
+    assert stays_wrong(pattern, angle, cantilevers((12, 24, 32), device, angle, pattern=pattern, bending=bending))
+
+
+def test_an_irregular_net_locks_and_one_with_rows_across_does_not(device):
+    """A stiff membrane takes the bending from the jittered net, which goes away with h, apart from its calibration."""
+    hard, soft = {"stretching": 1e8, "width": 1.0}, {"stretching": 1e4, "width": 1.0}
+    rows = [cantilevers((8, 16), device, 30.0, **k) for k in (soft, hard)]
+    irregular = [cantilevers((8, 16), device, pattern="jittered", **k) for k in (soft, hard)]
+    # The equilateral net changes by what the sides take.
+    taken = side_loss(1.0, 1e4, 1.0)
+    assert all(abs(b["stiffness"] / a["stiffness"] - 1.0) < taken for a, b in zip(*rows, strict=True))
+    coarse, fine = (b["stiffness"] / a["stiffness"] - 1.0 for a, b in zip(*irregular, strict=True))
+    assert coarse > 0.3 and taken < fine < coarse / 2.0
+    assert irregular[0][-1]["stiffness"] > 1.05
+
+
+def test_quadratic_bending_is_wrong_where_the_membrane_is_soft(device):
+    """Large Γ stretches a soft cloth along its length; the one energy takes the change of that for bending."""
+    hard, soft = (
+        [measured("cantilever", 8, bending, gamma=gamma, stretching=k, device=device)["stiffness"] for bending in BENDING]
+        for gamma, k in ((1.0, 1e5), (20.0, 100.0))
+    )
+    # They differ by the strain, Γ over the stretching, in parts of the bending.
+    assert abs(hard[0] / hard[1] - 1.0) < 1e-4 and abs(soft[0] / soft[1] - 1.0) > 0.005, (hard, soft)
+
+
+def test_a_chain_is_exact(device):
+    """To the rounding of ten iterations' worth of solutions."""
+    for links in (1, 5, 40):
+        assert measured("chain", links, device=device)["error"] < links * 100 * np.finfo(np.float64).eps
+
+
+@pytest.mark.parametrize("stretching", [1e2, 1e4])
+def test_a_catenary_is_of_second_order(stretching, device):
+    errors = [measured("catenary", n, stretching=stretching, device=device)["error"] for n in (20, 40, 80)]
+    np.testing.assert_allclose(np.diff(np.log2(errors)), -2.0, atol=0.05)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_patch_is_exact(pattern, device):
+    found = measured("patch", 8, pattern=pattern, angle=0.3, device=device)
+    # An acceleration of 1e-12 of the first one, over the lowest of a thousand squared frequencies.
+    assert found["error"] < 1e-9 and found["elements"] > 100
+
+
+def test_results_are_json_and_run_as_tasks(tmp_path):
+    tasks = [task(measure, case="chain", resolution=n) for n in (2, 3)]
+    found = {
+        each.arguments["resolution"]: result for each, result in sweep(tasks, store=Store(tmp_path / "s.jsonl"), workers=1)
+    }
+    assert found[3]["status"] == "ok" and found[3]["elements"] == 3 and found[3]["ms"] > 0.0
+    json.dumps(measure("cylinder", 6), allow_nan=False)
+    json.dumps(measure("cantilever", 4, width=1.0), allow_nan=False)
+
+
+def test_what_does_not_settle_says_so(monkeypatch):
+    monkeypatch.setattr(physics, "_CHUNK", 2)
+    found = measure("cantilever", 6, limit=1e-6)
+    assert found["status"] == "slow" and found["reason"].startswith("not at rest after") and found["error"] is None
+    monkeypatch.undo()
+    in_one = measured("cantilever", 6)
+    monkeypatch.setattr(physics, "_CHUNK", 10)
+    assert measured("cantilever", 6)["stiffness"] == pytest.approx(in_one["stiffness"], rel=1e-6)
+    # Rounding in float32 of springs this stiff exceeds the weight.
+    found = measure("cantilever", 6, stretching=1e12, dtype="float32")
+    assert found["status"] == "diverged" and "float32" in found["reason"] and found["stiffness"] is None
+    json.dumps(found, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"case": "beam"}, "case is 'beam'"),
+        ({"bending": "cubic"}, "bending is 'cubic'"),
+        ({"pattern": "hexagonal"}, "pattern is 'hexagonal'"),
+        ({"resolution": 0}, "resolution is 0"),
+        ({"resolution": 1}, "spacing is 1; at most"),
+        ({"angle": np.nan}, "angle is nan"),
+        ({"gamma": 200.0}, "gamma is 200; it must be 100 or less"),
+        ({"limit": 0.0}, "limit is 0"),
+        ({"dtype": "float16"}, "float16"),
+    ],
+)
+def test_arguments_are_checked(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        measure(**{"case": "cantilever", "resolution": 6, "width": 1.0} | arguments)
+
+
+def test_the_plot(tmp_path):
+    results = []
+    for angle in (0.0, 0.5):
+        for bending in BENDING:
+            for n in (4, 8, 16):
+                arguments = {"case": "cantilever", "resolution": n, "bending": bending, "angle": angle}
+                found = {"status": "ok", "reason": "", "error": 1.0 / n, "stiffness": 1.0, "sides": 0.01, "ms": n, "h": 1.0 / n}
+                results.append((arguments, found))
+    results[0][1].update(status="slow", error=None)
+    results.append(({"case": "chain", "resolution": 3}, measure("chain", 3)))
+    for name in ("plot.png", "plot.svg"):
+        plot_physics(tmp_path / name, results)
+    drawn = (tmp_path / "plot.svg").read_text()
+    plot_physics(tmp_path / "plot.svg", results)
+    assert drawn == (tmp_path / "plot.svg").read_text()
+    with pytest.raises(ValueError, match="no results"):
+        plot_physics(tmp_path / "plot.png", [])
+    with pytest.raises(ValueError, match=r"ending is '\.txt'"):
+        plot_physics(tmp_path / "plot.txt", results)
