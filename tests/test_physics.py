@@ -43,13 +43,14 @@ def test_the_elastica_for_small_and_unknown_shapes():
 
 
 @pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("width", [0.4, 0.7])
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_a_strip_of_whole_triangles(pattern, angle):
+def test_a_strip_of_whole_triangles(pattern, width, angle):
     """Inside, of the orientation of a grid, in one piece, with a clamp of one hinge at least."""
     h = 0.1
-    cut = strip(pattern, np.radians(angle), h, width=0.7)
+    cut = strip(pattern, np.radians(angle), h, width=width)
     x, y, z = cut.mesh.points.T
-    assert abs(z).max() <= 0.35 + 1e-9 and x.max() <= 1.0 + 1e-9 and x.min() >= -3.0 * h - 1e-9 and not y.any()
+    assert abs(z).max() <= width / 2 + 1e-9 and x.max() <= 1.0 + 1e-9 and x.min() >= -3.0 * h - 1e-9 and not y.any()
     corners = cut.mesh.points[cut.mesh.triangles]
     assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 1] > 0.0).all()
     assert len(np.unique(cut.mesh.triangles)) == len(x)
@@ -100,7 +101,7 @@ def test_an_irregular_net_that_is_rolled_is_too_stiff(bending, device):
     assert min(found) > 1.2 and max(found) < 1.4, found
 
 
-def converges(found, order=1.0):
+def converges(found, order):
     """Whether errors fall by an order, to what the free sides take: what is left then is no more than the last change."""
     signed = np.array([each["stiffness"] - 1.0 for each in found])
     changes = np.abs(np.diff(signed))
@@ -110,8 +111,8 @@ def converges(found, order=1.0):
 # Turned by 30° it has rows across, whose sides alone are jagged.
 @pytest.mark.parametrize(("angle", "bending"), [(0.0, "dihedral"), (13.0, "quadratic"), (30.0, "dihedral")])
 def test_a_cantilever_of_an_equilateral_net_converges(angle, bending, device):
-    """At any angle, by first order or more."""
-    assert converges(cantilevers((6, 12, 24), device, angle, bending=bending))
+    """At any angle, at an order between 1.5 and 3 from meshes this coarse on."""
+    assert converges(cantilevers((6, 12, 24), device, angle, bending=bending), 1.4)
 
 
 @pytest.mark.slow
@@ -119,7 +120,7 @@ def test_a_cantilever_of_an_equilateral_net_converges(angle, bending, device):
 @pytest.mark.parametrize("bending", BENDING)
 @pytest.mark.parametrize("gamma", [0.5, 1.0])
 def test_cantilevers_of_equilateral_nets_converge(angle, bending, gamma, device):
-    assert converges(cantilevers((8, 16, 32), device, angle, bending=bending, gamma=gamma))
+    assert converges(cantilevers((8, 16, 32), device, angle, bending=bending, gamma=gamma), 1.4)
 
 
 def least(pattern, angle):
@@ -152,14 +153,15 @@ def test_least_stiffness():
 
 
 def stays_wrong(pattern, angle, found):
-    """Whether the stiffness is between those of a narrow strip and of a cylinder and finer meshes do not come nearer to D.
+    """Whether the stiffness is between those of a narrow strip and of a cylinder, and so far from D that it stays wrong.
 
-    What the jagged sides change is a spacing or less of either side of the width of 2.
+    What the jagged sides change is a spacing or less of either side of the width of 2. As errors at least halve, all finer
+    meshes change less than the last.
     """
     h, stiffness = found[-1]["h"], [each["stiffness"] for each in found]
     known = rolled(pattern, np.radians(angle))
     between = least(pattern, np.radians(angle)) * (1.0 - h) < stiffness[-1] < known * (1.0 + h)
-    return between and abs(stiffness[-1] - 1.0) > 0.5 * abs(stiffness[0] - 1.0) > 0.02
+    return between and abs(stiffness[-1] - 1.0) > 2.0 * max(abs(stiffness[-1] - stiffness[-2]), found[-1]["sides"])
 
 
 # The stiffness at rest by the side: what a net has where it curves along its rows and along its diagonals.
@@ -259,7 +261,7 @@ def test_what_does_not_settle_says_so(monkeypatch):
         ({"bending": "cubic"}, "bending is 'cubic'"),
         ({"pattern": "hexagonal"}, "pattern is 'hexagonal'"),
         ({"resolution": 0}, "resolution is 0"),
-        ({"resolution": 1}, "spacing is 1; at most"),
+        ({"resolution": 2}, "spacing is 0.5; it must be at most a quarter of length 1 and width 1"),
         ({"angle": np.nan}, "angle is nan"),
         ({"gamma": 200.0}, "gamma is 200; it must be 100 or less"),
         ({"limit": 0.0}, "limit is 0"),

@@ -35,7 +35,8 @@ def plot_physics(path, results):
     panels = figure.subplots(down, 2 * across, squeeze=False, sharey=True).reshape(-1, 2)
     for (left, right), (title, lines) in zip(panels, rows.items(), strict=False):
         for k, (label, points) in enumerate(lines.items()):
-            good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if _has_error(found))
+            # One that is exact to the last bit has no place on logarithmic axes either.
+            good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if found["error"])
             style = {"marker": _MARKS[k % len(_MARKS)], "markersize": 4, "linewidth": 1.0, "color": f"C{k}"}
             left.plot([h for h, _, _ in good], [error for _, error, _ in good], label=label, **style)
             timed = sorted((ms, error) for _, error, ms in good if ms is not None)
@@ -63,11 +64,6 @@ def _finish(left, right, title, points):
         left.legend(frameon=False, fontsize=7, labelcolor=GREY)
     failed = [f"{_label(a)}, {a['resolution']}: {found['status']}" for a, found in points if found["status"] != "ok"]
     right.set_title("\n".join(failed), fontsize=7, loc="right", color=GREY, parse_math=False)
-
-
-def _has_error(found):
-    """Whether a result has a place on logarithmic axes; one that is exact to the last bit has none."""
-    return found["status"] == "ok" and bool(found["error"])
 
 
 def _title(arguments):

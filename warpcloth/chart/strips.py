@@ -3,8 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
 from ..checks import choice, number
@@ -58,21 +56,18 @@ def strip(pattern, angle, spacing, length=1.0, width=1.0):
         width: [m].
 
     Raises:
-        ValueError: The pattern is unknown, or nothing fits in.
+        ValueError: The pattern is unknown, or the spacing more than a quarter of length or width, where it might
+            hang together by a vertex.
     """
     points, triangles = _net(pattern, angle, spacing, length, width)
     near = 1e-9 * length
     low, high = np.array([-_CLAMP * spacing, -width / 2]), np.array([length, width / 2])
     inside = ((points > low - near) & (points < high + near)).all(axis=1)
-    triangles = _largest_piece(triangles[inside[triangles].all(axis=1)])
-    if not len(triangles):
-        raise ValueError(f"spacing is {spacing:g}; at most a third of length {length:g} and width {width:g} fits")
+    triangles = triangles[inside[triangles].all(axis=1)]
     used, triangles = np.unique(triangles, return_inverse=True)
     x, z = points[used].T
     mesh = Mesh(np.stack([x, np.zeros_like(x), z], axis=1), triangles.reshape(-1, 3))
     pinned = x <= near
-    if pinned.all() or not pinned.any():
-        raise ValueError(f"spacing is {spacing:g}; at most a third of length {length:g} fits")
     energy = roll(mesh)
     reach = np.ptp(x[mesh.hinges], axis=1)
     clamp = (x[pinned].max() + x[~pinned].min()) / 2.0 - (energy * reach).sum() / energy.sum() / 2.0
@@ -113,6 +108,8 @@ def _net(pattern, angle, spacing, length, width):
     number("spacing", spacing, above=0.0)
     number("length", length, above=0.0)
     number("width", width, above=0.0)
+    if spacing > (1.0 + 1e-9) * min(length, width) / 4.0:
+        raise ValueError(f"spacing is {spacing:g}; it must be at most a quarter of length {length:g} and width {width:g}")
     rows = int(np.ceil(np.hypot(length, width) / (np.sqrt(0.75) * spacing))) + 4
     size = 2 * rows * spacing
     grid = Mesh.grid(2 * rows + 1, 2 * rows + 1, size, "equilateral" if pattern == "jittered" else pattern)
@@ -123,18 +120,6 @@ def _net(pattern, angle, spacing, length, width):
         return points, grid.triangles
     points = points + spacing * np.random.default_rng(0).uniform(-JITTER, JITTER, points.shape)
     return points, Delaunay(points).simplices[:, ::-1]
-
-
-def _largest_piece(triangles):
-    """Those that hang together by edges; what holds by a vertex alone would swing."""
-    if not len(triangles):
-        return triangles
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
-    _, edge = np.unique(edges, axis=0, return_inverse=True)
-    of = np.repeat(np.arange(len(triangles)), 3)
-    shared = csr_array((np.ones(len(of)), (of, edge.ravel())))
-    _, piece = connected_components(shared @ shared.T, directed=False)
-    return triangles[piece == np.bincount(piece).argmax()]
 
 
 def _end(mesh):
