@@ -57,9 +57,10 @@ def _finish(left, right, title, points):
     right.set_xlabel("time [ms]", color=GREY)
     for axes in (left, right):
         axes.set(xscale="log", yscale="log")
-        axes.tick_params(colors=GREY, labelsize=8)
+        axes.tick_params(which="both", colors=GREY, labelsize=7)
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color("0.7")
+    right.xaxis.set_minor_formatter("")  # over a decade or two they overlap
     if left.get_legend_handles_labels()[1]:
         left.legend(frameon=False, fontsize=7, labelcolor=GREY)
     failed = [f"{_label(a)}, {a['resolution']}: {found['status']}" for a, found in points if found["status"] != "ok"]
