@@ -247,6 +247,14 @@ def share(name, text):
     return value
 
 
+def milliseconds(name, text):
+    """A time in ms, written as 16ms, 0.016s or 16."""
+    unit = next((unit for unit in ("ms", "s") if text.endswith(unit)), "")
+    value = convert(name, text.removesuffix(unit).strip(), (float,)) * (1e3 if unit == "s" else 1.0)
+    number(name, value, above=0.0)
+    return value
+
+
 def _truth(text):
     return _TRUTH[text.lower()]
 

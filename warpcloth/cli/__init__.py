@@ -13,7 +13,7 @@ import warnings
 
 import numpy as np
 
-from . import analyze, chart, compare, deform, run
+from . import analyze, chart, choose, compare, deform, run
 from .terminal import Interrupted, say, show_warning
 
 
@@ -95,6 +95,8 @@ def _parser():
     compare.add_arguments(compares)
     charts = commands.add_parser("chart", help=chart.TEXT, description=chart.TEXT, allow_abbrev=False)
     chart.add_arguments(charts)
+    chooses = add("choose", choose.choose, "Choose the cheapest solver and settings for a scene.", epilog=choose.EPILOG)
+    choose.add_arguments(chooses)
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
@@ -103,11 +105,13 @@ def _parser():
     info.add_argument("--advise", action="store_true", help="say which terms, precision and resolution matter, by trying")
     info.add_argument("--tolerance", metavar="SHARE", help="of --advise: a change that does not matter, 1%% where not given")
     info.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try, 30 where not given")
+    runs.add_argument("--tolerance", metavar="SHARE", help="choose solver and settings of that error, such as 1%%, see choose")
+    runs.add_argument("--budget", metavar="TIME", help="choose the most accurate of such a time a frame, such as 16ms")
     runs.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not the scene's")
-    for sub in (runs, info, deforms, analyzes, compares):
+    for sub in (runs, info, deforms, analyzes, compares, chooses):
         sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print one JSON object")
-    for sub in (runs, info, deforms, analyzes):
+    for sub in (runs, info, deforms, analyzes, chooses):
         sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
     for sub in (runs, deforms):
         sub.add_argument("-o", "--output", required=True, metavar="FILE", help="the .usd, .usda, .usdc or .usdz file to write")

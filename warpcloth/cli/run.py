@@ -27,6 +27,10 @@ def run(arguments):
     frames = scene.frames if arguments.frames is None else arguments.frames
     check_writable(arguments.output)
     device = find_device(arguments.device)
+    if arguments.tolerance is not None or arguments.budget is not None:
+        from .choose import take_choice
+
+        take_choice(arguments, device)
     setup = solver_setup(arguments, scene, device)
     progress = Progress(frames, _hint(arguments, setup, scene))
     try:

@@ -1,0 +1,160 @@
+"""The choice of a solver from recorded measurements."""
+
+import itertools
+import json
+from dataclasses import asdict
+
+import pytest
+
+from warpcloth.chart import trajectory
+from warpcloth.chart.choose import Measured, choose, climb, ladders, pick
+from warpcloth.chart.sweep import Store
+from warpcloth.chart.tasks import SceneRef, Setup
+from warpcloth.cli import main
+
+# hanging, 64 × 64 vertices: error and ms a frame, with quartiles, of ladders from coarse to fine.
+TABLE = {
+    ("explicit", 152): (0.0032, 46.0, (45.0, 48.0)),
+    ("xpbd", 20): (0.031, 21.0, (20.0, 22.0)),
+    ("xpbd", 40): (0.016, 42.0, (41.0, 44.0)),
+    ("xpbd", 80): (0.0079, 84.0, (82.0, 88.0)),
+    ("xpbd", 160): (0.004, 168.0, (165.0, 171.0)),
+    ("newton", 4): (0.0075, 477.0, (470.0, 490.0)),
+    ("newton", 8): (0.0040, 900.0, (890.0, 950.0)),
+    ("pbd", 10): (None, None, None),
+    ("pbd", 120): (0.009, 47.0, (44.0, 50.0)),
+}
+
+
+def measured(setup):
+    error, milliseconds, spread = TABLE[setup.solver, setup.options["substeps"]]
+    return Measured(setup, error, milliseconds, spread, "" if error else "diverged in frame 3")
+
+
+LADDERS = [
+    [Setup(solver, {"substeps": substeps}) for _, substeps in rungs]
+    for solver, rungs in itertools.groupby(TABLE, key=lambda key: key[0])
+]
+ALL = [measured(setup) for ladder in LADDERS for setup in ladder]
+
+
+def name(choice):
+    return str(choice.chosen.setup) if choice.chosen else None
+
+
+@pytest.mark.parametrize(
+    ("options", "chosen", "meets"),
+    [
+        ({"tolerance": 0.01}, "explicit substeps=152", True),
+        ({"tolerance": 0.05}, "xpbd substeps=20", True),
+        ({"tolerance": 0.01, "floor": 0.002}, "explicit substeps=152", True),
+        ({"tolerance": 0.0035, "floor": 0.002}, "explicit substeps=152", False),
+        ({"tolerance": 0.01, "budget": 46.0}, "explicit substeps=152", True),
+        ({"tolerance": 0.01, "budget": 30.0}, "xpbd substeps=20", False),
+        ({"tolerance": 0.001}, "explicit substeps=152", False),
+        ({"budget": 45.0}, "xpbd substeps=40", True),
+        ({"budget": 1.0}, None, False),
+        ({"tolerance": 0.01, "budget": 1.0}, None, False),
+    ],
+)
+def test_the_cheapest_that_meets_it(options, chosen, meets):
+    choice = pick(ALL, **options)
+    assert (name(choice), choice.meets) == (chosen, meets)
+
+
+@pytest.mark.parametrize("options", [{"tolerance": t} for t in (0.1, 0.03, 0.01, 0.005, 0.001)] + [{"budget": 45.0}])
+def test_climbing_picks_the_same_and_measures_no_more_than_it_needs(options):
+    said, asked = [], []
+
+    def measure(setups):
+        asked.extend(setups)
+        return [measured(setup) for setup in setups]
+
+    choice, found = climb(LADDERS, measure, **options, progress=said.append)
+    assert name(choice) == name(pick(ALL, **options))
+    assert len(asked) == len(set(map(str, asked))) == len(found) and said[-1] == found
+    if options == {"tolerance": 0.01}:
+        # xpbd 80 meets it, and newton 4 is dearer than what does.
+        left_out = {str(setup) for ladder in LADDERS for setup in ladder} - {str(setup) for setup in asked}
+        assert left_out == {"xpbd substeps=160", "newton substeps=8"}
+
+
+def test_rivals_are_those_whose_times_overlap():
+    choice = pick(ALL, tolerance=0.01)
+    assert [str(each.setup) for each in choice.rivals] == ["pbd substeps=120"]
+    assert "within the spread of the times as cheap: pbd substeps=120 (47 ms)" in choice.certainty
+    assert pick(ALL, tolerance=0.05).rivals == [] and "nothing else" in pick(ALL, tolerance=0.05).certainty
+
+
+def test_what_is_refused():
+    for options in ({}, {"tolerance": 0.0}, {"budget": -1.0}, {"tolerance": "1%"}):
+        with pytest.raises(ValueError, match=r"tolerance|budget"):
+            pick(ALL, **options)
+    assert pick([], tolerance=0.1).chosen is None and "nothing was measured" in pick([], tolerance=0.1).certainty
+
+
+def test_ladders_are_of_one_method_each_and_go_on():
+    setups = [Setup("xpbd", {"substeps": n, "iterations": 1}) for n in (40, 10)] + [
+        Setup("xpbd", {"substeps": 5, "iterations": 2})
+    ]
+    found = [[setup.options["substeps"] for setup in ladder] for ladder in ladders(setups)]
+    assert found == [[10, 40, 80, 160, 320], [5, 10, 20, 40]]
+
+
+SCENES = [
+    ("hanging", {"n": 6}, 12),
+    ("chain", {"links": 5}, 12),
+    pytest.param("hanging", {"n": 32}, 20, marks=pytest.mark.slow),
+    pytest.param("hanging", {"n": 64}, 15, marks=pytest.mark.slow),
+    pytest.param("cantilever", {}, 20, marks=pytest.mark.slow),
+    pytest.param("chain", {}, 60, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("scene", "parameters", "frames"), SCENES)
+def test_the_choice_meets_the_tolerance_when_it_is_run_afresh(scene, parameters, frames, tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    solvers = ["explicit", "xpbd", "newton"] if frames == 12 else None
+    scene = SceneRef(scene, parameters)
+    choice, found, exact = choose(scene, 0.01, solvers=solvers, frames=frames, store=Store(), workers=1)
+    again = trajectory.measure(asdict(scene), asdict(choice.chosen.setup), reference=str(exact.path))
+    assert choice.meets and again["error"] + exact.error <= 0.01
+    assert again["error"] == pytest.approx(choice.chosen.error, rel=1e-6)
+    cheaper = [each for each in found if each.milliseconds and each.milliseconds < choice.chosen.milliseconds]
+    assert not any(each.error is not None and each.error + exact.error <= 0.01 for each in cheaper)
+
+
+def test_the_command(tmp_path, monkeypatch, capsys):
+    """It prints the command to use, which works; the second time nothing is measured; run takes the choice."""
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    command = ["choose", "hanging", "-p", "n=5", "--tolerance", "1%", "--frames", "6", "--solvers", "xpbd", "explicit"]
+    assert main(command) == 0
+    last = capsys.readouterr().out.splitlines()[-1].split()
+    assert last[:5] == ["warpcloth", "run", "hanging", "-p", "n=5"] and main([*last[1:], "--frames", "2"]) == 0
+    stored = (tmp_path / "cache" / "trajectories.jsonl").read_text()
+    capsys.readouterr()
+    assert main([*command, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["meets"] and facts["chosen"]["error"] <= 0.01 and facts["command"].split() == last
+    assert (tmp_path / "cache" / "trajectories.jsonl").read_text() == stored
+    run = ["run", "hanging", "-p", "n=5", "--frames", "6", "-o", "out.usdc"]
+    assert main([*run, "--tolerance", "1%"]) == 0
+    assert "warpcloth: chosen: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("choose hanging", "give one of them"),
+        ("choose hanging --tolerance 0", "tolerance is 0.0; it must be a number above 0"),
+        ("choose hanging --budget fast", "budget"),
+        ("choose hanging --tolerance 1% --solvers newtons", "newtons"),
+        ("run hanging --tolerance 1% --solver newton -o o.usdc", "--solver is given, and --tolerance or --budget chooses it"),
+    ],
+)
+def test_wrong_use(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main(words.split()) == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,106 @@
+"""The command ``choose``: the cheapest solver and settings that meet a tolerance for a scene, on this machine."""
+
+import shlex
+import sys
+
+from .. import scene_files
+from .run import named_scene
+from .terminal import Progress, as_json, find_device
+
+EPILOG = """\
+Each solver climbs from coarse settings to fine ones until it meets the tolerance or is dearer than what does; errors are RMS
+distances over vertices and frames from a reference solution, over the longest side of the cloth. What is measured is kept.
+
+  warpcloth choose hanging -p n=32 --tolerance 1%
+  warpcloth choose hanging --budget 16ms
+"""
+
+
+def add_arguments(parser):
+    """Adds what the command takes but for what all commands do."""
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
+    add("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    add("--tolerance", metavar="SHARE", help="largest error, such as 1%% of the size of the cloth")
+    add("--budget", metavar="TIME", help="longest frame, such as 16ms")
+    add("--solvers", nargs="+", metavar="NAME", help="to choose among; all where not given")
+    add("--frames", type=int, metavar="N", help="frames to run, if not the scene's")
+    add("--limit", type=float, default=60.0, metavar="SECONDS", help="that a run may take, 60 where not given")
+
+
+def choose(arguments):
+    device = find_device(arguments.device)
+    choice, found, exact, values = chosen(arguments, device)
+    from ..chart.choose import as_json as facts_of
+
+    command = None if choice.chosen is None else command_line(arguments, values, choice.chosen.setup)
+    facts = {"scene": arguments.scene, "parameters": values, **facts_of(choice, found, exact), "command": command}
+    print(as_json(facts) if arguments.json else _text(facts, choice, found, exact))
+    return 0
+
+
+def chosen(arguments, device):
+    """The choice for the scene, tolerance and budget of the arguments, all that was measured, reference, and parameters."""
+    from ..chart.choose import choose
+    from ..chart.tasks import SceneRef
+
+    _source, values, _scene = named_scene(arguments)
+    tolerance = None if arguments.tolerance is None else scene_files.share("tolerance", arguments.tolerance)
+    budget = None if arguments.budget is None else scene_files.milliseconds("budget", arguments.budget)
+    progress = Progress(None, first="measuring")
+    try:
+        choice, found, exact = choose(
+            SceneRef(arguments.scene, values),
+            tolerance,
+            budget,
+            arguments.solvers,
+            arguments.frames,
+            str(device),
+            arguments.dtype,
+            arguments.limit,
+        )
+    finally:
+        progress.close()
+    return choice, found, exact, values
+
+
+def take_choice(arguments, device):
+    """Sets solver and options of a run to what is chosen for its tolerance and budget.
+
+    Raises:
+        ValueError: They are given already, or nothing will do.
+    """
+    for name, given in (("--solver", arguments.solver), ("-s", arguments.s)):
+        if given:
+            raise ValueError(f"{name} is given, and --tolerance or --budget chooses it; leave one out")
+    arguments.solvers, arguments.limit = None, 60.0
+    choice, _found, _exact, _values = chosen(arguments, device)
+    if not choice.meets:
+        raise ValueError(f"nothing meets --tolerance and --budget: {choice.certainty}")
+    setup = choice.chosen.setup
+    print(f"warpcloth: chosen: {setup}; {choice.certainty}", file=sys.stderr)
+    arguments.solver, arguments.s = setup.solver, [f"{name}={value}" for name, value in setup.options.items()]
+
+
+def command_line(arguments, values, setup):
+    """The command that runs a scene with a setup."""
+    words = ["warpcloth", "run", arguments.scene]
+    given = [f"{name}={value}" for name, value in values.items() if name in scene_files.assignments(arguments.p)]
+    words += ["-p", *given] if given else []
+    words += ["--solver", setup.solver, "-s", *(f"{name}={value}" for name, value in setup.options.items())]
+    return shlex.join([*words, "--dtype", arguments.dtype, "-o", "out.usdc"])
+
+
+def _text(facts, choice, found, exact):
+    lines = [f"{facts['scene']}: {len(found)} settings measured; the reference is known to {exact.error:.2%}"]
+    width = max(len(str(each.setup)) for each in found)
+    for each in sorted(found, key=lambda each: (each.milliseconds is None, each.milliseconds or 0.0)):
+        name = str(each.setup).ljust(width)
+        if each.error is None or each.milliseconds is None:
+            lines.append(f"  {name}  {each.reason or 'no error'}")
+        else:
+            lines.append(
+                f"  {name}  {each.milliseconds:9.3g} ms  {each.error:8.3%}{'  chosen' if each is choice.chosen else ''}"
+            )
+    lines.append(choice.certainty)
+    return "\n".join([*lines, *([facts["command"]] if facts["command"] else [])])
