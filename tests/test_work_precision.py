@@ -263,6 +263,22 @@ def test_time_diagram(device, tmp_path, drawn):
     assert len(points) == sum(row["status"] == "ok" for row in found["rows"])
 
 
+def test_the_physics_diagram(tmp_path):
+    """The catenary is met with order 2, a chain to rounding; the picture and the table have all of it."""
+    found = work_precision.physics_diagram(SceneRef("catenary"), store=Store(), executor=ThreadPoolExecutor(1))
+    errors = [row["error"] for row in found["rows"]]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.abs(orders - 2.0).max() < 0.15
+    write_csv(tmp_path / "physics.csv", found)
+    table = (tmp_path / "physics.csv").read_text().splitlines()
+    assert len(table) == 6 and float(table[1].split(",")[table[0].split(",").index("error")]) == errors[0]
+    chain = work_precision.physics_diagram(SceneRef("chain"), store=Store(), executor=ThreadPoolExecutor(1))
+    assert max(row["error"] for row in chain["rows"]) < 1e-10
+    for wrong in (SceneRef("hanging"), SceneRef("chain", {"links": 5})):
+        with pytest.raises(ValueError, match="the diagram physics is of cantilever, chain, catenary, without parameters"):
+            work_precision.physics_diagram(wrong)
+
+
 def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
     with ThreadPoolExecutor(1) as executor:
         run = {"executor": executor, "device": device, "limit": 0.5, "frames": 12}
@@ -323,6 +339,8 @@ def test_command(tmp_path, monkeypatch, capsys):
         (["hanging", "--solvers", "newtons"], "invalid choice: 'newtons'"),
         (["hanging", "--frames", "0"], "frames is 0"),
         (["hanging", "--workers", "0"], "workers is 0"),
+        (["chain", "--diagram", "physics", "--frames", "3"], "--solvers and --frames are for the others"),
+        (["hanging", "--diagram", "physics"], "the diagram physics is of cantilever"),
         (["hanging", "--diagram", "spectrum", "--dtype", "float32"], "--solvers and --dtype are for the others"),
         (["hanging", "-o", "chart.gif"], "ending is '.gif'"),
         (["hanging", "--csv", "none/chart.csv"], "does not exist"),

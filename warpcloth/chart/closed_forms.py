@@ -40,7 +40,8 @@ def plot_physics(path, results):
             style = {"marker": _MARKS[k % len(_MARKS)], "markersize": 4, "linewidth": 1.0, "color": f"C{k}"}
             left.plot([h for h, _, _ in good], [error for _, error, _ in good], label=label, **style)
             timed = sorted((ms, error) for _, error, ms in good if ms is not None)
-            right.plot([ms for ms, _ in timed], [error for _, error in timed], **style)
+            if timed:
+                right.plot([ms for ms, _ in timed], [error for _, error in timed], **style)
             for side in {found["sides"] for _, found in points if found["sides"] is not None}:
                 for axes in (left, right):
                     axes.axhline(side, color=f"C{k}", linewidth=0.8, linestyle=(0, (4, 3)))
@@ -56,6 +57,9 @@ def _finish(left, right, title, points):
     left.set_xlabel("h / L", color=GREY)
     right.set_xlabel("time [ms]", color=GREY)
     for axes in (left, right):
+        if not any(len(line.get_xdata(orig=True)) for line in axes.lines):  # as of a cylinder, which nothing solves for
+            axes.set_axis_off()
+            continue
         axes.set(xscale="log", yscale="log")
         axes.tick_params(which="both", colors=GREY, labelsize=7)
         axes.spines[["top", "right"]].set_visible(False)

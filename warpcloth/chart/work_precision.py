@@ -6,9 +6,10 @@ dictionary for each setting in ``rows``; :mod:`warpcloth.chart.fronts` draws it.
 
 import csv
 import json
+import math
 
 from ..outputs import TEXT, Output
-from . import convergence, spectrum, trajectory
+from . import convergence, physics, spectrum, trajectory
 from .digest import scene_digest
 from .machine import machine
 from .reference import reference
@@ -25,7 +26,19 @@ WITHIN = 0.01  # the error of which the cheapest setting is named
 _KNOWN, _SECONDS = 1e-4, 120.0
 # What a CSV has of a setting, in this order; what it does not know is empty.
 COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
-COLUMNS += ("ms_per_second", "iterations", "gap", "predicted", "compile_s", "factorise_s", "residual", "frames", "message")
+COLUMNS += (
+    "h",
+    "stiffness",
+    "ms_per_second",
+    "iterations",
+    "gap",
+    "predicted",
+    "compile_s",
+    "factorise_s",
+    "residual",
+    "frames",
+    "message",
+)
 
 
 def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float64", limit=20.0, **run):
@@ -124,6 +137,58 @@ def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):
     ]
     facts = {"seed": convergence.SEED, "frame": frame}
     return {**_facts("spectrum", scene, device, "float64"), **facts, "rows": rows}
+
+
+# What the diagram "physics" measures of each scene: arguments of `physics.measure` but for the resolution, and resolutions.
+PHYSICS = {
+    "cantilever": (
+        [
+            {"case": "cantilever", "bending": bending, "pattern": pattern, "angle": angle}
+            for pattern in ("equilateral", "diagonal", "alternating", "jittered")
+            for angle in (0.0, math.pi / 4)
+            for bending in ("quadratic", "dihedral")
+        ],
+        (8, 12, 16, 24),
+    ),
+    "chain": ([{"case": "chain"}], (5, 10, 20, 40, 80)),
+    "catenary": ([{"case": "catenary"}], (8, 16, 32, 64, 128)),
+}
+
+
+def physics_diagram(scene, device="cpu", dtype="float64", limit=20.0, **run):
+    """Errors of rest shapes to closed forms against mesh size and time, see :func:`physics.measure`.
+
+    Args:
+        scene: A :class:`SceneRef` of "cantilever", "chain" or "catenary", without parameters: sizes and nets are varied.
+        device: A Warp device.
+        dtype: "float32" or "float64".
+        limit: Seconds a point.
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+
+    Returns:
+        dict: See the module; a row has ``arguments``, those of `physics.measure`.
+
+    Raises:
+        ValueError: The scene has no closed form here, or has parameters.
+    """
+    if scene.name not in PHYSICS or scene.parameters:
+        raise ValueError(f"{scene}: the diagram physics is of {', '.join(PHYSICS)}, without parameters, which it varies itself")
+    plans, resolutions = PHYSICS[scene.name]
+    given = {"device": str(device), "dtype": dtype, "limit": limit}
+    plans = [{**plan, "resolution": resolution} for plan in plans for resolution in resolutions]
+    tasks = [task(physics.measure, **plan, **given) for plan in plans]
+    rows = [
+        {"solver": "equilibrium", "options": {}, "label": _label_of(plan), "arguments": plan, **result}
+        for plan, result in zip(plans, _results(tasks, run), strict=True)
+    ]
+    return {**_facts("physics", scene, device, dtype), "seed": None, "rows": rows}
+
+
+def _label_of(plan):
+    """A point of the diagram "physics" in few words, such as "cantilever quadratic diagonal 45° 16"."""
+    words = [plan["case"], *(plan[name] for name in ("bending", "pattern") if name in plan)]
+    words += [f"{math.degrees(plan['angle']):.0f}°"] if "angle" in plan else []
+    return " ".join([*words, str(plan["resolution"])])
 
 
 def cheapest(rows):

@@ -12,14 +12,16 @@ from .run import named_scene
 from .terminal import Interrupted, as_json, check_writable, find_device, open_bar
 
 TEXT = "Chart speed against accuracy."
-DIAGRAMS = ("time", "solver", "spectrum")
+DIAGRAMS = ("time", "solver", "physics", "spectrum")
 
 EPILOG = """\
 Diagrams, each by itself:
 time: the error of a trajectory, RMS over vertices and frames against a reference solution of the same mesh, over the time of a
 second of motion, for steps and iterations of all solvers. solver: what methods that minimise one and the same step leave of its
 objective, over iterations and time. spectrum: errors of projective dynamics beside those that the spectrum of its matrix
-relative to the true Hessian predicts, for few vertices. What diverges, is refused or takes too long is listed with the reason.
+relative to the true Hessian predicts, for few vertices. physics: errors of rest shapes to closed forms over mesh size and
+time, for cantilever (on nets of four patterns, turned), chain and catenary. What diverges, is refused or takes too long is
+listed with the reason.
 
 Settings that are measured are kept in WARPCLOTH_CACHE, or ~/.cache/warpcloth, and not measured again by the same code; after an
 interruption the same command goes on. Times are those of processes side by side, one thread each; compare them within a chart.
@@ -88,6 +90,8 @@ def work_precision(arguments):
     }
     if arguments.diagram == "time":
         options["watch"] = progress.watch
+    elif arguments.diagram == "physics" and (set(options) & {"solvers", "frames"}):
+        raise ValueError("the diagram physics is of rest shapes; --solvers and --frames are for the others")
     elif arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
         raise ValueError("the diagram spectrum is of projective dynamics in float64; --solvers and --dtype are for the others")
     measure, plot, lines = _parts(arguments.diagram)
@@ -120,8 +124,21 @@ def _parts(diagram):
     return {
         "time": (measured.time_diagram, fronts.plot_time, _time_lines),
         "solver": (measured.solver_diagram, fronts.plot_solver, _solver_lines),
+        "physics": (measured.physics_diagram, _plot_physics, _physics_lines),
         "spectrum": (measured.spectrum_diagram, fronts.plot_spectrum, _spectrum_lines),
     }[diagram]
+
+
+def _plot_physics(path, found):
+    from ..chart.closed_forms import plot_physics
+
+    plot_physics(path, [(row["arguments"], row) for row in found["rows"]])
+
+
+def _physics_lines(found):
+    """The error of each point."""
+    known = [row for row in found["rows"] if row["error"] is not None]
+    return [f"  error         {100.0 * row['error']:.3g} %, {row['ms'] or 0.0:.3g} ms: {row['label']}" for row in known]
 
 
 def _check_outputs(arguments):
