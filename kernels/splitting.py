@@ -49,7 +49,8 @@ def local_minimiser(term: Term, dtype):
     """The device function (v, z, rest, r) → argmin u(z) + ½r‖v − z‖², r > 0, from a guess z.
 
     In closed form (p(v) + r v)/(1 + r) of a term that projects; else by Newton's method with the semi-definite Hessian of
-    the term and a line search.
+    the term and a line search. NaN where a force or the energy is not finite, which would else pass for the minimum: of what
+    overflows CUDA's fused products make infinity where others make NaN.
     """
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     flat = wp.types.vector(3 * term.rows, dtype)
@@ -83,7 +84,7 @@ def local_minimiser(term: Term, dtype):
             p = solve_definite(H, right, n)
             slope = -wp.dot(right, p)
             if not (wp.dot(p, p) > dtype(64.0) * epsilon(r) * epsilon(r) * wp.ddot(z, z)):
-                return z + (g - g)  # NaN where forces are not finite, which would else pass for the minimum
+                return z + (g - g) + (now - now) * z
             direction = y_type()
             for i in range(n):
                 direction[i // 3, i % 3] = p[i]
@@ -101,8 +102,8 @@ def local_minimiser(term: Term, dtype):
                     t = dtype(0.5) * t
                     halvings += 1
                     if halvings > steps:
-                        return z
-        return z
+                        return z + (now - now) * z
+        return z + (now - now) * z
 
     return closed if project is not None else newton
 
