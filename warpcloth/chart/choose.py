@@ -146,6 +146,7 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
     pick([], tolerance, budget)  # refuses wrong ones before anything is measured
     # One at a time: side by side they would slow one another.
     run = {"store": Store(cache_folder() / "trajectories.jsonl"), "workers": 1} | run
+    rungs = ladders(setups_of_runs(scene, solvers, device, dtype))
     exact = reference(scene, frames, **({} if tolerance is None else {"tolerance": tolerance / _FINER}))
 
     def measure(setups):
@@ -157,7 +158,7 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
         found = {one.key: result for one, result in sweep(tasks, **run)}
         return [_measured(setup, found[one.key]) for setup, one in zip(setups, tasks, strict=True)]
 
-    choice, found = climb(ladders(setups_of_runs(scene, solvers, device, dtype)), measure, tolerance, budget, exact.error)
+    choice, found = climb(rungs, measure, tolerance, budget, exact.error)
     return choice, found, exact
 
 

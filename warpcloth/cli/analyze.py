@@ -223,7 +223,7 @@ def _summary(facts):
         lines.append(f"  colours       {facts['coloured']}, {low:.5g} to {high:.5g}")
     if facts["file"]:
         lines.append(f"  file          {place(facts)}")
-    lines += [f"  {name:<13} {facts[name]}" for name in ("csv", "report", "npz", "plot") if facts[name]]
+    lines += [f"  {name:<13} {facts[name]}" for name in ("csv", "report", "npz", "plot", "still") if facts[name]]
     if facts["excluded"]:
         lines.append("  left out")
         lines += [f"    {sentence}" for sentence in facts["exclusions"][:_SENTENCES]]
