@@ -96,7 +96,7 @@ def write_report(
     """
     listed = {name: measure for measure in analyzer.measures for name in scalar_names(measure)}
     report = Report(extremes={name: Extremes() for name in listed})
-    _check(analyzer, listed, usd or stills, usd, stills, colour, curves)
+    _check(analyzer, listed, usd, stills, colour, curves)
     _check_pictures(plot, stills)
     check_apart([usd, csv, json, npz, plot, *(stills or {}).values()], analyzer.sequence.files)
     if (usd or stills) and colour != "none" and (stills or colour or _can_colour()):
@@ -162,8 +162,8 @@ def camel(name):
     return first + "".join(part[:1].upper() + part[1:] for part in others)
 
 
-def _check(analyzer, listed, coloured, usd, stills, colour, curves):
-    if coloured and not listed:
+def _check(analyzer, listed, usd, stills, colour, curves):
+    if (usd or stills) and not listed:
         raise ValueError(f"colour: {analyzer.measures[0].name} has no number to be coloured; measure something else too")
     if colour is not None and colour not in listed and (colour != "none" or stills):
         raise ValueError(f"colour = {colour!r}: must be one of {', '.join(listed)}" + ("" if stills else ", or none"))

@@ -77,7 +77,7 @@ def pick(measurements, tolerance=None, budget=None, floor=0.0):
             number(name, value, above=0.0)
     known = [each for each in measurements if each.error is not None and each.milliseconds is not None]
     affordable = [each for each in known if budget is None or each.milliseconds <= budget]
-    accurate = [each for each in affordable if tolerance is not None and each.error + floor <= tolerance]
+    accurate = [each for each in affordable if _meets(each, tolerance, floor)]
     if accurate:
         chosen = min(accurate, key=lambda each: each.milliseconds)
         rivals = _as_cheap(chosen, accurate)
@@ -114,9 +114,7 @@ def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=Non
         found += round_
         if progress is not None:
             progress(found)
-        meeting = [
-            e.milliseconds for e in found if e.error is not None and tolerance is not None and e.error + floor <= tolerance
-        ]
+        meeting = [each.milliseconds for each in found if _meets(each, tolerance, floor)]
         most = min([*meeting, float("inf") if budget is None else budget])
         left = [ladder for ladder, last in zip(left, round_, strict=True) if ladder and not _ends(last, tolerance, floor, most)]
     return pick(found, tolerance, budget, floor), found
