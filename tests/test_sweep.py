@@ -2,17 +2,18 @@
 
 import json
 import os
+import platform
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.chart.machine import machine
+from warpcloth.chart.machine import machine, name
 from warpcloth.chart.sweep import Store, cache_folder, sweep
-from warpcloth.chart.tasks import SceneRef, Setup, Task, source_digest, task
+from warpcloth.chart.tasks import SceneRef, Setup, Task, run, source_digest, task
 
 
 def square(x, folder=None):
@@ -73,7 +74,55 @@ def test_an_interruption_keeps_what_is_finished(tmp_path):
         for done, _ in enumerate(sweep(squares(4), executor, store), 1):
             if done == 2:
                 break
-    assert len(Store(tmp_path / "store.jsonl")) == 2
+    assert len(Store(tmp_path / "store.jsonl")) >= 2
+
+
+class AtOnce(Executor):
+    """Has all results before the first is asked for."""
+
+    def submit(self, function, *arguments):
+        future = Future()
+        try:
+            future.set_result(function(*arguments))
+        except ValueError as error:
+            future.set_exception(error)
+        return future
+
+
+def test_an_error_keeps_what_is_finished():
+    """Whichever of them is looked at first."""
+    store = Store()
+    with pytest.raises(ValueError, match="x is -1"):
+        list(sweep([task(square, x=-1), *squares(5)], AtOnce(), store))
+    assert len(store) == 5
+
+
+def alone(x):
+    """Whether nothing else is measured in this process meanwhile."""
+    global _measuring
+    _measuring += 1
+    time.sleep(0.01)
+    found, _measuring = _measuring == 1, _measuring - 1
+    return found
+
+
+_measuring = 0
+
+
+def test_threads_measure_one_after_another():
+    """Side by side they would slow one another."""
+    with ThreadPoolExecutor(4) as executor:
+        assert all(result for _, result in sweep([task(alone, x=x) for x in range(8)], executor))
+
+
+def test_other_code_is_refused_and_the_machine_kept(tmp_path):
+    """In another process, for here both are the same."""
+    each = task(square, x=2)
+    with pytest.raises(ValueError, match=r"the process that asks another; install the same"):
+        run(each, "another")
+    path = tmp_path / "store.jsonl"
+    list(sweep([each], AtOnce(), Store(path)))
+    assert Store(path).machine(each) == name() and platform.node() in name()
 
 
 def test_a_file_that_is_no_store_is_refused(tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.chart import convergence, fronts, spectrum, work_precision
+from warpcloth.chart import convergence, fronts, machine, spectrum, work_precision
 from warpcloth.chart.convergence import OneStep
 from warpcloth.chart.digest import scene_digest
 from warpcloth.chart.setups import RUNS, STEPS, label, setups_of_runs, setups_of_steps
@@ -322,7 +322,7 @@ def test_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(work_precision, "sweep", interrupted)
     assert main(command) == 130
     assert "interrupted after 2 of 4 settings, which are kept" in capsys.readouterr().err
-    assert len(Store(tmp_path / "cache" / "work-precision.jsonl")) == 2
+    assert len(Store(tmp_path / "cache" / "work-precision.jsonl")) >= 2  # and what was finished meanwhile
     monkeypatch.setattr(work_precision, "sweep", real)
     assert main([*command, "-o", "chart.png", "--csv", "chart.csv"]) == 0
     said = capsys.readouterr().out
@@ -331,6 +331,7 @@ def test_command(tmp_path, monkeypatch, capsys):
     assert main([*command, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["diagram"] == "time" and len(facts["rows"]) == 4 and facts["machine"]["source"]
+    assert {row["machine"] for row in facts["rows"]} == {row["machine"] for row in table("chart.csv")} == {machine.name()}
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from ..checks import number
 from . import trajectory
 from .reference import reference
 from .setups import setups_of_runs
-from .sweep import Store, cache_folder, sweep
+from .sweep import kept, sweep
 from .tasks import Setup, task
 
 # Rungs that each ladder goes on with above its last, each with twice the substeps.
@@ -26,6 +26,7 @@ class Measured:
         milliseconds: Median of a frame [ms]; None where there is none.
         spread: Quartiles of a frame [ms], (low, high), or None.
         reason: Why there is no error, or "".
+        machine: What measured it, in few words.
     """
 
     setup: Setup
@@ -33,6 +34,7 @@ class Measured:
     milliseconds: float | None
     spread: tuple[float, float] | None = None
     reason: str = ""
+    machine: str = ""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=Non
 
 
 def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device="cpu", dtype="float32", limit=60.0, **run):
-    """Measures setups of a scene on this machine until the choice among them is made.
+    """Measures setups of a scene until the choice among them is made, for this machine or, with an executor, for its workers.
 
     Args:
         scene: The :class:`warpcloth.chart.tasks.SceneRef`.
@@ -143,7 +145,8 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
     """
     pick([], tolerance, budget)  # refuses wrong ones before anything is measured
     # One at a time: side by side they would slow one another.
-    run = {"store": Store(cache_folder() / "trajectories.jsonl"), "workers": 1} | run
+    run = {"workers": 1} | run
+    run = run if "store" in run else {"store": kept("trajectories", run.get("executor")), **run}
     rungs = ladders(setups_of_runs(scene, solvers, device, dtype))
     exact = reference(scene, frames, **({} if tolerance is None else {"tolerance": tolerance / _FINER}))
 
@@ -154,7 +157,8 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
             for setup in setups
         ]  # fmt: skip
         found = {one.key: result for one, result in sweep(tasks, **run)}
-        return [_measured(setup, found[one.key]) for setup, one in zip(setups, tasks, strict=True)]
+        machine = run["store"].machine
+        return [_measured(setup, found[one.key], machine(one)) for setup, one in zip(setups, tasks, strict=True)]
 
     choice, found = climb(rungs, measure, tolerance, budget, exact.error)
     return choice, found, exact
@@ -178,9 +182,9 @@ def ladders(setups):
     return list(found.values())
 
 
-def _measured(setup, result):
+def _measured(setup, result, machine):
     spread = None if result["spread"] is None else tuple(result["spread"])
-    return Measured(setup, result["error"], result["ms"], spread, result["reason"])
+    return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine)
 
 
 def as_json(choice, found, exact):

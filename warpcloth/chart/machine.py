@@ -2,6 +2,7 @@
 
 import os
 import platform
+from functools import cache
 from pathlib import Path
 
 
@@ -19,7 +20,7 @@ def machine(device="cpu"):
 
     found = wp.get_device(device)
     return {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "device": found.name if found.is_cuda else "cpu",
         "system": f"{platform.system()} {platform.release()}",
@@ -32,7 +33,14 @@ def machine(device="cpu"):
     }
 
 
-def _processor():
+@cache
+def name(device="cpu"):
+    """Host, processor and, where it is no CPU, device, in few words: what stands beside each measurement."""
+    facts = machine(device)
+    return ", ".join([platform.node(), facts["processor"], *([] if facts["device"] == "cpu" else [facts["device"]])])
+
+
+def processor():
     """The name on the package; Linux alone says it in a file."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from ..quiet import initialise_warp
-from .tasks import run
+from .tasks import run, source_digest
 
 # One thread a process: more would take the cores of the others, and Warp's CPU kernels use one as it is.
 _ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
@@ -27,7 +27,7 @@ class Store:
     """
 
     def __init__(self, path=None):
-        self.path, self._results = None if path is None else Path(path), {}
+        self.path, self._results, self._machines = None if path is None else Path(path), {}, {}
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -39,7 +39,7 @@ class Store:
         for number, line in enumerate(lines):
             try:
                 entry = json.loads(line)
-                self._results[entry["key"]] = entry["result"]
+                self._results[entry["key"]], self._machines[entry["key"]] = entry["result"], entry.get("machine")
             except (ValueError, TypeError, KeyError):
                 if number < len(lines) - 1:
                     raise ValueError(f"{self.path}, line {number + 1}: is no result; remove the file or give another") from None
@@ -56,12 +56,17 @@ class Store:
     def __len__(self):
         return len(self._results)
 
-    def keep(self, task, result):
-        """Adds a result, on the disk before this returns."""
-        self._results[task.key] = result
+    def machine(self, task):
+        """The name of the machine that measured it."""
+        return self._machines[task.key]
+
+    def keep(self, task, result, machine):
+        """Adds a result and the machine that it is of, on the disk before this returns."""
+        self._results[task.key], self._machines[task.key] = result, machine
         if self.path is None:
             return
-        line = json.dumps({"key": task.key, "function": task.function, "arguments": task.arguments, "result": result})
+        asked = {"key": task.key, "function": task.function, "arguments": task.arguments}
+        line = json.dumps(asked | {"machine": machine, "result": result})
         with self.path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
             file.flush()
@@ -73,8 +78,9 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
 
     Args:
         tasks: :class:`warpcloth.chart.tasks.Task`\\s.
-        executor: Any `concurrent.futures.Executor`, such as that of a Dask client; without one, processes of this machine. As
-            with all of Python's, a script that starts them needs ``if __name__ == "__main__":``.
+        executor: Any `concurrent.futures.Executor`, such as :func:`warpcloth.chart.cluster.connect` gives; without one,
+            processes of this machine. As with all of Python's, a script that starts them needs ``if __name__ == "__main__":``.
+            Threads of one process measure one after another.
         store: A :class:`Store`; without one nothing is kept.
         progress: Function called with (finished, tasks, seconds left or None) at first and after each; or None.
         workers: Processes side by side, where there is no executor: as many as cores. Times are of a machine that is as busy.
@@ -96,18 +102,21 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
     with contextlib.ExitStack() as stack:
         if executor is None:
             executor = stack.enter_context(_processes(min(workers or os.cpu_count() or 1, len(left))))
-        futures = {executor.submit(run, task): task for task in left}
+        futures = {}
         try:
+            for task in left:
+                futures[executor.submit(run, task, source_digest())] = task
             for done, future in enumerate(as_completed(futures), 1):
                 task = futures[future]
-                result = future.result()
-                store.keep(task, result)
+                result, machine = future.result()
+                store.keep(task, result, machine)
                 seconds = (time.perf_counter() - started) / done * (len(left) - done)
                 say(finished + done, len(tasks), seconds)
                 yield task, result
         finally:
-            for future in futures:
-                future.cancel()
+            for future, task in futures.items():
+                if not future.cancel() and future.done() and future.exception() is None and task not in store:
+                    store.keep(task, *future.result())  # finished, and not looked at
 
 
 @contextlib.contextmanager
@@ -134,6 +143,11 @@ def _begin():
     """In each process: an interruption ends it without a word, as the first process says what there is to say."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     initialise_warp()
+
+
+def kept(name, executor=None):
+    """The :class:`Store` of a chart in the folder for caches; of a cluster another one, for its times are of other machines."""
+    return Store(cache_folder() / getattr(executor, "folder", "") / f"{name}.jsonl")
 
 
 def cache_folder():

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import platform
+import threading
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import import_module
@@ -9,6 +11,10 @@ from pathlib import Path
 
 from .. import scene_files
 from ..solvers import SOLVERS
+from . import machine
+
+# One measurement at a time in a process: threads side by side slow one another, and Warp records one graph at a time.
+_ALONE = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -106,9 +112,23 @@ def task(function, **arguments):
     return Task(f"{function.__module__}:{function.__qualname__}", plain)
 
 
-def run(task):
-    """What an executor calls."""
-    return task.run()
+def run(task, source):
+    """What an executor calls: the result of a task, and the name of the machine that measured it.
+
+    Args:
+        task: The :class:`Task`.
+        source: The :func:`source_digest` of the process that asks.
+
+    Raises:
+        ValueError: This process has other code, whose results have other keys.
+    """
+    if source != source_digest():
+        raise ValueError(
+            f"the code of warpcloth of {platform.node()} is {source_digest()}, and that of the process that asks {source}; "
+            "install the same on all machines and start the workers again"
+        )
+    with _ALONE:
+        return task.run(), machine.name(task.arguments.get("device", "cpu"))
 
 
 @cache

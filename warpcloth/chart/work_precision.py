@@ -14,7 +14,7 @@ from .digest import scene_digest
 from .machine import machine
 from .reference import reference
 from .setups import label, setups_of_runs, setups_of_steps
-from .sweep import Store, cache_folder, sweep
+from .sweep import kept, sweep
 from .tasks import task
 
 # The part of a scene's frames before the one step of "solver" and "spectrum", and the part that is run in "time": later motion
@@ -38,6 +38,7 @@ COLUMNS += (
     "residual",
     "frames",
     "message",
+    "machine",
 )
 
 
@@ -256,7 +257,7 @@ def _measured(function, scene, setups, given, run):
 
 
 def _results(tasks, run):
-    """The result of each task, in their order."""
-    run = {"store": Store(cache_folder() / "work-precision.jsonl"), **run}
+    """The result of each task and the machine that measured it, in their order."""
+    run = run if "store" in run else {"store": kept("work-precision", run.get("executor")), **run}
     results = {each.key: result for each, result in sweep(tasks, **run)}
-    return [results[each.key] for each in tasks]
+    return [{**results[each.key], "machine": run["store"].machine(each)} for each in tasks]

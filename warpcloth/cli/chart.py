@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections import Counter
 
 from ..chart.figures import PICTURES, check_path
 from ..checks import whole
@@ -9,7 +10,7 @@ from ..outputs import Output, check_apart
 from ..scene_files import assignments
 from . import stability
 from .run import named_scene
-from .terminal import Interrupted, as_json, check_writable, find_device, open_bar
+from .terminal import Interrupted, add_dask, as_json, check_writable, executing, find_device, open_bar
 
 TEXT = "Chart speed against accuracy."
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
@@ -54,6 +55,7 @@ def add(charts, name, command, text, epilog):
     sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
     sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
     sub.add_argument("--workers", type=int, metavar="N", help="processes side by side: by default the cores, on a GPU one")
+    add_dask(sub)
     sub.add_argument("-o", "--output", metavar="FILE", help=f"draw it, as {', '.join(PICTURES)}")
     sub.add_argument("--csv", metavar="FILE", help="write a table")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
@@ -96,14 +98,16 @@ def work_precision(arguments):
         raise ValueError("the diagram spectrum is of projective dynamics in float64; --solvers and --dtype are for the others")
     measure, plot, lines = _parts(arguments.diagram)
     try:
-        found = measure(
-            SceneRef(arguments.scene, given),
-            device=str(device),
-            limit=arguments.limit,
-            workers=arguments.workers or (1 if device.is_cuda else None),
-            progress=progress,
-            **options,
-        )
+        with executing(arguments) as executor:
+            found = measure(
+                SceneRef(arguments.scene, given),
+                device=str(device),
+                limit=arguments.limit,
+                workers=arguments.workers or (1 if device.is_cuda else None),
+                progress=progress,
+                **executor,
+                **options,
+            )
     except KeyboardInterrupt:
         raise Interrupted(progress.interrupted()) from None
     finally:
@@ -192,6 +196,7 @@ def _summary(found, lines_of):
     counts = {status: sum(row["status"] == status for row in rows) for status in ("ok", "diverged", "slow", "refused")}
     said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
     lines = [f"{found['scene']}: {len(rows)} settings, {said}", f"  device        {device}, {found['dtype']}"]
+    lines += [f"  measured on   {count} {name}" for name, count in Counter(row["machine"] for row in rows).items()]
     lines += lines_of(found)
     return "\n".join([*lines, *(f"  {row['status']:<12}  {row['label']}: {row['reason']}" for row in rows if row["reason"])])
 

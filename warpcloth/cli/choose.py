@@ -5,7 +5,7 @@ import sys
 
 from .. import scene_files
 from .run import named_scene
-from .terminal import Progress, as_json, find_device
+from .terminal import Progress, add_dask, as_json, executing, find_device
 
 EPILOG = """\
 Each solver climbs from coarse settings to fine ones until it meets the tolerance or is dearer than what does; errors are RMS
@@ -26,6 +26,7 @@ def add_arguments(parser):
     add("--solvers", nargs="+", metavar="NAME", help="to choose among; all where not given")
     add("--frames", type=int, metavar="N", help="frames to run, if not the scene's")
     add("--limit", type=float, default=60.0, metavar="SECONDS", help="that a run may take, 60 where not given")
+    add_dask(parser)
 
 
 def choose(arguments):
@@ -49,16 +50,18 @@ def chosen(arguments, device):
     budget = None if arguments.budget is None else scene_files.milliseconds("budget", arguments.budget)
     progress = Progress(None, first="measuring")
     try:
-        choice, found, exact = choose(
-            SceneRef(arguments.scene, values),
-            tolerance,
-            budget,
-            arguments.solvers,
-            arguments.frames,
-            str(device),
-            arguments.dtype,
-            arguments.limit,
-        )
+        with executing(arguments) as executor:
+            choice, found, exact = choose(
+                SceneRef(arguments.scene, values),
+                tolerance,
+                budget,
+                arguments.solvers,
+                arguments.frames,
+                str(device),
+                arguments.dtype,
+                arguments.limit,
+                **executor,
+            )
     finally:
         progress.close()
     return choice, found, exact, values
@@ -73,7 +76,7 @@ def take_choice(arguments, device):
     for name, given in (("--solver", arguments.solver), ("-s", arguments.s)):
         if given:
             raise ValueError(f"{name} is given, and --tolerance or --budget chooses it; leave one out")
-    arguments.solvers, arguments.limit = None, 60.0
+    arguments.solvers, arguments.limit, arguments.dask = None, 60.0, None
     choice, _found, _exact, _values = chosen(arguments, device)
     if not choice.meets:
         raise ValueError(f"nothing meets --tolerance and --budget: {choice.certainty}")
@@ -102,5 +105,6 @@ def _text(facts, choice, found, exact):
             lines.append(
                 f"  {name}  {each.milliseconds:9.3g} ms  {each.error:8.3%}{'  chosen' if each is choice.chosen else ''}"
             )
+    lines += [f"  measured on {name}" for name in dict.fromkeys(each.machine for each in found)]
     lines.append(choice.certainty)
     return "\n".join([*lines, *([facts["command"]] if facts["command"] else [])])

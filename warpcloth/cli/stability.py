@@ -7,13 +7,13 @@ from contextlib import contextmanager
 from ..chart.axes import AXES, FIXED
 from ..chart.figures import PICTURES, check_path
 from ..chart.stability import ACCURACY, VERDICTS, Survey
-from ..chart.sweep import Store, cache_folder, sweep
+from ..chart.sweep import kept, sweep
 from ..chart.tasks import SceneRef, Setup
 from ..checks import number, whole
 from ..model import DTYPES
 from ..scene_files import assignments, convert, options
 from ..solvers import SOLVERS
-from .terminal import Interrupted, as_json, check_writable
+from .terminal import Interrupted, add_dask, as_json, check_writable, executing
 
 _COUNT = 9
 
@@ -46,6 +46,7 @@ def add_arguments(parser):
     )
     parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="of each run, 60 if not given")
     parser.add_argument("--workers", type=int, metavar="N", help="processes side by side, as many as cores if not given")
+    add_dask(parser)
     parser.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
     parser.add_argument("--dtype", choices=DTYPES, default="float64")
     parser.add_argument("-o", "--output", metavar="FILE", help=f"draw the maps, as {', '.join(PICTURES)}")
@@ -63,13 +64,14 @@ def chart(arguments):
         number(name, getattr(arguments, name), **({"above": 0.0} if name == "limit" else {"least": 0.0}))
     given = {"device": arguments.device, "dtype": arguments.dtype, "limit": arguments.limit, "accuracy": arguments.accuracy}
     tasks = survey.tasks(reference=arguments.accuracy > 0.0, **given)
-    store = Store(cache_folder() / "stability.jsonl")
-    try:
-        with _progress() as progress:
-            cells = survey.table(sweep(tasks, store=store, progress=progress, workers=arguments.workers))
-    except KeyboardInterrupt:
-        done = sum(task in store for task in tasks)
-        raise Interrupted(f"interrupted; {done} of {len(tasks)} rows are kept, run it again to go on") from None
+    with executing(arguments) as executor:
+        store = kept("stability", executor.get("executor"))
+        try:
+            with _progress() as progress:
+                cells = survey.table(sweep(tasks, store=store, progress=progress, workers=arguments.workers, **executor))
+        except KeyboardInterrupt:
+            done = sum(task in store for task in tasks)
+            raise Interrupted(f"interrupted; {done} of {len(tasks)} rows are kept, run it again to go on") from None
     if arguments.output or arguments.csv:
         from ..chart.maps import plot_maps, write_table
 
@@ -81,6 +83,7 @@ def chart(arguments):
     if arguments.json:
         axes = {survey.x: survey.xs, survey.y: survey.ys}
         facts = {"scene": str(survey.scene), "x": survey.x, "y": survey.y, "axes": axes, "fixed": FIXED | survey.fixed}
+        facts["machines"] = sorted({store.machine(task) for task in tasks})
         print(as_json(facts | {"steps": survey.steps, "maps": dict(zip(methods, cells, strict=True))}))
         return 0
     for method, rows in zip(methods, cells, strict=True):

@@ -1,5 +1,6 @@
 """What the commands share: the device by its name, progress and results on a terminal, and where results go."""
 
+import contextlib
 import json
 import math
 import os
@@ -65,6 +66,30 @@ def open_bar(total, text, counts):
     shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
     form = "{desc}{percentage:3.0f}%|{bar}| " + counts
     return tqdm(total=total, desc=f"{text}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
+
+
+def add_dask(parser):
+    """Adds what runs measurements elsewhere."""
+    text = "measure on the Dask cluster of the scheduler at ADDRESS, such as tcp://host:8786, or of a scheduler file"
+    parser.add_argument("--dask", metavar="ADDRESS", help=text)
+
+
+@contextlib.contextmanager
+def executing(arguments):
+    """What a sweep is to run on, as its arguments: a Dask cluster, or nothing, for processes of this machine.
+
+    Raises:
+        ValueError: A number of processes is given beside a cluster.
+    """
+    if arguments.dask is None:
+        yield {}
+        return
+    if getattr(arguments, "workers", None) is not None:
+        raise ValueError("--workers is of processes of this machine, and --dask of a cluster, which has its own; leave one out")
+    from ..chart.cluster import connect
+
+    with connect(arguments.dask) as cluster:
+        yield {"executor": cluster}
 
 
 class Progress:

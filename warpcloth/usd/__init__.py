@@ -3,7 +3,7 @@
 from .frames import FrameSequence
 from .measures import MeasureWriter
 from .scene import read_scene, write_scene
-from .stage import StageMesh, read_mesh, read_stage_mesh
+from .stage import StageMesh, flattened, read_mesh, read_stage_mesh
 from .writer import AnimationWriter
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "FrameSequence",
     "MeasureWriter",
     "StageMesh",
+    "flattened",
     "read_mesh",
     "read_scene",
     "read_stage_mesh",

@@ -161,6 +161,16 @@ def open_stage(path):
         raise ValueError(f"{path}: is no USD stage ({reason.strip()})") from None
 
 
+def flattened(path):
+    """The text of one .usda file with all that a stage takes from others, but for value clips.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no USD stage.
+    """
+    return open_stage(path).ExportToString(addSourceFileComment=False)
+
+
 def find_prim(stage, path, prim=None):
     """The prim that holds the cloth.
 
