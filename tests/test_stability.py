@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import warpcloth as wc
 from warpcloth.chart import stability
 from warpcloth.chart.axes import AXES, FIXED, applied, record_at, scene_at, vary
 from warpcloth.chart.maps import _PLAIN, plot_maps, write_table
-from warpcloth.chart.rules import DIVERGES, concave_rate, largest_relaxation, rings, rules
+from warpcloth.chart.rules import DIVERGES, KNOWN, concave_rate, largest_relaxation, rings, rules
 from warpcloth.chart.stability import Survey, boundary, measure
 from warpcloth.chart.sweep import Store, sweep
 from warpcloth.chart.tasks import SceneRef, Setup
@@ -358,15 +359,68 @@ def test_what_is_measured_is_kept(tmp_path, monkeypatch):
 # --- Pictures, tables, command line.
 
 
+def test_the_reference_is_known_to_what_halving_its_step_changes(device):
+    """The floor bounds its distance to a run of an eighth of the step, and falls with the square of the step."""
+    survey = {"fixed": {"stiffness": 1.0}, "axis": "dt", "values": [2e-3, 4e-3], "steps": 40, "device": device}
+    ((fine, coarse),) = measure(asdict(HANGING), [asdict(Setup("newton", {"integrator": "bdf2"}))], **survey)
+    assert fine["error"] > fine["floor"] > 0.0 and coarse["floor"] > 2.0 * fine["floor"]
+    scene = scene_at(HANGING, {"stiffness": 1.0, "dt": 4e-3}, 40)
+    runs = [
+        stability.run(scene, wc.Newton(substeps=4 * k, integrator="bdf2", tolerance=1e-6), device=device) for k in (2, 4, 16)
+    ]
+    before, after = (stability._apart(runs[i], runs[i + 1], 0) for i in (0, 1))
+    assert coarse["floor"] == pytest.approx(before, rel=1e-6) and after < before
+
+
+@pytest.mark.parametrize(
+    ("floor", "error", "verdict"),
+    [
+        (0.001, 0.005, "stable"),
+        (0.004, 0.007, "unsure"),
+        (0.004, 0.013, "unsure"),
+        (0.004, 0.015, "inaccurate"),
+        (0.02, 0.1, "inaccurate"),
+    ],
+)
+def test_no_verdict_that_the_reference_does_not_bear(floor, error, verdict):
+    """Errors about an accuracy of 0.01: points of one vertex that moves along an edge of 1 m."""
+    x = np.zeros((2, 1, 2, 3))
+    x[:, :, 1, 0] = 1.0
+
+    def trial(off):
+        # RMS over two frames and two vertices: all are off.
+        return stability.Trial(x + np.array([0.0, off, 0.0]), np.array([1]), np.ones(1), [""], [None])
+
+    record = Setup("pbd", {"substeps": 4}).record()
+    cell = stability._judge(trial(error), 0, [trial(floor), trial(0.0)], 0.01, record)
+    assert cell["verdict"] == verdict and cell["status"] == "ok"
+    assert (cell["error"], cell["floor"]) == pytest.approx((error, floor))
+    assert cell["reason"] == "" if verdict == "stable" else f"known to {100.0 * floor:.2g} %" in cell["reason"]
+    assert stability._judge(trial(error), 0, None, 0.01, record)["verdict"] == "stable"
+    lost = stability._judge(trial(error), 0, "no reference: stopped after 1 s", 0.01, record)
+    assert lost["verdict"] == "unsure" and lost["error"] is None and lost["reason"].startswith("no reference")
+
+
+def test_options_of_methods_share_a_reference(device, monkeypatch):
+    """Which has neither; where the step varies each has its own."""
+    real, asked = stability._reference, []
+    monkeypatch.setattr(stability, "_reference", lambda *given: (asked.append(given), real(*given))[1])
+    for axis, values, count in (("iterations", [1, 2, 3], 1), ("dt", [1e-3, 2e-3], 2)):
+        asked.clear()
+        fixed = {**FIXED} if axis != "dt" else {}
+        rows = measure(asdict(HANGING), [asdict(Setup("xpbd"))], fixed, axis, values, 4, device=device)
+        assert len(asked) == count and all(cell["floor"] > 0.0 for cell in rows[0])
+
+
 def made_up():
-    """A survey of 3 × 2 cells, with a line from 0.1 to 10, and one of each verdict."""
-    survey = Survey(HANGING, (Setup("newton"),), "dt", "stiffness", (1e-3, 1e-2, 1e-1), (1.0, 10.0), {"iterations": 3}, 40)
+    """A survey of 4 × 2 cells, with a line from 0.1 to 10, and one of each verdict."""
+    survey = Survey(HANGING, (Setup("newton"),), "dt", "stiffness", (1e-3, 1e-2, 1e-1, 1.0), (1.0, 10.0), {"iterations": 3}, 40)
 
     def cell(verdict, ratio, step=None):
-        return stability._cell(verdict, "why, indeed", step=step) | {"rules": {"2/ω_max": ratio}}
+        return stability._cell(verdict, "why, indeed", step=step, floor=0.002) | {"rules": {"2/ω_max": ratio, KNOWN: ratio}}
 
-    top = [cell("diverged", 10.0, 1), cell("diverged", 20.0, 40), cell("refused", None)]
-    return survey, [[[cell("stable", 0.1), cell("inaccurate", 0.2), cell("stalled", 0.4)], top]]
+    top = [cell("diverged", 10.0, 1), cell("diverged", 20.0, 40), cell("refused", None), cell("slow", None)]
+    return survey, [[[cell("stable", 0.1), cell("inaccurate", 0.2), cell("stalled", 0.4), cell("unsure", 0.4)], top]]
 
 
 def test_a_map_is_drawn(tmp_path, monkeypatch):
@@ -378,15 +432,20 @@ def test_a_map_is_drawn(tmp_path, monkeypatch):
     survey, cells = made_up()
     plot_maps(tmp_path / "map.png", survey, cells)
     (axes,) = kept[0].axes
-    mesh, line = axes.collections
+    mesh, line, known = axes.collections
     colours = np.asarray(mesh.get_array())
-    assert np.array_equal(colours[0], [_PLAIN["stable"], _PLAIN["inaccurate"], _PLAIN["stalled"]])
+    assert np.array_equal(colours[0], [_PLAIN[name] for name in ("stable", "inaccurate", "stalled", "stable")])
     assert colours[1, 0].sum() < colours[1, 1].sum() and np.array_equal(colours[1, 2], _PLAIN["refused"])
+    (hatched,) = axes.patches
+    assert hatched.get_hatch() and hatched.get_bbox().bounds == pytest.approx((-0.5, -0.5, 1.0, 1.0))
+    assert np.array_equal(hatched.get_edgecolor()[:3], _PLAIN["inaccurate"])
     # The ratio is 0.1 in the lower cells and 10 in the upper: 1 half-way, on the logarithm.
     path = line.get_paths()[0].vertices
     assert path[np.isclose(path[:, 0], -3.0)][:, 1] == pytest.approx(0.5)
+    assert np.array_equal(known.get_paths()[0].vertices, path), "the line beyond which the reference is not known"
     texts = {text.get_text() for text in kept[0].legends[0].get_texts()}
-    assert texts == {"stable", "inaccurate", "stalled", "refused", "diverged at once", "in the end", "2/ω_max"}
+    named = {"stable", "inaccurate", "stalled", "stable or inaccurate", "refused", "slow", "diverged at once", "in the end"}
+    assert texts == named | {"2/ω_max", KNOWN}
     assert "iterations 3" in kept[0]._suptitle.get_text() and axes.get_title() == "newton"
     for ending in ("svg", "pdf"):
         plot_maps(tmp_path / f"map.{ending}", survey, cells)
@@ -402,8 +461,9 @@ def test_a_table_has_a_line_for_each_cell(tmp_path):
     write_table(tmp_path / "map.csv", survey, cells)
     with open(tmp_path / "map.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 6 and rows[3]["verdict"] == "diverged" and rows[3]["step"] == "1" and rows[0]["step"] == ""
-    assert [float(row["dt"]) for row in rows[:3]] == list(survey.xs) and rows[5]["2/ω_max"] == ""
+    assert len(rows) == 8 and rows[4]["verdict"] == "diverged" and rows[4]["step"] == "1" and rows[0]["step"] == ""
+    assert [float(row["dt"]) for row in rows[:4]] == list(survey.xs) and rows[7]["2/ω_max"] == ""
+    assert {row["floor"] for row in rows} == {"0.002"} and rows[1][KNOWN] == "0.2"
     assert rows[1]["reason"] == "why, indeed"
 
 

@@ -8,12 +8,13 @@ import numpy as np
 from ..outputs import TEXT, Output
 from .axes import AXES
 from .figures import GREY, PICTURES, check_path, save
-from .rules import DIVERGES
+from .rules import DIVERGES, KNOWN
 
 # sRGB. What diverged goes from the dark, at once, to the light, in the last frame; all differ in lightness too, for those who
 # do not see red.
 _PLAIN = {
     "stable": (0.66, 0.83, 0.93),
+    "unsure": (0.66, 0.83, 0.93),
     "inaccurate": (0.98, 0.88, 0.50),
     "stalled": (0.93, 0.62, 0.20),
     "slow": (0.72, 0.72, 0.72),
@@ -30,7 +31,10 @@ _STYLES = {
     "h² = m/(k(L/l − 1))": "-",
     "1 + Σk h²/m iterations": "--",
     "a ring an iteration": "-.",
+    KNOWN: (0, (1, 2)),
 }
+# Of what is stable or inaccurate.
+_UNSURE = {"facecolor": _PLAIN["stable"], "edgecolor": _PLAIN["inaccurate"], "hatch": "///", "linewidth": 0.0}
 _TICKS = 5
 
 
@@ -59,6 +63,7 @@ def plot_maps(path, survey, cells):
     shown = {}
     for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
         axes.pcolormesh(*map(_edges, places), _colours(rows, survey.steps), edgecolors="white", linewidth=0.4)
+        _hatch(axes, places, rows)
         for name, dashes in _STYLES.items():
             style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
             if _line(axes, places, rows, name, style):
@@ -103,6 +108,17 @@ def _colour(cell, steps):
     return _EARLY + min(part, 1.0) * (_LATE - _EARLY)
 
 
+def _hatch(axes, places, rows):
+    """What is stable or inaccurate in the colours of both."""
+    from matplotlib.patches import Rectangle
+
+    across, up = map(_edges, places)
+    for j, row in enumerate(rows):
+        for i, cell in enumerate(row):
+            if cell["verdict"] == "unsure":
+                axes.add_patch(Rectangle((across[i], up[j]), across[i + 1] - across[i], up[j + 1] - up[j], **_UNSURE))
+
+
 def _line(axes, places, rows, name, style):
     """The line where a rule is 1, between the cells; whether there is one."""
     ratios = np.array([[cell["rules"].get(name) or np.nan for cell in row] for row in rows], dtype=float)
@@ -119,7 +135,13 @@ def _legend(figure, shown, verdicts):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    entries = [Patch(fc=colour, ec=GREY, lw=0.5, label=verdict) for verdict, colour in _PLAIN.items() if verdict in verdicts]
+    entries = [
+        Patch(**_UNSURE, label="stable or inaccurate")
+        if verdict == "unsure"
+        else Patch(fc=colour, ec=GREY, lw=0.5, label=verdict)
+        for verdict, colour in _PLAIN.items()
+        if verdict in verdicts
+    ]
     if "diverged" in verdicts:
         entries += [Patch(color=_EARLY, label="diverged at once"), Patch(color=_LATE, label="in the end")]
     entries += [
@@ -129,13 +151,13 @@ def _legend(figure, shown, verdicts):
 
 
 def write_table(path, survey, cells):
-    """A line of CSV for each cell: method, values of the axes, verdict, step of divergence, growth, error, rules, reason.
+    """A line for each cell: method, values of the axes, verdict, step of divergence, growth, error, floor, rules and reason.
 
     Raises:
         FileNotFoundError: The folder does not exist.
     """
     names = list(dict.fromkeys(name for rows in cells for row in rows for cell in row for name in cell["rules"]))
-    plain = ("verdict", "step", "growth", "error")
+    plain = ("verdict", "step", "growth", "error", "floor")
     with Output(path, "x", **TEXT) as output:
         table = csv.writer(output.file, lineterminator="\n")
         table.writerow(["method", survey.x, survey.y, *plain, *names, "reason"])

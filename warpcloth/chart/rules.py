@@ -10,6 +10,8 @@ from ..terms import Spring
 
 # Beyond these a run diverges; beyond the others it is wrong, or need not be.
 DIVERGES = ("2/ω_max", "2/√(2 Σk/m)", "forward Euler", "ω λ_max = 2", "ω = 1 + 3^(−1/n)")
+# Not of a method: how far the reference of a map is known, over the accuracy that is asked for.
+KNOWN = "error of the reference = accuracy"
 # What a run must gain in energy to count as diverged.
 GROWTH = 100.0
 

@@ -11,15 +11,15 @@ from ..checks import choice
 from ..simulate import Watch
 from ..solvers import Newton
 from ..status import Result
-from .axes import AXES, FIXED, STEPS_PER_FRAME, record_at, scene_at, together, vary
-from .rules import rules
+from .axes import AXES, FIXED, OPTIONS, STEPS_PER_FRAME, record_at, scene_at, together, vary
+from .rules import KNOWN, rules
 from .tasks import SceneRef, Setup, task
 
-VERDICTS = ("stable", "inaccurate", "stalled", "diverged", "refused", "slow")
+VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
 # RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
 ACCURACY = 0.01
-# Steps of the reference in one of the map.
-_FINER = 4
+# Steps in one of the map, of the reference and before it of a coarser run, from which it differs by what it is known to.
+_FINER = (2, 4)
 _FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
 
 
@@ -92,23 +92,24 @@ def measure(
         device: Of the run.
         dtype: Of the run; the reference has float64.
         limit: Seconds for each run.
-        reference: Whether to compare with Newton, BDF2, of a quarter of the step.
+        reference: Whether to compare with Newton, BDF2, of a quarter of the step. Where that refuses the scene there is none.
 
     Returns:
         list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS` ("stalled": a step ended in
-        no minimum), ``status`` ("ok", "diverged", "slow" or "refused"), ``reason``, ``step`` (that of divergence, or None),
-        ``growth`` (see :class:`Trial`) and ``error`` (or None), and ``rules`` (see :func:`warpcloth.chart.rules.rules`).
+        no minimum; "unsure": inaccurate or not, the reference does not tell), ``status`` ("ok", "diverged", "slow" or
+        "refused"), ``reason``, ``step`` (that of divergence, or None), ``growth`` (see :class:`Trial`), ``error`` (or None),
+        ``floor``, the distance of the reference to a run of twice its step, which bounds its own error if each halving at
+        least halves that (or None), and ``rules`` (see :func:`warpcloth.chart.rules.rules`), of which :data:`KNOWN` is
+        ``floor`` over ``accuracy``.
     """
     ref, setups = SceneRef(**scene), [Setup(**setup) for setup in setups]
     groups = [values]
     if not together(scene_at(ref, {"dt": FIXED["dt"], **fixed}, steps), axis):
         groups = [[value] for value in values]
-    rows = [[] for _ in setups]
-    for group in groups:
-        answer = None
-        if reference:
-            exact = Newton(substeps=_FINER * STEPS_PER_FRAME, integrator="bdf2", tolerance=1e-6)
-            answer = _attempt(ref, exact, fixed, axis, group, steps, device, "float64", limit)
+    rows, answer = [[] for _ in setups], None
+    for number, group in enumerate(groups):
+        if reference and (number == 0 or axis not in OPTIONS):  # of no option of a method
+            answer = _reference(ref, fixed, axis, group, steps, device, limit)
         for row, setup in zip(rows, setups, strict=True):
             try:
                 record = record_at(setup, fixed if len(group) > 1 else {**fixed, axis: group[0]})
@@ -121,6 +122,8 @@ def measure(
                 if cell["status"] != "refused":
                     of_cell = scene_at(ref, {**fixed, axis: value}, steps)
                     cell = cell | {"rules": {name: _finite(ratio) for name, ratio in rules(of_cell, record, steps).items()}}
+                    if cell["floor"] is not None and accuracy > 0.0:
+                        cell["rules"][KNOWN] = cell["floor"] / accuracy
                 row.append(cell)
     return rows
 
@@ -138,27 +141,48 @@ def _attempt(ref, record, fixed, axis, group, steps, device, dtype, limit):
         return _cell("refused", str(error))
 
 
+def _reference(ref, fixed, axis, group, steps, device, limit):
+    """What a group is compared with: :class:`Trial` of the coarser run and of the reference, or why not; None without any."""
+    found = []
+    for finer in _FINER:
+        record = Newton(substeps=finer * STEPS_PER_FRAME, integrator="bdf2", tolerance=1e-6)
+        found.append(_attempt(ref, record, fixed, axis, group, steps, device, "float64", limit))
+        if isinstance(found[-1], dict):
+            return None if found[-1]["status"] == "refused" else f"no reference: {found[-1]['reason']}"
+    return found
+
+
+def _apart(first, other, copy):
+    """RMS distance of a copy in two runs, over vertices and frames and over the size; None where one did not end."""
+    if min(each.good[copy] for each in (first, other)) < len(first.points) - 1:
+        return None
+    squares = ((first.points[:, copy] - other.points[:, copy]) ** 2).sum(axis=-1)
+    return _finite(math.sqrt(squares.mean()) / np.ptp(other.points[0, copy], axis=0).max())
+
+
 def _judge(trial, copy, answer, accuracy, record):
-    """The cell of one copy."""
+    """The cell of one copy; ``answer`` as of :func:`_reference`."""
     growth, reason = _finite(trial.growth[copy]), trial.reasons[copy]
+    floor = _apart(*answer, copy) if isinstance(answer, list) else None
     if trial.good[copy] < len(trial.points) - 1:
         step = int(trial.good[copy] + 1) * record.per_frame(1.0)
-        return _cell("diverged", reason, step=step, growth=growth)
-    error = None
-    if isinstance(answer, Trial) and answer.good[copy] == len(answer.points) - 1:
-        apart = trial.points[:, copy] - answer.points[:, copy]
-        size = np.ptp(answer.points[0, copy], axis=0).max()
-        error = _finite(math.sqrt((apart**2).sum(axis=-1).mean()) / size)
+        return _cell("diverged", reason, step=step, growth=growth, floor=floor)
+    error = None if floor is None else _apart(trial, answer[-1], copy)
+    known = {"growth": growth, "error": error, "floor": floor}
     if trial.results[copy] in _FAILED:
-        return _cell("stalled", reason, growth=growth, error=error)
-    if error is not None and error > accuracy:
-        reason = f"RMS distance to the reference {100.0 * error:.3g} % of the size"
-        return _cell("inaccurate", reason, growth=growth, error=error)
-    return _cell("stable", "", growth=growth, error=error)
+        return _cell("stalled", reason, **known)
+    if answer is None:
+        return _cell("stable", "", **known)
+    if error is None:
+        return _cell("unsure", answer if isinstance(answer, str) else "no reference: it diverges", **known)
+    reason = f"RMS distance to the reference {100.0 * error:.3g} % of the size, which is known to {100.0 * floor:.2g} %"
+    if error - floor > accuracy:
+        return _cell("inaccurate", reason, **known)
+    return _cell("stable", "", **known) if error + floor <= accuracy else _cell("unsure", reason, **known)
 
 
 def _cell(verdict, reason, **more):
-    status = "ok" if verdict in VERDICTS[:3] else verdict
+    status = "ok" if verdict in VERDICTS[:4] else verdict
     return {
         "verdict": verdict,
         "status": status,
@@ -166,6 +190,7 @@ def _cell(verdict, reason, **more):
         "step": None,
         "growth": None,
         "error": None,
+        "floor": None,
         "rules": {},
     } | more
 
