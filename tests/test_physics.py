@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.chart import physics
+from warpcloth.chart import closed_forms, physics
 from warpcloth.chart.closed_forms import plot_physics
 from warpcloth.chart.elastica import aspect, gamma_of
 from warpcloth.chart.physics import measure, side_loss
@@ -217,6 +217,36 @@ def test_a_chain_is_exact(device):
         assert measured("chain", links, device=device)["error"] < links * 100 * np.finfo(np.float64).eps
 
 
+@pytest.mark.parametrize(
+    ("case", "resolution", "dtype", "most"),
+    [
+        # ε of the places, of size 1, over an extension of 0.2·9.81/2k·(1 + 1/N), k = 50 N/m: 1.1e-14, and at most twice that.
+        ("chain", 40, "float64", 2.3e-14),
+        ("chain", 40, "float32", 1.3e-5),
+        ("catenary", 8, "float64", 1e-10),
+        ("cantilever", 6, "float64", 1e-10),
+        ("patch", 6, "float64", 1e-9),
+    ],
+)
+def test_how_well_rest_shapes_are_known(case, resolution, dtype, most, device):
+    """What is exact is wrong by no more than the floor; a looser tolerance of the rest shape shows in it."""
+    found = measured(case, resolution, dtype=dtype, device=device)
+    epsilon = np.finfo(dtype).eps
+    assert epsilon / 8.0 < found["floor"] < most, found
+    if case in ("chain", "patch"):
+        assert found["error"] <= found["floor"]
+
+
+def test_a_loose_tolerance_raises_the_floor(device, monkeypatch):
+    """A rest shape whose vertices are unbalanced by 1e-3 g is known to about that, and the error is off by no more."""
+    exact = measured("cantilever", 6, device=device)
+    real = physics.equilibrium
+    monkeypatch.setattr(physics, "equilibrium", lambda scene, **options: real(scene, tolerance=1e-3, **options))
+    loose = measured("cantilever", 6, device=device)
+    print(exact["floor"], loose["floor"], loose["error"] - exact["error"])
+    assert 1e3 * exact["floor"] < loose["floor"] and abs(loose["error"] - exact["error"]) < 3.0 * loose["floor"]
+
+
 @pytest.mark.parametrize("stretching", [1e2, 1e4])
 def test_a_catenary_is_of_second_order(stretching, device):
     errors = [measured("catenary", n, stretching=stretching, device=device)["error"] for n in (20, 40, 80)]
@@ -273,18 +303,26 @@ def test_arguments_are_checked(arguments, message):
         measure(**{"case": "cantilever", "resolution": 6, "width": 1.0} | arguments)
 
 
-def test_the_plot(tmp_path):
+def test_the_plot(tmp_path, monkeypatch):
     results = []
     for angle in (0.0, 0.5):
         for bending in BENDING:
             for n in (4, 8, 16):
                 arguments = {"case": "cantilever", "resolution": n, "bending": bending, "angle": angle}
                 found = {"status": "ok", "reason": "", "error": 1.0 / n, "stiffness": 1.0, "sides": 0.01, "ms": n, "h": 1.0 / n}
+                found["floor"] = 0.2 * n if angle else 1e-9
                 results.append((arguments, found))
     results[0][1].update(status="slow", error=None)
     results.append(({"case": "chain", "resolution": 3}, measure("chain", 3)))
+    kept, save = [], closed_forms.save
+    monkeypatch.setattr(closed_forms, "save", lambda figure, path: (kept.append(figure), save(figure, path)))
     for name in ("plot.png", "plot.svg"):
         plot_physics(tmp_path / name, results)
+    # The largest floor of a panel is a line, and its words say where it is; one far below does not squeeze the errors.
+    chain = results[-1][1]["floor"]
+    for panel, floor in zip(kept[0].axes[::2], (1e-9, 3.2, chain), strict=True):
+        (line,) = (line for line in panel.lines if line.get_label() == f"rest shapes are known to {floor:.1g}")
+        assert list(line.get_ydata()) == [floor] * 2 and panel.get_ylim()[1] >= floor
     drawn = (tmp_path / "plot.svg").read_text()
     plot_physics(tmp_path / "plot.svg", results)
     assert drawn == (tmp_path / "plot.svg").read_text()

@@ -130,9 +130,22 @@ def test_spectrum_of_one_spring(device):
     step = OneStep(scene, 0, 1, device)
     length = np.linalg.norm((step.base.numpy() + step.best)[1])
     mu, V, A = spectrum.relative_spectrum(step)
+    assert step.roundings()[:, 1].any() and not step.roundings()[:, 0].any(), "a pin has no rounding"
     across = k / length / (m / step.h**2 + k)
     assert 1.0 - mu == pytest.approx([across, across, 0.0], rel=1e-12, abs=1e-12)
     assert V.T @ A @ V == pytest.approx(np.eye(3), abs=1e-12)
+
+
+def test_errors_of_projective_dynamics_end_at_the_floor(device):
+    """After all iterations that count its error is rounding, which the floor bounds, by less than a hundred times."""
+    found = spectrum.measure(asdict(SMALL), scene_digest(SMALL.load()), FRAME, 16, device)
+    step = OneStep(SMALL.load(), FRAME, 16, device)
+    _mu, V, A = spectrum.relative_spectrum(step)
+    places, stepper = np.repeat(step.free, 3), spectrum._bound(step, 256, device)
+    step.place(stepper)
+    stepper.step()
+    left, first = ((d.ravel()[places] @ A @ V) for d in (step.correction(stepper) - step.best, step.best))
+    assert 0.01 * found["floor"] < np.linalg.norm(left) / np.linalg.norm(first) < found["floor"] < spectrum.RESOLVED
 
 
 @pytest.mark.parametrize("substeps", [4, 16])
@@ -223,6 +236,13 @@ def table(path):
         return list(csv.DictReader(file))
 
 
+def floor_of(axes, label):
+    """The height of the line of that name."""
+    ((height, other),) = (line.get_ydata() for line in axes.lines if line.get_label() == label)
+    assert height == other
+    return height
+
+
 def text_of(figure):
     return "\n".join(text.get_text() for axes in figure.axes for text in axes.texts)
 
@@ -253,15 +273,18 @@ def test_time_diagram(device, tmp_path, drawn):
     lines = table(tmp_path / "chart.csv")
     assert [line["label"] for line in lines] == list(rows) and lines[-1]["error"] == ""
     assert float(lines[0]["error"]) == found["rows"][0]["error"] and float(lines[0]["strain_error"]) > 0.0
-    axes, _notes = drawn[0].axes
+    axes, strains, _notes = drawn[0].axes
     text = text_of(drawn[0])
     numbered = front(found["rows"])
     assert all(f"{i}  {found['rows'][place]['label']}" in text for i, place in enumerate(numbered, 1))
     assert name + ": diverged" in text
     shown = {label for _, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     assert {"explicit", "newton", "error of the reference", "nothing is better in both"} <= shown
-    points = np.concatenate([line.get_xydata() for line in axes.lines if line.get_marker() not in ("None", "")])
-    assert len(points) == sum(row["status"] == "ok" for row in found["rows"])
+    good = [row for row in found["rows"] if row["status"] == "ok"]
+    for panel, name in ((axes, "error"), (strains, "strain_error")):
+        points = np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() not in ("None", "")])
+        assert sorted(map(tuple, points)) == sorted((row["ms_per_second"], row[name]) for row in good)
+        assert floor_of(panel, "error of the reference") == found["reference"][name] < min(points[:, 1])
 
 
 def test_the_physics_diagram(tmp_path):
@@ -274,7 +297,8 @@ def test_the_physics_diagram(tmp_path):
     table = (tmp_path / "physics.csv").read_text().splitlines()
     assert len(table) == 6 and float(table[1].split(",")[table[0].split(",").index("error")]) == errors[0]
     chain = work_precision.physics_diagram(SceneRef("chain"), store=Store(), executor=ThreadPoolExecutor(1))
-    assert max(row["error"] for row in chain["rows"]) < 1e-10
+    assert all(row["error"] <= row["floor"] < 1e-12 for row in chain["rows"])
+    assert float(table[1].split(",")[table[0].split(",").index("floor")]) == found["rows"][0]["floor"] < 1e-10
     for wrong in (SceneRef("hanging"), SceneRef("chain", {"links": 5})):
         with pytest.raises(ValueError, match="the diagram physics is of cantilever, chain, catenary, without parameters"):
             work_precision.physics_diagram(wrong)
@@ -299,6 +323,9 @@ def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
             assert np.array_equal(line.get_xydata(), np.transpose([[point[name] for point in row["points"]], gaps]))
     assert "admm weight=1: diverged: a gap of 1e+07" in text_of(drawn[0]).replace("\n  ", " ")
     assert [list(line.get_ydata()) for line in drawn[1].axes[0].lines] == [row["eigenvalues"] for row in other["rows"]]
+    assert floor_of(drawn[1].axes[1], "rounding of the places") == max(row["floor"] for row in other["rows"])
+    for axes in (iterations, ms):
+        assert floor_of(axes, "rounding of the objective") == max(row["floor"] for row in one["rows"])
     write_csv(tmp_path / "solver.csv", one)
     lines = table(tmp_path / "solver.csv")
     assert len(lines) == sum(len(row["points"]) for row in one["rows"]) and float(lines[0]["gap"]) > 0.0

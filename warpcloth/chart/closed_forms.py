@@ -10,7 +10,8 @@ _MARKS = "os^Dv"
 def plot_physics(path, results):
     """Plots the error against h and against the time, two panels a case, pattern and angle.
 
-    Dashed: what the free sides of a cantilever cost, below which no mesh comes. What did not end well is named beside.
+    Dashed: what the free sides of a cantilever cost, below which no mesh comes; and how well the rest shapes are known, below
+    which errors mean nothing, written where it is below the picture. What did not end well is named beside.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -44,14 +45,30 @@ def plot_physics(path, results):
                 right.plot([ms for ms, _ in timed], [error for _, error in timed], **style)
             for side in {found["sides"] for _, found in points if found["sides"] is not None}:
                 for axes in (left, right):
-                    axes.axhline(side, color=f"C{k}", linewidth=0.8, linestyle=(0, (4, 3)))
+                    text = "_" if k else "what free sides take"
+                    axes.axhline(side, color=f"C{k}", linewidth=0.8, linestyle=(0, (4, 3)), label=text)
         _finish(left, right, title, [pair for points in lines.values() for pair in points])
+    for (left, right), lines in zip(panels, rows.values(), strict=False):
+        _floor(left, right, [found["floor"] for points in lines.values() for _, found in points if found["floor"]])
     for axes in panels[len(rows) :].ravel():
         axes.remove()
     save(figure, path)
 
 
+def _floor(left, right, floors):
+    """A line at the largest of the floors; errors alone say how far down the picture goes."""
+    if not floors:
+        return
+    (low, high), floor = left.get_ylim(), max(floors)
+    for axes in (left, right):
+        axes.axhline(floor, color=GREY, linewidth=0.8, linestyle="--", label=f"rest shapes are known to {floor:.1g}")
+        axes.set_ylim(low, max(high, 2.0 * floor))
+    left.legend(frameon=False, fontsize=7, labelcolor=GREY)
+
+
 def _finish(left, right, title, points):
+    from matplotlib.ticker import LogLocator
+
     left.set_title(title, fontsize=9, loc="left", color=GREY)
     left.set_ylabel("relative error", color=GREY)
     left.set_xlabel("h / L", color=GREY)
@@ -64,7 +81,11 @@ def _finish(left, right, title, points):
         axes.tick_params(which="both", colors=GREY, labelsize=7)
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color("0.7")
-    right.xaxis.set_minor_formatter("")  # over a decade or two they overlap
+    for axes in (left, right):
+        if axes.axison:
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter("")
     if left.get_legend_handles_labels()[1]:
         left.legend(frameon=False, fontsize=7, labelcolor=GREY)
     failed = [f"{_label(a)}, {a['resolution']}: {found['status']}" for a, found in points if found["status"] != "ok"]

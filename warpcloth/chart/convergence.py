@@ -99,12 +99,15 @@ class OneStep:
         """(φ(d) − lowest)/(first − lowest): 1 at x̃, 0 where φ is least."""
         return (self.objective(d) - self.lowest) / (self.first - self.lowest)
 
-    def _rounding(self):
-        """The largest change of φ about the minimiser, where it has no slope, as every coordinate is changed by a rounding."""
+    def roundings(self):
+        """Changes of d by a rounding of every coordinate of x, eight of them, (8, n, 3) [m]."""
         random = np.random.default_rng(SEED)
         epsilon = np.finfo(np.float64).eps * np.abs(self.base.numpy()).max()
-        moves = epsilon * random.uniform(-1.0, 1.0, size=(8, *self.best.shape)) * self.free[:, None]
-        return max(abs(self.objective(self.best + move) - self.lowest) for move in moves)
+        return epsilon * random.uniform(-1.0, 1.0, size=(8, *self.best.shape)) * self.free[:, None]
+
+    def _rounding(self):
+        """The largest change of φ about the minimiser, where it has no slope."""
+        return max(abs(self.objective(self.best + move) - self.lowest) for move in self.roundings())
 
 
 def one_step(scene, digest, frame, substeps, device):

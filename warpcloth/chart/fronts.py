@@ -18,13 +18,18 @@ _STYLES = {
 }
 _DASHES = ("-", "--", ":", "-.")
 _WIDTH, _LINES = 52, 60  # of the texts beside a picture
+# Of a motion, with what is written along them.
+_ERRORS = {
+    "error": "error: RMS of all vertices and frames, over the size",
+    "strain_error": "error of strains: 99th percentile of edges and frames",
+}
 
 
 def plot_time(path, found):
     """Draws the error of each setting over its time, those that nothing beats as a numbered line with their names beside it.
 
-    What has no error is named with the reason; the error of the reference solution is a line that no point below means
-    anything.
+    A second panel has the 99th percentile of the error of strains. What has no error is named with the reason; in both panels
+    the error of the reference solution is a line, and no point below means anything.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -39,7 +44,7 @@ def plot_time(path, found):
     texts = [f"{number}  {row['label']}" for number, row in enumerate(best, 1)]
     texts += ["", f"cheapest within {100.0 * WITHIN:g} %:", *(row["label"] for row in cheapest(found["rows"]))]
     texts += _missing("not drawn:", found)
-    figure, (axes,), notes = _figure(path, 1, texts)
+    figure, panels, notes = _figure(path, texts)
     lines = {}
     for row in found["rows"]:
         if row["status"] == "ok":
@@ -47,18 +52,20 @@ def plot_time(path, found):
     for (solver, _), rows in lines.items():
         rows.sort(key=lambda row: row["ms_per_second"])
         colour, marker = _STYLES[solver]
-        x, y = ([row[name] for row in rows] for name in ("ms_per_second", "error"))
-        axes.plot(x, y, color=colour, linewidth=0.5, alpha=0.6)
-        axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none", label=solver)
+        for axes, name in zip(panels, _ERRORS, strict=True):
+            x, y = ([row[of] for row in rows] for of in ("ms_per_second", name))
+            axes.plot(x, y, color=colour, linewidth=0.5, alpha=0.6)
+            axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none", label=solver)
     x, y = ([row[name] for row in best] for name in ("ms_per_second", "error"))
-    axes.plot(x, y, color="gold", linewidth=4.0, zorder=0, label="nothing is better in both")
-    for number, row in enumerate(best, 1):
-        place = (row["ms_per_second"], row["error"])
-        axes.annotate(str(number), place, (-4, -4), textcoords="offset points", ha="right", va="top", fontsize=8)
-    axes.axhline(found["reference"]["error"], color=GREY, linestyle="--", linewidth=0.8, label="error of the reference")
-    axes.set(xlabel="ms for a second of motion", ylabel="error: RMS of all vertices and frames, over the size")
+    panels[0].plot(x, y, color="gold", linewidth=4.0, zorder=0, label="nothing is better in both")
+    for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
+        for number, row in enumerate(best, 1):
+            place = (row["ms_per_second"], row[name])
+            axes.annotate(str(number), place, (-4, -4), textcoords="offset points", ha="right", va="top", fontsize=8)
+        _floor(axes, found["reference"][name], "error of the reference")
+        axes.set(xlabel="ms for a second of motion", ylabel=text)
     title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}, {found['machine']['device']}"
-    _finish(figure, [axes], notes, title, texts)
+    _finish(figure, panels, notes, title, texts)
     save(figure, path)
 
 
@@ -75,7 +82,7 @@ def plot_solver(path, found):
         ValueError: The path has another ending.
     """
     texts = _missing("ended early:", found)
-    figure, panels, notes = _figure(path, 2, texts)
+    figure, panels, notes = _figure(path, texts)
     seen, floor = {}, max((row["floor"] for row in found["rows"]), default=None)
     for row in found["rows"]:
         colour, marker = _STYLES[row["solver"]]
@@ -87,7 +94,7 @@ def plot_solver(path, found):
     for axes, text in zip(panels, ("iterations", "ms of the step"), strict=True):
         axes.set(xlabel=text)
         if floor is not None:
-            axes.axhline(floor, color=GREY, linestyle="--", linewidth=0.8, label="rounding of the objective")
+            _floor(axes, floor, "rounding of the objective")
     panels[0].set_ylabel("gap of the objective, 1 at x̃")
     step = f"a step of 1/{found['rate']:g} s after {found['frame']} frames"
     title = f"{found['scene']}, {step}, {found['dtype']}, {found['machine']['device']}"
@@ -96,7 +103,7 @@ def plot_solver(path, found):
 
 
 def plot_spectrum(path, found):
-    """Draws 1 − μ over its rank, and beside it errors as points on the lines that the spectrum predicts.
+    """Draws μ over its rank, and beside it errors as points on the lines that the spectrum predicts, down to rounding.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -108,7 +115,7 @@ def plot_spectrum(path, found):
         ValueError: The path has another ending.
     """
     texts = _missing("not drawn:", found)
-    figure, panels, notes = _figure(path, 2, texts)
+    figure, panels, notes = _figure(path, texts)
     for k, row in enumerate(row for row in found["rows"] if row["points"]):
         mu, colour, points = row["eigenvalues"], f"C{k}", row["points"]
         panels[0].plot(range(1, len(mu) + 1), mu, color=colour, linewidth=1.2)
@@ -119,11 +126,19 @@ def plot_spectrum(path, found):
         known = [point for point in points if point["predicted"] is not None]
         at, errors = ([point[name] for point in known] for name in ("iterations", "predicted"))
         panels[1].plot(at, errors, color=colour, linewidth=0.8)
+    floors = [row["floor"] for row in found["rows"] if row["floor"] is not None]
+    if floors:
+        _floor(panels[1], max(floors), "rounding of the places")
     panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
     panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
     title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
     _finish(figure, panels, notes, title, texts)
     save(figure, path)
+
+
+def _floor(axes, value, label):
+    """A line below which nothing is known."""
+    axes.axhline(value, color=GREY, linestyle="--", linewidth=0.8, label=label)
 
 
 def _missing(head, found):
@@ -132,16 +147,16 @@ def _missing(head, found):
     return ["", head, *lines] if lines else []
 
 
-def _figure(path, panels, texts):
-    """A figure with panels on logarithmic scales, and one for texts."""
+def _figure(path, texts):
+    """A figure with two panels on logarithmic scales, and one for texts."""
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 
     if len(texts) > _LINES:
         texts[_LINES:] = [f"… {len(texts) - _LINES} lines more in the table"]
     height = max(5.0, 0.155 * (len(texts) + 14))
-    figure = Figure(figsize=(4.6 * panels + (4.0 if panels == 1 else 3.4), height), layout="constrained")
-    *axes, notes = figure.subplots(1, panels + 1, width_ratios=[1.6] * panels + [1.0])
+    figure = Figure(figsize=(12.6, height), layout="constrained")
+    *axes, notes = figure.subplots(1, 3, width_ratios=[1.6, 1.6, 1.0])
     for each in axes:
         each.set(xscale="log", yscale="log")
         each.grid(True, which="major", linewidth=0.3, color="0.8")

@@ -61,14 +61,15 @@ def measure(scene, digest, frame, substeps, device="cpu", limit=20.0):
 
     Returns:
         dict: ``status``, ``reason``, ``eigenvalues`` μ, ``contraction`` max |1 − μ|, ``points`` with ``iterations``,
-        ``error`` ‖d − d*‖_A over that at x̃, and ``predicted``, the same from the first error that is small on, else None; and
-        ``measured`` and ``expected``, the factor of an iteration between the last two points, of errors and of predictions.
+        ``error`` ‖d − d*‖_A over that at x̃, and ``predicted``, the same from the first error that is small on, else None;
+        ``floor``, the largest error that roundings of x alone make; and ``measured`` and ``expected``, the factor of an
+        iteration between the last two points, of errors and of predictions.
 
     Raises:
         ValueError: See :func:`relative_spectrum`, and the scene has no such step.
     """
     step = one_step(scene, digest, frame, substeps, device)
-    result = {"status": "ok", "reason": "", "points": [], "measured": None, "expected": None}
+    result = {"status": "ok", "reason": "", "points": [], "floor": None, "measured": None, "expected": None}
     try:
         _bound(step, 1, device)
     except ValueError as error:
@@ -78,6 +79,7 @@ def measure(scene, digest, frame, substeps, device="cpu", limit=20.0):
     weights = A @ V  # of an error to its parts
     places = np.repeat(step.free, 3)
     first = np.linalg.norm(step.best.ravel()[places] @ weights)
+    result["floor"] = max(float(np.linalg.norm(move.ravel()[places] @ weights) / first) for move in step.roundings())
     parts, since, began = None, 0, time.perf_counter()
     for iterations in LADDER:
         stepper = _bound(step, iterations, device)

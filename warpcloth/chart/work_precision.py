@@ -33,6 +33,7 @@ COLUMNS += (
     "iterations",
     "gap",
     "predicted",
+    "floor",
     "compile_s",
     "factorise_s",
     "residual",
@@ -182,7 +183,7 @@ def physics_diagram(scene, device="cpu", dtype="float64", limit=20.0, **run):
         {"solver": "equilibrium", "options": {}, "label": _label_of(plan), "arguments": plan, **result}
         for plan, result in zip(plans, _results(tasks, run), strict=True)
     ]
-    return {**_facts("physics", scene, device, dtype), "seed": None, "rows": rows}
+    return {**_facts("physics", scene, device, dtype), "seed": physics.SEED, "rows": rows}
 
 
 def _label_of(plan):
