@@ -4,7 +4,7 @@ import csv
 import json
 import re
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +107,66 @@ def test_compliance_makes_jacobi_more_stable(device):
         limits.append(largest_relaxation(scene_at(scene, fixed, 1), fixed["dt"], record_at(setup, fixed)))
     found = boundary(net("shear", 8), setup, "relaxation", limits[0] / 2, limits[0] * 2, 600, fixed, WIDTH, device=device)
     assert found == pytest.approx(limits[0], rel=0.01) and limits[0] > 1.1 * limits[1]
+
+
+SOFT_JACOBI = [
+    ("xpbd", {"sweep": "constraint-averaged"}),
+    ("xpbd", {"sweep": "constraint-averaged", "integrator": "midpoint"}),
+    ("xpbd", {"sweep": "constraint-averaged", "integrator": "bdf2"}),
+    ("pbd", {"sweep": "jacobi", "stiffness": "per-step"}),
+    ("pbd", {"sweep": "constraint-averaged"}),
+]
+
+
+@pytest.mark.parametrize("iterations", [1, 4, 5])
+@pytest.mark.parametrize(("solver", "options"), SOFT_JACOBI)
+def test_limits_of_jacobi_with_compliance(solver, options, iterations, device):
+    """α̃ = 1/(khₑ²) of XPBD counts twice, in D + α̃ and with λ, each integrator has its least q; "per-step" spreads it."""
+    fixed, setup, scene = {"dt": 1.0, "iterations": iterations}, Setup(solver, options), net("shear", 8)
+    limit = record_at(setup, fixed).relaxation / rules(scene_at(scene, fixed, 1), record_at(setup, fixed), 1)["ω λ_max = 2"]
+    # The mode that decides about odd numbers is taken for that which decides about even ones.
+    found = boundary(scene, setup, "relaxation", limit / 2, limit * 2, 600, fixed, WIDTH, device=device)
+    assert found == pytest.approx(limit, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("solver", "iterations", "accuracy"), [("pbd", 1, 0.01), ("pbd", 4, 0.01), ("xpbd", 1, 0.01), ("xpbd", 4, 0.07)]
+)
+def test_limits_of_gauss_seidel_with_compliance(solver, iterations, accuracy, device):
+    fixed, setup, scene = {"dt": 1.0, "iterations": iterations}, Setup(solver), net("structural", 8)
+    limit = 1.0 / rules(scene_at(scene, fixed, 1), record_at(setup, fixed), 1)["ω = 1 + 3^(−1/n)"]
+    found = boundary(scene, setup, "relaxation", limit / 2, limit * 2, 600, fixed, WIDTH, device=device)
+    assert found == pytest.approx(limit, rel=accuracy)
+
+
+def test_a_spring_between_two_pins_limits_nothing():
+    scene = replace(net("shear", 6, "inf").load(), pins="z == 0")
+    setup = record_at(Setup("pbd", {"sweep": "jacobi"}), {"iterations": 4})
+    assert 0.4 < largest_relaxation(scene, FIXED["dt"], setup) < 0.7
+
+
+def test_no_line_is_drawn_where_damping_moves_it(device):
+    """Forward Euler holds small steps with damping: |z|² = 1 − hβω² + h²ω² of β times the stiffness."""
+    scene = net("shear", 6).load()
+    damped = replace(scene, terms=[replace(term, damping=1.0) for term in scene.terms])
+    for setup in (Setup("explicit", {"scheme": "forward"}), Setup("pbd"), Setup("xpbd", {"sweep": "constraint-averaged"})):
+        names = [set(rules(one, record_at(setup, {}), 100)) & set(DIVERGES) for one in (scene, damped)]
+        assert len(names[0]) == 1 and not names[1]
+
+
+@pytest.mark.parametrize(("integrator", "part"), [("euler", 1.0), ("midpoint", 0.5), ("bdf2", 2 / 3)])
+def test_rules_of_integrators_are_of_their_effective_step(integrator, part):
+    values = {"dt": 0.02, "compression": 0.2}
+    ref = SceneRef("chain", {"links": 1, "stiffness": 100.0, "mass": 0.01})
+    found = rules(scene_at(ref, values, 4), record_at(Setup("newton", {"integrator": integrator}), values), 4)
+    assert found["h² = m/(k(L/l − 1))"] == pytest.approx(part * 0.02 * 50.0, rel=1e-4)
+
+
+@pytest.mark.parametrize(("compression", "most"), [(0.0, 0.0), (0.2, 2.9315)])
+def test_the_concave_rate_of_many_vertices(compression, most):
+    """Of a flat net, whose least eigenvalues are a multitude about 0, and of a compressed one, that of the dense matrix."""
+    model = scene_at(net("shear", 12), {"dt": 0.1, "compression": compression}, 4).build(dtype="float64")
+    assert concave_rate(model) == pytest.approx(most, rel=1e-3, abs=1e-4)
 
 
 def test_forward_euler_diverges_at_any_step(device):
@@ -354,6 +414,25 @@ def test_what_is_measured_is_kept(tmp_path, monkeypatch):
         first = survey.table(sweep(tasks, executor, Store(tmp_path / "s.jsonl")))
         monkeypatch.setattr(stability, "run", None)
         assert survey.table(sweep(survey.tasks(reference=False), executor, Store(tmp_path / "s.jsonl"))) == first
+
+
+SCENE = """
+import warpcloth as wc
+def scene(n: int = 4, k: float = 1e3):
+    terms = [wc.Spring(pairs=("structural", "shear"), stiffness=FACTOR * k)]
+    return wc.Scene(wc.Mesh.grid(n, n), density=0.1, terms=terms, pins="corners and z == 0", duration=0.1)
+"""
+
+
+@pytest.mark.parametrize("axis", ["dt", "resolution"])
+def test_a_scene_that_was_changed_is_measured_again(axis, tmp_path):
+    keys = []
+    for factor in (1.0, 1.0, 1e-4):
+        (tmp_path / "mine.py").write_text(SCENE.replace("FACTOR", str(factor)))
+        xs = (1e-3, 1e-2) if axis == "dt" else (3, 5)
+        survey = Survey(SceneRef(str(tmp_path / "mine.py")), (Setup("pbd"),), axis, "stiffness", xs, (1.0, 2.0), {}, 8)
+        keys.append([task.key for task in survey.tasks(reference=False)])
+    assert keys[0] == keys[1] and not set(keys[0]) & set(keys[2])
 
 
 # --- Pictures, tables, command line.

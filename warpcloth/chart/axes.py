@@ -76,7 +76,7 @@ def scene_at(ref, values, steps):
         ValueError: The scene cannot have such a value.
     """
     if "resolution" in values:
-        ref = _refined(ref, values["resolution"])
+        ref = refined(ref, values["resolution"])
     scene = ref.load()
     if scene.pins.keyframes is not None:
         raise ValueError(
@@ -93,7 +93,12 @@ def scene_at(ref, values, steps):
     return replace(scene, positions=scene.positions + noise, fps=1.0 / frame, duration=frames * frame)
 
 
-def _refined(ref, value):
+def refined(ref, value):
+    """The :class:`SceneRef` with a resolution.
+
+    Raises:
+        ValueError: The scene has no parameter for that.
+    """
     from ..scene_files import find_source
 
     known = find_source(ref.name).parameters

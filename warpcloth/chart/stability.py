@@ -11,7 +11,8 @@ from ..checks import choice
 from ..simulate import Watch
 from ..solvers import Newton
 from ..status import Result
-from .axes import AXES, FIXED, OPTIONS, STEPS_PER_FRAME, record_at, scene_at, together, vary
+from .axes import AXES, FIXED, OPTIONS, STEPS_PER_FRAME, record_at, refined, scene_at, together, vary
+from .digest import scene_digest
 from .rules import KNOWN, rules
 from .tasks import SceneRef, Setup, task
 
@@ -77,7 +78,18 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
 
 
 def measure(
-    scene, setups, fixed, axis, values, steps, accuracy=ACCURACY, device="cpu", dtype="float64", limit=60.0, reference=True
+    scene,
+    setups,
+    fixed,
+    axis,
+    values,
+    steps,
+    accuracy=ACCURACY,
+    device="cpu",
+    dtype="float64",
+    limit=60.0,
+    reference=True,
+    digests=None,
 ):
     """Cells that differ in one value, of each setup: a row of copies where one run can have them, else a run each.
 
@@ -93,6 +105,7 @@ def measure(
         dtype: Of the run; the reference has float64.
         limit: Seconds for each run.
         reference: Whether to compare with Newton, BDF2, of a quarter of the step. Where that refuses the scene there is none.
+        digests: Of the scene, see :func:`warpcloth.chart.digest.scene_digest`: a scene that was changed has another key.
 
     Returns:
         list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS` ("stalled": a step ended in
@@ -246,7 +259,14 @@ class Survey:
         rest = {name: value for name, value in {**FIXED, **self.fixed}.items() if name != along}
         setups = [asdict(setup) for setup in self.setups]
         given = {"setups": setups, "axis": along, "values": list(values), "steps": self.steps, **options}
+        given["digests"] = self._digests()
         return [task(measure, scene=self.scene, fixed={**rest, other: value}, **given) for value in others]
+
+    def _digests(self):
+        """Of the scene at each of its resolutions."""
+        values = {self.x: self.xs, self.y: self.ys}.get("resolution", [])
+        refs = [refined(self.scene, value) for value in values] or [self.scene]
+        return [scene_digest(ref.load()) for ref in refs]
 
     def _first(self):
         return {self.x: self.xs[0], self.y: self.ys[0]}
