@@ -74,6 +74,47 @@ def test_what_cannot_run_is_said_and_not_called_needless():
         advise(scene, wc.Explicit(substeps=4, above_limit="allow"), frames=3)
 
 
+def held_twice(n=5):
+    """A cloth whose pins are soft and there twice, either of which would do."""
+    pins = [wc.Attachment(vertices=[0, n - 1], stiffness=1e5) for _ in range(2)]
+    terms = [wc.Spring(pairs=("structural", "shear"), stiffness=1e3), *pins]
+    return wc.Scene(wc.Mesh.grid(n, n), density=0.1, terms=terms, duration=1.0)
+
+
+def test_terms_that_stand_in_for_one_another_are_not_both_left_out():
+    found = advise(held_twice(), NEWTON, frames=10)
+    trials = by_name(found)
+    one, other = (trials[f"without Attachment {k} of 2"] for k in (1, 2))
+    both = trials["without Attachment 1 of 2 and Attachment 2 of 2"]
+    assert one.matters is other.matters is False and both.matters and both.kind == "terms"
+    assert not any("leave it out" in sentence for sentence in found.sentences)
+    assert any("leave one out, and try again" in sentence for sentence in found.sentences)
+    # Where none matters with the others left out too, all may be.
+    idle = replace(held_twice(), pins=[0, 4])
+    assert by_name(advise(idle, NEWTON, frames=10))["without Attachment 1 of 2 and Attachment 2 of 2"].matters is False
+
+
+def test_frames_that_were_not_run_are_said():
+    """A limit that the cloth meets after 10 frames does not matter before, and is not said to be needless for good."""
+    scene = hanging.scene(n=5)
+    late = [*scene.terms[:1], wc.SpringLimit(pairs=[(0, 24)], most=1.2, stiffness=1e3)]
+    short, whole = (advise(replace(scene, terms=late), NEWTON, frames=frames) for frames in (6, 60))
+    assert by_name(short)["without SpringLimit"].matters is False
+    assert any("only 6 of 60 frames were run" in sentence for sentence in short.sentences)
+    assert not any("frames were run" in sentence for sentence in whole.sentences)
+
+
+def test_a_finer_mesh_that_diverges_is_not_called_for():
+    """The step of explicit is that of the scene; what is finer is told by its vertices, not by its time."""
+    record = wc.Explicit(substeps=16, above_limit="allow")
+    others = {"n=4": hanging.scene(n=4), "n=12": hanging.scene(n=12)}
+    found = advise(hanging.scene(n=4), record, frames=3, resolutions=others)
+    trials = by_name(found)
+    assert trials["n=12"].matters is None and trials["n=12"].finer and trials["n=4"].finer is False
+    assert any(s.startswith("n=12: diverged in frame") for s in found.sentences)
+    assert not any("too coarse" in s or "inf" in s for s in found.sentences)
+
+
 def test_the_command(capsys):
     command = ["info", "hanging", "-p", "n=6", "--solver", "newton", "-s", "substeps=4", "--advise"]
     assert main([*command, "--frames", "5", "--tolerance", "1%"]) == 0
@@ -81,7 +122,9 @@ def test_the_command(capsys):
     assert "without QuadraticBending" in said and "n=12" in said and "advice:" in said
     assert main([*command, "--frames", "2", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
-    assert [trial["kind"] for trial in facts["trials"]] == ["term", "term", "precision", "step", "resolution", "resolution"]
+    kinds = [trial["kind"] for trial in facts["trials"]]
+    assert kinds == ["term", "term", "terms", "precision", "step", "resolution", "resolution"]  # 2 frames need neither term
+    assert [trial["finer"] for trial in facts["trials"]] == [None] * 5 + [False, True]
     assert facts["tolerance"] == 0.01
 
 
@@ -91,6 +134,7 @@ def test_the_command(capsys):
         ("--tolerance 1%", "--tolerance is given without --advise"),
         ("--frames 3", "--frames is given without --advise"),
         ("--advise --tolerance much", "tolerance"),
+        ("--advise --tolerance 2", "tolerance is 2, 2 times the whole"),
         ("--advise --tolerance 0%", "tolerance is 0.0; it must be a number above 0"),
         ("--advise --frames 0", "frames is 0"),
     ],

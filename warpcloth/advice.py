@@ -18,13 +18,14 @@ class Trial:
     """A run of the scene with one thing changed, against the scene as it is.
 
     Attributes:
-        kind: "term", "precision", "step" or "resolution".
+        kind: "term", "terms" (all that do not matter by themselves), "precision", "step" or "resolution".
         name: What was changed, such as "without QuadraticBending" or "n=64".
         change: RMS distance of the results over vertices and frames, over the longest side of the cloth; of another resolution
             between the surfaces, both ways. NaN where there is no result.
         cost: Time of a frame over that of the scene as it is.
         matters: Whether the change is above the tolerance; None where there is no result.
         reason: Why there is none, or "".
+        finer: Of another resolution whether it has more vertices, else None.
     """
 
     kind: str
@@ -33,6 +34,7 @@ class Trial:
     cost: float
     matters: bool | None
     reason: str = ""
+    finer: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -42,12 +44,14 @@ class Advice:
     Attributes:
         trials: List of :class:`Trial`.
         frames: Frames that were run.
+        declared: Frames that the scene has.
         milliseconds: Median of a frame of the scene as it is, of its first and of its last run [ms].
         tolerance: Below which a change does not matter.
     """
 
     trials: list
     frames: int
+    declared: int
     milliseconds: tuple[float, float]
     tolerance: float
 
@@ -69,16 +73,28 @@ class Advice:
                 if step.matters
                 else f"half the step: {step.reason}"
             )
+        needless = [trial for trial in self.trials if trial.kind == "term" and trial.matters is False]
+        together = next((trial for trial in self.trials if trial.kind == "terms"), None)
+        redundant = together is not None and together.matters is not False
+        for trial in needless:
+            saved = f", and a frame takes {trial.cost:.2f} times as long" if self.steady else ""
+            leave = "" if redundant else ": leave it out"
+            found.append(f"{trial.name} changes the result by {trial.change:.2%} alone{saved}{leave}")
+        if redundant:
+            why = f"{together.change:.2%}" if np.isfinite(together.change) else together.reason
+            found.append(f"{together.name} at once: {why}; of these leave one out, and try again")
+        if needless and self.frames < self.declared:
+            found.append(
+                f"only {self.frames} of {self.declared} frames were run: what begins to matter later is not seen; give --frames"
+            )
         for trial in self.trials:
-            if trial.kind == "term" and trial.matters is False:
-                saved = f", and a frame takes {trial.cost:.2f} times as long" if self.steady else ""
-                found.append(f"{trial.name} changes the result by {trial.change:.2%} alone{saved}: leave it out")
-            elif trial.kind == "precision" and trial.matters is False:
+            if trial.kind == "precision" and trial.matters is False:
                 found.append(f"float32 is enough: float64 changes the result by {trial.change:.2%} alone")
             elif trial.kind == "precision" and trial.matters:
                 found.append(f"float64 changes the result by {trial.change:.2%}: take it")
-        finer = [trial for trial in self.trials if trial.kind == "resolution" and trial.cost > 1.0]
-        coarser = [trial for trial in self.trials if trial.kind == "resolution" and trial.cost <= 1.0]
+        finer = [trial for trial in self.trials if trial.finer]
+        coarser = [trial for trial in self.trials if trial.finer is False]
+        found += [f"{trial.name}: {trial.reason}" for trial in finer if trial.matters is None]
         found += [f"{trial.name} changes the result by {trial.change:.2%}: too coarse" for trial in finer if trial.matters]
         enough = [trial for trial in coarser if trial.matters is False]
         found += [f"{trial.name} is enough: it changes the result by {trial.change:.2%} alone" for trial in enough]
@@ -118,10 +134,11 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
     size = float(np.ptp(scene.mesh.points, axis=0).max())
     other = "float64" if dtype == "float32" else "float32"
     halved = replace(solver, dt=None, substeps=2 * solver.per_frame(scene.fps))
+    names = _names(scene.terms)
     plans = [
         *(
-            ("term", f"without {term.label}", {"changed": _without(scene, term)})
-            for term in scene.terms
+            ("term", f"without {name}", {"changed": _without(scene, [term])})
+            for name, term in zip(names, scene.terms, strict=True)
             if len(scene.terms) > 1
         ),
         ("precision", other, {"changed": scene, "dtype": other}),
@@ -129,34 +146,51 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         *(("resolution", name, {"changed": changed}) for name, changed in (resolutions or {}).items()),
     ]
     trials = []
-    for kind, name, options in plans:
+    for done, (kind, name, options) in enumerate(plans, 1):
         trials.append(_trial(kind, name, options, run, base, first, scene, size, tolerance, device))
         if progress is not None:
-            progress(len(trials), len(plans))
-    return Advice(trials, frames, (first, run(scene)[1]), tolerance)
+            progress(done, len(plans))
+        if done == len(scene.terms) > 1:
+            # What one of two terms does by itself neither seems to do.
+            needless = [k for k, trial in enumerate(trials) if trial.matters is False]
+            if len(needless) > 1:
+                without = {"changed": _without(scene, [scene.terms[k] for k in needless])}
+                name = "without " + " and ".join(names[k] for k in needless)
+                trials.append(_trial("terms", name, without, run, base, first, scene, size, tolerance, device))
+    return Advice(trials, frames, scene.frames, (first, run(scene)[1]), tolerance)
 
 
-def _without(scene, term):
-    return replace(scene, terms=[other for other in scene.terms if other is not term])
+def _names(terms):
+    """Labels of terms, numbered where several have one."""
+    labels = [term.label for term in terms]
+    counted = [(label, labels[:k].count(label) + 1, labels.count(label)) for k, label in enumerate(labels)]
+    return [f"{label} {k} of {count}" if count > 1 else label for label, k, count in counted]
+
+
+def _without(scene, terms):
+    return replace(scene, terms=[other for other in scene.terms if not any(other is term for term in terms)])
 
 
 def _trial(kind, name, options, run, base, first, scene, size, tolerance, device):
+    finer = len(options["changed"].mesh.points) > len(scene.mesh.points) if kind == "resolution" else None
     try:
         found, milliseconds = run(**options)
     except ValueError as error:
-        return Trial(kind, name, np.nan, np.nan, None, str(error))
+        return Trial(kind, name, np.nan, np.nan, None, str(error), finer)
     cost = milliseconds / first
     if not found.status.ok:
+        if not kind.startswith("term"):
+            return Trial(kind, name, np.nan, cost, None, found.status.message, finer)
         # Of a term that holds the cloth together: it matters, by more than can be said.
         return Trial(kind, name, np.inf, cost, True, found.status.message)
     if kind == "resolution":
         if not (len(scene.mesh.triangles) and len(options["changed"].mesh.triangles)):
-            return Trial(kind, name, np.nan, cost, None, "the mesh has edges alone, and no surface to compare")
+            return Trial(kind, name, np.nan, cost, None, "the mesh has edges alone, and no surface to compare", finer)
         change = _surface_change(base, scene, found, options["changed"], device)
     else:
         between = np.asarray(found.points, dtype=np.float64) - np.asarray(base.points, dtype=np.float64)
         change = float(np.sqrt((between**2).sum(axis=2).mean()))
-    return Trial(kind, name, change / size, cost, bool(change / size > tolerance))
+    return Trial(kind, name, change / size, cost, bool(change / size > tolerance), finer=finer)
 
 
 def _surface_change(one, first, other, second, device):

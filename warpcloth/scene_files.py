@@ -241,9 +241,11 @@ def convert(name, text, kinds):
 
 
 def share(name, text):
-    """A share of the whole, written as 1% or 0.01."""
+    """A share of the whole, written as 1% or 0.01; above 1 it is refused, as a percentage without its sign."""
     value = convert(name, text.removesuffix("%"), (float,)) / (100.0 if text.endswith("%") else 1.0)
     number(name, value, above=0.0)
+    if value > 1.0:
+        raise ValueError(f"{name} is {text}, {value:g} times the whole; it must be no more than 100%, such as 1% or 0.01")
     return value
 
 

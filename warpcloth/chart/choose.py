@@ -27,6 +27,7 @@ class Measured:
         spread: Quartiles of a frame [ms], (low, high), or None.
         reason: Why there is no error, or "".
         machine: What measured it, in few words.
+        final: Whether that holds for finer steps too: it took too long, or its method is refused.
     """
 
     setup: Setup
@@ -35,6 +36,7 @@ class Measured:
     spread: tuple[float, float] | None = None
     reason: str = ""
     machine: str = ""
+    final: bool = False
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,11 @@ def pick(measurements, tolerance=None, budget=None, floor=0.0):
     chosen = min(affordable, key=lambda each: (each.error, each.milliseconds))
     if tolerance is None:
         rivals = [each for each in affordable if each is not chosen and abs(each.error - chosen.error) <= floor]
-        return Choice(chosen, True, rivals, f"its error of {chosen.error:.3%} is known to {floor:.2%} of the size")
-    return Choice(chosen, False, [], f"nothing measured meets {tolerance:.3%}; the most accurate comes to {chosen.error:.3%}")
+        return Choice(chosen, True, rivals, f"its error of {percent(chosen.error)} is known to {percent(floor)} of the size")
+    within = "" if budget is None else " within the budget"
+    known = f", and the reference is known to {percent(floor)} only" if chosen.error <= tolerance else ""
+    sentence = f"nothing measured{within} meets {percent(tolerance)}; the most accurate comes to {percent(chosen.error)}{known}"
+    return Choice(chosen, False, [], sentence)
 
 
 def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=None):
@@ -184,7 +189,9 @@ def ladders(setups):
 
 def _measured(setup, result, machine):
     spread = None if result["spread"] is None else tuple(result["spread"])
-    return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine)
+    # Of explicit alone a finer step may be taken where one is refused.
+    final = result["status"] == "slow" or (result["status"] == "refused" and setup.solver != "explicit")
+    return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final)
 
 
 def as_json(choice, found, exact):
@@ -197,12 +204,10 @@ def as_json(choice, found, exact):
 
 
 def _ends(last, tolerance, floor, most):
-    """Whether rungs above this one cannot be chosen; of one that was too slow they are slower."""
-    if last.error is None and last.milliseconds is None:
-        return False  # diverged or refused: a finer one may do
-    if last.milliseconds is not None and last.milliseconds > most:
+    """Whether rungs above this one cannot be chosen."""
+    if last.final or (last.milliseconds is not None and last.milliseconds > most):
         return True
-    return _meets(last, tolerance, floor)
+    return _meets(last, tolerance, floor)  # of one that diverged a finer one may do
 
 
 def _meets(each, tolerance, floor):
@@ -218,12 +223,17 @@ def _as_cheap(chosen, accurate):
 
 
 def _certainty(chosen, rivals, tolerance, floor):
-    margin = f"its error of {chosen.error:.3%} is {tolerance / max(chosen.error, 1e-30):.2g} times below the tolerance"
-    known = f", known to {floor:.2%}" if floor else ""
+    margin = f"its error of {percent(chosen.error)} is {tolerance / max(chosen.error, 1e-30):.3g} times below the tolerance"
+    known = f", known to {percent(floor)}" if floor else ""
     if not rivals:
         return f"{margin}{known}; nothing else that meets it is as cheap"
     names = ", ".join(f"{each.setup} ({each.milliseconds:.3g} ms)" for each in rivals[:3])
     return f"{margin}{known}; within the spread of the times as cheap: {names}"
+
+
+def percent(share):
+    """A share of the whole as text, with three digits however small it is."""
+    return f"{100.0 * share:.3g}%"
 
 
 def _least(known):

@@ -14,6 +14,7 @@ def advise_on(arguments, source, values, scene, device):
 
     tolerance = 0.01 if arguments.tolerance is None else scene_files.share("tolerance", arguments.tolerance)
     solver = solver_setup(arguments, scene, device).checked
+    resolutions = _resolutions(source, values, len(scene.mesh.points))
     progress = Progress(None, first="trying")
     try:
         found = advise(
@@ -21,7 +22,7 @@ def advise_on(arguments, source, values, scene, device):
             solver,
             tolerance,
             arguments.frames,
-            resolutions=_resolutions(source, values, len(scene.mesh.points)),
+            resolutions=resolutions,
             device=device,
             dtype=arguments.dtype,
             progress=progress,
@@ -38,7 +39,12 @@ def advise_on(arguments, source, values, scene, device):
         "milliseconds": list(found.milliseconds),
         "steady": found.steady,
         "trials": [asdict(trial) for trial in found.trials],
-        "advice": found.sentences,
+        "advice": found.sentences
+        + (
+            []
+            if resolutions
+            else ["resolution is not tried: no whole number among the parameters of the scene sets its vertices"]
+        ),
     }
     print(as_json(facts) if arguments.json else _text(facts))
     return 0
@@ -62,15 +68,13 @@ _VERDICTS = {True: "matters", False: "does not matter"}
 
 def _text(facts):
     first, last = facts["milliseconds"]
-    times = f"{first:.3g} ms" if facts["steady"] else f"{first:.3g} and {last:.3g} ms, too unlike to compare costs"
-    lines = [
-        f"{facts['scene']}: {facts['frames']} frames with {facts['solver']}, {times} each; tolerance {facts['tolerance']:.3g}"
-    ]
+    times = f"{first:.3g} ms each" if facts["steady"] else f"{first:.3g} and {last:.3g} ms each, too unlike to compare costs"
+    lines = [f"{facts['scene']}: {facts['frames']} frames with {facts['solver']}, {times}; tolerance {facts['tolerance']:.3g}"]
     width = max(len(trial["name"]) for trial in facts["trials"])
     for trial in facts["trials"]:
         name, change = trial["name"].ljust(width), f"{trial['change']:9.3%}"
         if trial["matters"] is None:
-            lines.append(f"  {name}  not run: {trial['reason']}")
+            lines.append(f"  {name}  no result: {trial['reason']}")
         else:
             why = f": {trial['reason']}" if trial["reason"] else ""
             lines.append(f"  {name}  {change} change  {trial['cost']:5.2f} of the time  {_VERDICTS[trial['matters']]}{why}")

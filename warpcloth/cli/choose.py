@@ -52,7 +52,7 @@ def chosen(arguments, device):
     try:
         with executing(arguments) as executor:
             choice, found, exact = choose(
-                SceneRef(arguments.scene, values),
+                SceneRef(arguments.scene, scene_files.assignments(arguments.p)),
                 tolerance,
                 budget,
                 arguments.solvers,
@@ -91,11 +91,16 @@ def command_line(arguments, values, setup):
     given = [f"{name}={value}" for name, value in values.items() if name in scene_files.assignments(arguments.p)]
     words += ["-p", *given] if given else []
     words += ["--solver", setup.solver, "-s", *(f"{name}={value}" for name, value in setup.options.items())]
+    words += [] if arguments.frames is None else ["--frames", str(arguments.frames)]
+    words += [] if arguments.device == "cpu" else ["--device", arguments.device]
     return shlex.join([*words, "--dtype", arguments.dtype, "-o", "out.usdc"])
 
 
 def _text(facts, choice, found, exact):
-    lines = [f"{facts['scene']}: {len(found)} settings measured; the reference is known to {exact.error:.2%}"]
+    from ..chart.choose import percent
+
+    measured = f"{facts['scene']}: {len(found)} settings measured over {len(exact.points) - 1} frames"
+    lines = [f"{measured}; the reference is known to {percent(exact.error)}"]
     width = max(len(str(each.setup)) for each in found)
     for each in sorted(found, key=lambda each: (each.milliseconds is None, each.milliseconds or 0.0)):
         name = str(each.setup).ljust(width)
@@ -103,7 +108,8 @@ def _text(facts, choice, found, exact):
             lines.append(f"  {name}  {each.reason or 'no error'}")
         else:
             lines.append(
-                f"  {name}  {each.milliseconds:9.3g} ms  {each.error:8.3%}{'  chosen' if each is choice.chosen else ''}"
+                f"  {name}  {each.milliseconds:9.3g} ms  {percent(each.error):>9}"
+                + ("  chosen" if each is choice.chosen else "")
             )
     lines += [f"  measured on {name}" for name in dict.fromkeys(each.machine for each in found)]
     lines.append(choice.certainty)
