@@ -184,6 +184,15 @@ def test_forward_euler_diverges_at_any_step(device):
         assert cell["rules"]["forward Euler"] == pytest.approx(steps / needed, rel=1e-3)
 
 
+def test_rounding_is_not_divergence(device):
+    """In float32 a net at rest gains some eighty times the energy of its noise, by a walk; above the limit it diverges."""
+    limit, _ = step_limits(net("shear", 12).load().build(dtype="float64"))
+    for part, verdict in ((0.7, "stable"), (1.01, "diverged")):
+        given = {"device": device, "dtype": "float32", "reference": False}
+        ((cell,),) = measure(asdict(net("shear", 12)), [asdict(Setup("explicit"))], {}, "dt", [part * limit], 4000, **given)
+        assert cell["verdict"] == verdict and (verdict == "diverged" or cell["growth"] < 1.0)
+
+
 def test_rules_of_one_spring():
     """h² = m/(k(L/l − 1)) of one compressed spring with a fixed end; Σk h²/m; rings of a chain."""
     ref = SceneRef("chain", {"links": 1, "stiffness": 100.0, "mass": 0.01})

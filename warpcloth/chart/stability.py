@@ -31,7 +31,8 @@ class Trial:
     Attributes:
         points: (frames+1, B, n, 3) [m].
         good: The last good frame of each copy (B,).
-        growth: Largest energy of motion in a good frame, over what the start, gravity and time can have given to it (B,).
+        growth: Largest energy of motion in a good frame, over what the start, gravity, time and rounding can have given to it
+            (B,).
         reasons: A sentence for each copy, "" if nothing is to be said.
         results: :class:`warpcloth.status.Result` of each copy.
     """
@@ -59,7 +60,10 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of steps too large, which are the subject
         stepper = record.bind(model)
-    watch, frames, B = Watch(model, stepper.h, slowest=0.0), scene.frames, copies
+    frames, B = scene.frames, copies
+    # What rounding of places gives to a velocity in a step of ωh = 2, ω²h ε l, adds up as a walk does.
+    rounding = 4.0 / stepper.h * np.finfo(model.numpy_dtype).eps * math.sqrt(frames * stepper.steps_per_frame)
+    watch = Watch(model, stepper.h, slowest=rounding)
     points = np.full((frames + 1, B, model.per_copy, 3), np.nan)
     points[0] = model.positions.numpy().reshape(B, -1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
