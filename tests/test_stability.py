@@ -139,6 +139,7 @@ def test_limits_of_gauss_seidel_with_compliance(solver, iterations, accuracy, de
     assert found == pytest.approx(limit, rel=accuracy)
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_spring_between_two_pins_limits_nothing():
     scene = replace(net("shear", 6, "inf").load(), pins="z == 0")
     setup = record_at(Setup("pbd", {"sweep": "jacobi"}), {"iterations": 4})
