@@ -157,17 +157,33 @@ def _moves(scene, size):
 
 
 def _cylinder(settle, bending, pattern, angle, resolution):
-    """Energy of those triangles that have all their hinges, with half of each hinge's; κ = 1/m."""
+    """Rolled up by κ = 1/m."""
     mesh = strip(pattern, angle, 1.0 / resolution).mesh
-    shares, area = inner_shares(mesh)
-    x, _, z = mesh.points.T
-    rolled = np.stack([np.sin(x), np.cos(x) - 1.0, z], axis=1)
-    scene = Scene(mesh, density=1.0, positions=rolled, terms=[bending(stiffness=D * shares)])
-    model = scene.build(**settle.options)
-    energy = wp.zeros(1, dtype=wp.float64, device=model.device)
-    Energy(model, Sums(model)).add(model.positions, energy)
-    stiffness = float(energy.numpy()[0]) / (0.5 * D * float(area))
+    stiffness = bending_density(bending, mesh, rolled_up(mesh.points, 1.0), **settle.options)
     return {"error": abs(stiffness - 1.0), "stiffness": stiffness, "elements": len(mesh.triangles), "h": 1.0 / resolution}
+
+
+def rolled_up(points, curvature):
+    """Points (n, 3) of the plane y = 0, rolled to a cylinder along x of that curvature [1/m], or flat."""
+    x, _, z = points.T
+    # sin(κx)/κ and (1 − cos κx)/κ, which sinc knows at 0 too.
+    half = np.sinc(curvature * x / (2.0 * np.pi))
+    return np.stack([x * np.sinc(curvature * x / np.pi), -0.5 * curvature * (x * half) ** 2, z], axis=1)
+
+
+def bending_density(bending, mesh, positions, **options):
+    """Energy over ½D an area [1/m²] of a mesh moved there: of triangles that have all their hinges, with half of each."""
+    shares, area = inner_shares(mesh)
+    scene = Scene(mesh, density=1.0, positions=positions, terms=[bending(stiffness=D * shares)])
+    return float(energies(scene, **options)[0].sum() / (0.5 * D * area))
+
+
+def energies(scene, **options):
+    """Energy [J] of each element of each term where the scene starts, a list of arrays."""
+    model = scene.build(**options)
+    energy = Energy(model, Sums(model))
+    energy.add(model.positions, wp.zeros(1, dtype=wp.float64, device=model.device))
+    return [values.numpy() for values in energy.of_elements]
 
 
 def _cantilever(settle, bending, net, gamma, stretching, width):

@@ -12,7 +12,7 @@ from . import stability
 from .run import named_scene
 from .terminal import Interrupted, add_dask, as_json, check_writable, executing, find_device, open_bar
 
-TEXT = "Chart speed against accuracy."
+TEXT = "Chart speed against accuracy, stability and failures."
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
 
 EPILOG = """\
@@ -30,12 +30,22 @@ interruption the same command goes on. Times are those of processes side by side
   warpcloth chart work-precision hanging -p n=16 --solvers newton xpbd -o chart.png --csv chart.csv
 """
 
+FAILURE_EPILOG = """\
+locking: irregular nets strain, wrinkle or stay flat. isometry: quadratic bending of what stretches or is curved at rest.
+slivers: gradient and explicit step of thin triangles, and hinges folded flat. cotangents: negative weights, and what
+deformation makes of them. rank: rotations of points in a plane, on a line, in one place. Points are measured by the terms,
+solvers and fits themselves, lines are closed forms; what is measured is kept, as of work-precision.
+
+  warpcloth chart failure slivers -o slivers.png --csv slivers.csv
+"""
+
 
 def add_arguments(parser):
     """Adds the commands of all charts."""
     parser.set_defaults(command=lambda arguments: parser.print_help(sys.stderr) or 2, debug=False)
     charts = parser.add_subparsers(title="charts", metavar="CHART")
     _add_work_precision(charts)
+    _add_failure(charts)
     form = argparse.RawDescriptionHelpFormatter
     text = "Map where methods are stable, inaccurate or diverge."
     maps = charts.add_parser(
@@ -51,8 +61,6 @@ def add(charts, name, command, text, epilog):
     form = argparse.RawDescriptionHelpFormatter
     sub = charts.add_parser(name, help=text, description=text, epilog=epilog, allow_abbrev=False, formatter_class=form)
     sub.set_defaults(command=command)
-    sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
     sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
     sub.add_argument("--workers", type=int, metavar="N", help="processes side by side: by default the cores, on a GPU one")
     add_dask(sub)
@@ -68,6 +76,8 @@ def _add_work_precision(charts):
     from ..solvers import SOLVERS
 
     sub = add(charts, "work-precision", work_precision, "Error over time, of settings of all solvers.", EPILOG)
+    sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
+    sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
     sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="time where not given")
     sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=SOLVERS, help="those alone")
     sub.add_argument("--frames", type=int, metavar="N", help="to run, by default half; before a step, by default a third")
@@ -75,14 +85,61 @@ def _add_work_precision(charts):
     sub.add_argument("--limit", type=float, default=20.0, metavar="SECONDS", help="that a setting may take (20)")
 
 
+def _add_failure(charts):
+    from ..chart.failures import FAILURES
+
+    sub = add(charts, "failure", failure, "Chart where terms, weights and fits fail, beside theory.", FAILURE_EPILOG)
+    sub.add_argument("failure", metavar="FAILURE", choices=FAILURES, help=", ".join(FAILURES))
+
+
+def failure(arguments):
+    from ..chart.failures import failure_chart, plot_failure, write_csv
+
+    _check_outputs(arguments)
+    device = find_device(arguments.device)
+    progress = Settings()
+    try:
+        found = failure_chart(
+            arguments.failure,
+            device=str(device),
+            workers=arguments.workers or (1 if device.is_cuda else None),
+            progress=progress,
+        )
+    except KeyboardInterrupt:
+        raise Interrupted(progress.interrupted()) from None
+    finally:
+        progress.close()
+    if arguments.output:
+        plot_failure(arguments.output, found)
+    if arguments.csv:
+        write_csv(arguments.csv, found)
+    print(as_json(found) if arguments.json else _failure_summary(found))
+    return 0
+
+
+def _failure_summary(found):
+    """Of each panel how many points there are, how far those with a law are from it at most, and what has no value."""
+    lines = [found["title"], f"  device        {found['machine']['device']}"]
+    for key, panel in found["panels"].items():
+        points = [row for row in found["rows"] if row["panel"] == key]
+        followed = [row for row in points if row["expected"] is not None and row["value"] is not None]
+        size = max((abs(row["expected"]) for row in followed), default=0.0)
+        # Relative, but where a law is 0, if for rounding, to the most that it is.
+        scales = [each if each > 1e-9 * size else size or 1.0 for each in (abs(row["expected"]) for row in followed)]
+        apart = [abs(row["value"] - row["expected"]) / scale for row, scale in zip(followed, scales, strict=True)]
+        met = f", {len(followed)} of them off their law by {max(apart):.1e} at most" if followed else ""
+        lines.append(f"  {key:<13} {len(points)} points{met}: {panel['title']}")
+    lines += [f"  no value      {row['series']}, {row['x']:.3g}: {row['reason']}" for row in found["rows"] if row["reason"]]
+    return "\n".join(lines)
+
+
 def work_precision(arguments):
     from ..chart.tasks import SceneRef
     from ..chart.work_precision import write_csv
 
-    for name in ("frames", "workers"):
-        if getattr(arguments, name) is not None:
-            whole(name, getattr(arguments, name), least=1)
-    _check_outputs(arguments)
+    if arguments.frames is not None:
+        whole("frames", arguments.frames, least=1)
+    _check_outputs(arguments, [arguments.scene])
     device = find_device(arguments.device)
     _source, values, _scene = named_scene(arguments)
     given = {name: values[name] for name in assignments(arguments.p)}
@@ -145,9 +202,11 @@ def _physics_lines(found):
     return [f"  error         {100.0 * row['error']:.3g} %, {row['ms'] or 0.0:.3g} ms: {row['label']}" for row in known]
 
 
-def _check_outputs(arguments):
-    """Finds out before minutes of measurements that a result cannot be written."""
-    check_apart([arguments.output, arguments.csv], [arguments.scene])
+def _check_outputs(arguments, inputs=()):
+    """Finds out before minutes of measurements that a result cannot be written, and that no process would measure."""
+    if arguments.workers is not None:
+        whole("workers", arguments.workers, least=1)
+    check_apart([arguments.output, arguments.csv], inputs)
     if arguments.output:
         check_path(arguments.output, PICTURES)
     if arguments.csv:

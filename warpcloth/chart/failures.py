@@ -1,0 +1,70 @@
+"""Where terms, weights and fits fail, each failure as measured points beside the laws that explain them.
+
+A chart is a module with a `TITLE`, `PANELS`, what is drawn, and `tasks`, what measures it: each task returns points,
+dictionaries with ``panel``, ``series``, ``x``, ``value`` (None where there is none) and ``reason``.
+"""
+
+import csv
+
+from ..checks import choice
+from ..outputs import TEXT, Output
+from . import cotangents, isometry, locking, rank, slivers
+from .machine import machine
+from .panels import plot_panels
+from .sweep import Store, cache_folder, sweep
+
+FAILURES = {"locking": locking, "isometry": isometry, "slivers": slivers, "cotangents": cotangents, "rank": rank}
+COLUMNS = ("panel", "series", "x", "value", "law", "expected", "reason")
+
+
+def failure_chart(name, device="cpu", **run):
+    """Measures what a failure does.
+
+    Args:
+        name: One of `FAILURES`.
+        device: A Warp device.
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+
+    Returns:
+        dict: JSON values; in ``rows`` the points, with the ``law`` that a series follows and what that ``expected``.
+
+    Raises:
+        ValueError: There is no such failure.
+    """
+    choice("failure", name, tuple(FAILURES))
+    tasks = FAILURES[name].tasks(str(device))
+    run = {"store": Store(cache_folder() / "failures.jsonl"), **run}
+    results = {task.key: points for task, points in sweep(tasks, **run)}
+    panels = {panel.key: panel for panel in FAILURES[name].PANELS}
+    rows = []
+    for point in (point for task in tasks for point in results[task.key]):
+        panel = panels[point["panel"]]
+        law = panel.follows.get(point["series"])
+        expected = float(panel.laws[law](point["x"])) if law else None
+        rows.append({**point, "law": law, "expected": expected})
+    facts = {"failure": name, "title": FAILURES[name].TITLE, "device": str(device), "seed": 0, "machine": machine(device)}
+    shown = {key: {"title": panel.title, "x": panel.x, "y": panel.y} for key, panel in panels.items()}
+    return {**facts, "panels": shown, "rows": rows}
+
+
+def plot_failure(path, found):
+    """Draws what :func:`failure_chart` returned.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    plot_panels(path, FAILURES[found["failure"]].PANELS, found["rows"], found["title"])
+
+
+def write_csv(path, found):
+    """Writes a line for each point.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+    """
+    with Output(path, "x", **TEXT) as output:
+        table = csv.DictWriter(output.file, COLUMNS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(found["rows"])

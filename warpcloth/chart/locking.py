@@ -1,0 +1,209 @@
+"""Locking: a net that cannot bend without straining bends too little, the more the stiffer its membrane is.
+
+Chords of a cylinder are shorter than its arcs by κ²h²/24, and what that costs passes the bending energy ½Dκ² an area where
+κ²h⁴K = 576D. A regular net of three lengths of edge gives way to it at no cost and keeps its curvature; an irregular net
+keeps some of the strain, or loses curvature to wrinkles. Springs k of all edges are a membrane of K = 2k/√3 on an equilateral
+net, and are taken for one on others.
+
+Apart from it each net has its own bending stiffness, the error of its pattern, which no refinement cures; that is what a
+cantilever shows while its membrane is soft. Divided by it, what is left is locking, and falls with h⁴. Regular nets lock there
+too, though less: their curvature varies, and their sides curl.
+
+Springs alone end in no shape: what is left has no stiffness, and slides on along its wrinkles.
+"""
+
+import numpy as np
+
+from ..equilibrium import SETTLED, equilibrium
+from ..kernels.terms.dihedral_bending import rest_state
+from ..mesh import Mesh
+from ..scene import Scene
+from ..simulate import simulate
+from ..solvers import Newton
+from ..terms import DihedralBending, Spring
+from . import physics
+from .panels import Panel, point
+from .physics import D, energies, rolled_up
+from .strips import strip
+from .tasks import task
+
+TITLE = "9. Locking: irregular nets strain, wrinkle or stay flat where regular ones bend"
+# Patterns and the angle by which they are turned [°]: "alternating" cannot bend along its diagonals without strain.
+NETS = {"equilateral": 0.0, "jittered": 0.0, "alternating": 45.0}
+CURVATURE = 1.0  # [1/m]
+GAMMA = 1.0
+# Elements along a sheet that is at rest when rolled up.
+_RELAXED = (("equilateral", 8), ("jittered", 8), ("jittered", 16), ("alternating", 8))
+# Patterns and angles [°] of nets of springs that are let go.
+_LET_GO = (("equilateral", 0.0), ("jittered", 0.0), ("jittered", 20.0), ("jittered", 40.0))
+# KL²/D of membranes so soft that nothing locks, where a cantilever shows the pattern by itself, and of a stiff one.
+SOFT, STIFF = 1e4, 1e8
+_DECADES = {8: range(4, 11), 16: range(4, 10)}
+_CANTILEVERS = [(pattern, n) for pattern in ("equilateral", "jittered") for n in (6, 8, 12, 16, 24)] + [("alternating", 8)]
+_ONSET = "costs as much as bending"
+_LAW, _KEPT, _FREE = "κ²h⁴K/576D", "nothing lost", "no locking"
+
+
+def ratio(curvature, h, K):
+    """κ²h⁴K/576D, where K is over D [1/m²]."""
+    return curvature**2 * h**4 * K / 576.0
+
+
+PANELS = (
+    Panel(
+        "cost",
+        "Strain of a cylinder, and of sheets at rest when rolled up",
+        "κ²h⁴K/576D",
+        "membrane energy over ½Dκ² an area",
+        ("log", "log"),
+        laws={_LAW: lambda x: x},
+        follows={"threads round it, imposed": _LAW},
+        marks={1.0: _ONSET},
+        limits=(1e-12, 1e3),
+    ),
+    Panel(
+        "kept",
+        "Curvature that a sheet keeps which is at rest when rolled up",
+        "κ²h⁴K/576D",
+        "part of the curvature kept",
+        ("log", "linear"),
+        laws={_KEPT: lambda x: 1.0},
+        follows={"equilateral, h = 1/8 m": _KEPT},
+        marks={1.0: _ONSET},
+        limits=(0.0, 1.1),
+    ),
+    Panel(
+        "time",
+        "Springs alone, rolled up and let go: what wrinkles slides on",
+        "time [s]",
+        "part of the curvature kept",
+        ("log", "linear"),
+        laws={_KEPT: lambda t: 1.0},
+        follows={"equilateral": _KEPT},
+        limits=(0.0, 1.1),
+    ),
+    Panel(
+        "apparent",
+        f"A wide cantilever, Γ = {GAMMA:g}, h = L/8: pattern and locking",
+        "KL²/D",
+        "apparent bending stiffness over D",
+        ("log", "log"),
+        laws={"D": lambda x: 1.0},
+    ),
+    Panel(
+        "locking",
+        "The same over that with a soft membrane: locking alone",
+        "κ²h⁴K/576D with κ = Γ/2L, that of the clamp",
+        "apparent over unlocked stiffness",
+        ("log", "log"),
+        laws={_FREE: lambda x: 1.0},
+        marks={1.0: _ONSET},
+    ),
+    Panel(
+        "refined",
+        "Refinement cures locking, and not the pattern",
+        "h/L",
+        "apparent bending stiffness over D",
+        ("log", "log"),
+        laws={"D": lambda x: 1.0},
+    ),
+)
+
+
+def tasks(device):
+    """One for each net and resolution."""
+    found = [task(imposed, device=device)]
+    found += [task(relaxed, pattern=pattern, elements=n, device=device) for pattern, n in _RELAXED]
+    found += [task(let_go, pattern=pattern, degrees=turn, device=device) for pattern, turn in _LET_GO]
+    return found + [task(cantilever, pattern=pattern, elements=n, device=device) for pattern, n in _CANTILEVERS]
+
+
+def imposed(device):
+    """Threads of a square grid that run round a cylinder, K = k, for κ, h and K of all sizes."""
+    found = []
+    for n in (9, 17, 33):
+        mesh = Mesh.grid(n, n, pattern="alternating")
+        columns = mesh.points[:, 0].argsort(kind="stable").reshape(n, n)
+        round_it = np.stack([columns[:-1].ravel(), columns[1:].ravel()], axis=1)
+        h = 1.0 / (n - 1)
+        for curvature in (0.25, 1.0):
+            for K in (1e4, 1e6, 1e8):
+                terms = [Spring(pairs=round_it, stiffness=K * D)]
+                rolled = rolled_up(mesh.points, curvature)
+                scene = Scene(mesh, density=1.0, positions=rolled, terms=terms)
+                (energy,) = energies(scene, device=device, dtype="float64")
+                cost = energy.mean() / h**2 / (0.5 * D * curvature**2)
+                found.append(point("cost", "threads round it, imposed", ratio(curvature, h, K), cost))
+    return found
+
+
+def relaxed(pattern, elements, device):
+    """A sheet whose hinges are at rest on the cylinder and whose springs are in the plane, at rest between the two."""
+    h = 1.0 / elements
+    flat = strip(pattern, np.radians(NETS[pattern]), h).mesh
+    rolled = Mesh(rolled_up(flat.points, CURVATURE), flat.triangles)
+    area = flat.triangle_areas.sum()
+    series, found = f"{pattern}, h = 1/{elements} m", []
+    for K in np.geomspace(1e3, 1e10, 15):
+        terms = [
+            Spring(stiffness=np.sqrt(0.75) * K * D, rest_lengths=flat.edge_lengths),
+            DihedralBending(stiffness=D),
+        ]
+        scene = Scene(rolled, density=D, terms=terms, gravity=(0.0, 0.0, 0.0))
+        rest, x = equilibrium(scene, device=device), ratio(CURVATURE, h, K)
+        if rest.status.result not in SETTLED:
+            found += [point(panel, series, x, None, rest.status.message) for panel in ("cost", "kept")]
+            continue
+        settled = Scene(rolled, density=D, positions=rest.points, terms=terms)
+        strained = energies(settled, device=device, dtype="float64")[0].sum()
+        found.append(point("cost", series, x, strained / (0.5 * D * CURVATURE**2 * area)))
+        found.append(point("kept", series, x, kept(flat, rolled.points, rest.points)))
+    return found
+
+
+def kept(mesh, imposed, points):
+    """Part of the angles of its hinges on an imposed shape that a mesh has, weighted by what they cost."""
+    before, weights = rest_state(imposed, mesh.hinges).T
+    after = rest_state(points, mesh.hinges)[:, 0]
+    return float((weights * after) @ before / (weights * before @ before))
+
+
+def let_go(pattern, degrees, device):
+    """Springs alone, rolled up and let go for 20 s, by implicit Euler of 1/60 s, which brakes all but what costs nothing."""
+    flat = strip(pattern, np.radians(degrees), 0.1).mesh
+    start = rolled_up(flat.points, CURVATURE)
+    terms = [Spring(stiffness=1e3)]
+    scene = Scene(flat, density=0.1, positions=start, terms=terms, gravity=(0.0, 0.0, 0.0), duration=20.0)
+    solver = Newton(substeps=1, tolerance=1e-8, linear="factorised")
+    run = simulate(scene, solver, device=device, dtype="float64")
+    series = pattern if pattern == "equilateral" else f"{pattern}, turned by {degrees:g}°"
+    frames = np.unique(np.geomspace(1, len(run.points) - 1, 25).astype(int))
+    return [point("time", series, run.times[frame], kept(flat, start, run.points[frame])) for frame in frames]
+
+
+def cantilever(pattern, elements, device):
+    """Apparent stiffness of a cantilever by the stiffness of its membrane, as it is and over that with a soft one."""
+    angle, found, unlocked = np.radians(NETS[pattern]), [], None
+    for stretching in [10.0**e for e in _DECADES[elements]] if elements in _DECADES else (SOFT, STIFF):
+        rest = physics.measure("cantilever", elements, "dihedral", pattern, angle, GAMMA, device, stretching=stretching)
+        stiffness, h, reason = rest["stiffness"], rest["h"], rest["reason"]
+        if stiffness is None and not reason:
+            reason = "beyond 20 times D"
+        if stretching == SOFT:
+            unlocked = stiffness
+        if elements == min(_DECADES):
+            found.append(point("apparent", pattern, stretching, stiffness, reason))
+        if elements in _DECADES:
+            alone = stiffness / unlocked if stiffness and unlocked else None
+            series, at = f"{pattern}, h = L/{elements}", ratio(0.5 * GAMMA, h, stretching)
+            found.append(point("locking", series, at, alone, reason))
+        if pattern != "alternating" and stretching in (SOFT, STIFF):
+            found.append(point("refined", f"{pattern}, KL²/D = 1e{np.log10(stretching):.0f}", h, stiffness, reason))
+    if elements == min(_DECADES):
+        # An upper bound: a sheet at rest finds a softer shape.
+        rolled = physics.measure("cylinder", elements, "dihedral", pattern, angle, device=device)["stiffness"]
+        found += [
+            point("apparent", f"{pattern}, rolled up, without membrane", 10.0**end, rolled)
+            for end in (_DECADES[elements][0], _DECADES[elements][-1])
+        ]
+    return found

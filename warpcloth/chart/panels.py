@@ -1,0 +1,122 @@
+"""Panels of measured points with laws as lines, of one shape for all charts of failures."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .figures import GREY, PICTURES, check_path, save
+
+_MARKS = "os^DvPX*"
+_COLOURS = ("black", "tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purple", "tab:cyan", "tab:brown")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What one panel shows.
+
+    Attributes:
+        key: Its name in tables.
+        title: A sentence that says what fails.
+        x: Label of the axis, with its unit.
+        y: The same of the other axis.
+        scales: Of x and of y, "linear" or "log".
+        laws: Functions of x by the label of their line.
+        follows: The law of a series, by label; not all have one.
+        marks: Labels of vertical lines by their x.
+        limits: Ends of y, None to fit.
+    """
+
+    key: str
+    title: str
+    x: str
+    y: str
+    scales: tuple[str, str] = ("linear", "linear")
+    laws: dict[str, Callable] = field(default_factory=dict)
+    follows: dict[str, str] = field(default_factory=dict)
+    marks: dict[float, str] = field(default_factory=dict)
+    limits: tuple[float, float] | None = None
+
+
+def point(panel, series, x, value, reason=""):
+    """A measured point as JSON; ``value`` None where there is none, and then the reason."""
+    return {
+        "panel": panel,
+        "series": series,
+        "x": float(x),
+        "value": None if value is None else float(value),
+        "reason": reason,
+    }
+
+
+def plot_panels(path, panels, rows, title):
+    """Draws points as markers and laws as lines.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        panels: :class:`Panel` records.
+        rows: Points, see :func:`point`.
+        title: Of the whole.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    check_path(path, PICTURES)
+    from matplotlib.figure import Figure
+
+    across = 2 if len(panels) == 4 else min(len(panels), 3)
+    down = math.ceil(len(panels) / across)
+    figure = Figure(figsize=(5.0 * across, 4.1 * down + 0.3), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
+    places = figure.subplots(down, across, squeeze=False).ravel()
+    for axes, panel in zip(places, panels, strict=False):
+        _draw(axes, panel, [row for row in rows if row["panel"] == panel.key])
+    for axes in places[len(panels) :]:
+        axes.remove()
+    figure.suptitle(title, fontsize=10, color=GREY)
+    save(figure, path)
+
+
+def _draw(axes, panel, rows):
+    axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
+    series = {}
+    for row in rows:
+        series.setdefault(row["series"], []).append(row)
+    for k, (label, points) in enumerate(series.items()):
+        known = sorted((row["x"], row["value"]) for row in points if row["value"] is not None)
+        style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKS[k % len(_MARKS)], "markersize": 4.5}
+        # Where a law is the line, points are left by themselves.
+        width = 0.0 if label in panel.follows else 0.8
+        axes.plot(*np.array(known).reshape(-1, 2).T, label=label, linewidth=width, fillstyle="none", **style)
+    at = [row["x"] for row in rows]
+    for (label, law), dashes in zip(panel.laws.items(), ("-", "--", "-.", ":"), strict=False):
+        x = _between(min(at), max(at), panel.scales[0])
+        axes.plot(x, [law(value) for value in x], dashes, color="0.55", linewidth=1.2, zorder=0, label=label)
+    for x, label in panel.marks.items():
+        axes.axvline(x, color="0.7", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
+        style = {"ha": "center", "va": "center", "rotation": 90, "fontsize": 7, "color": GREY}
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+        axes.annotate(label, (x, 0.7), xycoords=("data", "axes fraction"), bbox=box, zorder=1, **style)
+    if panel.limits:
+        axes.set_ylim(panel.limits)
+    axes.set_title(panel.title, fontsize=9, loc="left", color=GREY)
+    axes.set_xlabel(panel.x, color=GREY, fontsize=9)
+    axes.set_ylabel(panel.y, color=GREY, fontsize=9)
+    for axis, scale in zip((axes.xaxis, axes.yaxis), panel.scales, strict=True):
+        low, high = axis.get_view_interval()
+        if scale == "log" and high < 100.0 * low:  # its numbers, as there may be no power of ten
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("{x:g}")
+    axes.tick_params(which="both", colors=GREY, labelsize=8)
+    axes.grid(True, which="major", linewidth=0.3, color="0.85")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("0.7")
+    axes.legend(fontsize=7, labelcolor=GREY, framealpha=0.85, edgecolor="none")
+
+
+def _between(low, high, scale):
+    """Places of a line, at equal distances on the axis."""
+    return np.geomspace(low, high, 400) if scale == "log" else np.linspace(low, high, 721)
