@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shlex
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,12 +14,14 @@ import pytest
 import warpcloth as wc
 from warpcloth.chart import stability
 from warpcloth.chart.axes import AXES, FIXED, applied, record_at, scene_at, vary
+from warpcloth.chart.failures import FAILURES
 from warpcloth.chart.maps import _PLAIN, plot_maps, write_table
 from warpcloth.chart.rules import DIVERGES, KNOWN, concave_rate, largest_relaxation, rings, rules
 from warpcloth.chart.stability import Survey, boundary, measure
 from warpcloth.chart.sweep import Store, sweep
 from warpcloth.chart.tasks import SceneRef, Setup
-from warpcloth.cli import main
+from warpcloth.cli import _parser, main
+from warpcloth.cli.stability import _survey
 from warpcloth.solvers.explicit import step_limits
 
 DOCS = Path(__file__).parents[1] / "docs" / "stability.md"
@@ -328,8 +331,16 @@ def test_14_information_moves_a_ring_an_iteration(solver, device):
 
 
 def test_each_failure_is_in_a_chart():
+    """Each row names a command that parses, whose axes, methods and scene exist."""
     text = DOCS.read_text(encoding="utf-8")
-    assert re.findall(r"^\| (\d+) \|", text, re.MULTILINE) == [str(i) for i in range(1, 15)]
+    rows = re.findall(r"^\| (\d+) \| [^|]+ \| `([^`]+)`[^|]*\|$", text, re.MULTILINE)
+    assert [number for number, _ in rows] == [str(i) for i in range(1, 15)]
+    for _, command in rows:
+        given = _parser().parse_args(["chart", *shlex.split(command)])
+        if "failure" not in given:
+            survey = _survey(given)
+            assert survey.scene.load().frames and survey.tasks()
+    assert {given.split()[1] for _, given in rows if given.startswith("failure ")} == set(FAILURES)
 
 
 # --- What a map is made of.

@@ -45,12 +45,12 @@ _EQUAL, _CLAMPED, _LOST, _EXACT = "cot((α + β)/2)", "the same, negative ones 0
 PANELS = (
     Panel(
         "weight",
-        "Weight of an edge of two equal triangles",
+        f"Weight of an edge of two equal triangles; of 100° each {weight(200.0):.3f}".replace("-", "−"),
         "sum of the opposite angles α + β [°]",
         "weight",
         laws={_EQUAL: weight, _CLAMPED: lambda d: max(0.0, weight(d))},
         follows={"cotangent": _EQUAL, "clamped": _CLAMPED, "intrinsic Delaunay": _CLAMPED},
-        marks={180.0: "Delaunay", 200.0: f"100° each: {weight(200.0):.3f}".replace("-", "−")},
+        marks={180.0: "Delaunay"},
     ),
     Panel(
         "energy",

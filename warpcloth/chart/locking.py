@@ -34,6 +34,7 @@ CURVATURE = 1.0  # [1/m]
 GAMMA = 1.0
 # Elements along a sheet that is at rest when rolled up.
 _RELAXED = (("equilateral", 8), ("jittered", 8), ("jittered", 16), ("alternating", 8))
+_MODULI = np.geomspace(1e3, 1e10, 15).tolist()  # K/D [1/m²]
 # Patterns and angles [°] of nets of springs that are let go.
 _LET_GO = (("equilateral", 0.0), ("jittered", 0.0), ("jittered", 20.0), ("jittered", 40.0))
 # KL²/D of membranes so soft that nothing locks, where a cantilever shows the pattern by itself, and of a stiff one.
@@ -113,7 +114,7 @@ PANELS = (
 def tasks(device):
     """One for each net and resolution."""
     found = [task(imposed, device=device)]
-    found += [task(relaxed, pattern=pattern, elements=n, device=device) for pattern, n in _RELAXED]
+    found += [task(relaxed, pattern=pattern, elements=n, moduli=_MODULI, device=device) for pattern, n in _RELAXED]
     found += [task(let_go, pattern=pattern, degrees=turn, device=device) for pattern, turn in _LET_GO]
     return found + [task(cantilever, pattern=pattern, elements=n, device=device) for pattern, n in _CANTILEVERS]
 
@@ -137,14 +138,14 @@ def imposed(device):
     return found
 
 
-def relaxed(pattern, elements, device):
-    """A sheet whose hinges are at rest on the cylinder and whose springs are in the plane, at rest between the two."""
+def relaxed(pattern, elements, moduli, device):
+    """A sheet whose hinges are at rest on the cylinder and whose springs are in the plane, for K of these values over D."""
     h = 1.0 / elements
     flat = strip(pattern, np.radians(NETS[pattern]), h).mesh
     rolled = Mesh(rolled_up(flat.points, CURVATURE), flat.triangles)
     area = flat.triangle_areas.sum()
     series, found = f"{pattern}, h = 1/{elements} m", []
-    for K in np.geomspace(1e3, 1e10, 15):
+    for K in moduli:
         terms = [
             Spring(stiffness=np.sqrt(0.75) * K * D, rest_lengths=flat.edge_lengths),
             DihedralBending(stiffness=D),

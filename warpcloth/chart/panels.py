@@ -94,12 +94,12 @@ def _draw(axes, panel, rows):
     at = [row["x"] for row in rows]
     for (label, law), dashes in zip(panel.laws.items(), ("-", "--", "-.", ":"), strict=False):
         x = _between(min(at), max(at), panel.scales[0])
-        axes.plot(x, [law(value) for value in x], dashes, color="0.55", linewidth=1.2, zorder=0, label=label)
+        axes.plot(x, [law(value) for value in x], dashes, color="0.55", linewidth=1.2, zorder=1.5, label=label)
     for x, label in panel.marks.items():
         axes.axvline(x, color="0.7", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
         style = {"ha": "center", "va": "center", "rotation": 90, "fontsize": 7, "color": GREY}
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
-        axes.annotate(label, (x, 0.7), xycoords=("data", "axes fraction"), bbox=box, zorder=1, **style)
+        axes.annotate(label, (x, 0.4), xycoords=("data", "axes fraction"), bbox=box, zorder=1, **style)
     if panel.limits:
         axes.set_ylim(panel.limits)
     axes.set_title(panel.title, fontsize=9, loc="left", color=GREY)

@@ -65,7 +65,7 @@ def tasks(device):
 
 
 def sets(ratios, dtype, seed=0):
-    """P and Q = R P (c, n, 3) of that type, R (c, 3, 3) and the first axis of P (c, 3); P has singular values in these ratios."""
+    """P and Q = R P (c, n, 3) of that type, R (c, 3, 3) and the first axis of P (c, 3); P has singular values as given."""
     rng = np.random.default_rng(seed)
     centred = rng.normal(size=(_SETS, _POINTS, 3))
     axes, _ = np.linalg.qr(centred - centred.mean(axis=1, keepdims=True))

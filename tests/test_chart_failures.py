@@ -1,0 +1,301 @@
+"""Charts of failures: what is measured meets the closed forms, and fails where theory says so."""
+
+import csv
+import json
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from warpcloth.chart import cotangents, isometry, locking, rank
+from warpcloth.chart.failures import COLUMNS, FAILURES, failure_chart, plot_failure, write_csv
+from warpcloth.chart.panels import point
+from warpcloth.chart.sweep import Store
+from warpcloth.cli import main
+
+EPS = np.finfo(np.float64).eps
+
+
+def of(points, panel, series):
+    """x and value of a series, sorted by x."""
+    found = sorted((p["x"], p["value"]) for p in points if (p["panel"], p["series"]) == (panel, series))
+    assert found, series
+    return np.array(found).T
+
+
+# --- 9. Locking.
+
+
+def test_an_imposed_cylinder_costs_its_chords(device):
+    """K(κ²h²/24)²/2 over ½Dκ² is κ²h⁴K/576D: bent and fine or stiff and coarse are one; 1 where strain costs as much.
+
+    Chords are shorter by 1 − 2 sin(κh/2)/κh = κ²h²/24·(1 − κ²h²/80 + …).
+    """
+    x, cost = of(locking.imposed(device), "cost", "threads round it, imposed")
+    assert len(x) == 18 and x[0] < 1e-5 and x[-1] > 10.0
+    assert np.abs(cost / x - 1.0).max() < 2.0 * (locking.CURVATURE / 8) ** 2 / 80.0
+    assert ((cost > 1.0) == (x > 1.0)).all()
+
+
+def test_irregular_nets_lose_curvature_where_theory_says(device):
+    """Of a sheet at rest when rolled up: nothing is lost below κ²h⁴K/576D = 1e-2, and by regular nets nowhere.
+
+    There the strain is that of the shape, so that its cost goes as K; far above it is relieved.
+    """
+    moduli = [1e4, 1e5, 1e9, 1e10]
+    nets = {pattern: locking.relaxed(pattern, 8, moduli, device) for pattern in locking.NETS}
+    kept = {pattern: of(points, "kept", f"{pattern}, h = 1/8 m") for pattern, points in nets.items()}
+    cost = {pattern: of(points, "cost", f"{pattern}, h = 1/8 m") for pattern, points in nets.items()}
+    h = locking.CURVATURE / 8
+    assert np.abs(kept["equilateral"][1] - 1.0).max() < h**4 and cost["equilateral"][1].max() < 1e-6
+    for pattern, most in (("jittered", 0.95), ("alternating", 0.75)):
+        x, part = kept[pattern]
+        assert (np.abs(part[x < 1e-2] - 1.0) < 0.02).all() and (part[x > 100.0] < most).all() and part.min() > 0.5
+        soft, stiff = cost[pattern][1][x < 1e-2] / x[x < 1e-2], cost[pattern][1][x > 100.0]
+        assert np.ptp(soft) < 0.35 * soft.max() and (np.diff(stiff) < 0.0).all()
+
+
+def test_a_cantilever_locks_apart_from_its_pattern(device):
+    """Jittered nets are stiffer than D while the membrane is soft, which refinement leaves; locking falls with it."""
+    stiffness = {}
+    for pattern in ("equilateral", "jittered"):
+        for elements in (6, 12):
+            points = locking.cantilever(pattern, elements, device)
+            for name in ("1e4", "1e8"):
+                ((_, value),) = of(points, "refined", f"{pattern}, KL²/D = {name}").T
+                stiffness[pattern, elements, name] = value
+    for elements in (6, 12):
+        assert abs(stiffness["equilateral", elements, "1e4"] - 1.0) < 0.05 < 0.1 < stiffness["jittered", elements, "1e4"] - 1.0
+    for pattern in ("equilateral", "jittered"):
+        # Over the soft one: by κ²h⁴K/576D = 33 and 2.
+        coarse, fine = (stiffness[pattern, n, "1e8"] / stiffness[pattern, n, "1e4"] - 1.0 for n in (6, 12))
+        assert coarse > 0.5 and fine < coarse / 3.0
+    assert stiffness["jittered", 6, "1e8"] > 1.2 * stiffness["equilateral", 6, "1e8"]
+
+
+def test_locking_alone_is_over_the_same_net_with_a_soft_membrane(device):
+    points = locking.cantilever("alternating", 8, device)
+    x, value = of(points, "apparent", "alternating")
+    at, alone = of(points, "locking", "alternating, h = L/8")
+    assert x[0] == locking.SOFT and alone == pytest.approx(value / value[0], rel=1e-12)
+    # The free length is not quite 1.
+    assert at == pytest.approx(locking.ratio(0.5 * locking.GAMMA, 1 / 8, x), rel=0.5)
+    rolled = of(points, "apparent", "alternating, rolled up, without membrane")[1]
+    assert rolled == pytest.approx(1.5, rel=0.01) and value[0] < rolled[0]
+
+
+@pytest.mark.slow
+def test_what_has_no_stiffness_slides_on(device):
+    """Springs alone: three lengths of edge keep the curvature to (κh)², others lose more and more of it."""
+    h = locking.CURVATURE / 10
+    assert np.abs(of(locking.let_go("equilateral", 0.0, device), "time", "equilateral")[1] - 1.0).max() < h**2
+    for degrees in (0.0, 20.0, 40.0):
+        t, kept = of(locking.let_go("jittered", degrees, device), "time", f"jittered, turned by {degrees:g}°")
+        assert t[-1] == 20.0 and kept[-1] < 0.7 and kept[t < 0.2].min() > 0.9
+
+
+# --- 10. to 13., which are measured at once.
+
+
+@pytest.fixture(scope="module")
+def charts(device):
+    names = ("isometry", "slivers", "cotangents", "rank")
+    with ThreadPoolExecutor(1) as executor:
+        return {name: failure_chart(name, device, store=Store(), executor=executor) for name in names}
+
+
+def laws(found, panel):
+    """x, value and what the law expects, of all points of a panel that follow one, with their number."""
+    rows = [row for row in found["rows"] if row["panel"] == panel and row["law"] is not None]
+    return np.array([(row["x"], row["value"], row["expected"]) for row in rows]).T
+
+
+def test_quadratic_bending_holds_on_isometries_of_flat_sheets(charts):
+    """x → x + εx² costs ½D(2ε)², exact for quadratic functions; a rest curvature is not seen. Angles see what bends.
+
+    Rolled up a hinge of edge h turns by θ ≤ κh, and 2 sin(θ/2) is θ to θ²/24.
+    """
+    x, value, expected = laws(charts["isometry"], "stretch")
+    h = isometry._H
+    # Up to the rounding of y, eps|x|, against 2ε h².
+    assert np.abs(value - expected).max() < 64 * EPS / h**2 and value.max() == pytest.approx(0.5 * 0.6**2)
+    for panel in ("flat", "curved"):
+        x, value, expected = laws(charts["isometry"], panel)
+        curvature = np.maximum(np.abs(x), isometry.REST)
+        assert (np.abs(value - expected) < (curvature * h) ** 2 / 6.0 * curvature**2).all()
+    rows = charts["isometry"]["rows"]
+    at_rest = {
+        name: value for name in ("quadratic", "dihedral") for x, value in of(rows, "curved", name).T if x == isometry.REST
+    }
+    assert at_rest["quadratic"] == pytest.approx(0.5, rel=0.01) and abs(at_rest["dihedral"]) < EPS
+
+
+def test_slivers_are_stiff_without_bound_down_to_the_guard(charts):
+    """|∇θ| = 1/height, the same at any scale; 0 at 1e-6 of the longest side and below; the step goes as the height."""
+    for size in ("1 m", "1 mm"):
+        for dtype in ("float32", "float64"):
+            x, value = of(charts["slivers"]["rows"], "gradient", f"edge {size}, {dtype}")
+            alive = x > 1e-6
+            assert 0 < alive.sum() < len(x) and not value[~alive].any()
+            # The height itself is rounded, and a dozen numbers lie between.
+            assert np.abs(value[alive] * x[alive] - 1.0).max() < 16 * float(np.finfo(dtype).eps)
+    x, value, expected = laws(charts["slivers"], "step")
+    assert value == pytest.approx(expected, rel=1e-9)
+    # ω² = cD|∇θ|²/m, where |∇θ|² = (1 + ½)/h² and c = 2/√¾ of a hinge one of whose triangles is a sliver.
+    assert value[x < 1e-4] == pytest.approx(x[x < 1e-4] * 2.0 / np.sqrt(1.5 * 2.0 / np.sqrt(0.75)), rel=1e-3)
+
+
+def test_a_hinge_folded_flat_turns_round(charts):
+    """θ − θ̄ in (−π, π]: energy ½c(θ − θ̄)² and torque c(θ − θ̄), which jumps by 2π at θ̄ + π; quadratic 2c sin²(θ/2)."""
+    for panel in ("energy", "torque"):
+        _, value, expected = laws(charts["slivers"], panel)
+        assert len(value) == 108 and np.abs(value - expected).max() < 64 * EPS
+    for series, jump in (("dihedral, 0° at rest", 180.0), ("dihedral, 90° at rest", 270.0), ("quadratic", None)):
+        x, torque = of(charts["slivers"]["rows"], "torque", series)
+        steps = np.diff(torque)
+        assert (0.5 * (x[1:] + x[:-1]))[steps < -1.0].tolist() == ([jump] if jump else [])
+        if jump:
+            # Samples are 10° apart.
+            assert steps.min() == pytest.approx(np.radians(10.0) - 2.0 * np.pi, rel=1e-12)
+
+
+def test_cotangent_weights_are_negative_beyond_180_degrees(charts):
+    """cot((α + β)/2) of two equal triangles, −.176 of two apexes of 100°; clamped and intrinsic ones are 0 there."""
+    _, value, expected = laws(charts["cotangents"], "weight")
+    # cot changes by 1/sin² of half the sum, 1.7 at most, times the rounding of angles.
+    assert len(value) == 51 and np.abs(value - expected).max() < 64 * EPS
+    rows = charts["cotangents"]["rows"]
+    weights = {name: dict(of(rows, "weight", name).T) for name in ("cotangent", "clamped", "intrinsic Delaunay")}
+    assert weights["cotangent"][200.0] == pytest.approx(-0.17632698, rel=1e-7)
+    assert weights["clamped"][200.0] == weights["intrinsic Delaunay"][200.0] == 0.0
+    _, value, expected = laws(charts["cotangents"], "precision")
+    assert len(value) == 45 and np.abs(value - expected).max() < 256 * EPS and expected.max() > 1.0
+
+
+def test_negative_weights_tear_a_sheet_apart(charts):
+    """Spokes end below 0 as soon as a weight is negative; clamped, intrinsic inside, and rims do not.
+
+    Those end within 10 times what the tolerance of 1e-6 leaves of edges of 1.
+    """
+    rows = charts["cotangents"]["rows"]
+    for name in cotangents.CHOICES:
+        x, energy = of(rows, "energy", name)
+        failed = x > 180.0 if name == "cotangent" else np.zeros(len(x), dtype=bool)
+        assert (energy[failed] < -1e-3).all() and (np.abs(energy[~failed]) < 100 * 1e-12).all()
+        negative, stretch = of(rows, "bend", name)
+        # The boundary of a mesh has negative weights in any triangulation.
+        assert (stretch[negative > 12.0] > 1.5).all() if "tan" in name or "Delaunay" in name else (stretch < 1.25).all()
+
+
+def test_rotations_are_known_to_their_rank(charts):
+    """To ε(σ₁/σ₂)² about the line of the points, and the line itself to rounding."""
+    rows = charts["rank"]["rows"]
+    for dtype, eps in rank.EPS.items():
+        x, error = of(rows, "line", f"{dtype}: the rotation")
+        law = np.array([rank.known(ratio, dtype) for ratio in x])
+        # Twenty points are added.
+        assert (error < 20.0 * law).all() and (error > law / 20.0).all()
+        assert of(rows, "line", f"{dtype}: where the line goes")[1].max() < 20.0 * eps
+        x, share = of(rows, "reflection", f"U Vᵀ, {dtype}")
+        assert not share[x > 2.0 * np.sqrt(eps)].any() and (share[x < 0.1 * np.sqrt(eps)] > 20.0).all()
+        assert not of(rows, "reflection", f"kabsch, {dtype}")[1].any()
+
+
+def test_what_a_line_keeps_of_a_turn(charts):
+    """A plane the turn, a line the angle between itself and where it goes, a point nothing."""
+    x, value, expected = laws(charts["rank"], "turn")
+    # cos of the angle of a rotation is that of a sum of three numbers; near 180° its root is lost, half the digits.
+    assert len(x) == 57 and np.radians(np.abs(value - expected)).max() < 4.0 * np.sqrt(EPS)
+    assert of(charts["rank"]["rows"], "turn", "on a line")[1].max() == pytest.approx(90.0, abs=1e-6)
+    assert not of(charts["rank"]["rows"], "turn", "in one place")[1].any()
+
+
+# --- Tables, pictures, command.
+
+
+def test_rows_have_their_laws_and_a_table_a_line_for_each(charts, tmp_path):
+    for name, found in charts.items():
+        assert found["failure"] == name and json.dumps(found, allow_nan=False)
+        panels = {panel.key: panel for panel in FAILURES[name].PANELS}
+        assert {row["panel"] for row in found["rows"]} == set(panels) == set(found["panels"])
+        for panel in panels.values():
+            series = {row["series"] for row in found["rows"] if row["panel"] == panel.key}
+            assert set(panel.follows) <= series and set(panel.follows.values()) <= set(panel.laws)
+        write_csv(tmp_path / "t.csv", found)
+        with open(tmp_path / "t.csv", encoding="utf-8") as file:
+            table = list(csv.DictReader(file))
+        assert tuple(table[0]) == COLUMNS and len(table) == len(found["rows"])
+        assert [float(row["x"]) for row in table] == [row["x"] for row in found["rows"]]
+
+
+@pytest.mark.parametrize("name", ["isometry", "slivers", "cotangents", "rank"])
+def test_points_and_laws_are_drawn(name, charts, tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    kept, saving = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (kept.append(self), saving(self, *a, **k)))
+    plot_failure(tmp_path / "a.svg", charts[name])
+    plot_failure(tmp_path / "b.svg", charts[name])
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    assert len(kept[0].axes) == len(FAILURES[name].PANELS)
+    for axes, panel in zip(kept[0].axes, FAILURES[name].PANELS, strict=True):
+        lines = {line.get_label(): line for line in axes.lines}
+        assert set(panel.laws) <= set(lines) and axes.get_xlabel() == panel.x and axes.get_title(loc="left") == panel.title
+        for row in charts[name]["rows"]:
+            if row["panel"] == panel.key:
+                assert row["value"] in lines[row["series"]].get_ydata(orig=True)
+        for series, law in panel.follows.items():
+            assert lines[series].get_linewidth() == 0.0 and panel.laws[law](1.0) is not None
+
+
+def test_a_point_without_a_value_is_left_out_and_said(charts, tmp_path, capsys, monkeypatch):
+    lost = {**charts["rank"], "rows": [*charts["rank"]["rows"], point("turn", "on a line", 9.0, None, "too slow")]}
+    lost["rows"][-1] |= {"law": None, "expected": None}
+    plot_failure(tmp_path / "a.png", lost)
+    monkeypatch.setattr("warpcloth.chart.failures.failure_chart", lambda *a, **k: lost)
+    assert main(["chart", "failure", "rank"]) == 0
+    out = capsys.readouterr().out
+    assert "no value      on a line, 9: too slow" in out and "turn          58 points, 57 of them off their law by" in out
+
+
+def test_without_libigl_it_says_what_is_missing(device):
+    rows = cotangents.measure(device, libigl=False)
+    lost = [row for row in rows if row["series"] == "intrinsic Delaunay"]
+    assert len(lost) == 4 and all(row["value"] is None and "pip install" in row["reason"] for row in lost)
+
+
+def test_the_command(tmp_path, capfd, monkeypatch):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
+    given = ["chart", "failure", "isometry", "--workers", "1"]
+    assert main([*given, "-o", str(tmp_path / "i.png"), "--csv", str(tmp_path / "i.csv")]) == 0
+    out = capfd.readouterr().out
+    assert out.startswith("10. Quadratic bending") and "off their law by" in out
+    assert (tmp_path / "i.png").stat().st_size > 1000 and (tmp_path / "i.csv").is_file()
+    assert len((tmp_path / "cache" / "failures.jsonl").read_text().splitlines()) == 1
+    assert main([*given, "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    assert len(facts["rows"]) == 78 and facts["machine"]["source"] and len(facts["panels"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("wrinkles", "invalid choice: 'wrinkles'"),
+        ("", "required: FAILURE"),
+        ("rank -o map.doc", "the ending is '.doc'"),
+        ("rank --csv nowhere/a.csv", "nowhere"),
+        ("rank -o a.png --csv a.png", "a.png"),
+        ("rank --workers 0", "workers is 0"),
+        ("rank --device cuda:9", "device is 'cuda:9'"),
+        ("rank -p n=4", "unrecognized arguments"),
+    ],
+)
+def test_wrong_use_is_said_in_a_line(words, says, capfd):
+    assert main(["chart", "failure", *words.split()]) == 2
+    out, err = capfd.readouterr()
+    assert says in err and err.count("\n") == 1 and not out
+
+
+def test_an_unknown_failure_is_refused():
+    with pytest.raises(ValueError, match="failure is 'wrinkles'; it must be one of 'locking', 'isometry'"):
+        failure_chart("wrinkles")
