@@ -40,9 +40,10 @@ def test_an_imposed_cylinder_costs_its_chords(device):
 def test_irregular_nets_lose_curvature_where_theory_says(device):
     """Of a sheet at rest when rolled up: nothing is lost below κ²h⁴K/576D = 1e-2, and by regular nets nowhere.
 
-    There the strain is that of the shape, so that its cost goes as K; far above it is relieved.
+    There the strain is that of the shape, so that its cost goes as K, but for the softest parts, which give way by an eighth at
+    4e-3; far above it is relieved.
     """
-    moduli = [1e4, 1e5, 1e9, 1e10]
+    moduli = [1e3, 3e3, 1e4, 1e9, 1e10]
     nets = {pattern: locking.relaxed(pattern, 8, moduli, device) for pattern in locking.NETS}
     kept = {pattern: of(points, "kept", f"{pattern}, h = 1/8 m") for pattern, points in nets.items()}
     cost = {pattern: of(points, "cost", f"{pattern}, h = 1/8 m") for pattern, points in nets.items()}
@@ -52,7 +53,7 @@ def test_irregular_nets_lose_curvature_where_theory_says(device):
         x, part = kept[pattern]
         assert (np.abs(part[x < 1e-2] - 1.0) < 0.02).all() and (part[x > 100.0] < most).all() and part.min() > 0.5
         soft, stiff = cost[pattern][1][x < 1e-2] / x[x < 1e-2], cost[pattern][1][x > 100.0]
-        assert np.ptp(soft) < 0.35 * soft.max() and (np.diff(stiff) < 0.0).all()
+        assert len(soft) == 3 and np.ptp(soft) < 0.15 * soft.max() and (np.diff(stiff) < 0.0).all()
 
 
 def test_a_cantilever_locks_apart_from_its_pattern(device):

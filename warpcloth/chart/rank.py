@@ -38,7 +38,7 @@ PANELS = (
         "largest error of 200 sets [rad]",
         ("log", "log"),
         laws={_LAWS[dtype]: (lambda r, dtype=dtype: known(r, dtype)) for dtype in EPS},
-        limits=(1e-20, 30.0),
+        limits=(1e-25, 30.0),
     ),
     Panel(
         "turn",
