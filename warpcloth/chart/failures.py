@@ -11,10 +11,10 @@ from ..outputs import TEXT, Output
 from . import cotangents, isometry, locking, rank, slivers
 from .machine import machine
 from .panels import plot_panels
-from .sweep import Store, cache_folder, sweep
+from .sweep import kept, sweep
 
 FAILURES = {"locking": locking, "isometry": isometry, "slivers": slivers, "cotangents": cotangents, "rank": rank}
-COLUMNS = ("panel", "series", "x", "value", "law", "expected", "reason")
+COLUMNS = ("panel", "series", "x", "value", "law", "expected", "reason", "machine")
 
 
 def failure_chart(name, device="cpu", **run):
@@ -33,15 +33,15 @@ def failure_chart(name, device="cpu", **run):
     """
     choice("failure", name, tuple(FAILURES))
     tasks = FAILURES[name].tasks(str(device))
-    run = {"store": Store(cache_folder() / "failures.jsonl"), **run}
+    run = run if "store" in run else {"store": kept("failures", run.get("executor")), **run}
     results = {task.key: points for task, points in sweep(tasks, **run)}
     panels = {panel.key: panel for panel in FAILURES[name].PANELS}
     rows = []
-    for point in (point for task in tasks for point in results[task.key]):
+    for done, point in [(task, point) for task in tasks for point in results[task.key]]:
         panel = panels[point["panel"]]
         law = panel.follows.get(point["series"])
         expected = float(panel.laws[law](point["x"])) if law else None
-        rows.append({**point, "law": law, "expected": expected})
+        rows.append({**point, "law": law, "expected": expected, "machine": run["store"].machine(done)})
     facts = {"failure": name, "title": FAILURES[name].TITLE, "device": str(device), "seed": 0, "machine": machine(device)}
     shown = {key: {"title": panel.title, "x": panel.x, "y": panel.y} for key, panel in panels.items()}
     return {**facts, "panels": shown, "rows": rows}

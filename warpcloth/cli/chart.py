@@ -99,12 +99,14 @@ def failure(arguments):
     device = find_device(arguments.device)
     progress = Settings()
     try:
-        found = failure_chart(
-            arguments.failure,
-            device=str(device),
-            workers=arguments.workers or (1 if device.is_cuda else None),
-            progress=progress,
-        )
+        with executing(arguments) as executor:
+            found = failure_chart(
+                arguments.failure,
+                device=str(device),
+                workers=arguments.workers or (1 if device.is_cuda else None),
+                progress=progress,
+                **executor,
+            )
     except KeyboardInterrupt:
         raise Interrupted(progress.interrupted()) from None
     finally:
