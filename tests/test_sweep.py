@@ -61,7 +61,55 @@ def test_what_is_finished_is_not_measured_again(tmp_path):
     assert len(store) == 3 and tasks[1] in store
     found = dict_of(sweep(squares(4, marks), ThreadPoolExecutor(1), store))
     assert found == {0: 0, 1: 1, 2: 4, 3: 9} and len(list(marks.iterdir())) == 4
-    assert [json.loads(line)["result"]["square"] for line in path.read_text().splitlines()] == [0, 1, 4, 9]
+    lines = path.read_text().splitlines()
+    assert [json.loads(line)["result"]["square"] for line in lines if line != '{"key": "half'] == [0, 1, 4, 9]
+
+
+@pytest.mark.parametrize("left", ['{"key": "half', '{"k', "\0\0\0", '{"key": "é'.encode()[:-1].decode("latin1"), "whole"])
+def test_a_line_that_was_cut_costs_no_other(left, tmp_path):
+    """Those before it and those that are added after it stay, also one that lacks its end alone."""
+    path, tasks = tmp_path / "store.jsonl", squares(3)
+    Store(path).keep(tasks[0], 0, "a")
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] if left == "whole" else content + left.encode("latin1"))
+    store = Store(path)
+    assert len(store) == 1
+    for x, each in enumerate(tasks[1:], 1):
+        store.keep(each, x, "a")
+    again = Store(path)
+    assert [again[each] for each in tasks] == [0, 1, 2]
+
+
+def test_a_store_that_another_process_adds_to_is_left_as_it_is(tmp_path):
+    """Opened while the other is amid a line, it does not touch that."""
+    path, tasks = tmp_path / "store.jsonl", squares(3)
+    Store(path).keep(tasks[0], 0, "a")
+    line = json.dumps({"key": tasks[1].key, "result": 1}) + "\n"
+    with path.open("a") as other:
+        other.write(line[:20])
+        other.flush()
+        assert len(Store(path)) == 1
+        other.write(line[20:])
+    Store(path).keep(tasks[2], 2, "a")
+    assert len(Store(path)) == 3
+
+
+def test_a_full_disk_is_said_and_leaves_what_is_kept(tmp_path):
+    """The second line does not fit; once there is room again it does."""
+    resource = pytest.importorskip("resource")
+    path, tasks = tmp_path / "store.jsonl", squares(3)
+    store = Store(path)
+    store.keep(tasks[0], 0, "a")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 30, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"store\.jsonl"):
+            store.keep(tasks[1], 1, "a")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert len(Store(path)) == 1
+    store.keep(tasks[2], 2, "a")
+    assert len(Store(path)) == 2
 
 
 def dict_of(results):

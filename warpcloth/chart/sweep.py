@@ -12,12 +12,15 @@ from pathlib import Path
 from ..quiet import initialise_warp
 from .tasks import run, source_digest
 
+_HEAD = b'{"key": "'  # of a line of results
 # One thread a process: more would take the cores of the others, and Warp's CPU kernels use one as it is.
 _ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
 
 
 class Store:
-    """Results by key in a file, a line of JSON each; a line is whole or, after a crash, the last and left out.
+    """Results by key in a file, a line of JSON each, that several processes may add to at a time.
+
+    A line that was cut, by a crash or a full disk, is left out, and its result is measured again; the file is never rewritten.
 
     Args:
         path: The file, made with its folder where there is none; None keeps results in memory.
@@ -35,17 +38,15 @@ class Store:
             return
         if not self.path.is_file():
             raise ValueError(f"{self.path}: is no file; it must be one of results, or free")
-        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
-        for number, line in enumerate(lines):
+        # Text of JSON has no line ends but these; zeros are what a file system may leave of a line after a crash.
+        for number, line in enumerate(self.path.read_bytes().split(b"\n"), 1):
+            line = line.strip(b"\0\r ")
             try:
                 entry = json.loads(line)
                 self._results[entry["key"]], self._machines[entry["key"]] = entry["result"], entry.get("machine")
             except (ValueError, TypeError, KeyError):
-                if number < len(lines) - 1:
-                    raise ValueError(f"{self.path}, line {number + 1}: is no result; remove the file or give another") from None
-                # Written by a process that ended amid it.
-                whole = "".join(lines[:-1])
-                self.path.write_text(whole, encoding="utf-8")
+                if not line.startswith(_HEAD) and not _HEAD.startswith(line):
+                    raise ValueError(f"{self.path}, line {number}: is no result; remove the file or give another") from None
 
     def __contains__(self, task):
         return task.key in self._results
@@ -66,11 +67,17 @@ class Store:
         if self.path is None:
             return
         asked = {"key": task.key, "function": task.function, "arguments": task.arguments}
-        line = json.dumps(asked | {"machine": machine, "result": result})
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        text = json.dumps(asked | {"machine": machine, "result": result}).encode() + b"\n"
+        try:
+            with self.path.open("ab+", buffering=0) as file:
+                if file.seek(0, os.SEEK_END):
+                    file.seek(-1, os.SEEK_END)
+                    text = text if file.read(1) == b"\n" else b"\n" + text  # what was cut is ended first
+                while text:  # one write, which no other process comes between, unless the disk is full
+                    text = text[file.write(text) :]
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from None
 
 
 def sweep(tasks, executor=None, store=None, progress=None, workers=None):
