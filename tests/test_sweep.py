@@ -3,9 +3,13 @@
 import json
 import os
 import platform
+import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,6 +120,24 @@ def dict_of(results):
     return {each.arguments["x"]: result["square"] for each, result in results}
 
 
+def die(after):
+    """Waits for a file, then ends its process as a lack of memory does."""
+    while after and not os.path.exists(after):
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_is_killed_is_said(tmp_path):
+    """What is finished is kept."""
+    store, mark = tmp_path / "store.jsonl", tmp_path / "mark"
+    tasks = [*squares(2), task(die, after=str(mark))]
+    with pytest.raises(ChildProcessError, match="was killed, as for want of memory; what is finished is kept"):
+        for done, _ in enumerate(sweep(tasks, store=Store(store), workers=2), 1):
+            if done == 2:
+                mark.touch()
+    assert len(Store(store)) == 2
+
+
 def test_an_interruption_keeps_what_is_finished(tmp_path):
     store = Store(tmp_path / "store.jsonl")
     with ThreadPoolExecutor(1) as executor:
@@ -171,6 +193,53 @@ def test_other_code_is_refused_and_the_machine_kept(tmp_path):
     path = tmp_path / "store.jsonl"
     list(sweep([each], AtOnce(), Store(path)))
     assert Store(path).machine(each) == name() and platform.node() in name()
+
+
+SCRIPT = """
+import os, sys, time
+from warpcloth.chart.sweep import sweep
+from warpcloth.chart.tasks import task
+
+def wait(folder):
+    open(os.path.join(folder, str(os.getpid())), "w").close()
+    time.sleep(60.0)
+
+if __name__ == "__main__":
+    import waits
+    list(sweep([task(waits.wait, folder=sys.argv[1])], workers=1))
+"""
+
+
+def test_processes_end_with_the_one_that_started_them(tmp_path):
+    """Killed, it tells them nothing."""
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    (tmp_path / "waits.py").write_text(SCRIPT)
+    root = str(Path(wc.__file__).parents[1])
+    path = os.pathsep.join([root, str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    parent = subprocess.Popen([sys.executable, "waits.py", str(marks)], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
+    try:
+        until(lambda: any(marks.iterdir()))
+    finally:
+        parent.kill()
+        parent.wait()
+    (mark,) = marks.iterdir()
+    until(lambda: not alive(int(mark.name)))
+
+
+def until(true):
+    ends = time.monotonic() + 30.0
+    while not true():
+        assert time.monotonic() < ends
+        time.sleep(0.02)
+
+
+def alive(process):
+    """Whether a process runs; one that has ended may wait for whoever takes note of it."""
+    try:
+        return "State:\tZ" not in Path(f"/proc/{process}/status").read_text()
+    except FileNotFoundError:
+        return False
 
 
 def test_a_file_that_is_no_store_is_refused(tmp_path):

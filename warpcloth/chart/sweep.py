@@ -5,8 +5,9 @@ import json
 import multiprocessing
 import os
 import signal
+import threading
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from ..quiet import initialise_warp
@@ -94,6 +95,7 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
 
     Raises:
         Exception: What a task raises; those that are finished are kept, those that have not begun are dropped.
+        ChildProcessError: A process was killed.
     """
     tasks = list(tasks)
     store = Store() if store is None else store
@@ -115,7 +117,13 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
                 futures[executor.submit(run, task, source_digest())] = task
             for done, future in enumerate(as_completed(futures), 1):
                 task = futures[future]
-                result, machine = future.result()
+                try:
+                    result, machine = future.result()
+                except BrokenExecutor:
+                    raise ChildProcessError(
+                        "a process that measured was killed, as for want of memory; what is finished is kept, and the same "
+                        "goes on from there, with fewer workers in less memory"
+                    ) from None
                 store.keep(task, result, machine)
                 seconds = (time.perf_counter() - started) / done * (len(left) - done)
                 say(finished + done, len(tasks), seconds)
@@ -147,9 +155,18 @@ def _processes(workers):
 
 
 def _begin():
-    """In each process: an interruption ends it without a word, as the first process says what there is to say."""
+    """In each process: an interruption ends it without a word, as the first process says what there is to say.
+
+    It also ends when that was killed, which leaves it waiting for ever.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     initialise_warp()
+
+
+def _end_with(parent):
+    parent.join()
+    os._exit(1)
 
 
 def kept(name, executor=None):
