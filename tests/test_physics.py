@@ -270,6 +270,20 @@ def test_results_are_json_and_run_as_tasks(tmp_path):
     json.dumps(measure("cantilever", 4, width=1.0), allow_nan=False)
 
 
+def test_the_time_is_the_median_of_warm_solutions(monkeypatch):
+    """Of five where they are brief, of one where they are not; compiling is in none."""
+    calls, real = [], physics.equilibrium
+    monkeypatch.setattr(physics, "equilibrium", lambda *given, **rest: calls.append(rest) or real(*given, **rest))
+    monkeypatch.setattr(physics, "_BRIEF", 1e3)
+    found = measured("chain", 5)
+    assert [rest["iterations"] for rest in calls] == [1] + 5 * [physics._CHUNK]
+    assert 0.0 < found["spread"][0] <= found["ms"] <= found["spread"][1]
+    monkeypatch.setattr(physics, "_BRIEF", 1e-9)
+    calls.clear()
+    once = measured("chain", 5)
+    assert len(calls) == 2 and once["spread"] == 2 * [once["ms"]] and once["iterations"] == found["iterations"]
+
+
 def test_what_does_not_settle_says_so(monkeypatch):
     monkeypatch.setattr(physics, "_CHUNK", 2)
     found = measure("cantilever", 6, limit=1e-6)
@@ -309,7 +323,7 @@ def test_the_plot(tmp_path, monkeypatch):
         for bending in BENDING:
             for n in (4, 8, 16):
                 arguments = {"case": "cantilever", "resolution": n, "bending": bending, "angle": angle}
-                found = {"status": "ok", "reason": "", "error": 1.0 / n, "stiffness": 1.0, "sides": 0.01, "ms": n, "h": 1.0 / n}
+                found = {"status": "ok", "reason": "", "error": 1.0 / n, "stiffness": 1.0, "sides": 0.01, "ms": 40 + n, "h": 1.0 / n}
                 found["floor"] = 0.2 * n if angle else 1e-9
                 results.append((arguments, found))
     results[0][1].update(status="slow", error=None)
@@ -323,6 +337,10 @@ def test_the_plot(tmp_path, monkeypatch):
     for panel, floor in zip(kept[0].axes[::2], (1e-9, 3.2, chain), strict=True):
         (line,) = (line for line in panel.lines if line.get_label() == f"rest shapes are known to {floor:.1g}")
         assert list(line.get_ydata()) == [floor] * 2 and panel.get_ylim()[1] >= floor
+    for axes in (axes for axes in kept[0].axes if axes.get_xlabel() == "time [ms]"):
+        low, high = axes.get_xlim()
+        shown = [text.get_text() for text in axes.get_xticklabels() if low <= text.get_position()[0] <= high]
+        assert sum(map(bool, shown)) > 1, "times of less than a decade have numbers too"
     drawn = (tmp_path / "plot.svg").read_text()
     plot_physics(tmp_path / "plot.svg", results)
     assert drawn == (tmp_path / "plot.svg").read_text()

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from warpcloth.chart import tasks as listed
 from warpcloth.chart.machine import machine, name
 from warpcloth.chart.sweep import Store, cache_folder, sweep
 from warpcloth.chart.tasks import SceneRef, Setup, Task, run, source_digest, task
@@ -131,7 +132,7 @@ def test_a_process_that_is_killed_is_said(tmp_path):
     """What is finished is kept."""
     store, mark = tmp_path / "store.jsonl", tmp_path / "mark"
     tasks = [*squares(2), task(die, after=str(mark))]
-    with pytest.raises(ChildProcessError, match="was killed, as for want of memory; what is finished is kept"):
+    with pytest.raises(ChildProcessError, match=r"ended: killed, as for want of memory, .* what is finished is kept"):
         for done, _ in enumerate(sweep(tasks, store=Store(store), workers=2), 1):
             if done == 2:
                 mark.touch()
@@ -259,6 +260,18 @@ def test_keys_are_of_what_is_measured_and_of_the_code(monkeypatch):
     before = one.key
     monkeypatch.setattr("warpcloth.chart.tasks.source_digest", lambda: "another")
     assert one.key != before and len(source_digest()) == 16
+
+
+@pytest.mark.parametrize("changed", ["processor", "cores", "device", "warp", "numpy"])
+def test_times_of_another_machine_are_not_found(changed, monkeypatch):
+    """A folder of caches may be shared, and what computes may be replaced."""
+    one, facts = task(square, x=1, device="cpu"), machine()
+    before = one.key
+    monkeypatch.setattr("warpcloth.chart.machine.machine", lambda device: facts | {changed: "another"})
+    listed._machine.cache_clear()
+    after = one.key
+    listed._machine.cache_clear()
+    assert after != before
 
 
 def test_scenes_and_setups_as_data():

@@ -1,5 +1,6 @@
 """Charts of speed against accuracy: the gap of one step, the error of a motion, the spectrum, and what is made of them."""
 
+import contextlib
 import csv
 import json
 from concurrent.futures import ThreadPoolExecutor
@@ -167,6 +168,19 @@ def test_projective_dynamics_converges_as_its_spectrum_says(substeps, device):
         assert last["error"] <= most * (1.0 + spectrum.LINEAR) * before["error"]
 
 
+def test_a_step_without_a_spectrum_costs_no_other(tmp_path):
+    """Of so little motion the shortest steps have nothing to minimise; of all, it is said."""
+    still = {"n": 4, "stiffness": 1.0}
+    with ThreadPoolExecutor(1) as executor:
+        found = spectrum_diagram(SceneRef("hanging", still), frames=1, limit=0.2, executor=executor, store=Store())
+        assert [row["status"] for row in found["rows"]].count("ok") in range(1, 5)
+        assert "has nothing to minimise" in found["rows"][-1]["reason"] and left_out(found)
+        fronts.plot_spectrum(tmp_path / "spectrum.png", found)
+        hard = SceneRef("net", {"n": 4, "stiffness": "inf"})
+        with pytest.raises(ValueError, match="Newton cannot take Spring with infinite stiffness"):
+            spectrum_diagram(hard, frames=1, executor=executor, store=Store())
+
+
 def test_spectrum_of_too_many_unknowns_is_refused(device):
     with pytest.raises(ValueError, match=r"hanging has 2694 unknowns; a spectrum takes 2000 at most"):
         spectrum.relative_spectrum(OneStep(SceneRef("hanging", {"n": 30}).load(), 1, 1, device))
@@ -194,6 +208,41 @@ def test_explicit_starts_at_the_fewest_stable_substeps(device):
     rest, motion = step_limits(SMALL.load().build(device=device))
     limit = 60.0 * min(rest / 1.1, motion)
     assert 1.0 / first < limit <= 1.0 / (first - 1) and more == [round(1.5 * first), 2 * first]
+
+
+def test_steps_are_as_long_at_any_frame_rate(tmp_path):
+    """And no longer than a frame; settings that come to the same are one."""
+    (tmp_path / "frames.py").write_text(
+        "import warpcloth as wc\n\ndef scene(fps=60.0):\n    mesh = wc.Mesh.grid(3, 3)\n"
+        "    return wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=10.0)], pins=[0], fps=fps)\n"
+    )
+    of = {fps: setups_of_runs(SceneRef(str(tmp_path / "frames.py"), {"fps": fps}), ["xpbd", "newton"]) for fps in (60.0, 4.0)}
+    assert [s.options["substeps"] for s in of[4.0]] == [15 * s.options["substeps"] for s in of[60.0]]
+    fast = setups_of_runs(SceneRef(str(tmp_path / "frames.py"), {"fps": 6e3}))
+    assert {s.options["substeps"] for s in fast if s.solver != "explicit"} == {1, 2}
+    assert len({str(s) for s in fast}) == len(fast) and {s.solver for s in fast} == set(SOLVERS)
+
+
+def test_what_takes_hard_constraints_has_settings_for_them(device):
+    """Of each solver that takes some one or more, so that a chart of them compares solvers."""
+    model = SceneRef("net", {"n": 4, "stiffness": "inf"}).load().build(device=device)
+    bound = set()
+    for setup in setups_of_runs(SceneRef("net", {"n": 4, "stiffness": "inf"}), device=device):
+        with contextlib.suppress(ValueError):
+            setup.record().bind(model)
+            bound.add(setup.solver)
+    assert bound == {"pbd", "hierarchical-pbd", "xpbd", "constrained-dynamics"}
+
+
+def test_below_the_error_of_the_reference_nothing_is_better():
+    """What is known to no more than 3 ranks by time alone below that, and is within 1 % only if that is added."""
+    rows = [
+        {"status": "ok", "ms_per_second": ms, "error": error, "solver": f"s{ms}"}
+        for ms, error in ((1, 9), (2, 3), (3, 1), (4, 2))
+    ]
+    assert front(rows, 3.0) == [0, 1] and front(rows, 2.5) == [0, 1, 2] and front(rows) == [0, 1, 2]
+    near = [row | {"error": 0.001 * row["error"]} for row in rows]
+    assert [row["solver"] for row in cheapest(near, 0.0081)] == ["s3"] and len(cheapest(near)) == 4
 
 
 def test_nothing_beats_the_front():
@@ -285,6 +334,15 @@ def test_time_diagram(device, tmp_path, drawn):
         points = np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() not in ("None", "")])
         assert sorted(map(tuple, points)) == sorted((row["ms_per_second"], row[name]) for row in good)
         assert floor_of(panel, "error of the reference") == found["reference"][name] < min(points[:, 1])
+
+
+def test_a_chart_of_errors_needs_motion(tmp_path):
+    (tmp_path / "still.py").write_text(
+        "import warpcloth as wc\n\ndef scene():\n    mesh = wc.Mesh.grid(3, 3)\n"
+        "    return wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=10.0)], gravity=(0.0, 0.0, 0.0))\n"
+    )
+    with pytest.raises(ValueError, match=r"nothing moves in .*still\.py within 2 frames"):
+        time_diagram(SceneRef(str(tmp_path / "still.py")), frames=2, executor=Nobody())
 
 
 def test_the_physics_diagram(tmp_path):

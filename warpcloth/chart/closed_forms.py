@@ -67,7 +67,7 @@ def _floor(left, right, floors):
 
 
 def _finish(left, right, title, points):
-    from matplotlib.ticker import LogLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator
 
     left.set_title(title, fontsize=9, loc="left", color=GREY)
     left.set_ylabel("relative error", color=GREY)
@@ -82,10 +82,10 @@ def _finish(left, right, title, points):
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color("0.7")
     for axes in (left, right):
-        if axes.axison:
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter("")
+        if axes.axison:  # over a decade or two the usual ones overlap, within one there may be none
+            low, high = axes.get_xlim()
+            ticks = LogLocator(subs=(1.0, 3.0)) if high > 10.0 * low else MaxNLocator(4)
+            axes.xaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_formatter="")
     if left.get_legend_handles_labels()[1]:
         left.legend(frameon=False, fontsize=7, labelcolor=GREY)
     failed = [f"{_label(a)}, {a['resolution']}: {found['status']}" for a, found in points if found["status"] != "ok"]

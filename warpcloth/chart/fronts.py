@@ -42,7 +42,11 @@ def plot_time(path, found):
     """
     best = sorted((row for row in found["rows"] if row.get("front")), key=lambda row: row["ms_per_second"])
     texts = [f"{number}  {row['label']}" for number, row in enumerate(best, 1)]
-    texts += ["", f"cheapest within {100.0 * WITHIN:g} %:", *(row["label"] for row in cheapest(found["rows"]))]
+    texts += [
+        "",
+        f"cheapest within {100.0 * WITHIN:g} %:",
+        *(row["label"] for row in cheapest(found["rows"], found["reference"]["error"])),
+    ]
     texts += _missing("not drawn:", found)
     figure, panels, notes = _figure(path, texts)
     lines = {}

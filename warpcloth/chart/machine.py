@@ -16,8 +16,10 @@ def machine(device="cpu"):
     import scipy
     import warp as wp
 
+    from ..quiet import initialise_warp
     from .tasks import source_digest
 
+    initialise_warp()
     found = wp.get_device(device)
     return {
         "processor": processor(),

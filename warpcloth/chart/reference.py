@@ -148,6 +148,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
     path = cache_folder() / "references" / f"{key}.npz"
     found = _kept(path, key)
     if found is None or (found.error > tolerance and found.limit < limit):
+        path.parent.mkdir(parents=True, exist_ok=True)  # before minutes of runs
         facts = {"path": str(path), "key": key, "scene": digest, "times": np.arange(frames + 1) / declared.fps}
         found = Reference(**facts, **_solve(declared, frames, tolerance, limit, progress))
         found.save()

@@ -60,17 +60,18 @@ def measure(scene, digest, frame, substeps, device="cpu", limit=20.0):
         limit: Seconds for the iterations.
 
     Returns:
-        dict: ``status``, ``reason``, ``eigenvalues`` μ, ``contraction`` max |1 − μ|, ``points`` with ``iterations``,
-        ``error`` ‖d − d*‖_A over that at x̃, and ``predicted``, the same from the first error that is small on, else None;
-        ``floor``, the largest error that roundings of x alone make; and ``measured`` and ``expected``, the factor of an
+        dict: ``status`` ("ok" or "refused", also where the scene has no such step), ``reason``, ``eigenvalues`` μ,
+        ``contraction`` max |1 − μ|, ``points`` with ``iterations``, ``error`` ‖d − d*‖_A over that at x̃, and ``predicted``,
+        the same from the first error that is small on, else None; ``floor``, the largest error that roundings of x alone make;
+        and ``measured`` and ``expected``, the factor of an
         iteration between the last two points, of errors and of predictions.
 
     Raises:
-        ValueError: See :func:`relative_spectrum`, and the scene has no such step.
+        ValueError: See :func:`relative_spectrum`.
     """
-    step = one_step(scene, digest, frame, substeps, device)
     result = {"status": "ok", "reason": "", "points": [], "floor": None, "measured": None, "expected": None}
     try:
+        step = one_step(scene, digest, frame, substeps, device)
         _bound(step, 1, device)
     except ValueError as error:
         return result | {"status": "refused", "reason": str(error)}

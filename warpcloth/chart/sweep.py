@@ -119,11 +119,11 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
                 task = futures[future]
                 try:
                     result, machine = future.result()
-                except BrokenExecutor:
+                except BrokenExecutor as error:
                     raise ChildProcessError(
-                        "a process that measured was killed, as for want of memory; what is finished is kept, and the same "
-                        "goes on from there, with fewer workers in less memory"
-                    ) from None
+                        "a process that measures ended: killed, as for want of memory, or begun by a script without "
+                        'if __name__ == "__main__":; what is finished is kept, and with fewer workers it takes less memory'
+                    ) from error
                 store.keep(task, result, machine)
                 seconds = (time.perf_counter() - started) / done * (len(left) - done)
                 say(finished + done, len(tasks), seconds)

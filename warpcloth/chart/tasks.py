@@ -91,8 +91,9 @@ class Task:
 
     @property
     def key(self):
-        """A hash of what is measured and of the code that measures it."""
-        text = json.dumps([self.function, self.arguments, source_digest()], sort_keys=True, allow_nan=False)
+        """A hash of what is measured, of the code that measures it, and of the machine: on another it takes another time."""
+        place = _machine(self.arguments.get("device", "cpu"))
+        text = json.dumps([self.function, self.arguments, source_digest(), place], sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
     def run(self):
@@ -129,6 +130,13 @@ def run(task, source):
         )
     with _ALONE:
         return task.run(), machine.name(task.arguments.get("device", "cpu"))
+
+
+@cache
+def _machine(device):
+    from .machine import machine
+
+    return machine(device)
 
 
 @cache

@@ -33,7 +33,8 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         - ``status``: "ok", "diverged", "slow" or "refused", and ``reason``, a sentence, of the first "".
         - ``error``: :func:`warpcloth.chart.reference.position_error` against the reference, of the frames after the start.
         - ``strain_error``: :func:`warpcloth.chart.reference.strain_error` of the same.
-        - ``ms``: What a frame takes, the median of all but the first of each run, which warms up [ms].
+        - ``ms``: What a frame takes, the median of all but the first of each run, which warms up [ms]. Of one frame
+          the next is run too.
         - ``spread``: Its lower and upper quartile [ms].
         - ``ms_per_second``: ``ms`` for each second that is simulated.
         - ``compile_s``: What it takes to build, bind and warm up before the first frame, with compiling what is in no cache,
@@ -50,6 +51,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
     declared, record = SceneRef(**scene).load(), Setup(**setup).record()
     exact = None if reference is None else Reference.load(reference)
     frames = _checked_frames(frames, declared, exact)
+    least = max(frames, 2)  # as the first warms up
     found = dict.fromkeys(("error", "strain_error", "ms", "spread", "ms_per_second", "compile_s", "factorise_s", "residual"))
     found = {"status": "ok", "reason": "", **found, "message": "", "frames": 0}
     runs, left = [], limit
@@ -58,10 +60,10 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         for _ in range(repeats):
             clock = Clock(left)
             try:
-                runs.append(simulate(declared, record, device=device, dtype=dtype, frames=frames, progress=clock))
+                runs.append(simulate(declared, record, device=device, dtype=dtype, frames=least, progress=clock))
             except TooSlow:
                 if not runs:
-                    reason = f"{len(clock.frames)} of {frames} frames took {sum(clock.frames):.3g} s, more than {limit:g} s"
+                    reason = f"{len(clock.frames)} of {least} frames took {sum(clock.frames):.3g} s, more than {limit:g} s"
                     found |= {"status": "slow", "reason": reason, "frames": len(clock.frames)}
                     found |= _times([clock.frames], declared.fps)
             except ValueError as error:
@@ -73,7 +75,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         return found
     first = runs[0]
     status, timings = first.status, first.timings
-    found |= {"frames": int(status.frame), "residual": _plain(status.residual)}
+    found |= {"frames": min(int(status.frame), frames), "residual": _plain(status.residual)}
     found["message"] = "; ".join(dict.fromkeys([status.message, *(str(warning.message) for warning in warned)]))
     found |= _times([run.timings["frames"] for run in runs], declared.fps)
     warm_up = timings["frames"][0] - 1e-3 * found["ms"]
@@ -81,7 +83,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
     if not status.ok:
         return found | {"status": "diverged", "reason": status.message}
     if exact is not None:
-        points, others = first.points[1:].astype(np.float64), exact.points[1 : frames + 1]
+        points, others = first.points[1 : frames + 1].astype(np.float64), exact.points[1 : frames + 1]
         for name, error in (("error", position_error), ("strain_error", strain_error)):
             found[name] = _plain(error(points, others, declared.mesh))
     return found

@@ -99,9 +99,11 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
     setups = setups_of_runs(scene, solvers, device, dtype)
     frames = frames or max(scene.load().frames // _RUN, 1)
     exact = reference(scene, frames=frames, tolerance=_KNOWN, limit=_SECONDS, progress=watch)
+    if (exact.points == exact.points[0]).all():
+        raise ValueError(f"nothing moves in {scene} within {frames} frames; a chart of errors needs motion")
     given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}
     rows = _measured(trajectory.measure, scene, setups, given, run)
-    for place in front(rows):
+    for place in front(rows, exact.error):
         rows[place]["front"] = True
     known = {name: getattr(exact, name) for name in ("error", "strain_error", "substeps", "seconds", "key")}
     facts = {"seed": None, "frames": frames, "reference": known}  # nothing is drawn at random
@@ -128,6 +130,9 @@ def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):
     frame = frames or max(declared.frames // _BEFORE, 1)
     given = {"scene": scene, "digest": scene_digest(declared), "frame": frame, "device": str(device), "limit": limit}
     tasks = [task(spectrum.measure, **given, substeps=substeps) for substeps in (1, 2, 4, 8, 16)]
+    results = _results(tasks, run)
+    if all(each["status"] == "refused" for each in results):
+        raise ValueError(results[0]["reason"])
     rows = [
         {
             "solver": "projective-dynamics",
@@ -135,7 +140,7 @@ def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):
             "label": f"1/{declared.fps * each.arguments['substeps']:g} s",
             **result,
         }
-        for each, result in zip(tasks, _results(tasks, run), strict=True)
+        for each, result in zip(tasks, results, strict=True)
     ]
     facts = {"seed": convergence.SEED, "frame": frame}
     return {**_facts("spectrum", scene, device, "float64"), **facts, "rows": rows}
@@ -193,23 +198,33 @@ def _label_of(plan):
     return " ".join([*words, str(plan["resolution"])])
 
 
-def cheapest(rows):
-    """Of each solver the row of least time with an error of no more than :data:`WITHIN`, the fastest first."""
+def cheapest(rows, floor=0.0):
+    """Of each solver the row of least time with an error of no more than :data:`WITHIN`, the fastest first.
+
+    Args:
+        rows: Of :func:`time_diagram`.
+        floor: Error of the reference, which each error may be off by.
+    """
     found = {}
     for row in sorted(filter(_has_error, rows), key=lambda row: row["ms_per_second"]):
-        if row["error"] <= WITHIN:
+        if row["error"] + floor <= WITHIN:
             found.setdefault(row["solver"], row)
     return list(found.values())
 
 
-def front(rows):
-    """Places of the rows that no other beats in both time and error, the fastest first."""
+def front(rows, floor=0.0):
+    """Places of the rows that no other beats in both time and error, the fastest first.
+
+    Args:
+        rows: Of :func:`time_diagram`.
+        floor: Error of the reference: what is below it is as good as any other there.
+    """
     places = [i for i, row in enumerate(rows) if _has_error(row)]
     found, least = [], float("inf")
     for i in sorted(places, key=lambda i: (rows[i]["ms_per_second"], rows[i]["error"])):
         if rows[i]["error"] < least:
             found.append(i)
-            least = rows[i]["error"]
+            least = rows[i]["error"] if rows[i]["error"] > floor else -1.0
     return found
 
 
