@@ -321,6 +321,8 @@ def test_time_diagram(device, tmp_path, drawn):
     write_csv(tmp_path / "chart.csv", found)
     lines = table(tmp_path / "chart.csv")
     assert [line["label"] for line in lines] == list(rows) and lines[-1]["error"] == ""
+    facts = {"scene": "hanging(n=6)", "dtype": "float32", "seed": "", **{k: str(v) for k, v in found["machine"].items()}}
+    assert all(line[name] == value for line in lines for name, value in facts.items())
     assert float(lines[0]["error"]) == found["rows"][0]["error"] and float(lines[0]["strain_error"]) > 0.0
     axes, strains, _notes = drawn[0].axes
     text = text_of(drawn[0])
@@ -387,6 +389,7 @@ def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
     write_csv(tmp_path / "solver.csv", one)
     lines = table(tmp_path / "solver.csv")
     assert len(lines) == sum(len(row["points"]) for row in one["rows"]) and float(lines[0]["gap"]) > 0.0
+    assert {line["seed"] for line in lines} == {"0"}
 
 
 # --- the command
@@ -426,6 +429,8 @@ def test_command(tmp_path, monkeypatch, capsys):
         (["hanging", "--solvers", "newtons"], "invalid choice: 'newtons'"),
         (["hanging", "--frames", "0"], "frames is 0"),
         (["hanging", "--workers", "0"], "workers is 0"),
+        (["hanging", "--limit", "0"], "limit is 0"),
+        (["hanging", "--limit", "nan", "--diagram", "solver"], "limit is nan"),
         (["chain", "--diagram", "physics", "--frames", "3"], "--solvers and --frames are for the others"),
         (["hanging", "--diagram", "physics"], "the diagram physics is of cantilever"),
         (["hanging", "--diagram", "spectrum", "--dtype", "float32"], "--solvers and --dtype are for the others"),

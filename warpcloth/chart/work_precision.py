@@ -22,8 +22,9 @@ from .tasks import task
 _BEFORE, _RUN = 3, 2
 SUBSTEPS = 4  # steps a frame of the one step
 WITHIN = 0.01  # the error of which the cheapest setting is named
-# How well the reference solution is to be known, relative to the size of the cloth, and seconds that it may take.
-_KNOWN, _SECONDS = 1e-4, 120.0
+# How well the reference solution is to be known, relative to the size of the cloth, and how many times what a setting may
+# take it may, but no less than so many seconds.
+_KNOWN, _TIMES, _SECONDS = 1e-4, 6.0, 120.0
 # What a CSV has of a setting, in this order; what it does not know is empty.
 COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
 COLUMNS += (
@@ -41,6 +42,9 @@ COLUMNS += (
     "message",
     "machine",
 )
+# And of all settings alike, in every line.
+FACTS = ("scene", "dtype", "seed", "processor", "cores", "device", "system", "python", "numpy", "scipy", "warp", "warpcloth")
+FACTS += ("source",)
 
 
 def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float64", limit=20.0, **run):
@@ -86,7 +90,7 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
         frames: Frames that are run, half of the scene's where not given.
         device: A Warp device.
         dtype: Of the runs; the reference solution has float64.
-        limit: Seconds a setting.
+        limit: Seconds a setting; the reference solution may take six times as long, and 120 s in any case.
         watch: Function that says how far the reference solution is, see :func:`reference`, or None.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
 
@@ -98,7 +102,7 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
     """
     setups = setups_of_runs(scene, solvers, device, dtype)
     frames = frames or max(scene.load().frames // _RUN, 1)
-    exact = reference(scene, frames=frames, tolerance=_KNOWN, limit=_SECONDS, progress=watch)
+    exact = reference(scene, frames=frames, tolerance=_KNOWN, limit=max(_TIMES * limit, _SECONDS), progress=watch)
     if (exact.points == exact.points[0]).all():
         raise ValueError(f"nothing moves in {scene} within {frames} frames; a chart of errors needs motion")
     given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}
@@ -234,16 +238,16 @@ def left_out(found):
 
 
 def write_csv(path, found):
-    """Writes a line for each setting, in the diagram "solver" for each of its points.
+    """Writes a line for each setting, in the diagram "solver" for each of its points, each with what it was measured on.
 
     Raises:
         FileNotFoundError: The folder does not exist.
     """
     with Output(path, "x", **TEXT) as output:
-        table = csv.DictWriter(output.file, COLUMNS, lineterminator="\n", extrasaction="ignore")
+        table = csv.DictWriter(output.file, COLUMNS + FACTS, lineterminator="\n", extrasaction="ignore")
         table.writeheader()
         for row in found["rows"]:
-            facts = {**row, "options": json.dumps(row["options"])}
+            facts = {**found, **found["machine"], **row, "options": json.dumps(row["options"])}
             for point in row.get("points") or [row]:
                 low, high = point.get("spread") or (None, None)
                 table.writerow({**facts, **point, "options": facts["options"], "ms_low": low, "ms_high": high})

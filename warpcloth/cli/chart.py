@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 
 from ..chart.figures import PICTURES, check_path
-from ..checks import whole
+from ..checks import number, whole
 from ..outputs import Output, check_apart
 from ..scene_files import assignments
 from . import stability
@@ -82,7 +82,9 @@ def _add_work_precision(charts):
     sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=SOLVERS, help="those alone")
     sub.add_argument("--frames", type=int, metavar="N", help="to run, by default half; before a step, by default a third")
     sub.add_argument("--dtype", choices=DTYPES, help="by default float32 of motion, float64 of a step")
-    sub.add_argument("--limit", type=float, default=20.0, metavar="SECONDS", help="that a setting may take (20)")
+    sub.add_argument(
+        "--limit", type=float, default=20.0, metavar="SECONDS", help="that a setting may take (20), a reference six times that"
+    )
 
 
 def _add_failure(charts):
@@ -141,6 +143,7 @@ def work_precision(arguments):
 
     if arguments.frames is not None:
         whole("frames", arguments.frames, least=1)
+    number("limit", arguments.limit, above=0.0)
     _check_outputs(arguments, [arguments.scene])
     device = find_device(arguments.device)
     _source, values, _scene = named_scene(arguments)
