@@ -234,6 +234,25 @@ def test_what_takes_hard_constraints_has_settings_for_them(device):
     assert bound == {"pbd", "hierarchical-pbd", "xpbd", "constrained-dynamics"}
 
 
+def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
+    """Of a solver with many settings; and what has no points is no line in the legend."""
+    rows = [
+        {"solver": solver, "label": f"{solver} {n}", "status": "refused", "reason": why, "points": [], "floor": 1e-9}
+        for solver, n, why in (("newton", 1, "hard"), ("newton", 4, "hard"), ("newton", 8, "soft"), ("admm", 1, "hard"))
+    ]
+    points = [{"iterations": n, "gap": 1.0 / n, "ms": 40.0 + n} for n in (1, 2, 4)]
+    rows.append({"solver": "xpbd", "label": "xpbd", "status": "ok", "reason": "", "points": points, "floor": 1e-9})
+    found = {"scene": "net", "frame": 1, "rate": 60.0, "dtype": "float64", "machine": {"device": "cpu"}, "rows": rows}
+    said = [("newton, 2 settings", "refused: hard"), ("newton 8", "refused: soft"), ("admm 1", "refused: hard")]
+    assert left_out(found) == said
+    fronts.plot_solver(tmp_path / "solver.png", found)
+    (legend,) = (axes.get_legend() for axes in drawn[0].axes if axes.get_legend())
+    assert [text.get_text() for text in legend.get_texts()] == ["xpbd", "rounding of the objective"]
+    low, high = (ms := drawn[0].axes[1]).get_xlim()
+    shown = [text.get_text() for text in ms.get_xticklabels() if low <= text.get_position()[0] <= high]
+    assert sum(map(bool, shown)) > 1 and not any(text.get_text() for text in ms.get_xticklabels(minor=True))
+
+
 def test_below_the_error_of_the_reference_nothing_is_better():
     """What is known to no more than 3 ranks by time alone below that, and is within 1 % only if that is added."""
     rows = [

@@ -2,7 +2,7 @@
 
 import math
 
-from .figures import GREY, PICTURES, check_path, save
+from .figures import GREY, PICTURES, check_path, number_times, save
 
 _MARKS = "os^Dv"
 
@@ -67,8 +67,6 @@ def _floor(left, right, floors):
 
 
 def _finish(left, right, title, points):
-    from matplotlib.ticker import LogLocator, MaxNLocator
-
     left.set_title(title, fontsize=9, loc="left", color=GREY)
     left.set_ylabel("relative error", color=GREY)
     left.set_xlabel("h / L", color=GREY)
@@ -82,10 +80,8 @@ def _finish(left, right, title, points):
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color("0.7")
     for axes in (left, right):
-        if axes.axison:  # over a decade or two the usual ones overlap, within one there may be none
-            low, high = axes.get_xlim()
-            ticks = LogLocator(subs=(1.0, 3.0)) if high > 10.0 * low else MaxNLocator(4)
-            axes.xaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_formatter="")
+        if axes.axison:
+            number_times(axes.xaxis)
     if left.get_legend_handles_labels()[1]:
         left.legend(frameon=False, fontsize=7, labelcolor=GREY)
     failed = [f"{_label(a)}, {a['resolution']}: {found['status']}" for a, found in points if found["status"] != "ok"]

@@ -37,6 +37,16 @@ def check_path(path, endings):
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
 
 
+def number_times(axis):
+    """Numbers a logarithmic axis of less than two decades, where the usual numbers overlap, or there may be none."""
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    low, high = axis.get_view_interval()
+    if high < 100.0 * low:
+        ticks = LogLocator(subs=(1.0, 3.0)) if high > 10.0 * low else MaxNLocator(4)
+        axis.set(major_locator=ticks, major_formatter="{x:g}", minor_formatter="")
+
+
 def save(figure, path):
     """Writes a figure in the format of its ending: .png, .svg or .pdf."""
     from matplotlib import rc_context

@@ -2,7 +2,7 @@
 
 import textwrap
 
-from .figures import GREY, PICTURES, check_path, save
+from .figures import GREY, PICTURES, check_path, number_times, save
 from .work_precision import WITHIN, cheapest, left_out
 
 # Each solver has its colour and marker in every picture.
@@ -92,6 +92,8 @@ def plot_solver(path, found):
         colour, marker = _STYLES[row["solver"]]
         style = _DASHES[seen.setdefault(row["solver"], 0) % len(_DASHES)]
         seen[row["solver"]] += 1
+        if not row["points"]:
+            continue
         for axes, name in zip(panels, ("iterations", "ms"), strict=True):
             x, y = ([point[name] for point in row["points"]], [max(point["gap"], floor) for point in row["points"]])
             axes.plot(x, y, style, marker=marker, color=colour, markersize=3, linewidth=1.0, label=row["label"])
@@ -164,7 +166,7 @@ def _figure(path, texts):
     for each in axes:
         each.set(xscale="log", yscale="log")
         each.grid(True, which="major", linewidth=0.3, color="0.8")
-        each.tick_params(colors=GREY, labelsize=8)
+        each.tick_params(which="both", colors=GREY, labelsize=8)
         each.spines[["top", "right"]].set_visible(False)
     notes.axis("off")
     return figure, axes, notes
@@ -174,6 +176,7 @@ def _finish(figure, axes, notes, title, texts):
     """Title, legend, and the texts below it."""
     known = {}
     for each in axes:
+        number_times(each.xaxis)
         known.update(zip(*reversed(each.get_legend_handles_labels()), strict=True))
     notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=7, borderaxespad=0.0)
     top = 1.0 - 0.155 * (len(known) + 1) / figure.get_size_inches()[1]

@@ -233,8 +233,15 @@ def front(rows, floor=0.0):
 
 
 def left_out(found):
-    """(label, status and reason) of the rows of a diagram that have no point in the picture."""
-    return [(row["label"], f"{row['status']}: {row['reason']}") for row in found["rows"] if row["status"] != "ok"]
+    """(label, status and reason) of the rows of a diagram that have no point in the picture, one for all alike of a solver."""
+    groups = {}
+    for row in found["rows"]:
+        if row["status"] != "ok":
+            groups.setdefault((row["solver"], f"{row['status']}: {row['reason']}"), []).append(row["label"])
+    return [
+        (labels[0] if len(labels) == 1 else f"{solver}, {len(labels)} settings", why)
+        for (solver, why), labels in groups.items()
+    ]
 
 
 def write_csv(path, found):

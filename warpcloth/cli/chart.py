@@ -256,13 +256,18 @@ class Settings:
 
 
 def _summary(found, lines_of):
+    from ..chart.work_precision import left_out
+
     rows, device = found["rows"], found["machine"]["device"]
     counts = {status: sum(row["status"] == status for row in rows) for status in ("ok", "diverged", "slow", "refused")}
     said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
     lines = [f"{found['scene']}: {len(rows)} settings, {said}", f"  device        {device}, {found['dtype']}"]
     lines += [f"  measured on   {count} {name}" for name, count in Counter(row["machine"] for row in rows).items()]
     lines += lines_of(found)
-    return "\n".join([*lines, *(f"  {row['status']:<12}  {row['label']}: {row['reason']}" for row in rows if row["reason"])])
+    for label, why in left_out(found):
+        status, _, reason = why.partition(": ")
+        lines.append(f"  {status:<12}  {label}: {reason}")
+    return "\n".join(lines)
 
 
 def _time_lines(found):
