@@ -242,7 +242,7 @@ def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
     ]
     points = [{"iterations": n, "gap": 1.0 / n, "ms": 40.0 + n} for n in (1, 2, 4)]
     rows.append({"solver": "xpbd", "label": "xpbd", "status": "ok", "reason": "", "points": points, "floor": 1e-9})
-    found = {"scene": "net", "frame": 1, "rate": 60.0, "dtype": "float64", "machine": {"device": "cpu"}, "rows": rows}
+    found = {"scene": "a$^$.py", "frame": 1, "rate": 60.0, "dtype": "float64", "machine": {"device": "cpu"}, "rows": rows}
     said = [("newton, 2 settings", "refused: hard"), ("newton 8", "refused: soft"), ("admm 1", "refused: hard")]
     assert left_out(found) == said
     fronts.plot_solver(tmp_path / "solver.png", found)

@@ -181,4 +181,4 @@ def _finish(figure, axes, notes, title, texts):
     notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=7, borderaxespad=0.0)
     top = 1.0 - 0.155 * (len(known) + 1) / figure.get_size_inches()[1]
     notes.text(0.0, top, "\n".join(texts), fontsize=7, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
-    figure.suptitle(title, fontsize=9, color=GREY)
+    figure.suptitle(title, fontsize=9, color=GREY, parse_math=False)
