@@ -2,7 +2,7 @@
 
 import math
 
-from .figures import GREY, PICTURES, check_path, number_times, save
+from .figures import GREY, PICTURES, check_path, number_axis, save
 
 _MARKS = "os^Dv"
 
@@ -81,7 +81,7 @@ def _finish(left, right, title, points):
         axes.spines[["left", "bottom"]].set_color("0.7")
     for axes in (left, right):
         if axes.axison:
-            number_times(axes.xaxis)
+            number_axis(axes.xaxis)
     if left.get_legend_handles_labels()[1]:
         left.legend(frameon=False, fontsize=7, labelcolor=GREY)
     failed = [f"{_label(a)}, {a['resolution']}: {found['status']}" for a, found in points if found["status"] != "ok"]

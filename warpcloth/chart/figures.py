@@ -37,7 +37,7 @@ def check_path(path, endings):
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
 
 
-def number_times(axis):
+def number_axis(axis):
     """Numbers a logarithmic axis of less than two decades, where the usual numbers overlap, or there may be none."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 

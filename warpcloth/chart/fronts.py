@@ -2,7 +2,7 @@
 
 import textwrap
 
-from .figures import GREY, PICTURES, check_path, number_times, save
+from .figures import GREY, PICTURES, check_path, number_axis, save
 from .work_precision import WITHIN, cheapest, left_out
 
 # Each solver has its colour and marker in every picture.
@@ -176,7 +176,7 @@ def _finish(figure, axes, notes, title, texts):
     """Title, legend, and the texts below it."""
     known = {}
     for each in axes:
-        number_times(each.xaxis)
+        number_axis(each.xaxis)
         known.update(zip(*reversed(each.get_legend_handles_labels()), strict=True))
     notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=7, borderaxespad=0.0)
     top = 1.0 - 0.155 * (len(known) + 1) / figure.get_size_inches()[1]
