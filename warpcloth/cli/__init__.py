@@ -1,5 +1,5 @@
 """The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures and compares
-animations, charts methods.
+animations, charts and benchmarks methods.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
 saved), 2 wrong use (one line on stderr), 130 interrupted. Any other error ends with 2 and one line as well, for most come of
@@ -13,7 +13,7 @@ import warnings
 
 import numpy as np
 
-from . import analyze, chart, choose, compare, deform, run
+from . import analyze, bench, chart, choose, compare, deform, run
 from .terminal import Interrupted, say, show_warning
 
 
@@ -97,6 +97,8 @@ def _parser():
     chart.add_arguments(charts)
     chooses = add("choose", choose.choose, "Choose the cheapest solver and settings for a scene.", epilog=choose.EPILOG)
     choose.add_arguments(chooses)
+    benches = add("bench", bench.bench, "Measure what frames cost, and compare two results.", epilog=bench.EPILOG)
+    bench.add_arguments(benches)
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
@@ -108,10 +110,10 @@ def _parser():
     runs.add_argument("--tolerance", metavar="SHARE", help="choose solver and settings of that error, such as 1%%, see choose")
     runs.add_argument("--budget", metavar="TIME", help="choose the most accurate of such a time a frame, such as 16ms")
     runs.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not the scene's")
-    for sub in (runs, info, deforms, analyzes, compares, chooses):
+    for sub in (runs, info, deforms, analyzes, compares, chooses, benches):
         sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print one JSON object")
-    for sub in (runs, info, deforms, analyzes, chooses):
+    for sub in (runs, info, deforms, analyzes, chooses, benches):
         sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
     for sub in (runs, deforms):
         sub.add_argument("-o", "--output", required=True, metavar="FILE", help="the .usd, .usda, .usdc or .usdz file to write")

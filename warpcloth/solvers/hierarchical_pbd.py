@@ -79,6 +79,7 @@ class HierarchicalPBDStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model)
+        self.iterations = options.iterations
         self.levels = levels(model, options.levels)
         self.sweep = Sweep(self.model, self.state.x, self.h, "coloured", options.relaxation)
         self.past = Past(model, self.sweep.elements)

@@ -68,6 +68,7 @@ class NewtonStepper(Stepper):
     def step(self):
         self._predict()
         results = self.minimiser.minimise(self.options.tolerance, self.options.iterations)
+        self.iterations = self.minimiser.iterations
         self._finish()
         self.results = [before.worse(now) for before, now in zip(self.results, results, strict=True)]
         self.residual = np.maximum(self.residual, self.minimiser.residual)  # keeps NaN

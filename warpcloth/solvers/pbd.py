@@ -74,6 +74,7 @@ class PBDStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model)
+        self.iterations = options.iterations
         model = self.model
         spread = options.iterations if options.stiffness == "per-step" else None
         self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)

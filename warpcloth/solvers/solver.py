@@ -97,10 +97,12 @@ class Stepper:
         steps_per_frame: Steps a frame.
         results: The worst :class:`warpcloth.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 of methods that have none.
+        iterations: Iterations of the last step; sweeps of methods that sweep, 1 of methods that do not iterate.
         factorise_seconds: What factorising constant matrices took, once, [s]; 0 of methods that have none.
     """
 
     factorise_seconds = 0.0
+    iterations = 1
 
     def __init__(self, options, model, integrator="euler"):
         require_model(model)

@@ -93,6 +93,7 @@ class XPBDStepper(Stepper):
 
     def __init__(self, options, model):
         super().__init__(options, model, options.integrator)
+        self.iterations = options.iterations
         model = self.model
         self.sweep = Sweep(
             model,

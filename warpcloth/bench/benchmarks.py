@@ -1,0 +1,138 @@
+"""Benchmarks as data, and their rows: each in a fresh process, one after another."""
+
+import os
+import tempfile
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from ..chart.axes import refined
+from ..chart.setups import label, setups_of_runs
+from ..chart.sweep import sweep
+from ..chart.tasks import SceneRef, Setup, task
+from ..quiet import initialise_warp
+from . import bandwidth
+from .measure import measure
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A solver on a scene of several sizes.
+
+    Attributes:
+        scene: Of any size.
+        setup: Of explicit without a step, the fewest stable substeps of each size.
+        sizes: Resolutions of the scene, see :func:`warpcloth.chart.axes.refined`; without any the scene as it is.
+        device: A Warp device.
+        dtype: ``"float32"`` or ``"float64"``.
+        frames: To time at most.
+    """
+
+    scene: SceneRef
+    setup: Setup
+    sizes: tuple = ()
+    device: str = "cpu"
+    dtype: str = "float32"
+    frames: int = 20
+
+    def scenes(self):
+        """The scene of each size.
+
+        Raises:
+            ValueError: It has no resolution.
+        """
+        return [refined(self.scene, size) for size in self.sizes] or [self.scene]
+
+    def setup_of(self, scene):
+        """The :class:`Setup` for one of the scenes."""
+        if self.setup.solver != "explicit" or {"dt", "substeps"} & set(self.setup.options):
+            return self.setup
+        (fewest, *_) = setups_of_runs(scene, ["explicit"], self.device, self.dtype)
+        return Setup("explicit", {**fewest.options, **self.setup.options})
+
+
+_STEPS = {"substeps": 4}
+_SWEEPS = {**_STEPS, "iterations": 20}
+# Sizes such that a frame of each solver takes less than about a second on one core.
+_SETUPS = (
+    (Setup("explicit"), (16, 32, 64, 128)),
+    (Setup("newton", _STEPS), (16, 32, 64)),
+    (Setup("projective-dynamics", _SWEEPS), (16, 32, 64)),
+    (Setup("admm", _SWEEPS), (16, 32, 64)),
+    (Setup("pbd", _SWEEPS), (16, 32, 64, 128)),
+    (Setup("hierarchical-pbd", _SWEEPS), (16, 32, 64, 128)),
+    (Setup("xpbd", _SWEEPS), (16, 32, 64, 128)),
+    (Setup("constrained-dynamics", {**_STEPS, "iterations": 1}), (8, 16, 32)),
+)
+
+
+def standard(**given):
+    """Every solver on ``hanging`` of growing size; ``given`` are further fields of each :class:`Benchmark`."""
+    return [Benchmark(SceneRef("hanging"), setup, sizes, **given) for setup, sizes in _SETUPS]
+
+
+class Run:
+    """The rows of benchmarks, which it has as far as it has come: whoever interrupts it keeps them.
+
+    Args:
+        benchmarks: :class:`Benchmark`\\s, of one device.
+
+    Attributes:
+        total: How many rows there will be.
+        rows: Those that are measured: what :func:`warpcloth.bench.measure.measure` returns, with ``scene``, ``parameters``,
+            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``benchmark`` (its place), ``share`` (``bytes_per_s``
+            over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with no kernel in any cache.
+        bandwidth: What :func:`warpcloth.bench.bandwidth.measure` returns.
+    """
+
+    def __init__(self, benchmarks):
+        self.benchmarks, self.rows, self.bandwidth = list(benchmarks), [], None
+        self.total = sum(len(each.scenes()) for each in self.benchmarks)
+
+    def measure(self, progress=lambda done, total: None):
+        """Measures all rows; ``progress`` is called with (rows, total) before the first and after each."""
+        progress(0, self.total)
+        initialise_warp()  # of this process, whose cache stays as it is
+        device = self.benchmarks[0].device
+        self.bandwidth = _alone(task(bandwidth.measure, device=device))
+        for place, benchmark in enumerate(self.benchmarks):
+            with _kernel_cache():
+                for i, scene in enumerate(benchmark.scenes()):
+                    self.rows.append({**self._row(benchmark, scene, cold=i == 0), "benchmark": place})
+                    progress(len(self.rows), self.total)
+
+    def _row(self, benchmark, scene, cold):
+        setup, device, dtype = benchmark.setup_of(scene), benchmark.device, benchmark.dtype
+
+        def measured(frames):
+            return _alone(
+                task(measure, scene=scene, setup=setup, frames=frames, device=device, dtype=dtype, started=time.time())
+            )
+
+        started = measured(0)["start_s"] if cold else None
+        row = measured(benchmark.frames)
+        share = row["bytes_per_s"] and row["bytes_per_s"] / max(self.bandwidth.values())
+        named = {"scene": scene.name, "parameters": scene.parameters, "solver": setup.solver, "options": setup.options}
+        named |= {"label": label(setup), "device": device, "dtype": dtype}
+        return {**named, **row, "share": share, "cold_start_s": started}
+
+
+def _alone(asked):
+    """The result of a task in a fresh process."""
+    ((_, result),) = sweep([asked], workers=1)
+    return result
+
+
+@contextmanager
+def _kernel_cache():
+    """An empty folder for the kernels that are compiled meanwhile, by processes that are started."""
+    before = os.environ.get("WARP_CACHE_PATH")
+    with tempfile.TemporaryDirectory(prefix="warpcloth-kernels-") as folder:
+        os.environ["WARP_CACHE_PATH"] = folder
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ["WARP_CACHE_PATH"]
+            else:
+                os.environ["WARP_CACHE_PATH"] = before
