@@ -22,7 +22,8 @@ def exponent(sizes, values):
     """p of values ∝ sizesᵖ, by least squares over the logarithms, and its standard error.
 
     Args:
-        sizes, values: (m,), above 0.
+        sizes: (m,), above 0.
+        values: (m,), above 0.
 
     Returns:
         (p, error): The error is None of two points, and both are None of fewer or where all sizes are one.
@@ -69,7 +70,8 @@ def ratios(old, new):
     difference exceeds it where the quartiles do not overlap.
 
     Args:
-        old, new: Results, see :func:`read`.
+        old: A result, see :func:`read`.
+        new: Another.
 
     Returns:
         list: Of each row what it is, ``label``, ``ms`` (old, new), ``ratio``, ``spread`` (low, high), ``verdict`` ("faster",

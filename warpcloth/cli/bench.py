@@ -57,18 +57,13 @@ def bench(arguments):
     progress = _Rows()
     try:
         run.measure(progress)
+        if all(row["status"] == "refused" for row in run.rows):
+            raise ValueError(run.rows[0]["reason"])
     except KeyboardInterrupt:
-        _write(arguments, run, device)
         raise Interrupted(f"interrupted after {len(run.rows)} of {run.total} rows") from None
-    except BaseException:
-        _write(arguments, run, device)
-        raise
     finally:
         progress.close()
-    refused = [row for row in run.rows if row["status"] == "refused"]
-    if len(refused) == run.total:
-        raise ValueError(refused[0]["reason"])
-    _write(arguments, run, device)
+        _write(arguments, run, device)
     diverged = [f"{row['label']} {_scene_of(row)}" for row in run.rows if row["status"] == "diverged"]
     return say(f"diverged: {', '.join(diverged)}", 1) if diverged else 0
 
@@ -85,14 +80,7 @@ def _benchmarks(arguments, device):
 
     given = {"device": str(device), "dtype": arguments.dtype, "frames": arguments.frames}
     if arguments.scene is None:
-        for name, value in {
-            "-p": arguments.p,
-            "--solver": arguments.solver,
-            "-s": arguments.s,
-            "--sizes": arguments.sizes,
-        }.items():
-            if value:
-                raise ValueError(f"{name} is given without SCENE, which it is for")
+        _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which it is for")
         return standard(**given)
     _source, values, scene = named_scene(arguments)
     parameters = {name: values[name] for name in assignments(arguments.p)}
@@ -102,11 +90,17 @@ def _benchmarks(arguments, device):
     if step_given or arguments.solver != "explicit":
         solver = solver_setup(arguments, scene, device).solver
         chosen |= {} if step_given else {"substeps": solver.substeps}
-    setup = Setup(arguments.solver, chosen)
-    benchmark = Benchmark(SceneRef(arguments.scene, parameters), setup, tuple(dict.fromkeys(arguments.sizes)), **given)
-    for ref in benchmark.scenes():
-        ref.load()  # what it refuses is said before anything is measured
+    sizes = tuple(sorted(set(arguments.sizes)))
+    benchmark = Benchmark(SceneRef(arguments.scene, parameters), Setup(arguments.solver, chosen), sizes, **given)
+    benchmark.scenes()[0].load()  # what it refuses is said before anything is measured
     return [benchmark]
+
+
+def _refuse(arguments, names, why):
+    """Refuses options that are given."""
+    for name in names:
+        if getattr(arguments, name):
+            raise ValueError(f"{'-' * min(len(name), 2)}{name} is given {why}")
 
 
 class _Rows:
@@ -131,7 +125,7 @@ def _write(arguments, run, device):
     from ..bench.results import growth, write_csv
     from ..chart.machine import machine
 
-    if not run.rows:
+    if all(row["status"] == "refused" for row in run.rows):
         return
     if arguments.csv:
         write_csv(arguments.csv, run.rows)
@@ -145,34 +139,34 @@ def _write(arguments, run, device):
     print(as_json(facts) if arguments.json else _text(facts))
 
 
-_HEAD = ("ms a frame", "quartiles", "ns", "GB/s", "share", "launches", "start", "compile", "factor", "MB")
+_HEAD = ("ms a frame", "quartiles", "ns", "GB/s", "share", "launches", "start", "compile", "factor", "MB", "")
 
 
 def _text(facts):
     machine, copied = facts["machine"], max(facts["bandwidth"].values())
     name = machine["processor"] if machine["device"] == "cpu" else machine["device"]
-    lines, table = [f"{name}, warp {machine['warp']}; a copy moves {1e-9 * copied:.3g} GB/s"], [("", "", *_HEAD)]
-    for row in facts["rows"]:
-        if row["status"] == "refused":
-            table.append((_scene_of(row), row["label"], f"refused: {row['reason']}"))
-            continue
-        low, high = row["spread"]
-        cold = None if row["cold_start_s"] is None else row["cold_start_s"] - row["start_s"]
-        numbers = [f"{low:.3g}–{high:.3g}", *map(_number, (row["ns"], row["bytes_per_s"] * 1e-9))]
-        numbers += [f"{100.0 * row['share']:.2g} %", f"{row['launches']:.4g}"]
-        numbers += [
-            *map(_number, (row["start_s"], cold, row["factorise_s"] or None)),
-            _number(row["memory"] and row["memory"] / 1e6),
-        ]
-        table.append((_scene_of(row), row["label"], f"{row['ms']:.3g}", *numbers, row["reason"]))
-    lines += _aligned(table)
+    table = [("", "", *_HEAD), *(_cells(row) for row in facts["rows"])]
+    lines = [f"{name}, warp {machine['warp']}; a copy moves {1e-9 * copied:.3g} GB/s", *_aligned(table)]
     for each in facts["growth"]:
-        shared = " ".join(f"{name}={value}" for name, value in each["options"].items())
-        frame, iteration = (
-            f"{p:.2f}" + ("" if error is None else f" ± {error:.2f}") for p, error in (each["frame"], each["iteration"])
-        )
-        lines.append(f"{each['solver']} {shared}: a frame grows as vertices^{frame}, an iteration as vertices^{iteration}")
+        words = [each["solver"], *(f"{name}={value}" for name, value in each["options"].items())]
+        powers = [f"{p:.2f}" + ("" if error is None else f" ± {error:.2f}") for p, error in (each["frame"], each["iteration"])]
+        lines.append(f"{' '.join(words)}: a frame grows as vertices^{powers[0]}, an iteration as vertices^{powers[1]}")
     return "\n".join(lines)
+
+
+def _cells(row):
+    """A row as texts."""
+    if row["status"] == "refused":
+        return (_scene_of(row), row["label"], *[""] * (len(_HEAD) - 1), f"refused: {row['reason']}")
+    low, high = row["spread"]
+    compiling = None if row["cold_start_s"] is None else max(row["cold_start_s"] - row["start_s"], 0.0)
+    numbers = (row["start_s"], compiling, row["factorise_s"] or None, row["memory"] and 1e-6 * row["memory"])
+    return (
+        *(_scene_of(row), row["label"], _number(row["ms"]), f"{low:.3g}–{high:.3g}"),
+        *(_number(row["ns"]), _number(1e-9 * row["bytes_per_s"]), f"{100.0 * row['share']:.2g} %", f"{row['launches']:.4g}"),
+        *map(_number, numbers),
+        row["reason"],
+    )
 
 
 def _scene_of(row):
@@ -184,18 +178,10 @@ def _number(value):
 
 
 def _aligned(table):
-    """Rows of texts as lines, the first two columns to the left; one of three columns is a name and a sentence."""
-    whole = [row for row in table if len(row) > 3]
-    widths = [max(len(row[i]) for row in whole if i < len(row)) for i in range(max(map(len, whole)))]
-    widths[:2] = [max(len(row[i]) for row in table) for i in range(2)]
-    lines = []
-    for row in table:
-        cells = [
-            text.ljust(width) if i < 2 or len(row) == 3 else text.rjust(width)
-            for i, (text, width) in enumerate(zip(row, widths, strict=False))
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return lines
+    """Rows of texts as lines: two columns to the left, numbers to the right, and a remark."""
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    pads = (str.ljust, str.ljust, *[str.rjust] * (len(widths) - 3), str.ljust)
+    return ["  ".join(pad(text, width) for pad, text, width in zip(pads, row, widths, strict=True)).rstrip() for row in table]
 
 
 def _compare(arguments):
@@ -206,9 +192,9 @@ def _compare(arguments):
     """
     from ..bench.results import ratios, read
 
-    for name, value in {"SCENE": arguments.scene, "--csv": arguments.csv}.items():
-        if value:
-            raise ValueError(f"{name} is given beside --compare, which measures nothing; leave one out")
+    if arguments.scene:
+        raise ValueError("SCENE is given beside --compare, which measures nothing")
+    _refuse(arguments, ("p", "solver", "s", "sizes", "csv"), "beside --compare, which measures nothing")
     old, new = (read(path) for path in arguments.compare)
     found = ratios(old, new)
     if not found:
