@@ -83,7 +83,7 @@ def _warm(stepper, model, frames, elements):
     substeps = stepper.steps_per_frame
     low, median, high = (1e3 * np.percentile(times, [25, 50, 75])).tolist()
     mean = float(np.mean(iterations)) / substeps
-    moved = compulsory_bytes(model, mean)
+    moved = round(compulsory_bytes(model, mean))
     per_iteration = 1e9 * np.array(times) / np.maximum(np.array(iterations) * elements, 1)
     return {
         "frames": len(times),
@@ -91,7 +91,7 @@ def _warm(stepper, model, frames, elements):
         "spread": [low, high],
         "iterations": mean,
         "ns": float(np.median(per_iteration)) if elements else None,
-        "bytes": round(moved),
+        "bytes": moved,
         "bytes_per_s": moved * substeps / (1e-3 * median),
         "launches": launches_of(lambda: _run_frame(stepper)) / substeps,
     }

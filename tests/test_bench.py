@@ -1,0 +1,319 @@
+"""Benchmarks: what they count, what they make of times, and the command; times themselves are not tested."""
+
+import csv
+import json
+import os
+import time
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpcloth as wc
+from warpcloth.bench import benchmarks
+from warpcloth.bench.bandwidth import measure as bandwidth
+from warpcloth.bench.benchmarks import Benchmark, Run, standard
+from warpcloth.bench.counts import compulsory_bytes, elements_of, launches_of
+from warpcloth.bench.measure import measure
+from warpcloth.bench.results import exponent, growth, ratios, write_csv
+from warpcloth.capture import Segment
+from warpcloth.chart.tasks import SceneRef, Setup
+from warpcloth.cli import main
+from warpcloth.scenes import hanging
+from warpcloth.solvers import SOLVERS
+
+
+@pytest.mark.parametrize(("dtype", "size"), [("float32", 4), ("float64", 8)])
+@pytest.mark.parametrize("copies", [1, 3])
+def test_bytes(dtype, size, copies, device):
+    """Of each copy: x in and out and 1/m for each vertex, two indices and a rest length for each spring; k is one number."""
+    scene = wc.Scene(wc.Mesh.grid(5, 4), density=0.1, terms=[wc.Spring(pairs="structural", stiffness=1.0)])
+    model = scene.build(device=device, dtype=dtype, copies=copies)
+    n, springs = 20, 4 * 4 + 5 * 3
+    assert elements_of(model) == copies * springs
+    iteration = copies * (n * 7 * size + springs * (2 * 4 + size)) + size
+    for iterations in (1, 3.5):
+        assert compulsory_bytes(model, iterations) == iterations * iteration + copies * n * 6 * size
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def count_down(left: wp.array(dtype=int)):
+    left[0] = wp.max(left[0] - 1, 0)
+
+
+def test_launches_of_loops_on_the_device_count_each_time(device):
+    left, times = wp.array([5], dtype=int, device=device), wp.zeros(1, dtype=int, device=device)
+
+    def count():
+        wp.launch(count_down, 1, outputs=[left], device=device)
+
+    def record():
+        times.zero_()
+        wp.copy(times, left)
+        wp.capture_while(left, count)
+
+    segment = Segment(wp.get_device(device), record)
+    left.fill_(5)
+    before = wp.launch, wp.copy, wp.array.zero_, Segment.__call__
+    assert launches_of(segment) == 1 + 1 + 5
+    assert times.numpy()[0] == 5 and left.numpy()[0] == 0
+    left.fill_(3)
+    with pytest.raises(KeyError):
+        launches_of({}.__getitem__("x"))
+    assert (wp.launch, wp.copy, wp.array.zero_, Segment.__call__) == before
+    assert launches_of(lambda: (segment(), segment())) == 2 * 2 + 3
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_counting_takes_the_same_steps(solver, device):
+    """To the bit; of explicit they are a launch for each term and one for all vertices."""
+    record = SOLVERS[solver](substeps=20 if solver == "explicit" else 4)
+    steppers = [record.bind(hanging.scene(n=5).build(device=device)) for _ in range(2)]
+    for stepper in steppers * 8:  # of a start at rest nothing is to be minimised
+        stepper.step()
+    launches = launches_of(steppers[0].step)
+    steppers[1].step()
+    np.testing.assert_array_equal(*(stepper.state.x.numpy() for stepper in steppers))
+    assert launches >= 3 and steppers[0].iterations == steppers[1].iterations >= 1
+    if solver == "explicit":
+        assert launches == 3
+
+
+@pytest.mark.parametrize("benchmark", standard(), ids=lambda each: each.setup.solver)
+def test_a_row_of_every_solver(benchmark, device):
+    scene = SceneRef("hanging", {"n": 5})
+    setup = Benchmark(scene, benchmark.setup, device=device).setup_of(scene)
+    row = measure(asdict(scene), asdict(setup), frames=2, device=device, dtype="float32", started=time.time())
+    assert row["status"] == "ok" and row["frames"] == 2 and row["vertices"] == 25
+    scene = hanging.scene(n=5)
+    assert row["elements"] == sum(len(term.stencil(scene.mesh)) for term in scene.terms)
+    options = setup.options
+    assert row["substeps"] == options["substeps"] and 1 <= row["iterations"] <= options.get("iterations", 100)
+    if "pbd" in setup.solver:
+        assert row["iterations"] == options["iterations"]
+    model = scene.build(device=device)
+    assert row["bytes"] == round(compulsory_bytes(model, row["iterations"]))
+    assert row["bytes_per_s"] == pytest.approx(row["bytes"] * row["substeps"] / (1e-3 * row["ms"]))
+    assert row["spread"][0] <= row["ms"] <= row["spread"][1] and row["start_s"] > row["bind_s"] > 0.0
+    assert row["memory"] is None or row["memory"] > row["bytes"]
+    json.dumps(row, allow_nan=False)
+
+
+def test_the_standard_has_every_solver_on_growing_scenes():
+    listed = standard(device="cpu", dtype="float64", frames=3)
+    assert {each.setup.solver for each in listed} == set(SOLVERS)
+    for each in listed:
+        assert each.scene == SceneRef("hanging") and len(each.sizes) >= 3 and list(each.sizes) == sorted(set(each.sizes))
+        assert (each.dtype, each.frames) == ("float64", 3)
+        assert each.setup.solver == "explicit" or each.setup.record().substeps
+
+
+def test_a_copy_moves_something(device):
+    assert all(each > 0.0 for each in bandwidth(device).values())
+
+
+def test_the_exponent_of_a_power_is_exact():
+    sizes = np.array([16, 64, 256, 1024])
+    p, error = exponent(sizes, 3.0 * sizes**1.25)
+    assert p == pytest.approx(1.25, abs=1e-12) and error == pytest.approx(0.0, abs=1e-12)
+    assert exponent([4, 16], [1.0, 8.0]) == (pytest.approx(1.5), None)
+    assert exponent([4], [1.0]) == exponent([4, 4], [1.0, 2.0]) == exponent([], []) == (None, None)
+
+
+def test_the_error_of_an_exponent():
+    """Logarithms −1, 0, 1 and times that are off the line by e, −2e, e: p stays, and its error is √(6e²/1/2)."""
+    e = 0.01
+    p, error = exponent(np.exp([-1.0, 0.0, 1.0]), np.exp([-0.7 + e, -2.0 * e, 0.7 + e]))
+    assert p == pytest.approx(0.7) and error == pytest.approx(np.sqrt(3.0) * e)
+
+
+def row(n, ms, substeps=4, benchmark=0, solver="xpbd", status="ok", wide=0.1, **more):
+    found = {"scene": "hanging", "parameters": {"n": n}, "solver": solver, "options": {"substeps": substeps, "iterations": 5}}
+    found |= {"label": f"{solver} {substeps}×5", "device": "cpu", "dtype": "float32", "benchmark": benchmark, "status": status}
+    found |= {"reason": "", "vertices": n * n, "substeps": substeps, "iterations": 5.0, "ms": ms, "spread": None, "bytes": 100}
+    found |= {"launches": 10.0, "start_s": 1.0, "memory": 1000}
+    return found | ({"spread": [(1 - wide) * ms, (1 + wide) * ms]} if ms else {}) | more
+
+
+def result(*rows, processor="p"):
+    return {"machine": {"processor": processor, "device": "cpu"}, "rows": list(rows)}
+
+
+def test_growth_of_frames_and_of_iterations():
+    """Substeps that grow with n: a frame as n³, an iteration as n²; other benchmarks, and what failed, are apart."""
+    rows = [row(n, 0.1 * n**3, substeps=n) for n in (4, 8, 16)]
+    rows += [row(32, None, substeps=32, status="refused"), row(4, 1.0, benchmark=1), row(8, 4.0, benchmark=2)]
+    (one,) = growth(rows)
+    assert one["frame"] == pytest.approx([1.5, 0.0], abs=1e-9) and one["iteration"] == pytest.approx([1.0, 0.0], abs=1e-9)
+    assert one["options"] == {"iterations": 5} and one["solver"] == "xpbd"
+
+
+OLD = result(row(4, 1.0), row(8, 4.0), row(16, 16.0), row(32, 64.0), row(6, None, status="refused"))
+NEW = result(row(4, 0.5, launches=5.0, memory=None), row(8, 8.0), row(16, 17.0), row(6, 1.0), row(4, 1.0, solver="pbd"))
+
+
+def test_ratios():
+    found = {each["parameters"]["n"]: each for each in ratios(OLD, NEW)}
+    assert list(found) == [4, 8, 16]
+    assert [each["verdict"] for each in found.values()] == ["faster", "slower", ""]
+    assert [each["ratio"] for each in found.values()] == pytest.approx([0.5, 2.0, 17 / 16])
+    assert found[4]["spread"] == pytest.approx([0.5 * 0.9 / 1.1, 0.5 * 1.1 / 0.9]) and found[4]["ms"] == [1.0, 0.5]
+    assert (found[4]["launches"], found[4]["memory"], found[8]["bytes"]) == (0.5, None, 1.0)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with results old.json, new.json and such that are none."""
+    monkeypatch.chdir(tmp_path)
+    files = {"old": json.dumps(OLD), "new": json.dumps(NEW), "alone": json.dumps(result(row(5, 1.0)))}
+    files |= {"text": "no result", "list": "[]", "rows": '{"rows": [{}], "machine": {}}', "number": '{"rows": 3}'}
+    for name, text in files.items():
+        (tmp_path / f"{name}.json").write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def test_the_command_compares(folder, capsys):
+    assert main(["bench", "--compare", "old.json", "new.json"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 7 and "hanging n=16" in lines[3]
+    assert lines[1].split()[-1] == "faster" and lines[2].split()[-1] == "slower" and "–" in lines[1]
+    assert lines[4:] == [
+        "slower by more than the spread: xpbd 4×5 hanging n=8",
+        "faster by more than the spread: xpbd 4×5 hanging n=4",
+        "4 rows have no partner that was measured",
+    ]
+    (folder / "other.json").write_text(json.dumps({**NEW, "machine": {"processor": "q", "device": "cpu"}}), encoding="utf-8")
+    assert main(["bench", "--compare", "old.json", "other.json"]) == 0
+    assert capsys.readouterr().out.startswith("processor: p and q, so that times say little of the code\n")
+    assert main(["bench", "--compare", "old.json", "new.json", "--json"]) == 0
+    assert [each["verdict"] for each in json.loads(capsys.readouterr().out)["rows"]] == ["faster", "slower", ""]
+
+
+def test_the_command_measures(folder, device, capsys):
+    environment = dict(os.environ)
+    command = ["bench", "hanging", "-p", "bending=0", "--solver", "explicit", "--sizes", "6", "4", "6", "--frames", "3"]
+    assert main([*command, "--device", device, "--csv", "table.csv", "--json"]) == 0
+    assert dict(os.environ) == environment
+    found = json.loads(capsys.readouterr().out)
+    assert {"date", "machine", "bandwidth", "rows", "growth"} == set(found) and found["machine"]["device"]
+    small, large = found["rows"]
+    assert [row["parameters"]["n"] for row in (small, large)] == [4, 6] and small["vertices"] == 16
+    assert small["launches"] == large["launches"] == 3 and small["options"]["substeps"] < large["options"]["substeps"]
+    # With an empty cache a kernel is compiled, and that takes longer.
+    assert small["cold_start_s"] > small["start_s"] and large["cold_start_s"] is None
+    assert found["growth"][0]["frame"][1] is None
+    table = list(csv.DictReader((folder / "table.csv").open(encoding="utf-8")))
+    assert [(line["elements"], line["bytes"]) for line in table] == [
+        (str(r["elements"]), str(r["bytes"])) for r in found["rows"]
+    ]
+    assert float(table[0]["ms_low"]) <= float(table[0]["ms"]) <= float(table[0]["ms_high"])
+
+
+def rows_until(stop, error):
+    """Something in place of `benchmarks._alone`: made-up rows, and an error when so many are done."""
+    state = {"rows": 0}
+
+    def alone(asked):
+        if asked.function.endswith("bandwidth:measure"):
+            return {"copy": 1e9, "kernel": 2e9}
+        frames = asked.arguments["frames"]
+        if state["rows"] == stop:
+            raise error
+        state["rows"] += frames > 0
+        found = row(asked.arguments["scene"]["parameters"]["n"], 1.0, frames=3, elements=5, ns=1.0, bytes_per_s=1e9)
+        found["label"] = asked.arguments["setup"]["solver"]
+        return found | {"bind_s": 0.1, "factorise_s": 0.0}
+
+    return alone
+
+
+@pytest.mark.parametrize(
+    ("stop", "error", "said", "code"),
+    [
+        (2, KeyboardInterrupt(), "interrupted after 2 of 3 rows", 130),
+        (0, KeyboardInterrupt(), "interrupted after 0 of 3 rows", 130),
+        (2, MemoryError(), "MemoryError", 2),
+    ],
+)
+def test_what_ends_early_keeps_the_rows(stop, error, said, code, folder, monkeypatch, capsys):
+    monkeypatch.setattr(benchmarks, "_alone", rows_until(stop, error))
+    command = ["bench", "hanging", "--solver", "xpbd", "--sizes", "4", "6", "8", "--csv", "t.csv"]
+    assert main(command) == code
+    out, err = capsys.readouterr()
+    assert said in err and err.count("\n") == 1
+    assert (out.count("\nhanging n="), (folder / "t.csv").exists()) == (stop, stop > 0)
+    if stop:
+        assert "vertices^0.00" in out and "50 %" in out
+        assert len((folder / "t.csv").read_text().splitlines()) == 1 + stop
+
+
+def test_refused_and_diverged_rows(folder, monkeypatch, capsys):
+    """One that diverged gives 1; one that was refused stands in the table; where all are, its sentence is all there is."""
+    refused = row(4, None, status="refused", reason="too large", share=None, cold_start_s=None, start_s=None)
+    table = [
+        (["ok", "diverged"], 1, "warpcloth: diverged: xpbd hanging n=6\n"),
+        (["refused", "ok"], 0, ""),
+        (["refused", "refused"], 2, "warpcloth: too large\n"),
+    ]
+    for statuses, code, said in table:
+        made = rows_until(-1, None)
+
+        def alone(asked, made=made, statuses=statuses):
+            found = made(asked)
+            if "scene" not in asked.arguments:
+                return found
+            status = statuses[[4, 6].index(asked.arguments["scene"]["parameters"]["n"])]
+            return found | (refused | {"bytes_per_s": None} if status == "refused" else {"status": status})
+
+        monkeypatch.setattr(benchmarks, "_alone", alone)
+        assert main(["bench", "hanging", "--solver", "xpbd", "--sizes", "4", "6"]) == code
+        out, err = capsys.readouterr()
+        assert err == said and ("refused: too large" in out) == (code == 0)
+
+
+def test_scenes_without_sizes_are_taken_as_they_are(monkeypatch, tmp_path):
+    made = rows_until(-1, None)
+    monkeypatch.setattr(benchmarks, "_alone", made)
+    run = Run([Benchmark(SceneRef("hanging", {"n": 7}), Setup("pbd", {"substeps": 1}))])
+    run.measure()
+    assert run.total == len(run.rows) == 1 and run.rows[0]["parameters"] == {"n": 7}
+    write_csv(tmp_path / "t.csv", run.rows)
+    assert growth(run.rows) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("bench hangin", "there is no scene 'hangin'"),
+        ("bench hanging --sizes 0", "sizes is 0; it must be a whole number of 2 or more"),
+        ("bench hanging --sizes many", "invalid int value: 'many'"),
+        ("bench hanging --frames 0", "frames is 0; it must be a whole number of 1 or more"),
+        ("bench hanging --solver simplex", "invalid choice: 'simplex'"),
+        ("bench hanging --dtype float16", "invalid choice: 'float16'"),
+        ("bench hanging --device gpu", "device is 'gpu'"),
+        ("bench hanging -s tolerances=1", "Newton has no option 'tolerances'"),
+        ("bench hanging -s substeps=0", "substeps is 0"),
+        ("bench hanging -p m=3", "has no parameter 'm'"),
+        ("bench flag --sizes 4 -p m=3", "has no parameter 'm'"),
+        ("bench bunny --sizes 4", "bunny has no resolution to vary; its scene() must take n or links or elements"),
+        ("bench hanging --csv none/t.csv", "none does not exist"),
+        ("bench --sizes 4", "--sizes is given without SCENE, which it is for"),
+        ("bench -p n=4", "-p is given without SCENE"),
+        ("bench --solver xpbd", "--solver is given without SCENE"),
+        ("bench --compare old.json", "expected 2 arguments"),
+        ("bench hanging --compare old.json new.json", "SCENE is given beside --compare"),
+        ("bench --compare old.json new.json --csv t.csv", "--csv is given beside --compare"),
+        ("bench --compare old.json none.json", "none.json: No such file"),
+        ("bench --compare old.json text.json", "text.json: is no result of benchmarks"),
+        ("bench --compare list.json new.json", "list.json: is no result of benchmarks"),
+        ("bench --compare rows.json new.json", "rows.json: is no result of benchmarks"),
+        ("bench --compare number.json new.json", "number.json: is no result of benchmarks"),
+        ("bench --compare old.json alone.json", "have no row in common that was measured in both"),
+    ],
+)
+def test_wrong_use(words, said, folder, capsys):
+    before = sorted(folder.iterdir())
+    assert main(words.split()) == 2
+    out, err = capsys.readouterr()
+    assert said in err and err.count("\n") == 1 and not out and sorted(folder.iterdir()) == before
