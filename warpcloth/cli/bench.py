@@ -139,7 +139,7 @@ def _write(arguments, run, device):
     print(as_json(facts) if arguments.json else _text(facts))
 
 
-_HEAD = ("ms a frame", "quartiles", "ns", "GB/s", "share", "launches", "start", "compile", "factor", "MB", "")
+_HEAD = ("ms a frame", "quartiles", "ns", "GB/s", "share", "launches", "start s", "compile s", "factor s", "MB", "")
 
 
 def _text(facts):
