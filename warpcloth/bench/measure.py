@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..chart.tasks import SceneRef, Setup
+from ..solvers.solver import Stepper
 from ..status import Result
 from .counts import compulsory_bytes, elements_of, launches_of
 
@@ -100,9 +101,14 @@ def _warm(stepper, model, frames, elements):
 def _run_frame(stepper):
     """A frame, its points read on the host; the iterations of all its steps."""
     iterations = 0
-    for _ in range(stepper.steps_per_frame):
-        stepper.step()
-        iterations += stepper.iterations
+    # Where a solver has frames of its own, all its steps have the same iterations.
+    if getattr(type(stepper), "frame", None) is not getattr(Stepper, "frame", None):
+        stepper.frame()
+        iterations = stepper.steps_per_frame * stepper.iterations
+    else:
+        for _ in range(stepper.steps_per_frame):
+            stepper.step()
+            iterations += stepper.iterations
     stepper.state.x.numpy()
     return iterations
 
