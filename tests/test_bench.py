@@ -236,8 +236,8 @@ def rows_until(stop, error):
 @pytest.mark.parametrize(
     ("stop", "error", "said", "code"),
     [
-        (2, KeyboardInterrupt(), "interrupted after 2 of 3 rows", 130),
-        (0, KeyboardInterrupt(), "interrupted after 0 of 3 rows", 130),
+        (2, KeyboardInterrupt(), "interrupted after 2 of 3 rows, which are printed", 130),
+        (0, KeyboardInterrupt(), "interrupted before the first row; nothing was measured", 130),
         (2, MemoryError(), "MemoryError", 2),
     ],
 )

@@ -60,7 +60,7 @@ def bench(arguments):
         if all(row["status"] == "refused" for row in run.rows):
             raise ValueError(run.rows[0]["reason"])
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted after {len(run.rows)} of {run.total} rows") from None
+        raise Interrupted(_interrupted(run)) from None
     finally:
         progress.close()
         _write(arguments, run, device)
@@ -101,6 +101,13 @@ def _refuse(arguments, names, why):
     for name in names:
         if getattr(arguments, name):
             raise ValueError(f"{'-' * min(len(name), 2)}{name} is given {why}")
+
+
+def _interrupted(run):
+    """What is left."""
+    if not run.rows:
+        return "interrupted before the first row; nothing was measured"
+    return f"interrupted after {len(run.rows)} of {run.total} rows, which are printed"
 
 
 class _Rows:
