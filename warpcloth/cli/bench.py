@@ -17,7 +17,8 @@ Newton's method Newton iterations, of hierarchical PBD sweeps over all terms) ×
 over its time; positions in and out once, inverse masses and the arrays of all terms once an iteration, velocities in and out
 once. share: of what a copy moves on this device; small scenes stay in its caches, and may have more than 100 %. launches: of a
 step, kernels, fills and copies. start: from the start of a process to its first frame, with all kernels in the cache; compile:
-what it takes longer with none there. factor: constant matrices. MB: most memory, of the process on a CPU, of Warp's pool on CUDA.
+what it takes longer with none there. factor: constant matrices. MB: most memory, of the process on a CPU, of Warp's pool on
+CUDA.
 
   warpcloth bench --json > before.json
   warpcloth bench hanging --solver xpbd -s substeps=4 iterations=20 --sizes 32 64 128
