@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.chart import stability
+from warpcloth.chart import machine, stability
 from warpcloth.chart.axes import AXES, FIXED, applied, record_at, scene_at, vary
 from warpcloth.chart.failures import FAILURES
 from warpcloth.chart.maps import _PLAIN, plot_maps, write_table
@@ -530,6 +530,7 @@ def test_a_map_is_drawn(tmp_path, monkeypatch):
     saving = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (kept.append(self), saving(self, *a, **k)))
     survey, cells = made_up()
+    survey = replace(survey, scene=SceneRef("a$^$.py"))
     plot_maps(tmp_path / "map.png", survey, cells)
     (axes,) = kept[0].axes
     mesh, line, known = axes.collections
@@ -585,6 +586,10 @@ def test_the_command(tmp_path, capfd, monkeypatch):
     code, out, err = run(capfd, *given, "--json")
     facts = json.loads(out)
     assert code == 0 and facts["axes"]["dt"] == [1e-3, 1e-2, 1e-1] and len(facts["maps"]["explicit"]) == 2
+    assert facts["fixed"] == {} and facts["seed"] == 0 and facts["dtype"] == "float64" and facts["accuracy"] == 0.01
+    assert facts["machine"]["source"] and facts["maps"]["explicit"][0][0]["machine"] == machine.name()
+    with open(tmp_path / "m.csv", encoding="utf-8") as file:
+        assert {row["machine"] for row in csv.DictReader(file)} == {machine.name()}
     assert len((tmp_path / "cache" / "stability.jsonl").read_text().splitlines()) == 3
 
 
@@ -603,10 +608,15 @@ def test_the_command(tmp_path, capfd, monkeypatch):
         ("--x dt --y stiffness --steps 0", "steps is 0"),
         ("--x dt --y stiffness --limit 0", "limit is 0"),
         ("--x dt --y stiffness -o map.doc", "the ending is '.doc'"),
+        ("--x dt --y stiffness --csv nowhere/map.csv", "nowhere does not exist"),
+        ("--x dt --y stiffness -o map.png --csv map.png", "is given for two outputs"),
+        ("--x dt --y stiffness --workers 0", "workers is 0"),
+        ("--x dt --y stiffness --device cuda:9", "device is 'cuda:9'"),
         ("--y stiffness", "required: --x"),
     ],
 )
 def test_wrong_use_is_said_in_a_line(words, says, capfd, tmp_path, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    monkeypatch.setattr("warpcloth.cli.stability.sweep", None)  # nothing is measured before
     code, out, err = run(capfd, "hanging", *words.split())
     assert code == 2 and says in err and err.count("\n") == 1 and not out

@@ -79,7 +79,9 @@ def plot_maps(path, survey, cells):
         axes.remove()
     _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row})
     rest = ", ".join(f"{name} {value:.4g}" for name, value in survey.fixed.items())
-    figure.suptitle(f"{survey.scene}, {survey.steps} steps" + (f", {rest}" if rest else ""), fontsize=10, color=GREY)
+    figure.suptitle(
+        f"{survey.scene}, {survey.steps} steps" + (f", {rest}" if rest else ""), fontsize=10, color=GREY, parse_math=False
+    )
     save(figure, path)
 
 
@@ -151,7 +153,7 @@ def _legend(figure, shown, verdicts):
 
 
 def write_table(path, survey, cells):
-    """A line for each cell: method, values of the axes, verdict, step of divergence, growth, error, floor, rules and reason.
+    """A line for each cell: method, axes, verdict, step of divergence, growth, error, floor, rules, reason, machine if known.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -160,9 +162,10 @@ def write_table(path, survey, cells):
     plain = ("verdict", "step", "growth", "error", "floor")
     with Output(path, "x", **TEXT) as output:
         table = csv.writer(output.file, lineterminator="\n")
-        table.writerow(["method", survey.x, survey.y, *plain, *names, "reason"])
+        table.writerow(["method", survey.x, survey.y, *plain, *names, "reason", "machine"])
         for setup, rows in zip(survey.setups, cells, strict=True):
             for y, row in zip(survey.ys, rows, strict=True):
                 for x, cell in zip(survey.xs, row, strict=True):
                     values = [cell[name] for name in plain] + [cell["rules"].get(name) for name in names]
-                    table.writerow([str(setup), x, y, *("" if v is None else v for v in values), cell["reason"]])
+                    ends = cell["reason"], cell.get("machine", "")
+                    table.writerow([str(setup), x, y, *("" if v is None else v for v in values), *ends])

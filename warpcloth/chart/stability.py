@@ -275,13 +275,19 @@ class Survey:
     def _first(self):
         return {self.x: self.xs[0], self.y: self.ys[0]}
 
-    def table(self, results):
-        """Cells (setup, y, x) as nested lists, from (task, result) in any order; None where there is none."""
+    def table(self, results, store=None):
+        """Cells (setup, y, x) as nested lists, from (task, result) in any order; None where there is none.
+
+        Args:
+            results: As :func:`warpcloth.chart.sweep.sweep` gives them.
+            store: The :class:`warpcloth.chart.sweep.Store` that keeps them, which says the ``machine`` of each cell, or None.
+        """
         cells = [[[None] * len(self.xs) for _ in self.ys] for _ in self.setups]
         for done, rows in results:
             axis, fixed = done.arguments["axis"], done.arguments["fixed"]
             for row, of_setup in zip(rows, cells, strict=True):
                 for k, cell in enumerate(row):
+                    cell = cell if store is None else cell | {"machine": store.machine(done)}
                     if axis == self.x:
                         of_setup[self.ys.index(fixed[self.y])][k] = cell
                     else:

@@ -4,13 +4,12 @@ import argparse
 import sys
 from collections import Counter
 
-from ..chart.figures import PICTURES, check_path
+from ..chart.figures import PICTURES
 from ..checks import number, whole
-from ..outputs import Output, check_apart
 from ..scene_files import assignments
 from . import stability
 from .run import named_scene
-from .terminal import Interrupted, add_dask, as_json, check_writable, executing, find_device, open_bar
+from .terminal import add_dask, as_json, check_outputs, find_device, measuring
 
 TEXT = "Chart speed against accuracy, stability and failures."
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
@@ -46,14 +45,8 @@ def add_arguments(parser):
     charts = parser.add_subparsers(title="charts", metavar="CHART")
     _add_work_precision(charts)
     _add_failure(charts)
-    form = argparse.RawDescriptionHelpFormatter
     text = "Map where methods are stable, inaccurate or diverge."
-    maps = charts.add_parser(
-        "stability", help=text, description=text, epilog=stability.EPILOG, allow_abbrev=False, formatter_class=form
-    )
-    maps.set_defaults(command=stability.chart)
-    maps.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    stability.add_arguments(maps)
+    stability.add_arguments(add(charts, "stability", stability.chart, text, stability.EPILOG))
 
 
 def add(charts, name, command, text, epilog):
@@ -97,22 +90,10 @@ def _add_failure(charts):
 def failure(arguments):
     from ..chart.failures import failure_chart, plot_failure, write_csv
 
-    _check_outputs(arguments)
+    check_outputs(arguments)
     device = find_device(arguments.device)
-    progress = Settings()
-    try:
-        with executing(arguments) as executor:
-            found = failure_chart(
-                arguments.failure,
-                device=str(device),
-                workers=arguments.workers or (1 if device.is_cuda else None),
-                progress=progress,
-                **executor,
-            )
-    except KeyboardInterrupt:
-        raise Interrupted(progress.interrupted()) from None
-    finally:
-        progress.close()
+    with measuring(arguments, device) as run:
+        found = failure_chart(arguments.failure, device=str(device), **run)
     if arguments.output:
         plot_failure(arguments.output, found)
     if arguments.csv:
@@ -144,36 +125,22 @@ def work_precision(arguments):
     if arguments.frames is not None:
         whole("frames", arguments.frames, least=1)
     number("limit", arguments.limit, above=0.0)
-    _check_outputs(arguments, [arguments.scene])
+    check_outputs(arguments, [arguments.scene])
     device = find_device(arguments.device)
     _source, values, _scene = named_scene(arguments)
     given = {name: values[name] for name in assignments(arguments.p)}
-    progress = Settings()
     options = {
         name: getattr(arguments, name) for name in ("solvers", "frames", "dtype") if getattr(arguments, name) is not None
     }
-    if arguments.diagram == "time":
-        options["watch"] = progress.watch
-    elif arguments.diagram == "physics" and (set(options) & {"solvers", "frames"}):
+    if arguments.diagram == "physics" and (set(options) & {"solvers", "frames"}):
         raise ValueError("the diagram physics is of rest shapes; --solvers and --frames are for the others")
     elif arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
         raise ValueError("the diagram spectrum is of projective dynamics in float64; --solvers and --dtype are for the others")
     measure, plot, lines = _parts(arguments.diagram)
-    try:
-        with executing(arguments) as executor:
-            found = measure(
-                SceneRef(arguments.scene, given),
-                device=str(device),
-                limit=arguments.limit,
-                workers=arguments.workers or (1 if device.is_cuda else None),
-                progress=progress,
-                **executor,
-                **options,
-            )
-    except KeyboardInterrupt:
-        raise Interrupted(progress.interrupted()) from None
-    finally:
-        progress.close()
+    with measuring(arguments, device) as run:
+        watch = {"watch": run["progress"].watch} if arguments.diagram == "time" else {}
+        scene = SceneRef(arguments.scene, given)
+        found = measure(scene, device=str(device), limit=arguments.limit, **watch, **run, **options)
     if arguments.output:
         plot(arguments.output, found)
     if arguments.csv:
@@ -205,54 +172,6 @@ def _physics_lines(found):
     """The error of each point."""
     known = [row for row in found["rows"] if row["error"] is not None]
     return [f"  error         {100.0 * row['error']:.3g} %, {row['ms'] or 0.0:.3g} ms: {row['label']}" for row in known]
-
-
-def _check_outputs(arguments, inputs=()):
-    """Finds out before minutes of measurements that a result cannot be written, and that no process would measure."""
-    if arguments.workers is not None:
-        whole("workers", arguments.workers, least=1)
-    check_apart([arguments.output, arguments.csv], inputs)
-    if arguments.output:
-        check_path(arguments.output, PICTURES)
-    if arguments.csv:
-        Output(arguments.csv, "x").discard()
-    for output in filter(None, (arguments.output, arguments.csv)):
-        check_writable(output)
-
-
-class Settings:
-    """Counts settings, and shows them on a terminal with the time that is left; before them, how far the reference is."""
-
-    def __init__(self):
-        self.done, self.total, self.substeps, self.bar = 0, None, None, None
-
-    def watch(self, substeps, frame, frames):
-        if substeps != self.substeps:
-            self.close()
-            text = f"reference by {substeps} steps a frame"
-            self.bar, self.substeps = open_bar(frames, text, "{n_fmt} of {total_fmt} frames, {remaining} left"), substeps
-        if self.bar is not None:
-            self.bar.update(frame - self.bar.n)
-
-    def __call__(self, done, total, seconds):
-        if self.total is None:
-            self.close()
-            self.bar = open_bar(total, "measuring", "{n_fmt} of {total_fmt} settings{postfix}")
-        self.done, self.total = done, total
-        if self.bar is not None:
-            if seconds is not None:
-                self.bar.set_postfix_str(f"{seconds // 60:.0f}:{seconds % 60:02.0f} left", refresh=False)
-            self.bar.update(done - self.bar.n)
-
-    def close(self):
-        if self.bar is not None:
-            self.bar.close()
-
-    def interrupted(self):
-        """What is kept."""
-        if self.total is None:
-            return "interrupted before the first setting; nothing was measured"
-        return f"interrupted after {self.done} of {self.total} settings, which are kept; the same command goes on from there"
 
 
 def _summary(found, lines_of):

@@ -1,11 +1,9 @@
 """The command ``chart stability``: a map for each method over two axes."""
 
-import sys
 from collections import Counter
-from contextlib import contextmanager
 
-from ..chart.axes import AXES, FIXED
-from ..chart.figures import PICTURES, check_path
+from ..chart.axes import AXES, FIXED, SEED
+from ..chart.machine import machine
 from ..chart.stability import ACCURACY, VERDICTS, Survey
 from ..chart.sweep import kept, sweep
 from ..chart.tasks import SceneRef, Setup
@@ -13,7 +11,7 @@ from ..checks import number, whole
 from ..model import DTYPES
 from ..scene_files import assignments, convert, options
 from ..solvers import SOLVERS
-from .terminal import Interrupted, add_dask, as_json, check_writable, executing
+from .terminal import as_json, check_outputs, find_device, measuring
 
 _COUNT = 9
 
@@ -46,33 +44,20 @@ def add_arguments(parser):
         "--accuracy", type=float, default=ACCURACY, metavar="SHARE", help=f"{ACCURACY:g} if not given, 0 for none"
     )
     parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="of each run, 60 if not given")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes side by side, as many as cores if not given")
-    add_dask(parser)
-    parser.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
     parser.add_argument("--dtype", choices=DTYPES, default="float64")
-    parser.add_argument("-o", "--output", metavar="FILE", help=f"draw the maps, as {', '.join(PICTURES)}")
-    parser.add_argument("--csv", metavar="FILE", help="write a line for each cell")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def chart(arguments):
-    if arguments.output:
-        check_path(arguments.output, PICTURES)
-    for output in filter(None, (arguments.output, arguments.csv)):
-        check_writable(output)
+    check_outputs(arguments, [arguments.scene])
+    device = find_device(arguments.device)
     survey = _survey(arguments)
     for name in ("limit", "accuracy"):
         number(name, getattr(arguments, name), **({"above": 0.0} if name == "limit" else {"least": 0.0}))
-    given = {"device": arguments.device, "dtype": arguments.dtype, "limit": arguments.limit, "accuracy": arguments.accuracy}
+    given = {"device": str(device), "dtype": arguments.dtype, "limit": arguments.limit, "accuracy": arguments.accuracy}
     tasks = survey.tasks(reference=arguments.accuracy > 0.0, **given)
-    with executing(arguments) as executor:
-        store = kept("stability", executor.get("executor"))
-        try:
-            with _progress() as progress:
-                cells = survey.table(sweep(tasks, store=store, progress=progress, workers=arguments.workers, **executor))
-        except KeyboardInterrupt:
-            done = sum(task in store for task in tasks)
-            raise Interrupted(f"interrupted; {done} of {len(tasks)} rows are kept, run it again to go on") from None
+    with measuring(arguments, device) as run:
+        store = kept("stability", run.get("executor"))
+        cells = survey.table(sweep(tasks, store=store, **run), store)
     if arguments.output or arguments.csv:
         from ..chart.maps import plot_maps, write_table
 
@@ -83,9 +68,10 @@ def chart(arguments):
     methods = [str(setup) for setup in survey.setups]
     if arguments.json:
         axes = {survey.x: survey.xs, survey.y: survey.ys}
-        facts = {"scene": str(survey.scene), "x": survey.x, "y": survey.y, "axes": axes, "fixed": FIXED | survey.fixed}
-        facts["machines"] = sorted({store.machine(task) for task in tasks})
-        print(as_json(facts | {"steps": survey.steps, "maps": dict(zip(methods, cells, strict=True))}))
+        fixed = {name: value for name, value in {**FIXED, **survey.fixed}.items() if name not in axes}
+        facts = {"scene": str(survey.scene), "x": survey.x, "y": survey.y, "axes": axes, "fixed": fixed, "steps": survey.steps}
+        facts |= {**given, "seed": SEED, "machine": machine(device), "maps": dict(zip(methods, cells, strict=True))}
+        print(as_json(facts))
         return 0
     for method, rows in zip(methods, cells, strict=True):
         counts = Counter(cell["verdict"] for row in rows for cell in row)
@@ -121,20 +107,3 @@ def _values(of, name, texts):
     low, high, count = texts or (str(axis.low), str(axis.high), str(_COUNT))
     ends = [convert(f"--{of}-range", text, (float,)) for text in (low, high)]
     return axis.values(*ends, convert(f"--{of}-range", count, (int,)))
-
-
-@contextmanager
-def _progress():
-    """A function for `sweep` that shows rows on a terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from tqdm import tqdm
-
-    with tqdm(desc="measuring", unit="row", leave=False, file=sys.stderr) as bar:
-
-        def show(done, total, _seconds):
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield show

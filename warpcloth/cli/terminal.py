@@ -1,4 +1,4 @@
-"""What the commands share: the device by its name, progress and results on a terminal, and where results go."""
+"""What the commands share: device, progress and results on a terminal, where results go, and what measurements run on."""
 
 import contextlib
 import json
@@ -11,6 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..chart.figures import PICTURES, check_path
+from ..checks import whole
+from ..outputs import Output, check_apart
 from ..quiet import initialise_warp
 
 
@@ -55,6 +58,25 @@ def check_writable(output):
         raise ValueError(f"output = {output}: the folder {folder} cannot be written ({error.strerror})") from None
 
 
+def check_outputs(arguments, inputs=()):
+    """Finds out before minutes of measurements that a result cannot be written, and that no process would measure.
+
+    Raises:
+        FileNotFoundError: A folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: A file cannot be written or is given twice, or the number of processes is none.
+    """
+    if arguments.workers is not None:
+        whole("workers", arguments.workers, least=1)
+    check_apart([arguments.output, arguments.csv], inputs)
+    if arguments.output:
+        check_path(arguments.output, PICTURES)
+    if arguments.csv:
+        Output(arguments.csv, "x").discard()
+    for output in filter(None, (arguments.output, arguments.csv)):
+        check_writable(output)
+
+
 def open_bar(total, text, counts):
     """A bar of tqdm on a terminal, elsewhere None; ``counts`` is what stands after it."""
     if not sys.stderr.isatty():
@@ -90,6 +112,59 @@ def executing(arguments):
 
     with connect(arguments.dask) as cluster:
         yield {"executor": cluster}
+
+
+@contextlib.contextmanager
+def measuring(arguments, device):
+    """What a sweep is to run on and what it shows, as its arguments: see :func:`executing`; on a GPU one process.
+
+    Raises:
+        Interrupted: The user did; it says what is kept.
+        ValueError: A number of processes is given beside a cluster.
+    """
+    progress = Settings()
+    try:
+        with executing(arguments) as executor:
+            yield {"workers": arguments.workers or (1 if device.is_cuda else None), "progress": progress, **executor}
+    except KeyboardInterrupt:
+        raise Interrupted(progress.interrupted()) from None
+    finally:
+        progress.close()
+
+
+class Settings:
+    """Counts settings, and shows them on a terminal with the time that is left; before them, how far the reference is."""
+
+    def __init__(self):
+        self.done, self.total, self.substeps, self.bar = 0, None, None, None
+
+    def watch(self, substeps, frame, frames):
+        if substeps != self.substeps:
+            self.close()
+            text = f"reference by {substeps} steps a frame"
+            self.bar, self.substeps = open_bar(frames, text, "{n_fmt} of {total_fmt} frames, {remaining} left"), substeps
+        if self.bar is not None:
+            self.bar.update(frame - self.bar.n)
+
+    def __call__(self, done, total, seconds):
+        if self.total is None:
+            self.close()
+            self.bar = open_bar(total, "measuring", "{n_fmt} of {total_fmt} settings{postfix}")
+        self.done, self.total = done, total
+        if self.bar is not None:
+            if seconds is not None:
+                self.bar.set_postfix_str(f"{seconds // 60:.0f}:{seconds % 60:02.0f} left", refresh=False)
+            self.bar.update(done - self.bar.n)
+
+    def close(self):
+        if self.bar is not None:
+            self.bar.close()
+
+    def interrupted(self):
+        """What is kept."""
+        if self.total is None:
+            return "interrupted before the first setting; nothing was measured"
+        return f"interrupted after {self.done} of {self.total} settings, which are kept; the same command goes on from there"
 
 
 class Progress:
