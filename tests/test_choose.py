@@ -181,6 +181,18 @@ def test_the_command_takes_hard_constraints(tmp_path, monkeypatch, capsys):
     assert "links=3 stiffness=inf" in capsys.readouterr().out.splitlines()[-1]
 
 
+def test_an_interruption_says_what_is_kept(tmp_path, monkeypatch, capsys):
+    def interrupted(tasks, progress, **_):
+        progress(1, len(tasks), 2.0)
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    monkeypatch.setattr("warpcloth.chart.choose.sweep", interrupted)
+    assert main("choose chain -p links=3 --frames 3 --tolerance 5% --solvers pbd".split()) == 130
+    assert "settings that are measured are kept" in capsys.readouterr().err
+
+
 def test_the_command_line_has_the_device():
     arguments = SimpleNamespace(scene="s.py", p=[], frames=None, device="cuda:1", dtype="float64")
     assert "--device cuda:1 --dtype float64" in command_line(arguments, {}, Setup("pbd", {"substeps": 2}))

@@ -604,6 +604,8 @@ def test_the_command(tmp_path, capfd, monkeypatch):
         ("--x dt --y stiffness --solvers newton:depth=2", "has no option 'depth'"),
         ("--x dt --y stiffness --at height=2", "--at has no axis 'height'"),
         ("--x dt --y stiffness --x-range 0 1 3", "low is 0"),
+        ("--x iterations --y stiffness --at dt=0", "dt is 0"),
+        ("--x iterations --y stiffness --at dt=-1/60", "dt is -0.01"),
         ("--x dt --y stiffness -p m=3", "no parameter 'm'"),
         ("--x dt --y stiffness --steps 0", "steps is 0"),
         ("--x dt --y stiffness --limit 0", "limit is 0"),

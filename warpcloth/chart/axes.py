@@ -76,6 +76,7 @@ def scene_at(ref, values, steps):
     Raises:
         ValueError: The scene cannot have such a value.
     """
+    number("dt", values["dt"], above=0.0)
     if "resolution" in values:
         ref = refined(ref, values["resolution"])
     scene = ref.load()

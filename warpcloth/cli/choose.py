@@ -5,7 +5,7 @@ import sys
 
 from .. import scene_files
 from .run import named_scene
-from .terminal import Progress, add_dask, as_json, executing, find_device
+from .terminal import Interrupted, Settings, add_dask, as_json, executing, find_device
 
 EPILOG = """\
 Each solver climbs from coarse settings to fine ones until it meets the tolerance or is dearer than what does; errors are RMS
@@ -48,7 +48,7 @@ def chosen(arguments, device):
     _source, values, _scene = named_scene(arguments)
     tolerance = None if arguments.tolerance is None else scene_files.share("tolerance", arguments.tolerance)
     budget = None if arguments.budget is None else scene_files.milliseconds("budget", arguments.budget)
-    progress = Progress(None, first="measuring")
+    progress = Settings()
     try:
         with executing(arguments) as executor:
             choice, found, exact = choose(
@@ -60,8 +60,13 @@ def chosen(arguments, device):
                 str(device),
                 arguments.dtype,
                 arguments.limit,
+                progress=progress,
                 **executor,
             )
+    except KeyboardInterrupt:
+        raise Interrupted(
+            "interrupted; the settings that are measured are kept, and the same command goes on from there"
+        ) from None
     finally:
         progress.close()
     return choice, found, exact, values

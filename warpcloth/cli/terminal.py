@@ -133,7 +133,7 @@ def measuring(arguments, device):
 
 
 class Settings:
-    """Counts settings, and shows them on a terminal with the time that is left; before them, how far the reference is."""
+    """Counts the settings of a sweep, with the time that is left, on a terminal; before them, how far the reference is."""
 
     def __init__(self):
         self.done, self.total, self.substeps, self.bar = 0, None, None, None
@@ -147,7 +147,7 @@ class Settings:
             self.bar.update(frame - self.bar.n)
 
     def __call__(self, done, total, seconds):
-        if self.total is None:
+        if total != self.total:
             self.close()
             self.bar = open_bar(total, "measuring", "{n_fmt} of {total_fmt} settings{postfix}")
         self.done, self.total = done, total
