@@ -109,7 +109,7 @@ def plot_solver(path, found):
 
 
 def plot_spectrum(path, found):
-    """Draws μ over its rank, and beside it errors as points on the lines that the spectrum predicts, down to rounding.
+    """Draws μ over its rank, and beside it errors as points on the lines that the spectrum predicts, each down to its rounding.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -122,7 +122,8 @@ def plot_spectrum(path, found):
     """
     texts = _missing("not drawn:", found)
     figure, panels, notes = _figure(path, texts)
-    for k, row in enumerate(row for row in found["rows"] if row["points"]):
+    good = [row for row in found["rows"] if row["points"]]
+    for k, row in enumerate(good):
         mu, colour, points = row["eigenvalues"], f"C{k}", row["points"]
         panels[0].plot(range(1, len(mu) + 1), mu, color=colour, linewidth=1.2)
         at, errors = ([point[name] for point in points] for name in ("iterations", "error"))
@@ -132,9 +133,8 @@ def plot_spectrum(path, found):
         known = [point for point in points if point["predicted"] is not None]
         at, errors = ([point[name] for point in known] for name in ("iterations", "predicted"))
         panels[1].plot(at, errors, color=colour, linewidth=0.8)
-    floors = [row["floor"] for row in found["rows"] if row["floor"] is not None]
-    if floors:
-        _floor(panels[1], max(floors), "rounding of the places")
+    for k, row in enumerate(good):
+        _floor(panels[1], row["floor"], "rounding of the places", f"C{k}")
     panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
     panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
     title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
@@ -142,9 +142,9 @@ def plot_spectrum(path, found):
     save(figure, path)
 
 
-def _floor(axes, value, label):
+def _floor(axes, value, label, colour=GREY):
     """A line below which nothing is known."""
-    axes.axhline(value, color=GREY, linestyle="--", linewidth=0.8, label=label)
+    axes.axhline(value, color=colour, linestyle="--", linewidth=0.8, label=label)
 
 
 def _missing(head, found):
