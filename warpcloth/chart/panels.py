@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .figures import GREY, PICTURES, check_path, number_axis, save
+from .figures import GREY, PICTURES, check_path, save
 
 _MARKS = "os^DvPX*"
 _COLOURS = ("black", "tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purple", "tab:cyan", "tab:brown")
@@ -106,8 +106,10 @@ def _draw(axes, panel, rows):
     axes.set_xlabel(panel.x, color=GREY, fontsize=9)
     axes.set_ylabel(panel.y, color=GREY, fontsize=9)
     for axis, scale in zip((axes.xaxis, axes.yaxis), panel.scales, strict=True):
-        if scale == "log":
-            number_axis(axis)
+        low, high = axis.get_view_interval()
+        if scale == "log" and high < 100.0 * low:  # its numbers, as there may be no power of ten
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("{x:g}")
     axes.tick_params(which="both", colors=GREY, labelsize=8)
     axes.grid(True, which="major", linewidth=0.3, color="0.85")
     axes.spines[["top", "right"]].set_visible(False)
