@@ -129,3 +129,16 @@ def finish_largest():
         out[copy] = most
 
     return largest_chunk
+
+
+@cache
+def keep_largest():
+    """Kernel over copies: out[copy] = max(out[copy], value[copy]) of numbers of 0 or more; NaN stays."""
+
+    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
+    def keep(values: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
+        copy = wp.tid()
+        if out[copy] == out[copy] and not (values[copy] <= out[copy]):
+            out[copy] = values[copy]
+
+    return keep

@@ -1,4 +1,4 @@
-"""Factories of the kernels that move vertices through time: symplectic update, predict, finish, pins.
+"""Factories of the kernels that move vertices through time: predict, finish, pins.
 
 A pinned vertex has inverse mass 0. Fixed pins stay; moved ones take the place that their keyframes give. hₑ is the effective
 step of an implicit integrator, see :mod:`warpcloth.integrators`.
@@ -9,40 +9,6 @@ from functools import cache
 import warp as wp
 
 from .assemble import types
-
-
-@cache
-def explicit_update(dtype, symplectic: bool):
-    """Kernel over vertices: kick and drift (symplectic), or drift and kick at the same state (forward Euler).
-
-    a = g − ∇U/m;  symplectic: v += h a, x += h v;  forward: x += h v, v += h a. Leaves gradient at 0 for the next sum.
-    """
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def update(
-        inverse_mass: wp.array(dtype=dtype),
-        gravity: wp.array(dtype=vec3),
-        per_copy: int,
-        h: dtype,
-        # in and out
-        gradient: wp.array(dtype=vec3),
-        x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        w = inverse_mass[i]
-        if w > dtype(0.0):
-            before = v[i]
-            after = before + h * (gravity[i // per_copy] - w * gradient[i])
-            v[i] = after
-            if wp.static(symplectic):
-                x[i] = x[i] + h * after
-            else:
-                x[i] = x[i] + h * before
-        gradient[i] = vec3()
-
-    return update
 
 
 @cache

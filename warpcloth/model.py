@@ -74,6 +74,7 @@ class DeviceElements:
         damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
         origin: :class:`Origin` of a rest state that is set in each step, or None.
         cells: :class:`Cells` that the elements are the vertices of, or None.
+        ranges: Of elements in the order of their lowest vertices those of vertex i, ranges[i] to ranges[i+1], (N+1,); or None.
     """
 
     label: str
@@ -87,6 +88,7 @@ class DeviceElements:
     damping: wp.array | None = None
     origin: Origin | None = None
     cells: Cells | None = None
+    ranges: wp.array | None = None
 
     @property
     def arguments(self):
@@ -97,7 +99,7 @@ class DeviceElements:
     def arrays(self):
         """All arrays of the term."""
         cells = [self.cells.offsets, self.cells.shape] if self.cells else []
-        return self.arguments + ([] if self.damping is None else [self.damping]) + cells
+        return self.arguments + [array for array in (self.damping, self.ranges) if array is not None] + cells
 
     @property
     def count(self):
@@ -132,6 +134,8 @@ class DeviceElements:
             offsets = wp.array(np.append(0, ends).astype(np.int32), dtype=wp.int32, device=self.stencil.device)
             cells = replace(cells, offsets=offsets, shape=put(cells.shape))
         changed = {name: put(getattr(self, name)) for name in ("stencil", "stiffness", "rest")}
+        if self.damping is not None:
+            changed["damping"] = put(self.damping)
         origin = self.origin and replace(self.origin, rest=put(self.origin.rest), share=put(self.origin.share))
         return replace(self, **changed, origin=origin, cells=cells)
 
@@ -173,6 +177,7 @@ class Model:
         pins, keyframes: Moved pins (p,) and their places (F, p) [m], or None.
         terms: One :class:`DeviceElements` for each declared term.
         kernels: Names of the kernels that solvers asked for.
+        launches: How many launches there have been, a list of one that models of other terms share.
 
     Raises:
         ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
@@ -188,7 +193,7 @@ class Model:
         self.vec3, self.mat33 = types(self.dtype)
         self.per_copy = len(scene.mesh.points)
         self.count = copies * self.per_copy
-        self.kernels = set()
+        self.kernels, self.launches = set(), [0]
         vary = _Varied({} if vary is None else vary, copies)
 
         masses = self._varied_masses(vary)
@@ -268,12 +273,14 @@ class Model:
         """The kernel that ``factory(*key)`` makes, noted for :meth:`report` as factory(variant).Term."""
         kernel = factory(*key)
         terms = [part.name for part in key if isinstance(part, Term)]
+        terms += [part.term.name for parts in key if isinstance(parts, tuple) for part in parts]
         variants = [name for name, part in zip(inspect.signature(factory).parameters, key, strict=False) if part is True]
         variant = f"({', '.join(variants)})" if variants else ""
         self.kernels.add(".".join([f"{factory.__name__}{variant}", *terms]))
         return kernel
 
     def launch(self, kernel, dim, inputs, outputs=()):
+        self.launches[0] += 1
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _on_device(self, term, positions, vary):

@@ -88,8 +88,7 @@ def simulate(
             progress(0, frames)
         for frame in range(1, frames + 1):
             began = time.perf_counter()
-            for _ in range(stepper.steps_per_frame):
-                stepper.step()
+            stepper.frame()
             points, velocities = _frame(stepper)
             timings["frames"].append(time.perf_counter() - began)
             if not watch.passes(frame, points, velocities, stepper.results):

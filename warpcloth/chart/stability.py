@@ -68,8 +68,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
     points[0] = model.positions.numpy().reshape(B, -1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
         for frame in range(1, frames + 1):
-            for _ in range(stepper.steps_per_frame):
-                stepper.step()
+            stepper.frame()
             x, v = (np.array(array.numpy(), dtype=np.float64) for array in stepper.state)
             watch.passes(frame, x, v, stepper.results)
             points[frame, watch.alive] = x.reshape(B, -1, 3)[watch.alive]

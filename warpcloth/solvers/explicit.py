@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..capture import Segment
 from ..checks import choice
-from ..damping import Forces, Past, dissipations
-from ..kernels import step as kernels
+from ..damping import Past, dissipations
 from ..operators import Hessian
-from .solver import Step, Stepper, refuse_hard
+from ..passes import Gather, Sweep
+from .solver import LaunchedStepper, Step, refuse_hard
 
 
 @dataclass(frozen=True)
@@ -156,22 +155,19 @@ def _largest(matrix):
     return float(values[0]), vectors[:, 0]
 
 
-class ExplicitStepper(Stepper):
-    """:class:`Explicit` on a model."""
+class ExplicitStepper(LaunchedStepper):
+    """:class:`Explicit` on a model.
+
+    Attributes:
+        passes: The :class:`warpcloth.passes.Sweep` or :class:`warpcloth.passes.Gather` that a step is.
+    """
 
     def __init__(self, options, model):
         super().__init__(options, model)
-        self.gradient = model.vectors()
-        self._forces = Forces(model, self.h)
-        self._update = model.kernel(kernels.explicit_update, model.dtype, options.scheme == "symplectic")
-        self._step = Segment(model.device, self._launch_step)
+        kind = Gather if model.device.is_cuda else Sweep
+        self.passes = kind(model, self.h, options.scheme == "symplectic")
+        self.model = self.passes.model
+        self.record((lambda: self.launch_steps(1), 1))
 
-    def _launch_step(self):
-        model, (x, v) = self.model, self.state
-        self._forces.add(x, v, self.gradient)
-        given = [model.inverse_mass, model.gravity, model.per_copy, self.h]
-        model.launch(self._update, model.count, given, [self.gradient, x, v])
-        self.launch_pins()
-
-    def step(self):
-        self._step()
+    def launch_steps(self, steps):
+        self.passes.launch(*self.state, steps, lambda x: self.launch_pins(x=x))

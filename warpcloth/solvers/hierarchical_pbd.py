@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from ..capture import Segment
 from ..checks import number, whole
 from ..damping import Past
 from ..hierarchy import levels, on_device
 from ..kernels.hierarchy import follow
 from ..sweeps import Sweep, refuse_unprojectable
-from .solver import Step, Stepper, require_model
+from .solver import LaunchedStepper, Step, require_model
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class HierarchicalPBD(Step):
         return HierarchicalPBDStepper(self, model)
 
 
-class HierarchicalPBDStepper(Stepper):
+class HierarchicalPBDStepper(LaunchedStepper):
     """:class:`HierarchicalPBD` on a model.
 
     Attributes:
@@ -84,9 +83,8 @@ class HierarchicalPBDStepper(Stepper):
         self.sweep = Sweep(self.model, self.state.x, self.h, "coloured", options.relaxation)
         self.past = Past(model, self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
-        self._start = Segment(model.device, self._launch_start)
-        self._sweep = Segment(model.device, self.sweep.launch)
-        self._finish = Segment(model.device, lambda: self.launch_finish(self.sweep.correction))
+        finish = lambda: self.launch_finish(self.sweep.correction)
+        self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (finish, 1))
 
     def _on_level(self, level):
         """The sweep over a level, and the launch by which the vertices that it drops follow it."""
@@ -106,9 +104,3 @@ class HierarchicalPBDStepper(Stepper):
             for _ in range(self.options.coarse_iterations):
                 sweep.launch()
             self.model.launch(*followers)
-
-    def step(self):
-        self._start()
-        for _ in range(self.options.iterations):
-            self._sweep()
-        self._finish()

@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 
-from ..capture import Segment
 from ..checks import choice, number, whole
 from ..damping import Past
 from ..sweeps import SWEEPS, Sweep, refuse_unprojectable
-from .solver import Step, Stepper, require_model
+from .solver import LaunchedStepper, Step, require_model
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class PBD(Step):
         return PBDStepper(self, model)
 
 
-class PBDStepper(Stepper):
+class PBDStepper(LaunchedStepper):
     """:class:`PBD` on a model.
 
     Attributes:
@@ -79,16 +78,9 @@ class PBDStepper(Stepper):
         spread = options.iterations if options.stiffness == "per-step" else None
         self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)
         self.past = Past(model, self.sweep.elements)
-        self._start = Segment(model.device, self._launch_start)
-        self._sweep = Segment(model.device, self.sweep.launch)
-        self._finish = Segment(model.device, lambda: self.launch_finish(self.sweep.correction))
+        finish = lambda: self.launch_finish(self.sweep.correction)
+        self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (finish, 1))
 
     def _launch_start(self):
         self.launch_prediction()
         self.sweep.launch_start()
-
-    def step(self):
-        self._start()
-        for _ in range(self.options.iterations):
-            self._sweep()
-        self._finish()

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from ..capture import Segment
 from ..checks import choice, number, shown, whole
 from ..damping import Past, damped_terms, refuse_apart
 from ..integrators import INTEGRATORS
@@ -118,15 +119,15 @@ class Stepper:
         self.model = model.with_terms(damped_terms(model, self.he))
         self.past = Past(model, self.model.terms)
 
-    def launch_pins(self, parts=1):
-        """Moves the pins that have keyframes on by h/``parts``, which must be the same in all calls."""
+    def launch_pins(self, parts=1, x=None):
+        """Moves the pins that have keyframes on by h/``parts``, the same in all calls, in ``x`` if that is not of the state."""
         model = self.model
         if model.pins is None:
             return
         dim = (model.copies, len(model.pins))
         move, count = model.kernel(kernels.move_pins, model.dtype), model.kernel(kernels.count_step)
         given = [model.pins, model.keyframes, self.count, parts * self.steps_per_frame, model.per_copy, self.h / parts]
-        model.launch(move, dim, given, [self.state.x, self.state.v])
+        model.launch(move, dim, given, [self.state.x if x is None else x, self.state.v])
         model.launch(count, 1, [], [self.count])
 
     def launch_prediction(self):
@@ -141,6 +142,70 @@ class Stepper:
     def step(self):
         """One step of h."""
         raise NotImplementedError  # every solver has its own
+
+    def frame(self):
+        """One frame, to the bit what ``steps_per_frame`` times `step` makes."""
+        for _ in range(self.steps_per_frame):
+            self.step()
+
+
+# Launches of a graph: replaying it costs what 20 of them do, and recording one of them 50 times as much as its replay.
+LAUNCHES = 1000
+
+
+class LaunchedStepper(Stepper):
+    """A solver whose steps are launches alone, so that a frame is one graph, or a few where it has very many launches.
+
+    The constructor ends with `record`, and ``integrator.start()`` if it takes an integrator.
+    """
+
+    def record(self, *parts):
+        """Records a step.
+
+        Args:
+            parts: Pairs of a function that launches, and of how many times it runs.
+        """
+        device, launches = self.model.device, self.model.launches
+        self._parts, self._step, self._frame, self._size = parts, [], None, 0
+        for launch, times in parts:
+            before = launches[0]
+            self._step.append((Segment(device, launch), times))
+            self._size += (launches[0] - before) * times
+
+    def launch_steps(self, steps):
+        """So many steps."""
+        for _ in range(steps):
+            for launch, times in self._parts:
+                for _ in range(times):
+                    launch()
+
+    def _record_frame(self):
+        """Segments of a frame, and how many times each is replayed, recorded when a frame is first asked for."""
+        steps, device = self.steps_per_frame, self.model.device
+        chunk = min(steps, LAUNCHES // max(self._size, 1))
+        if chunk < 2:
+            return self._step * steps
+        graphs = -(-steps // chunk)
+        chunk, rest = divmod(steps, graphs)  # of nearly the same size
+        frame = [(Segment(device, lambda: self.launch_steps(chunk)), graphs - rest)]
+        return frame + ([(Segment(device, lambda: self.launch_steps(chunk + 1)), rest)] if rest else [])
+
+    def _replay(self, segments):
+        for segment, times in segments:
+            for _ in range(times):
+                segment()
+        self.note()
+
+    def step(self):
+        self._replay(self._step)
+
+    def frame(self):
+        if self._frame is None:
+            self._frame = self._record_frame()
+        self._replay(self._frame)
+
+    def note(self):
+        """Takes down how the steps since the last call ended; of methods that have no residual nothing."""
 
 
 def require_model(model):

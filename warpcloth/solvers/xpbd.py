@@ -5,14 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..capture import Mirror, Segment
+from ..capture import Mirror
 from ..checks import choice, number, whole
 from ..damping import Past
 from ..kernels.project import add_momentum
+from ..kernels.reduce import keep_largest
 from ..operators import Gradient, Sums
 from ..status import Result
 from ..sweeps import Sweep, refuse_unprojectable
-from .solver import ImplicitStep, Stepper, refuse_hard, require_model
+from .solver import ImplicitStep, LaunchedStepper, refuse_hard, require_model
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class XPBD(ImplicitStep):
         return XPBDStepper(self, model)
 
 
-class XPBDStepper(Stepper):
+class XPBDStepper(LaunchedStepper):
     """:class:`XPBD` on a model.
 
     Attributes:
@@ -109,14 +110,14 @@ class XPBDStepper(Stepper):
         soft = not any(elements.hard for elements in model.terms)
         self._gradient = Gradient(model, corrected=True, terms=self.sweep.elements) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
-        acceleration = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
-        self._acceleration = Mirror(acceleration)
+        self._acceleration = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
+        self._worst = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))
+        self._keep_largest = model.kernel(keep_largest)
         gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         self._scale = np.where(gravity > 0.0, gravity, 1.0)
         self._to_and_fro = options.integrator == "midpoint" and self.sweep.in_place
-        self._start = Segment(model.device, self._launch_start)
-        self._sweep = Segment(model.device, self._launch_sweep)
-        self._last = Segment(model.device, self._launch_last)
+        sweeps = options.iterations // (2 if self._to_and_fro else 1) - 1
+        self.record((self._launch_start, 1), (self._launch_sweep, sweeps), (self._launch_last, 1))
         self.integrator.start()
 
     def _launch_start(self):
@@ -140,19 +141,15 @@ class XPBDStepper(Stepper):
             self._launch_sweep()
             self._gradient.add(self.state.x, self._force, d)
         self._launch_momentum(1.0)
-        self._sums.largest(model.inverse_mass, self._force, self._acceleration.array)
+        self._sums.largest(model.inverse_mass, self._force, self._acceleration)
+        model.launch(self._keep_largest, model.copies, [self._acceleration], [self._worst.array])
         self.launch_finish(d)
 
     def _launch_momentum(self, sign):
         given = [self.model.mass, self.sweep.correction, sign / self.he**2]
         self.model.launch(self._add_momentum, self.model.count, given, [self._force])
 
-    def step(self):
-        self._start()
-        for _ in range(self.options.iterations // (2 if self._to_and_fro else 1) - 1):
-            self._sweep()
-        self._last()
-        residual = self._acceleration.read() / self._scale
-        self.residual = np.maximum(self.residual, residual)  # keeps NaN
-        for copy in np.flatnonzero(~np.isfinite(residual)):
+    def note(self):
+        self.residual = self._worst.read() / self._scale
+        for copy in np.flatnonzero(~np.isfinite(self.residual)):
             self.results[copy] = Result.DIVERGED
