@@ -21,11 +21,13 @@ class Part(NamedTuple):
     Attributes:
         term: The :class:`.term.Term`.
         damped: Whether it has damping, taken at x + h v about the state x, see :class:`.term.Dissipation`.
+        ordered: Whether the lowest vertex, for :func:`sweep`, is the first of all its elements.
         padded: Whether the incidences that :func:`gather` reads are rows of equal length, one slot of all vertices after another.
     """
 
     term: Term
     damped: bool = False
+    ordered: bool = False
     padded: bool = False
 
 
@@ -92,6 +94,32 @@ def local_gradient(part: Part, dtype):
 
 
 @cache
+def of_corner(term: Term, dtype):
+    """The device functions of a corner: (rest, corner, place) → its part w ⊗ place of y, (rest, corner, g) → w·g."""
+    vec3, _ = types(dtype)
+    M, weight = wp.constant(term.rows), term.weight
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+
+    @wp.func
+    def part(rest: rest_type, corner: int, place: vec3):
+        w = weight(rest, corner)
+        y = y_type()
+        for m in range(M):
+            y[m] = w[m] * place
+        return y
+
+    @wp.func
+    def force(rest: rest_type, corner: int, g: y_type):
+        w = weight(rest, corner)
+        total = w[0] * g[0]
+        for m in range(1, M):
+            total += w[m] * g[m]
+        return total
+
+    return part, force
+
+
+@cache
 def elements_of(part: Part, dtype):
     """The struct of what a kernel reads of one term.
 
@@ -140,9 +168,9 @@ def sweep_term(part: Part, dtype):
     """The device function that adds the forces of the elements of lowest vertex i: returned of i, in ``gradient`` of others."""
     vec3, _ = types(dtype)
     term = part.term
-    K, M, damped = wp.constant(term.vertices), wp.constant(term.rows), part.damped
+    K, damped, ordered = wp.constant(term.vertices), part.damped, part.ordered
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    weight, local = term.weight, local_gradient(part, dtype)
+    (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype)
     vector, whole, vertex, rest_of, number = load(vec3), load(wp.int32), load(wp.int32, 2), load(rest_type), load_shared(dtype)
     put = store(vec3)
 
@@ -156,36 +184,43 @@ def sweep_term(part: Part, dtype):
         gradient: wp.array(dtype=vec3),
     ):
         total = vec3()
+        place = vector(x, i)
+        move = vec3()
+        if wp.static(damped):
+            move = h * vector(v, i)
         e = whole(elements.offsets, i)
         last = whole(elements.offsets, i + 1)
         beta = dtype(0.0)
         while e < last:
             r = rest_of(elements.rest, e)
-            y = y_type()
-            dy = y_type()
-            for corner in range(K):
-                w = weight(r, corner)
-                j = vertex(elements.stencil, K * e + corner)
+            if wp.static(not ordered):
+                j = vertex(elements.stencil, K * e)
                 place = vector(x, j)
-                for m in range(M):
-                    y[m] = y[m] + w[m] * place
                 if wp.static(damped):
                     move = h * vector(v, j)
-                    for m in range(M):
-                        dy[m] = dy[m] + w[m] * move
+            y = part_of(r, 0, place)
+            dy = y_type()
             if wp.static(damped):
                 beta = number(elements.damping, e)
-            g = local(number(elements.stiffness, e), beta, r, y, dy, h)
-            for corner in range(K):
-                w = weight(r, corner)
-                force = vec3()
-                for m in range(M):
-                    force += w[m] * g[m]
+                dy = part_of(r, 0, move)
+            for corner in range(1, K):
                 j = vertex(elements.stencil, K * e + corner)
-                if j == i:
-                    total += force
-                else:
-                    put(gradient, j, vector(gradient, j) + force)
+                y += part_of(r, corner, vector(x, j))
+                if wp.static(damped):
+                    dy += part_of(r, corner, h * vector(v, j))
+            g = local(number(elements.stiffness, e), beta, r, y, dy, h)
+            if wp.static(ordered):
+                total += force_of(r, 0, g)
+                for corner in range(1, K):
+                    j = vertex(elements.stencil, K * e + corner)
+                    put(gradient, j, vector(gradient, j) + force_of(r, corner, g))
+            else:
+                for corner in range(K):
+                    j = vertex(elements.stencil, K * e + corner)
+                    if j == i:
+                        total += force_of(r, corner, g)
+                    else:
+                        put(gradient, j, vector(gradient, j) + force_of(r, corner, g))
             e += 1
         return total
 
@@ -289,17 +324,10 @@ def gather_term(part: Part, dtype):
     """The device function (elements, i, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term."""
     vec3, _ = types(dtype)
     term = part.term
-    K, M, damped, padded = wp.constant(term.vertices), wp.constant(term.rows), part.damped, part.padded
+    K, damped, padded, pairs = wp.constant(term.vertices), part.damped, part.padded, term.vertices == 2
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    weight, local, pairs = term.weight, local_gradient(part, dtype), term.vertices == 2
+    (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype)
     vector, whole, vertex, rest_of, number = load(vec3), load(wp.int32), load(wp.int32, 2), load(rest_type), load_shared(dtype)
-
-    @wp.func
-    def add_corner(y: y_type, rest: rest_type, corner: int, place: vec3):
-        w = weight(rest, corner)
-        for m in range(M):
-            y[m] = y[m] + w[m] * place
-        return y
 
     @wp.func
     def total_of(elements: elements_of(part, dtype), i: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype):
@@ -326,24 +354,22 @@ def gather_term(part: Part, dtype):
             if wp.static(pairs):
                 j = code >> 1
                 r = rest_of(elements.rest, e)
-                y = add_corner(add_corner(y, r, corner, place), r, 1 - corner, vector(x, j))
+                y = part_of(r, corner, place) + part_of(r, 1 - corner, vector(x, j))
                 if wp.static(damped):
-                    dy = add_corner(add_corner(dy, r, corner, move), r, 1 - corner, h * vector(v, j))
+                    dy = part_of(r, corner, move) + part_of(r, 1 - corner, h * vector(v, j))
             else:
                 e = code // K
                 corner = code - K * e
                 r = rest_of(elements.rest, e)
                 for c in range(K):
                     j = vertex(elements.stencil, K * e + c)
-                    y = add_corner(y, r, c, vector(x, j))
+                    y += part_of(r, c, vector(x, j))
                     if wp.static(damped):
-                        dy = add_corner(dy, r, c, h * vector(v, j))
+                        dy += part_of(r, c, h * vector(v, j))
             if wp.static(damped):
                 beta = number(elements.damping, e)
             g = local(number(elements.stiffness, e), beta, r, y, dy, h)
-            w = weight(r, corner)
-            for m in range(M):
-                total += w[m] * g[m]
+            total += force_of(r, corner, g)
             if wp.static(padded):
                 slot += count
             else:

@@ -53,10 +53,10 @@ def energy(y: Any, rest: Any):
 @wp.func
 def gradient(y: Any, rest: Any):
     length = wp.length(y[0])
-    g = y * y.dtype(0.0)
+    factor = y.dtype(0.0)
     if not collapsed(length, rest[0]):
-        g[0] = (y.dtype(1.0) - rest[0] / length) * y[0]
-    return g
+        factor = y.dtype(1.0) - rest[0] / length
+    return factor * y
 
 
 @wp.func
