@@ -3,7 +3,9 @@
 import numpy as np
 import warp as wp
 
+from .incidences import chain, gathered
 from .kernels import assemble, clusters, linear, reduce
+from .kernels.gather import gather_gradient
 
 # Chunks of a sum per copy: one on the CPU, which runs them in turn; on a GPU enough for it to be busy.
 CHUNKS = 256
@@ -74,22 +76,28 @@ class RowSums(Sums):
 
 
 class Gradient:
-    """∂U/∂x of all terms [N]; or of the ``terms`` given."""
+    """∂U/∂x of all terms [N]; or of the ``terms`` given. On CUDA one launch for all terms, on the CPU one for each."""
 
     def __init__(self, model, corrected=False, terms=None):
         self.model, self.terms = model, model.terms if terms is None else terms
-        cuda = model.device.is_cuda
-        factory = assemble.gather_gradient if cuda else assemble.scatter_gradient
-        self.kernels = [model.kernel(factory, elements.term, model.dtype, corrected) for elements in self.terms]
-        # Gathering needs to know which stencils a vertex belongs to; scattering does not, and then nothing is built.
-        self.incidences = [elements.incidences if cuda else () for elements in self.terms]
+        if model.device.is_cuda:
+            self._found = [gathered(elements, model.count) for elements in self.terms]
+            parts = tuple(part for part, _arrays in self._found)
+            self._gather = model.kernel(gather_gradient, parts, model.dtype, corrected) if parts else None
+            self._chain = chain(parts, [arrays for _part, arrays in self._found], model.dtype)
+        else:
+            factory = assemble.scatter_gradient
+            self._scatters = [model.kernel(factory, elements.term, model.dtype, corrected) for elements in self.terms]
 
     def add(self, x, out, correction=None):
         """out += ∂U/∂x at x, or at x + correction of operators built ``corrected``."""
-        fit_cells(self.model, self.terms, x, correction)
-        for elements, kernel, incidences in zip(self.terms, self.kernels, self.incidences, strict=True):
-            dim = len(incidences[0]) - 1 if incidences else elements.count
-            self.model.launch(kernel, dim, [*incidences, *elements.arguments, x, correction], [out])
+        model = self.model
+        fit_cells(model, self.terms, x, correction)
+        if not model.device.is_cuda:
+            for elements, kernel in zip(self.terms, self._scatters, strict=True):
+                model.launch(kernel, elements.count, [*elements.arguments, x, correction], [out])
+        elif self._gather:
+            model.launch(self._gather, model.count, [self._chain, x, correction], [out])
 
 
 class Energy:

@@ -5,17 +5,19 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from .incidences import chain, gathered, indices
 from .kernels import explicit as kernels
+from .kernels.elements import Part
 from .operators import Gradient, fit_cells
 
 
 def by_lowest(elements, count):
-    """The same elements in the order of their lowest vertices, and the range of each vertex, (count + 1,) int32 on the device."""
+    """The same elements in the order of their lowest vertices, and the range of each vertex, (count + 1,) int32."""
     lowest = elements.stencil.numpy().min(axis=1)
     if (np.diff(lowest) < 0).any():
         order = np.argsort(lowest, kind="stable")
         elements, lowest = elements.reordered(order), lowest[order]
-    return replace(elements, ranges=_put(elements, np.searchsorted(lowest, np.arange(count + 1))))
+    return replace(elements, ranges=indices(elements, np.searchsorted(lowest, np.arange(count + 1))))
 
 
 class Sweep:
@@ -39,16 +41,16 @@ class Sweep:
         # Contracted as on CUDA, where a product is added without being rounded: springs then take 0.8 of the time.
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
         self._kernel = model.kernel(kernels.sweep, tuple(parts), model.dtype, symplectic, flags)
-        self._chain = _chain(parts, [_swept(elements) for elements in others], model.dtype)
+        self._chain = chain(parts, [_swept(elements) for elements in others], model.dtype)
 
     def launch(self, x, v, steps, after_step):
-        """So many steps of x and v, with a call of ``after_step`` (x) after each."""
+        """So many steps of x and v, with a call of ``after_step`` (x, v) after each."""
         model = self.model
         for _ in range(steps):
             self._cells.add(x, self._gradient)
             given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, self.h]
             model.launch(self._kernel, model.copies, given, [self._gradient, x, v])
-            after_step(x)
+            after_step(x, v)
 
 
 class Gather:
@@ -59,16 +61,16 @@ class Gather:
 
     def __init__(self, model, h, symplectic):
         self.model, self.h = model, h
-        gathered = [_gathered(elements, model.count) for elements in model.terms]
-        parts = [part for part, _arrays in gathered]
+        self._found = [gathered(elements, model.count, elements.damping is not None) for elements in model.terms]
+        parts = [part for part, _arrays in self._found]
         fast = model.device.is_cuda and model.dtype is wp.float32
         self._kernel = model.kernel(kernels.gather, tuple(parts), model.dtype, symplectic, fast)
-        self._chain = _chain(parts, [arrays for _part, arrays in gathered], model.dtype)
+        self._chain = chain(parts, [arrays for _part, arrays in self._found], model.dtype)
         self._x = model.vectors()
         self._v = model.vectors() if any(part.damped for part in parts) else None
 
     def launch(self, x, v, steps, after_step):
-        """So many steps of x and v, with a call of ``after_step`` (x) after each."""
+        """So many steps of x and v, with a call of ``after_step`` (x, v) after each."""
         model = self.model
         states = [(x, v), (self._x, v if self._v is None else self._v)]
         for step in range(steps):
@@ -76,7 +78,7 @@ class Gather:
             fit_cells(model, model.terms, before[0], None)
             given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, self.h, *before]
             model.launch(self._kernel, model.count, given, [*after])
-            after_step(after[0])
+            after_step(*after)
         if steps % 2:
             wp.copy(x, self._x)
             if self._v is not None:
@@ -84,9 +86,9 @@ class Gather:
 
 
 def _swept_part(elements):
-    """The :class:`warpcloth.kernels.explicit.Part` of the elements of a sweep."""
+    """The :class:`warpcloth.kernels.elements.Part` of the elements of a sweep."""
     stencil = elements.stencil.numpy()
-    return kernels.Part(elements.term, elements.damping is not None, ordered=bool((stencil[:, 0] == stencil.min(axis=1)).all()))
+    return Part(elements.term, elements.damping is not None, ordered=bool((stencil[:, 0] == stencil.min(axis=1)).all()))
 
 
 def _swept(elements):
@@ -98,59 +100,3 @@ def _swept(elements):
         "damping": elements.damping,
         "rest": elements.rest,
     }
-
-
-def _gathered(elements, count):
-    """The :class:`warpcloth.kernels.explicit.Part` of the elements and what their struct has, by name.
-
-    Incidences are padded to rows of equal length, which neighbouring threads read side by side, unless that makes them more
-    than twice as many, as a few vertices of many elements would.
-    """
-    stencil = elements.stencil.numpy()
-    E, K = stencil.shape
-    vertices = stencil.ravel()
-    order = np.argsort(vertices, kind="stable")
-    offsets = np.searchsorted(vertices[order], np.arange(count + 1))
-    degrees = np.diff(offsets)
-    slots = int(degrees.max(initial=0))
-    padded = slots * count <= 2 * len(order)
-    place, size = np.arange(len(order)), len(order)
-    if padded:
-        place, size = (place - offsets[vertices[order]]) * count + vertices[order], slots * count
-    codes = np.full(size, -1, dtype=np.int64)
-    codes[place] = order
-    found = {"slots": slots, "stencil": elements.stencil, "stiffness": elements.stiffness}
-    found |= {"damping": elements.damping, "rest": elements.rest}
-    if K == 2:  # the other vertex is at hand, and what the element has beside it
-        codes[place] = 2 * stencil[order // 2, 1 - order % 2] + order % 2
-        source = np.zeros(size, dtype=np.int64)
-        source[place] = order // 2
-        found["stencil"] = None
-        found |= {name: _of_incidences(found[name], source) for name in ("stiffness", "damping", "rest")}
-    found["codes"] = _put(elements, codes)
-    if not padded:
-        found["offsets"] = _put(elements, offsets)
-    return kernels.Part(elements.term, elements.damping is not None, padded=padded), found
-
-
-def _of_incidences(array, source):
-    """The values of elements ``source``, if elements do not share one."""
-    if array is None or 0 in array.strides:
-        return array
-    return wp.array(array.numpy()[source], dtype=array.dtype, device=array.device)
-
-
-def _put(elements, values):
-    return wp.array(values.astype(np.int32), dtype=wp.int32, device=elements.stencil.device)
-
-
-def _chain(parts, arrays, dtype):
-    """The struct of all terms: that of the first, and the chain of the others."""
-    chain = kernels.chain_of(tuple(parts), dtype)()
-    if parts:
-        elements = kernels.elements_of(parts[0], dtype)()
-        for name, value in arrays[0].items():
-            if value is not None:
-                setattr(elements, name, value)
-        chain.first, chain.others = elements, _chain(parts[1:], arrays[1:], dtype)
-    return chain

@@ -170,4 +170,4 @@ class ExplicitStepper(LaunchedStepper):
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):
-        self.passes.launch(*self.state, steps, lambda x: self.launch_pins(x=x))
+        self.passes.launch(*self.state, steps, lambda x, v: self.launch_pins(x=x, v=v))

@@ -83,8 +83,7 @@ class HierarchicalPBDStepper(LaunchedStepper):
         self.sweep = Sweep(self.model, self.state.x, self.h, "coloured", options.relaxation)
         self.past = Past(model, self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
-        finish = lambda: self.launch_finish(self.sweep.correction)
-        self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (finish, 1))
+        self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
 
     def _on_level(self, level):
         """The sweep over a level, and the launch by which the vertices that it drops follow it."""
@@ -104,3 +103,6 @@ class HierarchicalPBDStepper(LaunchedStepper):
             for _ in range(self.options.coarse_iterations):
                 sweep.launch()
             self.model.launch(*followers)
+
+    def _launch_last(self):
+        self.launch_finish(self.sweep.correction)

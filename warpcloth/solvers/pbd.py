@@ -78,9 +78,11 @@ class PBDStepper(LaunchedStepper):
         spread = options.iterations if options.stiffness == "per-step" else None
         self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)
         self.past = Past(model, self.sweep.elements)
-        finish = lambda: self.launch_finish(self.sweep.correction)
-        self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (finish, 1))
+        self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
 
     def _launch_start(self):
         self.launch_prediction()
         self.sweep.launch_start()
+
+    def _launch_last(self):
+        self.launch_finish(self.sweep.correction)

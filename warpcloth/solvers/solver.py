@@ -119,15 +119,15 @@ class Stepper:
         self.model = model.with_terms(damped_terms(model, self.he))
         self.past = Past(model, self.model.terms)
 
-    def launch_pins(self, parts=1, x=None):
-        """Moves the pins that have keyframes on by h/``parts``, the same in all calls, in ``x`` if that is not of the state."""
+    def launch_pins(self, parts=1, x=None, v=None):
+        """Moves the pins that have keyframes on by h/``parts``, the same in all calls, in x and v if not in the state."""
         model = self.model
         if model.pins is None:
             return
         dim = (model.copies, len(model.pins))
         move, count = model.kernel(kernels.move_pins, model.dtype), model.kernel(kernels.count_step)
         given = [model.pins, model.keyframes, self.count, parts * self.steps_per_frame, model.per_copy, self.h / parts]
-        model.launch(move, dim, given, [self.state.x if x is None else x, self.state.v])
+        model.launch(move, dim, given, [self.state.x if x is None else x, self.state.v if v is None else v])
         model.launch(count, 1, [], [self.count])
 
     def launch_prediction(self):

@@ -1,0 +1,169 @@
+"""Functions of one element, and structs of the arrays of several terms, for kernels that take all terms in one pass.
+
+Such a kernel is made of one function and one struct of arrays a term, each with those of the terms after it inside.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import warp as wp
+
+from .assemble import types
+from .term import Term
+
+
+class Part(NamedTuple):
+    """What a kernel needs to know of the elements of one term.
+
+    Attributes:
+        term: The :class:`.term.Term`.
+        damped: Whether it has damping, taken at x + h v about the state x, see :class:`.term.Dissipation`.
+        pairs: Whether an incidence, for gathering, names the other vertex of its pair and has a rest state of its own.
+        ordered: Whether the lowest vertex, for sweeping, is the first of all its elements.
+        padded: Whether the incidences are rows of equal length, one slot of all vertices after another.
+    """
+
+    term: Term
+    damped: bool = False
+    pairs: bool = False
+    ordered: bool = False
+    padded: bool = False
+
+
+@cache
+def load(dtype, ndim=1):
+    """The device function (a, i) → element i of contiguous memory, without the arithmetic of strides and negative indices.
+
+    That is half the time of a sweep over springs.
+    """
+
+    @wp.func_native("return a.data[i];")
+    def load_element(a: wp.array(dtype=dtype, ndim=ndim), i: int) -> dtype: ...
+
+    return load_element
+
+
+@cache
+def load_shared(dtype):
+    """The same of arrays of any stride, such as 0 of what all elements share."""
+
+    @wp.func_native("return *(decltype(a.data))((char*)a.data + size_t(i) * size_t(a.strides[0]));")
+    def load_strided(a: wp.array(dtype=dtype), i: int) -> dtype: ...
+
+    return load_strided
+
+
+@cache
+def store(dtype):
+    """The device function (a, i, value): a[i] = value, as :func:`load`."""
+
+    @wp.func_native("a.data[i] = value;")
+    def store_element(a: wp.array(dtype=dtype), i: int, value: dtype): ...
+
+    return store_element
+
+
+@cache
+def local_gradient(part: Part, dtype, corrected: bool = False):
+    """The device function (k, β, rest, y, dy, h) → kA ∂u/∂y (M, 3), and what damping adds to it at y + dy.
+
+    With ``corrected`` all of it is taken at y + dy.
+    """
+    term = part.term
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    gradient, measure = term.gradient, term.measure
+
+    @wp.func
+    def elastic(k: dtype, beta: dtype, r: rest_type, y: y_type, dy: y_type, h: dtype):
+        return (k * measure(r)) * gradient(y, r)
+
+    @wp.func
+    def ahead(k: dtype, beta: dtype, r: rest_type, y: y_type, dy: y_type, h: dtype):
+        return (k * measure(r)) * gradient(y + dy, r)
+
+    if not part.damped:
+        return ahead if corrected else elastic
+    damped = term.dissipation.term or term
+    change_of, rest_of, damped_gradient, damped_measure = (
+        term.dissipation.change,
+        term.dissipation.rest,
+        damped.gradient,
+        damped.measure,
+    )
+
+    @wp.func
+    def with_damping(k: dtype, beta: dtype, r: rest_type, y: y_type, dy: y_type, h: dtype):
+        s = rest_of(y, change_of(y, y, r), r, dtype(1.0))
+        return elastic(k, beta, r, y, dy, h) + (beta / h * damped_measure(s)) * damped_gradient(y + dy, s)
+
+    return with_damping
+
+
+@cache
+def of_corner(term: Term, dtype):
+    """The device functions of a corner: (rest, corner, place) → its part w ⊗ place of y, (rest, corner, g) → w·g."""
+    vec3, _ = types(dtype)
+    M, weight = wp.constant(term.rows), term.weight
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+
+    @wp.func
+    def part(rest: rest_type, corner: int, place: vec3):
+        w = weight(rest, corner)
+        y = y_type()
+        for m in range(M):
+            y[m] = w[m] * place
+        return y
+
+    @wp.func
+    def force(rest: rest_type, corner: int, g: y_type):
+        w = weight(rest, corner)
+        total = w[0] * g[0]
+        for m in range(1, M):
+            total += w[m] * g[m]
+        return total
+
+    return part, force
+
+
+@cache
+def elements_of(part: Part, dtype):
+    """The struct of what a kernel reads of one term.
+
+    Swept: from offsets[i] to offsets[i+1] are the elements of lowest vertex i. Gathered: ``codes`` K·element + corner of the
+    incidences of each vertex; of pairs 2·neighbour + corner, and stiffness, damping and rest state are those of incidences.
+    Padded, ``slots`` for each vertex, slot by slot and -1 where there are no more; else from offsets[i] to offsets[i+1].
+    """
+
+    @wp.struct
+    class Elements:
+        offsets: wp.array(dtype=wp.int32)
+        codes: wp.array(dtype=wp.int32)
+        slots: int
+        stencil: wp.array2d(dtype=wp.int32)
+        stiffness: wp.array(dtype=dtype)
+        damping: wp.array(dtype=dtype)
+        rest: wp.array(dtype=wp.types.vector(part.term.parameters, dtype))
+
+    return Elements
+
+
+@wp.struct
+class Nothing:
+    """The end of a chain."""
+
+    unused: int
+
+
+@cache
+def chain_of(parts: tuple[Part, ...], dtype):
+    """The struct of what a kernel reads of all terms: that of the first, and the chain of the others."""
+    if not parts:
+        return Nothing
+    first_type, others_type = elements_of(parts[0], dtype), chain_of(parts[1:], dtype)
+
+    @wp.struct
+    class Chain:
+        first: first_type
+        others: others_type
+
+    return Chain

@@ -1,0 +1,113 @@
+"""Factories of what sums over the elements of a vertex in a fixed order, of all terms in one pass: deterministic on a GPU."""
+
+from functools import cache
+
+import warp as wp
+
+from .assemble import types
+from .elements import Part, chain_of, elements_of, load, load_shared, local_gradient, of_corner, store
+
+
+@cache
+def gather_term(part: Part, dtype, corrected: bool = False):
+    """The device function (elements, i, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term; with ``corrected`` ∂U/∂xᵢ at x + h v."""
+    vec3, _ = types(dtype)
+    term = part.term
+    K, damped, padded, pairs = wp.constant(term.vertices), part.damped, part.padded, part.pairs
+    moved = damped or corrected
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype, corrected)
+    vector, whole, vertex, rest_of, number = load(vec3), load(wp.int32), load(wp.int32, 2), load(rest_type), load_shared(dtype)
+
+    @wp.func
+    def total_of(
+        elements: elements_of(part, dtype), i: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype
+    ):
+        total = vec3()
+        beta = dtype(0.0)
+        place = vector(x, i)
+        move = vec3()
+        if wp.static(moved):
+            move = h * vector(v, i)
+        slot = i
+        left = elements.slots
+        if wp.static(not padded):
+            slot = whole(elements.offsets, i)
+            left = whole(elements.offsets, i + 1) - slot
+        while left > 0:
+            code = whole(elements.codes, slot)
+            if wp.static(padded):
+                if code < 0:
+                    break
+            y = y_type()
+            dy = y_type()
+            e = slot
+            corner = code & 1
+            if wp.static(pairs):
+                j = code >> 1
+                r = rest_of(elements.rest, e)
+                y = part_of(r, corner, place) + part_of(r, 1 - corner, vector(x, j))
+                if wp.static(moved):
+                    dy = part_of(r, corner, move) + part_of(r, 1 - corner, h * vector(v, j))
+            else:
+                e = code // K
+                corner = code - K * e
+                r = rest_of(elements.rest, e)
+                for c in range(K):
+                    j = vertex(elements.stencil, K * e + c)
+                    y += part_of(r, c, vector(x, j))
+                    if wp.static(moved):
+                        dy += part_of(r, c, h * vector(v, j))
+            if wp.static(damped):
+                beta = number(elements.damping, e)
+            g = local(number(elements.stiffness, e), beta, r, y, dy, h)
+            total += force_of(r, corner, g)
+            if wp.static(padded):
+                slot += count
+            else:
+                slot += 1
+            left -= 1
+        return total
+
+    return total_of
+
+
+@cache
+def gather_terms(parts: tuple[Part, ...], dtype, corrected: bool = False):
+    """The same of all terms."""
+    vec3, _ = types(dtype)
+    chain_type = chain_of(parts, dtype)
+
+    if not parts:
+
+        @wp.func
+        def total_of_nothing(chain: chain_type, i: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype):
+            return vec3()
+
+        return total_of_nothing
+    first, others = gather_term(parts[0], dtype, corrected), gather_terms(parts[1:], dtype, corrected)
+
+    @wp.func
+    def total_of(chain: chain_type, i: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype):
+        return first(chain.first, i, count, x, v, h) + others(chain.others, i, count, x, v, h)
+
+    return total_of
+
+
+@cache
+def gather_gradient(parts: tuple[Part, ...], dtype, corrected: bool = False):
+    """Kernel over vertices: adds ∂U/∂x [N] of all terms, at x or with ``corrected`` at x + d, to out."""
+    vec3, _ = types(dtype)
+    total_of, vector, put = gather_terms(parts, dtype, corrected), load(vec3), store(vec3)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather(
+        chain: chain_of(parts, dtype),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        put(out, i, vector(out, i) + total_of(chain, i, x.shape[0], x, d, dtype(1.0)))
+
+    return gather
