@@ -18,14 +18,15 @@ class Part(NamedTuple):
     Attributes:
         term: The :class:`.term.Term`.
         damped: Whether it has damping, taken at x + h v about the state x, see :class:`.term.Dissipation`.
-        pairs: Whether an incidence, for gathering, names the other vertex of its pair and has a rest state of its own.
+        pairs: Slots of a vertex, for gathering, whose incidences name the other vertex of a pair and have a rest state of their
+            own, slot by slot; 0 where incidences name elements.
         ordered: Whether the lowest vertex, for sweeping, is the first of all its elements.
-        padded: Whether the incidences are rows of equal length, one slot of all vertices after another.
+        padded: Whether incidences that name elements have as many slots for each vertex, slot by slot.
     """
 
     term: Term
     damped: bool = False
-    pairs: bool = False
+    pairs: int = 0
     ordered: bool = False
     padded: bool = False
 
@@ -129,16 +130,15 @@ def of_corner(term: Term, dtype):
 def elements_of(part: Part, dtype):
     """The struct of what a kernel reads of one term.
 
-    Swept: from offsets[i] to offsets[i+1] are the elements of lowest vertex i. Gathered: ``codes`` K·element + corner of the
-    incidences of each vertex; of pairs 2·neighbour + corner, and stiffness, damping and rest state are those of incidences.
-    Padded, ``slots`` for each vertex, slot by slot and -1 where there are no more; else from offsets[i] to offsets[i+1].
+    Swept: from offsets[i] to offsets[i+1] are the elements of lowest vertex i. Gathered: so many incidences has vertex i, and
+    ``codes`` are K·element + corner, from offsets[i] on or, padded, of the first slot of all vertices, then of the second …; of
+    pairs 2·neighbour + corner, -1 where there are no more.
     """
 
     @wp.struct
     class Elements:
         offsets: wp.array(dtype=wp.int32)
         codes: wp.array(dtype=wp.int32)
-        slots: int
         stencil: wp.array2d(dtype=wp.int32)
         stiffness: wp.array(dtype=dtype)
         damping: wp.array(dtype=dtype)

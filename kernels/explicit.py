@@ -195,11 +195,11 @@ def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool):
         v_after: wp.array(dtype=vec3),
     ):
         i = wp.tid()
+        total = total_of(chain, i, inverse_mass.shape[0], x, v, h)  # of pins too: what follows need not wait for w
         w = number(inverse_mass, i)
         place = vector(x, i)
         velocity = vector(v, i)
         if w > dtype(0.0):
-            total = total_of(chain, i, inverse_mass.shape[0], x, v, h)
             place, velocity = step(place, velocity, gravity[i // per_copy] - w * total, h)
         put(x_after, i, place)
         put(v_after, i, velocity)

@@ -93,10 +93,5 @@ def _swept_part(elements):
 
 def _swept(elements):
     """What the struct of the elements of a sweep has, by name."""
-    return {
-        "offsets": elements.ranges,
-        "stencil": elements.stencil,
-        "stiffness": elements.stiffness,
-        "damping": elements.damping,
-        "rest": elements.rest,
-    }
+    found = {"offsets": elements.ranges, "stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
+    return found if elements.damping is None else found | {"damping": elements.damping}
