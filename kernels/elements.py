@@ -18,15 +18,17 @@ class Part(NamedTuple):
     Attributes:
         term: The :class:`.term.Term`.
         damped: Whether it has damping, taken at x + h v about the state x, see :class:`.term.Dissipation`.
-        pairs: Slots of a vertex, for gathering, whose incidences name the other vertex of a pair and have a rest state of their
-            own, slot by slot; 0 where incidences name elements.
+        shared: Whether all elements share one stiffness.
+        pairs: Slots of a vertex, for gathering, as first and as second of a pair, where incidences name the other vertex and
+            have a rest state of their own, slot by slot; None where they name elements.
         ordered: Whether the lowest vertex, for sweeping, is the first of all its elements.
         padded: Whether incidences that name elements have as many slots for each vertex, slot by slot.
     """
 
     term: Term
     damped: bool = False
-    pairs: int = 0
+    shared: bool = False
+    pairs: tuple[int, int] | None = None
     ordered: bool = False
     padded: bool = False
 
@@ -132,7 +134,7 @@ def elements_of(part: Part, dtype):
 
     Swept: from offsets[i] to offsets[i+1] are the elements of lowest vertex i. Gathered: so many incidences has vertex i, and
     ``codes`` are K·element + corner, from offsets[i] on or, padded, of the first slot of all vertices, then of the second …; of
-    pairs 2·neighbour + corner, -1 where there are no more.
+    pairs the other vertex, -1 where there are no more.
     """
 
     @wp.struct

@@ -19,7 +19,7 @@ def sweep_term(part: Part, dtype):
     """The device function that adds the forces of the elements of lowest vertex i: returned of i, in ``gradient`` of others."""
     vec3, _ = types(dtype)
     term = part.term
-    K, damped, ordered = wp.constant(term.vertices), part.damped, part.ordered
+    K, damped, shared, ordered = wp.constant(term.vertices), part.damped, part.shared, part.ordered
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype)
     vector, whole, vertex, rest_of, number = load(vec3), load(wp.int32), load(wp.int32, 2), load(rest_type), load_shared(dtype)
@@ -39,6 +39,9 @@ def sweep_term(part: Part, dtype):
         move = vec3()
         if wp.static(damped):
             move = h * vector(v, i)
+        k = dtype(0.0)
+        if wp.static(shared):
+            k = number(elements.stiffness, 0)
         e = whole(elements.offsets, i)
         last = whole(elements.offsets, i + 1)
         beta = dtype(0.0)
@@ -59,7 +62,9 @@ def sweep_term(part: Part, dtype):
                 y += part_of(r, corner, vector(x, j))
                 if wp.static(damped):
                     dy += part_of(r, corner, h * vector(v, j))
-            g = local(number(elements.stiffness, e), beta, r, y, dy, h)
+            if wp.static(not shared):
+                k = number(elements.stiffness, e)
+            g = local(k, beta, r, y, dy, h)
             if wp.static(ordered):
                 total += force_of(r, 0, g)
                 for corner in range(1, K):

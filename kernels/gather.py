@@ -15,7 +15,7 @@ def gather_term(part: Part, dtype, corrected: bool = False):
         return gather_pairs(part, dtype, corrected)
     vec3, _ = types(dtype)
     term = part.term
-    K, damped, padded = wp.constant(term.vertices), part.damped, part.padded
+    K, damped, shared, padded = wp.constant(term.vertices), part.damped, part.shared, part.padded
     moved = damped or corrected
     y_type = wp.types.matrix((term.rows, 3), dtype)
     (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype, corrected)
@@ -28,6 +28,9 @@ def gather_term(part: Part, dtype, corrected: bool = False):
     ):
         total = vec3()
         beta = dtype(0.0)
+        k = dtype(0.0)
+        if wp.static(shared):
+            k = number(elements.stiffness, 0)
         slot = whole(elements.offsets, i)
         left = whole(elements.offsets, i + 1) - slot
         if wp.static(padded):
@@ -45,7 +48,9 @@ def gather_term(part: Part, dtype, corrected: bool = False):
                     dy += part_of(r, corner, h * vector(v, j))
             if wp.static(damped):
                 beta = number(elements.damping, e)
-            total += force_of(r, code - K * e, local(number(elements.stiffness, e), beta, r, y, dy, h))
+            if wp.static(not shared):
+                k = number(elements.stiffness, e)
+            total += force_of(r, code - K * e, local(k, beta, r, y, dy, h))
             if wp.static(padded):
                 slot += count
             else:
@@ -64,7 +69,8 @@ def gather_pairs(part: Part, dtype, corrected: bool):
     """
     vec3, _ = types(dtype)
     term = part.term
-    slots, damped = wp.constant(part.pairs), part.damped
+    (firsts, seconds), damped, shared = part.pairs, part.damped, part.shared
+    firsts, slots = wp.constant(firsts), wp.constant(firsts + seconds)
     moved = damped or corrected
     y_type = wp.types.matrix((term.rows, 3), dtype)
     (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype, corrected)
@@ -81,11 +87,14 @@ def gather_pairs(part: Part, dtype, corrected: bool):
         move = vec3()
         if wp.static(moved):
             move = h * vector(v, i)
+        k = dtype(0.0)
+        if wp.static(shared):
+            k = number(elements.stiffness, 0)
         for s in range(slots):
+            corner = wp.where(s < firsts, 0, 1)  # known to the compiler, and so are the weights
             slot = s * count + i
             code = whole(elements.codes, slot)
-            corner = code & 1
-            j = wp.max(code, 0) >> 1
+            j = wp.max(code, 0)
             r = rest_of(elements.rest, slot)
             y = part_of(r, corner, place) + part_of(r, 1 - corner, vector(x, j))
             dy = y_type()
@@ -93,7 +102,9 @@ def gather_pairs(part: Part, dtype, corrected: bool):
                 dy = part_of(r, corner, move) + part_of(r, 1 - corner, h * vector(v, j))
             if wp.static(damped):
                 beta = number(elements.damping, slot)
-            force = force_of(r, corner, local(number(elements.stiffness, slot), beta, r, y, dy, h))
+            if wp.static(not shared):
+                k = number(elements.stiffness, slot)
+            force = force_of(r, corner, local(k, beta, r, y, dy, h))
             total += wp.where(code >= 0, force, vec3())
         return total
 

@@ -16,31 +16,40 @@ def gathered(elements, count, damped=False):
     beside it at hand, unless the rest state is set, by element, in each step.
     """
     stencil = elements.stencil.numpy()
-    K, vertices = stencil.shape[1], stencil.ravel()
-    order = np.argsort(vertices, kind="stable")
-    vertices = vertices[order]
-    offsets = np.searchsorted(vertices, np.arange(count + 1))
-    slots = int(np.diff(offsets).max(initial=0))
-    place, size = np.arange(len(order)), len(order)
-    padded = slots * count <= 2 * size
-    if padded:
-        place, size = (place - offsets[vertices]) * count + vertices, slots * count
-    codes = np.full(size, -1, dtype=np.int64)
-    codes[place] = order
-    found = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
+    part = Part(elements.term, damped, shared=0 in elements.stiffness.strides)
+    arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
     if damped:
-        found["damping"] = elements.damping
-    pairs = padded and K == 2 and elements.origin is None and slots <= SLOTS
-    if pairs:
-        del found["stencil"]
-        codes[place] = 2 * stencil[order // 2, 1 - order % 2] + order % 2
-        source = np.zeros(size, dtype=np.int64)
-        source[place] = order // 2
-        found = {name: _of_incidences(array, source) for name, array in found.items()}
-    else:
-        found["offsets"] = indices(elements, offsets)
-    found["codes"] = indices(elements, codes)
-    return Part(elements.term, damped, pairs=slots if pairs else 0, padded=padded), found
+        arrays["damping"] = elements.damping
+    if stencil.shape[1] == 2 and elements.origin is None:
+        columns = [_rows(stencil[:, corner], count) for corner in range(2)]
+        slots = tuple(int(np.diff(offsets).max(initial=0)) for _order, _vertices, offsets in columns)
+        if sum(slots) <= SLOTS and sum(slots) * count <= 2 * stencil.size:
+            return part._replace(pairs=slots), _of_pairs(elements, columns, slots, count, arrays)
+    order, vertices, offsets = _rows(stencil.ravel(), count)
+    slots = int(np.diff(offsets).max(initial=0))
+    codes, padded = order, slots * count <= 2 * len(order)
+    if padded:
+        codes = np.full(slots * count, -1)
+        codes[(np.arange(len(order)) - offsets[vertices]) * count + vertices] = order
+    arrays |= {"offsets": indices(elements, offsets), "codes": indices(elements, codes)}
+    return part._replace(padded=padded), arrays
+
+
+def _rows(vertices, count):
+    """The order that sorts vertices (E,), the sorted ones, and where those of each of the ``count`` vertices are in it."""
+    order = np.argsort(vertices, kind="stable")
+    return order, vertices[order], np.searchsorted(vertices[order], np.arange(count + 1))
+
+
+def _of_pairs(elements, columns, slots, count, arrays):
+    """The arrays of incidences that name the other vertex, those as first of a pair before those as second."""
+    stencil = elements.stencil.numpy()
+    codes, source = np.full(sum(slots) * count, -1), np.zeros(sum(slots) * count, dtype=np.int64)
+    for corner, (order, vertices, offsets) in enumerate(columns):
+        place = (corner * slots[0] + np.arange(len(order)) - offsets[vertices]) * count + vertices
+        codes[place], source[place] = stencil[order, 1 - corner], order
+    found = {name: _of_incidences(array, source) for name, array in arrays.items() if name != "stencil"}
+    return found | {"codes": indices(elements, codes)}
 
 
 def _of_incidences(array, source):

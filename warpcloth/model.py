@@ -279,9 +279,9 @@ class Model:
         self.kernels.add(".".join([f"{factory.__name__}{variant}", *terms]))
         return kernel
 
-    def launch(self, kernel, dim, inputs, outputs=()):
+    def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
         self.launches[0] += 1
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
     def _on_device(self, term, positions, vary):
         copies = [term.elements(self.scene.mesh, start) for start in (positions if vary.has("positions") else positions[:1])]

@@ -25,6 +25,7 @@ class Sweep:
 
     Args:
         model: The :class:`warpcloth.model.Model`.
+        state: x and v (N,), which steps move on.
         h: Step [s].
         symplectic: Whether x moves on by the v after the step.
 
@@ -32,9 +33,9 @@ class Sweep:
         model: The model with its elements in the order of the sweep.
     """
 
-    def __init__(self, model, h, symplectic):
+    def __init__(self, model, state, h, symplectic):
         swept = [elements if elements.cells else by_lowest(elements, model.count) for elements in model.terms]
-        self.model, self.h = model.with_terms(swept), h
+        self.model, self.state = model.with_terms(swept), state
         cells, others = ([elements for elements in swept if (elements.cells is None) == apart] for apart in (False, True))
         self._cells, self._gradient = Gradient(model, terms=cells), model.vectors()
         parts = [_swept_part(elements) for elements in others]
@@ -42,15 +43,14 @@ class Sweep:
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
         self._kernel = model.kernel(kernels.sweep, tuple(parts), model.dtype, symplectic, flags)
         self._chain = chain(parts, [_swept(elements) for elements in others], model.dtype)
+        self._given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, h]
 
-    def launch(self, x, v, steps, after_step):
-        """So many steps of x and v, with a call of ``after_step`` (x, v) after each."""
-        model = self.model
+    def launch(self, steps, after_step):
+        """So many steps, with a call of ``after_step`` (x, v) after each."""
         for _ in range(steps):
-            self._cells.add(x, self._gradient)
-            given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, self.h]
-            model.launch(self._kernel, model.copies, given, [self._gradient, x, v])
-            after_step(x, v)
+            self._cells.add(self.state[0], self._gradient)
+            self.model.launch(self._kernel, self.model.copies, self._given, [self._gradient, *self.state])
+            after_step(*self.state)
 
 
 class Gather:
@@ -59,36 +59,37 @@ class Gather:
     x, and of what is damped v, go to and fro between two arrays; the last of an odd number of steps is copied back.
     """
 
-    def __init__(self, model, h, symplectic):
-        self.model, self.h = model, h
+    def __init__(self, model, state, h, symplectic):
+        self.model = model
         self._found = [gathered(elements, model.count, elements.damping is not None) for elements in model.terms]
         parts = [part for part, _arrays in self._found]
         fast = model.device.is_cuda and model.dtype is wp.float32
         self._kernel = model.kernel(kernels.gather, tuple(parts), model.dtype, symplectic, fast)
         self._chain = chain(parts, [arrays for _part, arrays in self._found], model.dtype)
-        self._x = model.vectors()
-        self._v = model.vectors() if any(part.damped for part in parts) else None
+        x, v = state
+        self._states = [(x, v), (model.vectors(), model.vectors() if any(part.damped for part in parts) else v)]
+        self._given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, h]
 
-    def launch(self, x, v, steps, after_step):
-        """So many steps of x and v, with a call of ``after_step`` (x, v) after each."""
+    def launch(self, steps, after_step):
+        """So many steps, with a call of ``after_step`` (x, v) after each."""
         model = self.model
-        states = [(x, v), (self._x, v if self._v is None else self._v)]
         for step in range(steps):
-            before, after = states[step % 2], states[1 - step % 2]
+            before, after = self._states[step % 2], self._states[1 - step % 2]
             fit_cells(model, model.terms, before[0], None)
-            given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, self.h, *before]
-            model.launch(self._kernel, model.count, given, [*after])
+            # Of 64² vertices 7 % faster than blocks of 256, of larger cloth the same.
+            model.launch(self._kernel, model.count, [*self._given, *before], [*after], block_dim=128)
             after_step(*after)
         if steps % 2:
-            wp.copy(x, self._x)
-            if self._v is not None:
-                wp.copy(v, self._v)
+            for array, last in zip(*self._states, strict=True):
+                if array is not last:
+                    wp.copy(array, last)
 
 
 def _swept_part(elements):
     """The :class:`warpcloth.kernels.elements.Part` of the elements of a sweep."""
     stencil = elements.stencil.numpy()
-    return Part(elements.term, elements.damping is not None, ordered=bool((stencil[:, 0] == stencil.min(axis=1)).all()))
+    ordered = bool((stencil[:, 0] == stencil.min(axis=1)).all())
+    return Part(elements.term, elements.damping is not None, 0 in elements.stiffness.strides, ordered=ordered)
 
 
 def _swept(elements):

@@ -53,10 +53,7 @@ def energy(y: Any, rest: Any):
 @wp.func
 def gradient(y: Any, rest: Any):
     length = wp.length(y[0])
-    factor = y.dtype(0.0)
-    if not collapsed(length, rest[0]):
-        factor = y.dtype(1.0) - rest[0] / length
-    return factor * y
+    return wp.where(collapsed(length, rest[0]), y.dtype(0.0), y.dtype(1.0) - rest[0] / length) * y
 
 
 @wp.func

@@ -165,9 +165,9 @@ class ExplicitStepper(LaunchedStepper):
     def __init__(self, options, model):
         super().__init__(options, model)
         kind = Gather if model.device.is_cuda else Sweep
-        self.passes = kind(model, self.h, options.scheme == "symplectic")
+        self.passes = kind(model, self.state, self.h, options.scheme == "symplectic")
         self.model = self.passes.model
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):
-        self.passes.launch(*self.state, steps, lambda x, v: self.launch_pins(x=x, v=v))
+        self.passes.launch(steps, lambda x, v: self.launch_pins(x=x, v=v))
