@@ -167,6 +167,7 @@ class ExplicitStepper(LaunchedStepper):
         kind = Gather if model.device.is_cuda else Sweep
         self.passes = kind(model, self.state, self.h, options.scheme == "symplectic")
         self.model = self.passes.model
+        self.past = Past(self.model, self.model.terms)  # none: what is damped is so within the pass
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):

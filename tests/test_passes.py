@@ -1,0 +1,158 @@
+"""The explicit step in one pass against forces and update apart, and frames against steps, to the bit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from test_solvers import SOLVERS, allocations, square
+
+import warpcloth as wc
+from warpcloth.damping import Forces
+from warpcloth.incidences import gathered
+from warpcloth.passes import Gather, Sweep, by_lowest
+from warpcloth.solvers import explicit, solver
+from warpcloth.solvers.explicit import step_limits
+
+MESH = wc.Mesh.grid(7, 5, pattern="alternating")
+N = len(MESH.points)
+RANDOM = np.random.default_rng(3)
+POSITIONS = MESH.points + RANDOM.normal(scale=0.01, size=(N, 3))
+VELOCITIES = RANDOM.normal(size=(N, 3))
+SPRINGS = wc.Spring(pairs=("structural", "shear"), stiffness=100.0)
+BACKWARDS = wc.Spring(pairs=SPRINGS.stencil(MESH)[:, ::-1], stiffness=100.0 + np.arange(len(SPRINGS.stencil(MESH))))
+TERMS = {
+    "nothing": [],
+    "springs": [SPRINGS],
+    "springs, the higher vertex first, each of its own stiffness": [BACKWARDS],
+    "damped springs": [replace(SPRINGS, damping=0.05)],
+    "limits": [wc.SpringLimit(stiffness=100.0, least=0.99, most=1.01), wc.StrainLimit(stiffness=10.0, least=0.99, most=1.01)],
+    "corotated": [wc.CorotatedMembrane(stiffness=100.0, damping=0.01)],
+    "St. Venant-Kirchhoff": [wc.StVKMembrane(stiffness=100.0, damping=0.01)],
+    "Neo-Hookean": [wc.NeoHookeanMembrane(stiffness=100.0)],
+    "quadratic bending": [wc.QuadraticBending(stiffness=1e-3, damping=1e-5)],
+    "dihedral bending": [wc.DihedralBending(stiffness=1e-3, damping=1e-5)],
+    "attachments": [wc.Attachment(vertices="corners", stiffness=10.0, damping=0.1)],
+    "clusters": [wc.RigidCluster(vertices=[[0, 1, 2, 7], [20, 21, 28]], stiffness=1e3)],
+    "several": [
+        replace(BACKWARDS, damping=0.02),
+        wc.RigidCluster(vertices=[[0, 1, 2, 7]], stiffness=1e3),
+        wc.DihedralBending(stiffness=1e-3),
+        wc.QuadraticBending(stiffness=1e-3, damping=1e-5),
+        wc.Attachment(vertices=[3], stiffness=10.0),
+    ],
+}
+
+
+def declared(terms, **scene):
+    """A disturbed sheet in motion; one pin stands still, two are led by keyframes."""
+    keyframes = POSITIONS[[0, 6]] + 0.02 * RANDOM.normal(size=(3, 2, 3)).cumsum(axis=0) * np.arange(3)[:, None, None]
+    pins = wc.Pins([0, 6], keyframes)
+    given = {"density": 0.1, "positions": POSITIONS, "velocities": VELOCITIES, "pins": pins, "duration": 1.0}
+    return wc.Scene(MESH, terms=terms, **(given | scene))
+
+
+def apart(model, stepper, scheme, steps):
+    """x and v after so many steps, forces by the kernels of one term each and the rest in NumPy."""
+    scene, h = model.scene, stepper.h
+    forces, gradient = Forces(model, h), model.vectors()
+    x, v = (array.numpy().astype(np.float64) for array in (model.positions, model.velocities))
+    inverse = model.inverse_mass.numpy().astype(np.float64)[:, None]
+    gravity = np.repeat(model.gravity.numpy(), model.per_copy, axis=0)
+    for step in range(1, steps + 1):
+        gradient.zero_()
+        forces.add(model.array(x, model.vec3), model.array(v, model.vec3), gradient)
+        a = np.where(inverse > 0.0, gravity - inverse * gradient.numpy(), 0.0)
+        before, v = v, v + h * a
+        move = h * (v if scheme == "symplectic" else before)
+        x = x + np.where(inverse > 0.0, move, 0.0)
+        frame, part = divmod(step / stepper.steps_per_frame, 1.0)
+        keyframes = scene.pins.keyframes
+        frames = np.minimum([int(frame), int(frame) + 1], len(keyframes) - 1)
+        place = (1.0 - part) * keyframes[frames[0]] + part * keyframes[frames[1]]
+        for first in range(0, model.count, model.per_copy):
+            i = first + scene.pins.vertices
+            x[i], v[i] = place, (place - x[i]) / h
+    return x, v
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("scheme", ["symplectic", "forward"])
+@pytest.mark.parametrize("way", ["own", "gathered"])
+@pytest.mark.parametrize("name", TERMS)
+def test_one_pass_is_forces_and_update(name, way, scheme, dtype, device, monkeypatch):
+    if way == "gathered":  # of CUDA, but right on the CPU too
+        monkeypatch.setattr(explicit, "Sweep", Gather)
+    scene, steps = declared(TERMS[name], fps=250.0), 5
+    vary = {"gravity": [[0.0, -9.81, 0.0], [1.0, 2.0, 3.0]]}
+    model = scene.build(device=device, dtype=dtype, copies=2, vary=vary)
+    stepper = wc.Explicit(substeps=4, scheme=scheme, above_limit="allow").bind(model)
+    assert stepper.h <= step_limits(model)[1]
+    for _ in range(steps):
+        stepper.step()
+    x, v = (array.numpy() for array in stepper.state)
+    exact_x, exact_v = apart(model, stepper, scheme, steps)
+    # Below the limit h²k/m + 2hc/m ≤ 4, so that a few roundings of places and moves of size 1, 16 of them here, change v by
+    # no more than 16·4ε/h a step.
+    tolerance = steps * 64 * np.finfo(dtype).eps / stepper.h
+    assert np.abs(v - exact_v).max() < tolerance
+    assert np.abs(x - exact_x).max() < steps * stepper.h * tolerance
+
+
+LAUNCHED = [name for name, made in SOLVERS.items() if isinstance(made, (wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD))]
+
+
+@pytest.mark.parametrize("launches", [1, 10, 10_000])
+@pytest.mark.parametrize("name", [*LAUNCHED, "xpbd midpoint", "newton"])
+def test_frames_are_steps_to_the_bit(name, launches, device, monkeypatch):
+    """In graphs of one step, of some with some over, and of all; with pins that move, a counter of their own, and damping."""
+    monkeypatch.setattr(solver, "LAUNCHES", launches)
+    record = wc.XPBD(substeps=1, iterations=4, integrator="midpoint") if name == "xpbd midpoint" else SOLVERS[name]
+    record = replace(record, substeps=7)
+    scene = declared([replace(SPRINGS, damping=0.01), wc.QuadraticBending(stiffness=1e-4)], fps=60.0)
+    steppers = [record.bind(scene.build(device=device, copies=2, vary={"Spring.stiffness": [50.0, 100.0]})) for _ in range(2)]
+    for _ in range(3):
+        steppers[0].frame()
+        for _ in range(7):
+            steppers[1].step()
+    for one, other in zip(*(stepper.state for stepper in steppers), strict=True):
+        assert np.array_equal(one.numpy(), other.numpy())
+    assert np.array_equal(steppers[0].residual, steppers[1].residual)
+    assert steppers[0].results == steppers[1].results
+
+
+@pytest.mark.parametrize("name", LAUNCHED)
+def test_a_frame_allocates_nothing(name, device):
+    record = replace(SOLVERS[name], substeps=5)
+    stepper = record.bind(square(solver=record, damping=0.01, fps=120.0, pins="corners").build(device=device))
+    stepper.frame()
+    with wp.ScopedMemoryTracker("frames", print=False) as tracker:
+        assert allocations(tracker, lambda: [stepper.frame() for _ in range(3)]) == 0
+
+
+def test_what_is_in_order_is_not_copied(device):
+    """A sweep takes elements by their lowest vertex, as grids have their springs; others it copies in that order."""
+    model = declared([SPRINGS, wc.DihedralBending(stiffness=1e-3)]).build(device=device)
+    swept = Sweep(model, (model.vectors(), model.vectors()), 1e-3, True).model
+    copied = []
+    for before, after in zip(model.terms, swept.terms, strict=True):
+        lowest = after.stencil.numpy().min(axis=1)
+        assert (np.diff(lowest) >= 0).all()
+        assert np.array_equal(np.diff(after.ranges.numpy()), np.bincount(lowest, minlength=model.count))
+        copied.append(after.stencil is not before.stencil)
+        assert by_lowest(after, model.count).stencil is after.stencil
+    assert copied == [False, True]
+    assert swept.report()["bytes"] == model.report()["bytes"] + 2 * 4 * (model.count + 1)
+
+
+@pytest.mark.parametrize("shape", ["chain", "star"])
+def test_a_vertex_of_many_elements_does_not_blow_up_memory(shape, device):
+    """Rows of equal length have at most twice as many slots as there are incidences; else there are no slots to spare."""
+    n = 200
+    ends = np.arange(1, n)
+    edges = np.stack([ends - 1 if shape == "chain" else 0 * ends, ends], axis=1)
+    mesh = wc.Mesh(np.random.default_rng(0).normal(size=(n, 3)), edges=edges)
+    model = wc.Scene(mesh, masses=np.ones(n), terms=[wc.Spring(stiffness=1.0)]).build(device=device)
+    part, arrays = gathered(model.terms[0], model.count)
+    assert part.pairs == ((1, 1) if shape == "chain" else None) and not part.padded
+    assert len(arrays["codes"]) == (2 * n if shape == "chain" else 2 * (n - 1))
