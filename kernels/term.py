@@ -31,7 +31,8 @@ class Dissipation:
         change: (y, another y, rest state of the term) → s of the other − s of y.
         rest: (y, s̃ − s of y, rest state of the term, share) → rest state of ``term``.
         merges: Whether D merges with the energy; else it is one beside it.
-        term: The :class:`Term` of the sum, or of D alone where it does not merge; None for the term itself.
+        term: The :class:`Term` of the sum, or of D alone where it does not merge, with the same weights; None for the term
+            itself.
     """
 
     change: Any
