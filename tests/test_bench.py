@@ -79,10 +79,10 @@ def test_counting_takes_the_same_steps(solver, device):
     assert 1 <= launches <= 3 if solver == "explicit" else launches > steppers[0].iterations
 
 
-@pytest.mark.parametrize("benchmark", standard(), ids=lambda each: each.setup.solver)
-def test_a_row_of_every_solver(benchmark, device):
+@pytest.mark.parametrize("one", standard(), ids=lambda each: each.setup.solver)
+def test_a_row_of_every_solver(one, device):
     scene = SceneRef("hanging", {"n": 5})
-    setup = Benchmark(scene, benchmark.setup, device=device).setup_of(scene)
+    setup = Benchmark(scene, one.setup, device=device).setup_of(scene)
     row = measure(asdict(scene), asdict(setup), frames=2, device=device, dtype="float32", started=time.time())
     assert row["status"] == "ok" and row["frames"] == 2 and row["vertices"] == 25
     scene = hanging.scene(n=5)
