@@ -99,42 +99,6 @@ def scatter_gradient(term: Term, dtype, corrected: bool = False):
 
 
 @cache
-def gather_gradient(term: Term, dtype, corrected: bool = False):
-    """Kernel over vertices, the same sum as :func:`scatter_gradient` in a fixed order, of one term; :mod:`.gather` takes all.
-
-    incidences[offsets[v] : offsets[v+1]] lists K·element + corner of the stencils that vertex v belongs to.
-    """
-    vec3, _ = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
-    rest_type = wp.types.vector(term.parameters, dtype)
-    y_of, weight, gradient, measure = local_coordinate(term, dtype, corrected), term.weight, term.gradient, term.measure
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def gather(
-        offsets: wp.array(dtype=wp.int32),
-        incidences: wp.array(dtype=wp.int32),
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
-        rest: wp.array(dtype=rest_type),
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        out: wp.array(dtype=vec3),
-    ):
-        v = wp.tid()
-        total = vec3()
-        for n in range(offsets[v], offsets[v + 1]):
-            e = incidences[n] // K
-            r = rest[e]
-            g = (stiffness[e] * measure(r)) * gradient(y_of(stencil, e, r, x, d), r)
-            w = weight(r, incidences[n] - e * K)
-            for m in range(M):
-                total += w[m] * g[m]
-        out[v] = out[v] + total
-
-    return gather
-
-
-@cache
 def hessian_blocks(term: Term, dtype, corrected: bool = False):
     """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], under the policy of the element's copy."""
     vec3, mat33 = types(dtype)

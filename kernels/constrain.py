@@ -317,7 +317,7 @@ def scatter_rows(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def gather_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over vertices: the same sum in a fixed order, through the incidences of :func:`assemble.gather_gradient`."""
+    """Kernel over vertices: the same sum in a fixed order, through :attr:`warpcloth.model.DeviceElements.incidences`."""
     vec3, _ = types(dtype)
     K, M, Q = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)

@@ -44,16 +44,3 @@ def set_damped_rest(term: Term, dtype, bdf2: bool, midpoint: bool):
         out[e] = rest_of(y, change, rest[e], share[e])
 
     return set_rest
-
-
-@cache
-def advance(dtype):
-    """Kernel over vertices: out = h v."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def advance_vertices(v: wp.array(dtype=vec3), h: dtype, out: wp.array(dtype=vec3)):
-        i = wp.tid()
-        out[i] = h * v[i]
-
-    return advance_vertices

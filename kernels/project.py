@@ -190,7 +190,7 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
 
 @cache
 def gather_correction(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
-    """Kernel over vertices: the same sum in a fixed order, through the incidences of :func:`assemble.gather_gradient`.
+    """Kernel over vertices: the same sum in a fixed order, through :attr:`warpcloth.model.DeviceElements.incidences`.
 
     It leaves λ as it is: :func:`advance_multipliers` follows.
     """

@@ -240,7 +240,7 @@ def scatter_splitting(term: Term, dtype):
 
 @cache
 def gather_splitting(term: Term, dtype):
-    """Kernel over vertices: the same sums in a fixed order, through the incidences of :func:`assemble.gather_gradient`."""
+    """Kernel over vertices: the same sums in a fixed order, through :attr:`warpcloth.model.DeviceElements.incidences`."""
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)

@@ -205,7 +205,9 @@ def test_the_command_measures(folder, device, capsys):
     assert {"date", "machine", "bandwidth", "rows", "growth"} == set(found) and found["machine"]["device"]
     small, large = found["rows"]
     assert [row["parameters"]["n"] for row in (small, large)] == [4, 6] and small["vertices"] == 16
-    assert 1.0 <= small["launches"] == large["launches"] <= 3.0 and small["options"]["substeps"] < large["options"]["substeps"]
+    assert small["options"]["substeps"] < large["options"]["substeps"]
+    # Of an odd number of steps on CUDA one copy a frame is more.
+    assert all(1.0 <= row["launches"] <= 1.0 + 1.0 / row["options"]["substeps"] for row in (small, large))
     assert small["cold_start_s"] > 0.0 and large["cold_start_s"] is None
     assert found["growth"][0]["frame"][1] is None
     table = list(csv.DictReader((folder / "table.csv").open(encoding="utf-8")))

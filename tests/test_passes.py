@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from test_damping import damping_forces
 from test_solvers import SOLVERS, allocations, square
 
 import warpcloth as wc
-from warpcloth.damping import Forces
 from warpcloth.incidences import gathered
+from warpcloth.operators import Gradient
 from warpcloth.passes import Gather, Sweep, by_lowest
 from warpcloth.solvers import explicit, solver
 from warpcloth.solvers.explicit import step_limits
@@ -56,14 +57,16 @@ def declared(terms, **scene):
 def apart(model, stepper, scheme, steps):
     """x and v after so many steps, forces by the kernels of one term each and the rest in NumPy."""
     scene, h = model.scene, stepper.h
-    forces, gradient = Forces(model, h), model.vectors()
+    forces, gradient = Gradient(model), model.vectors()
     x, v = (array.numpy().astype(np.float64) for array in (model.positions, model.velocities))
     inverse = model.inverse_mass.numpy().astype(np.float64)[:, None]
     gravity = np.repeat(model.gravity.numpy(), model.per_copy, axis=0)
     for step in range(1, steps + 1):
         gradient.zero_()
-        forces.add(model.array(x, model.vec3), model.array(v, model.vec3), gradient)
-        a = np.where(inverse > 0.0, gravity - inverse * gradient.numpy(), 0.0)
+        place = model.array(x, model.vec3)
+        forces.add(place, gradient)
+        a = gravity - inverse * (gradient.numpy() + damping_forces(model, h, place, v))
+        a = np.where(inverse > 0.0, a, 0.0)
         before, v = v, v + h * a
         move = h * (v if scheme == "symplectic" else before)
         x = x + np.where(inverse > 0.0, move, 0.0)

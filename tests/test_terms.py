@@ -11,7 +11,8 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from warpcloth.kernels import assemble, project
+from warpcloth.incidences import chain, gathered
+from warpcloth.kernels import assemble, gather, project
 from warpcloth.kernels import terms as energies
 from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.model import DTYPES
@@ -1092,7 +1093,20 @@ def test_gathering_is_scattering(term, dtype, device):
 
     factor = model.array(random.uniform(0.2, 1.0, elements.count), scalar)
     start = random.normal(scale=1e-3, size=(elements.count, *(() if term.project is None else (term.rows, 3))))
-    forces = [run(assemble.scatter_gradient, x, zero), *(run(assemble.gather_gradient, x, zero) for _ in range(2))]
+    part, arrays = gathered(elements, model.count)
+
+    def gathered_forces():
+        out = model.vectors()
+        out.fill_(model.vec3(1.0, 2.0, 3.0))
+        model.launch(
+            model.kernel(gather.gather_gradient, (part,), scalar),
+            model.count,
+            [chain([part], [arrays], scalar), x, zero],
+            [out],
+        )
+        return out.numpy()
+
+    forces = [run(assemble.scatter_gradient, x, zero), gathered_forces(), gathered_forces()]
     # Only the order of the sum differs, and the compiler's use of fused multiplication.
     size = np.abs(mesh.points).max() + 1.0
     assert (np.linalg.norm(forces[0] - forces[1], axis=1) <= FEW * eps(dtype) * (4.0 + size * row_sums(model))).all()

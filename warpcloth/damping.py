@@ -7,7 +7,6 @@ import warp as wp
 
 from .kernels import damping as kernels
 from .model import Origin
-from .operators import Gradient
 
 
 def damped_terms(model, he):
@@ -86,27 +85,3 @@ class Past:
             kernel = model.kernel(kernels.set_damped_rest, origin.term, model.dtype, bdf2, midpoint)
             given = [elements.stencil, origin.rest, origin.share, x, move, scale]
             model.launch(kernel, elements.count, given, [elements.rest])
-
-
-class Forces:
-    """∂U/∂x − damping forces [N] of a motion, for those who know v and not the end of a step.
-
-    The force of D is taken at x + h v: −β ds/dt ∂s for a rate of first order in h.
-    """
-
-    def __init__(self, model, h):
-        self.model, self.h = model, h
-        self.gradient = Gradient(model)
-        self.past = Past(model, dissipations(model, h))
-        if self.past.terms:
-            self._ahead = model.vectors()
-            self._damping = Gradient(model, corrected=True, terms=self.past.terms)
-            self._advance = model.kernel(kernels.advance, model.dtype)
-
-    def add(self, x, v, out):
-        """out += ∂U/∂x + ∂D/∂x."""
-        self.gradient.add(x, out)
-        if self.past.terms:
-            self.past.launch(x)
-            self.model.launch(self._advance, self.model.count, [v, self.h], [self._ahead])
-            self._damping.add(x, out, self._ahead)

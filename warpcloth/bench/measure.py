@@ -102,7 +102,7 @@ def _run_frame(stepper):
     """A frame, its points read on the host; the iterations of all its steps."""
     iterations = 0
     # Where a solver has frames of its own, all its steps have the same iterations.
-    if getattr(type(stepper), "frame", None) is not getattr(Stepper, "frame", None):
+    if type(stepper).frame is not Stepper.frame:
         stepper.frame()
         iterations = stepper.steps_per_frame * stepper.iterations
     else:
