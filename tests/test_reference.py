@@ -267,12 +267,15 @@ def test_what_has_no_reference_says_so(folder, tmp_path):
     assert not list(folder.glob("*"))
 
 
-def test_what_is_slow_or_not_known_warns(folder, tmp_path):
+def test_what_is_slow_or_not_known_warns(folder, tmp_path, monkeypatch):
     stiff = written(tmp_path / "stiff.py", "terms=[wc.RigidCluster(vertices=[[0, 1, 2]], stiffness=1e12)], duration=0.05")
     with pytest.warns(
         UserWarning, match=r"RigidCluster makes the reference of scene slow: .* below 4096 explicit steps a frame"
     ):
         assert reference(stiff).method == "Newton"
+    with pytest.warns(UserWarning, match=r"chain.* is known to .* only, not to 1e-20: smaller steps make it no less, for"):
+        assert reference(CHAIN, 2, tolerance=1e-20, limit=1e3).limit == np.inf
+    monkeypatch.setattr(module, "_idle", lambda errors: False)
     with pytest.warns(
         UserWarning, match=r"reference of chain.* is known to .* only, not to 1e-20: give it more time, or fewer"
     ):
@@ -291,7 +294,7 @@ def test_motion_that_no_step_resolves_ends_early(folder, monkeypatch):
         return replace(run, points=run.points + 1e-2 * scatter.normal(size=run.points.shape))
 
     monkeypatch.setattr(module, "simulate", scattered)
-    with pytest.warns(UserWarning, match=r"only, not to 1e-09: the motion is chaotic, take fewer frames"):
+    with pytest.warns(UserWarning, match=r"only, not to 1e-09: smaller steps make it no less, for the motion is chaotic"):
         found = reference(CHAIN, 2, tolerance=1e-9)
     assert found.limit == np.inf and found.error > 1e-3 and found.seconds < 60.0
 

@@ -126,7 +126,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
         scene: The :class:`warpcloth.chart.tasks.SceneRef`.
         frames: Number of frames, if not those of the scene.
         tolerance: Steps are halved until ``error`` is no more than this,
-        limit: or for so long [s], or until two halvings have not made it less, which is the mark of chaotic motion.
+        limit: or for so long [s], or until two halvings have not made it less, the mark of chaotic motion or of rounding.
         progress: Function called with (substeps, frame, frames) once each frame is known, or None.
 
     Returns:
@@ -153,7 +153,8 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
         found = Reference(**facts, **_solve(declared, frames, tolerance, limit, progress))
         found.save()
     if found.error > tolerance:
-        why = "the motion is chaotic, take fewer frames" if found.limit == math.inf else "give it more time, or fewer frames"
+        idle = "smaller steps make it no less, for the motion is chaotic or rounding is what is left, take fewer frames"
+        why = idle if found.limit == math.inf else "give it more time, or fewer frames"
         warnings.warn(f"the reference of {scene} is known to {found.error:.1e} only, not to {tolerance:g}: {why}", stacklevel=2)
     return found
 
