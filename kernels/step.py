@@ -99,8 +99,8 @@ def predict_bdf2(dtype):
 def move_pins(dtype):
     """Kernel over (copies, pins): places the pinned vertices where the keyframes say they are h later.
 
-    Counted in whole steps of this h, ``steps_per_frame`` of them to a keyframe; between keyframes linear, after the last at
-    rest. x is set, v = (x − x before)/h.
+    Counted in whole steps of this h, in each copy by itself, ``steps_per_frame`` of them to a keyframe; between keyframes
+    linear, after the last at rest. x is set, v = (x − x before)/h.
     """
     vec3, _ = types(dtype)
 
@@ -119,7 +119,7 @@ def move_pins(dtype):
     ):
         copy, p = wp.tid()
         i = copy * per_copy + pins[p]
-        after = step[0] + 1
+        after = step[copy] + 1
         last = keyframes.shape[0] - 1
         frame = wp.min(after // steps_per_frame, last)
         part = dtype(after - frame * steps_per_frame) / dtype(steps_per_frame)
@@ -134,11 +134,12 @@ def move_pins(dtype):
 
 @cache
 def count_step():
-    """Kernel of one thread: step[0] += 1."""
+    """Kernel over copies: step += 1."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def count(step: wp.array(dtype=wp.int32)):
-        step[0] = step[0] + 1
+        copy = wp.tid()
+        step[copy] = step[copy] + 1
 
     return count
 
@@ -217,3 +218,51 @@ def note_move(dtype):
             move[i] = h * v[i]
 
     return note
+
+
+@cache
+def reset(dtype, led: bool):
+    """Kernel over vertices: those of the copies that the mask (B,) has true start again, and what is kept of these copies too.
+
+    Arrays that a stepper lacks are None. A pinned vertex stands still; where keyframes lead it (``led``) it starts where the
+    model has it, whatever ``x_start`` says.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def reset_vertices(
+        mask: wp.array(dtype=wp.bool),
+        inverse_mass: wp.array(dtype=dtype),
+        per_copy: int,
+        positions: wp.array(dtype=vec3),
+        x_start: wp.array(dtype=vec3),
+        v_start: wp.array(dtype=vec3),
+        move_start: wp.array(dtype=vec3),
+        v_before_start: wp.array(dtype=vec3),
+        # out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        v_before: wp.array(dtype=vec3),
+        step: wp.array(dtype=wp.int32),
+        worst: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        if mask[copy]:
+            x[i] = x_start[i]
+            v[i] = v_start[i]
+            if inverse_mass[i] == dtype(0.0):
+                v[i] = vec3()
+                if wp.static(led):
+                    x[i] = positions[i]
+            if move:
+                move[i] = move_start[i]
+                v_before[i] = v_before_start[i]
+            if i == copy * per_copy:
+                if step:
+                    step[copy] = 0
+                if worst:
+                    worst[copy] = wp.float64(0.0)
+
+    return reset_vertices

@@ -14,6 +14,7 @@ from nets import net
 import warpcloth as wc
 from warpcloth.capture import Segment, on_host
 from warpcloth.solvers.explicit import step_limits
+from warpcloth.status import Result
 
 EPS = np.finfo(np.float64).eps
 SOLVERS = {
@@ -311,6 +312,159 @@ def test_copies_run_as_if_alone(name, device):
         points = wc.simulate(alone, solver, device=device, dtype="float64", frames=10).points
         # Factorising all copies at once eliminates in another order, hence not the same bits there.
         assert np.abs(batch[:, copy] - points).max() < 1e-9
+
+
+def led(solver, copies=3, device="cpu", **vary):
+    """Copies of a damped cloth whose corners are led away, of different stiffness and gravity, bound."""
+    corners = [0, 5]
+    keyframes = square().mesh.points[corners] + np.linspace(0.0, 0.02, 5)[:, None, None] * [0.0, 1.0, 0.5]
+    scene = square(solver=solver, damping=0.01, fps=600.0, pins=wc.Pins(corners, keyframes))
+    vary |= {"Spring.stiffness": [50.0, 100.0, 200.0], "gravity": [[0, -9.81, 0], [0, -1.6, 0], [3.0, 0, 0]]}
+    return solver.bind(scene.build(device=device, dtype="float64", copies=copies, vary=vary))
+
+
+def seen(stepper):
+    """x and v of all copies, (2, B, n, 3), of its own."""
+    return np.array([array.numpy() for array in stepper.state]).reshape(2, stepper.model.copies, -1, 3)
+
+
+def stepped(stepper, steps):
+    """The states after each of so many steps, (steps, 2, B, n, 3)."""
+    states = []
+    for _ in range(steps):
+        stepper.step()
+        states.append(seen(stepper))
+    return np.array(states)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_copy_put_back_starts_again(name, device):
+    """To the bit, though it has become NaN, and the other copies notice neither; keyframes start again as well."""
+    states = stepped(led(SOLVERS[name], device=device), 10)
+    stepper = led(SOLVERS[name], device=device)
+    start = seen(stepper)
+    assert np.array_equal(stepped(stepper, 3), states[:3])
+    spoilt = stepper.state.x.numpy()
+    spoilt[stepper.model.per_copy + 7] = np.nan
+    stepper.state.x.assign(spoilt)
+    others = stepped(stepper, 2)
+    assert np.isnan(others[:, :, 1]).any()
+    stepper.reset([False, True, False])
+    assert np.array_equal(seen(stepper)[:, 1], start[:, 1])
+    assert stepper.results[1] is Result.COMPLETED
+    assert stepper.residual[1] == 0.0
+    again = stepped(stepper, 5)
+    assert np.array_equal(again[:, :, 1], states[:5, :, 1])
+    assert np.array_equal(np.concatenate([others, again])[:, :, [0, 2]], states[3:, :, [0, 2]])
+    assert Result.DIVERGED not in stepper.results
+    assert np.isfinite(stepper.residual).all()
+
+
+def test_a_residual_starts_again_where_it_is_kept(device):
+    """XPBD keeps the largest on the device: what comes after is that of a fresh run."""
+    fresh, stepper = (led(SOLVERS["xpbd"], device=device) for _ in range(2))
+    stepped(fresh, 2), stepped(stepper, 9)
+    kept = stepper.residual.copy()
+    stepper.reset([False, True, False])
+    stepped(stepper, 2)
+    assert kept[1] > fresh.residual[1] == stepper.residual[1]
+    assert (stepper.residual[[0, 2]] >= kept[[0, 2]]).all()
+
+
+@pytest.mark.parametrize("kind", ["numpy", "warp", "vectors"])
+@pytest.mark.parametrize("name", ["explicit", "newton midpoint", "xpbd"])
+def test_copies_start_where_one_says(name, kind, device):
+    """As a model does whose copies vary so; pins stay with their keyframes and have no velocity."""
+    rng = np.random.default_rng(2)
+    positions = np.array(square().mesh.points + 0.01 * rng.normal(size=(3, 36, 3)))
+    velocities = rng.normal(size=(3, 36, 3))
+    stepper = led(SOLVERS[name], device=device)
+    model = stepper.model
+    held = positions.copy()
+    held[:, [0, 5]] = square().mesh.points[[0, 5]]
+    expected = stepped(led(SOLVERS[name], device=device, positions=held, velocities=velocities), 4)
+    stepped(stepper, 6)
+    given, mask = [positions, velocities], np.ones(3, dtype=bool)
+    if kind == "warp":
+        given = [wp.array(each, dtype=wp.float64, device=device) for each in given]
+    elif kind == "vectors":
+        given = [model.array(each.reshape(-1, 3), model.vec3) for each in given]
+    stepper.reset(mask if kind == "numpy" else wp.array(mask, dtype=wp.bool, device=device), *given)
+    assert np.array_equal(stepped(stepper, 4), expected)
+    stepper.reset()
+    assert np.array_equal(stepped(stepper, 4), stepped(led(SOLVERS[name], device=device), 4))
+
+
+def test_putting_copies_back_allocates_nothing(device):
+    """After the first time, with arrays of the host and of the device."""
+    stepper = led(SOLVERS["xpbd"], device=device)
+    places, mask = np.zeros((3, 36, 3)), np.array([True, False, True])
+    arrays = [wp.array(mask, dtype=wp.bool, device=device), *(wp.array(places, dtype=wp.float64, device=device),) * 2]
+    stepper.reset(mask, places, places)
+    with wp.ScopedMemoryTracker("resets", print=False) as tracker:
+        assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1, "the tracker sees an allocation"
+        assert allocations(tracker, lambda: [stepper.reset(), stepper.reset(mask, places, places)]) == 0
+        assert allocations(tracker, lambda: stepper.reset(*arrays)) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("pbd", {"mask": [True, False]}, r"mask is .*; it must be an array \(3,\) of truth values"),
+        ("pbd", {"mask": [0, 1, 0]}, "mask is .* of truth values, one for each copy"),
+        ("pbd", {"mask": wp.int32}, r"mask is an array \(3,\) of int32; on the device"),
+        ("pbd", {"positions": np.zeros((36, 3))}, r"positions has shape \(36, 3\); it must be \(3, 36, 3\)"),
+        ("pbd", {"velocities": np.full((3, 36, 3), np.nan)}, "velocities.* must be finite"),
+        ("pbd", {"positions": wp.float32}, r"positions is an array .* of float32; on the device .* \(3, 36, 3\) of float64"),
+        ("newton bdf2", {"positions": np.zeros((3, 36, 3))}, "reset takes no positions or velocities with integrator='bdf2'"),
+    ],
+)
+def test_what_copies_are_put_back_by_is_checked(name, given, message, device):
+    shapes = {"mask": 3, "positions": (3, 36, 3)}
+    given = {
+        each: wp.zeros(shapes[each], dtype=value, device=device) if isinstance(value, type) else value
+        for each, value in given.items()
+    }
+    with pytest.raises(ValueError, match=message):
+        led(SOLVERS[name], device=device).reset(**given)
+
+
+def from_dlpack(module):
+    """The function of an installed package that takes an array over, where it is."""
+    return pytest.importorskip(module).from_dlpack
+
+
+@pytest.mark.parametrize(
+    "shared",
+    [
+        pytest.param(lambda: np.asarray, id="numpy"),
+        pytest.param(lambda: np.from_dlpack, id="dlpack"),
+        pytest.param(lambda: from_dlpack("torch"), id="torch"),
+        pytest.param(lambda: from_dlpack("jax.dlpack"), id="jax"),
+    ],
+)
+def test_the_state_is_shared_without_copies(shared, device):
+    """What steps move is seen as (B, n, 3) numbers; only on the CPU does NumPy see it."""
+    over = shared()
+    if over in (np.asarray, np.from_dlpack) and not wp.get_device(device).is_cpu:
+        pytest.skip("NumPy has arrays of the host alone")
+    stepper = led(SOLVERS["explicit"], device=device)
+    points = over(stepper.state.x).reshape(3, 36, 3)
+    stepper.step()
+    wp.synchronize_device(device)
+    on_host = points.cpu() if hasattr(points, "cpu") else points
+    assert np.array_equal(np.asarray(on_host), seen(stepper)[0])
+
+
+def test_what_numpy_writes_is_the_state(device):
+    """Both ways: the next step starts there."""
+    if not wp.get_device(device).is_cpu:
+        pytest.skip("NumPy has arrays of the host alone")
+    stepper, other = (led(SOLVERS["explicit"], device=device) for _ in range(2))
+    velocities = np.random.default_rng(3).normal(size=(3, 36, 3))
+    np.asarray(stepper.state.v).reshape(3, 36, 3)[...] = velocities
+    other.state.v.assign(velocities.reshape(-1, 3))
+    assert np.array_equal(stepped(stepper, 2), stepped(other, 2))
 
 
 def test_moving_pins_follow_their_keyframes(device):

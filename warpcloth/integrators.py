@@ -21,6 +21,7 @@ class Euler:
     """
 
     part = 1.0  # hₑ/h
+    past = started = (None, None)  # what is kept from step to step beside x and v, and what it is before the first
 
     def __init__(self, stepper):
         self.stepper, self.he = stepper, self.part * stepper.h
@@ -94,7 +95,7 @@ class BDF2(Euler):
 
     def __init__(self, stepper):
         super().__init__(stepper)
-        self.move, self.v_before = (stepper.model.vectors() for _ in range(2))
+        self.past = self.move, self.v_before = [stepper.model.vectors() for _ in range(2)]
 
     def start(self):
         """Finds what was before, by steps with x₋₁ = x₀ and v₋₁ = v₀, which are those of Euler of hₑ, and puts the state back.
@@ -109,6 +110,7 @@ class BDF2(Euler):
                 stepper.count.fill_(-1)  # pins are led to their first keyframe, which is where they are
             stepper.step()
         self._launch(kernels.start_bdf2, [stepper.h, model.velocities, v], [self.move, self.v_before])
+        self.started = [wp.clone(array) for array in self.past]
         wp.copy(x, model.positions)
         wp.copy(v, model.velocities)
 

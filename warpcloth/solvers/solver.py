@@ -12,6 +12,7 @@ from ..damping import Past, damped_terms, refuse_apart
 from ..integrators import INTEGRATORS
 from ..kernels import step as kernels
 from ..model import Model
+from ..reset import Reset
 from ..scene import Scene
 from ..status import Result
 
@@ -104,6 +105,7 @@ class Stepper:
 
     factorise_seconds = 0.0
     iterations = 1
+    worst = None  # Mirror of the residuals of methods that keep the largest on the device, (B,)
 
     def __init__(self, options, model, integrator="euler"):
         require_model(model)
@@ -113,7 +115,8 @@ class Stepper:
         self.h = 1.0 / (fps * self.steps_per_frame)
         self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
         self.results, self.residual = [Result.COMPLETED] * model.copies, np.zeros(model.copies)
-        self.count = wp.zeros(1, dtype=wp.int32, device=model.device) if model.pins is not None else None
+        self.count = None if model.pins is None else wp.zeros(model.copies, dtype=wp.int32, device=model.device)
+        self._reset = None
         self.integrator = INTEGRATORS[integrator](self)
         self.he = self.integrator.he
         self.model = model.with_terms(damped_terms(model, self.he))
@@ -128,7 +131,7 @@ class Stepper:
         move, count = model.kernel(kernels.move_pins, model.dtype), model.kernel(kernels.count_step)
         given = [model.pins, model.keyframes, self.count, parts * self.steps_per_frame, model.per_copy, self.h / parts]
         model.launch(move, dim, given, [self.state.x if x is None else x, self.state.v if v is None else v])
-        model.launch(count, 1, [], [self.count])
+        model.launch(count, model.copies, [], [self.count])
 
     def launch_prediction(self):
         """x = x̃, and the pins where they are then."""
@@ -147,6 +150,29 @@ class Stepper:
         """One frame, to the bit what ``steps_per_frame`` times `step` makes."""
         for _ in range(self.steps_per_frame):
             self.step()
+
+    def reset(self, mask=None, positions=None, velocities=None):
+        """Puts copies back to their start, by one launch; from there on each is to the bit what it was in its first steps.
+
+        What the stepper knows of them starts again as well: keyframes, ``results`` and ``residual``. The other copies do not
+        notice. After the first call it allocates nothing; with everything on the device, of solvers without residual the
+        host waits for nothing.
+
+        Args:
+            mask: Which copies, (B,) truth values; all of them where it is None.
+            positions: Where they start (B, n, 3) [m], if not where the model does; of other copies any finite values. What
+                terms know of the start stays, and vertices with keyframes begin where these do.
+            velocities: Likewise [m/s]; pinned vertices have none.
+
+        Each is a Warp array, which on the device has the precision of the model and is read in place, or what NumPy takes for
+        an array.
+
+        Raises:
+            ValueError: If an argument breaks a rule, or positions or velocities are given with ``integrator="bdf2"``.
+        """
+        if self._reset is None:
+            self._reset = Reset(self)
+        self._reset(mask, positions, velocities)
 
 
 # Launches of a graph: of steps of one launch replaying them one by one takes 0.9 µs more each, recording one takes 100 µs.
