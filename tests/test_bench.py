@@ -131,7 +131,7 @@ def row(n, ms, substeps=4, benchmark=0, solver="xpbd", status="ok", wide=0.1, **
     found = {"scene": "hanging", "parameters": {"n": n}, "solver": solver, "options": {"substeps": substeps, "iterations": 5}}
     found |= {"label": f"{solver} {substeps}×5", "device": "cpu", "dtype": "float32", "benchmark": benchmark, "status": status}
     found |= {"reason": "", "vertices": n * n, "substeps": substeps, "iterations": 5.0, "ms": ms, "spread": None, "bytes": 100}
-    found |= {"launches": 10.0, "start_s": 1.0, "memory": 1000}
+    found |= {"launches": 10.0, "start_s": 1.0, "memory": 1000, "copies": 1, "cloths_per_s": ms and 1e3 / ms}
     return found | ({"spread": [(1 - wide) * ms, (1 + wide) * ms]} if ms else {}) | more
 
 
@@ -173,6 +173,7 @@ def folder(tmp_path, monkeypatch):
     """A folder with results old.json, new.json and such that are none."""
     monkeypatch.chdir(tmp_path)
     files = {"old": json.dumps(OLD), "new": json.dumps(NEW), "alone": json.dumps(result(row(5, 1.0)))}
+    files["before"] = json.dumps(result(*({k: v for k, v in each.items() if k != "copies"} for each in OLD["rows"])))
     files |= {"text": "no result", "list": "[]", "rows": '{"rows": [{}], "machine": {}}', "number": '{"rows": 3}'}
     for name, text in files.items():
         (tmp_path / f"{name}.json").write_text(text, encoding="utf-8")
@@ -192,8 +193,9 @@ def test_the_command_compares(folder, capsys):
     (folder / "other.json").write_text(json.dumps({**NEW, "machine": {"processor": "q", "device": "cpu"}}), encoding="utf-8")
     assert main(["bench", "--compare", "old.json", "other.json"]) == 0
     assert capsys.readouterr().out.startswith("processor: p and q, so that times say little of the code\n")
-    assert main(["bench", "--compare", "old.json", "new.json", "--json"]) == 0
-    assert [each["verdict"] for each in json.loads(capsys.readouterr().out)["rows"]] == ["faster", "slower", ""]
+    for old in ("old.json", "before.json"):  # results of before there were copies have one of each
+        assert main(["bench", "--compare", old, "new.json", "--json"]) == 0
+        assert [each["verdict"] for each in json.loads(capsys.readouterr().out)["rows"]] == ["faster", "slower", ""]
 
 
 def test_the_command_measures(folder, device, capsys):
@@ -215,6 +217,15 @@ def test_the_command_measures(folder, device, capsys):
         (str(r["elements"]), str(r["bytes"])) for r in found["rows"]
     ]
     assert float(table[0]["ms_low"]) <= float(table[0]["ms"]) <= float(table[0]["ms_high"])
+
+
+def test_the_command_measures_copies(device, capsys):
+    command = ["bench", "hanging", "-p", "n=4", "--solver", "pbd", "--copies", "3", "--frames", "3", "--device", device]
+    assert main([*command, "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["rows"]
+    assert found["copies"] == 3 and found["vertices"] == 3 * 16
+    assert found["cloths_per_s"] == pytest.approx(3e3 / found["ms"])
+    assert not ratios(result(found), result({**found, "copies": 1}))
 
 
 def rows_until(stop, error):
@@ -314,6 +325,7 @@ def test_scenes_without_sizes_are_taken_as_they_are(monkeypatch, tmp_path):
         ("bench hanging --sizes 0", "sizes is 0; it must be a whole number of 2 or more"),
         ("bench hanging --sizes many", "invalid int value: 'many'"),
         ("bench hanging --frames 0", "frames is 0; it must be a whole number of 1 or more"),
+        ("bench hanging --copies 0", "copies is 0; it must be a whole number of 1 or more"),
         ("bench hanging --solver simplex", "invalid choice: 'simplex'"),
         ("bench hanging --dtype float16", "invalid choice: 'float16'"),
         ("bench hanging --device gpu", "device is 'gpu'"),

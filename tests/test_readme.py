@@ -18,7 +18,7 @@ from warpcloth.terms import TERMS
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = [(m[1], m[2]) for m in re.finditer(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)]
-EXAMPLE, CURTAIN, DEFORMATION, ANALYSIS, ROTATIONS = (text for language, text in BLOCKS if language == "python")
+EXAMPLE, CURTAIN, DEFORMATION, ANALYSIS, COPIES, ROTATIONS = (text for language, text in BLOCKS if language == "python")
 (STAGE,) = (text for language, text in BLOCKS if language == "usda")
 COMMANDS = [line for language, text in BLOCKS if language == "sh" for line in text.splitlines() if line.startswith("warpcloth")]
 
@@ -50,6 +50,11 @@ def test_the_analysis(capsys):
     np.testing.assert_allclose(measured["stretch"][-1, :, 1], 1.0, atol=(1.5 / 19) ** 2 / 24 * 1.01)
     assert measured["rate_of_strain"].shape == (25, 722, 3, 3) and around["residual"].shape == (25, 400)
     assert "frame 0 has none before it" in capsys.readouterr().out
+
+
+def test_the_copies(capsys):
+    exec(compile(COPIES, "README.md", "exec"), {})
+    assert 0 < int(capsys.readouterr().out) < 40 * 64
 
 
 def test_every_measure_is_in_the_docs():

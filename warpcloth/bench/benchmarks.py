@@ -26,6 +26,7 @@ class Benchmark:
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
         frames: To time at most.
+        copies: How many of the scene run at once.
     """
 
     scene: SceneRef
@@ -34,6 +35,7 @@ class Benchmark:
     device: str = "cpu"
     dtype: str = "float32"
     frames: int = 20
+    copies: int = 1
 
     def scenes(self):
         """The scene of each size.
@@ -80,8 +82,9 @@ class Run:
     Attributes:
         total: How many rows there will be.
         rows: Those that are measured: what :func:`warpcloth.bench.measure.measure` returns, with ``scene``, ``parameters``,
-            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``benchmark`` (its place), ``share`` (``bytes_per_s``
-            over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with no kernel in any cache.
+            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``benchmark`` (its place), ``share``
+            (``bytes_per_s`` over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with no kernel
+            in any cache.
         bandwidth: What :func:`warpcloth.bench.bandwidth.measure` returns.
     """
 
@@ -102,18 +105,17 @@ class Run:
                     progress(len(self.rows), self.total)
 
     def _row(self, benchmark, scene, cold):
-        setup, device, dtype = benchmark.setup_of(scene), benchmark.device, benchmark.dtype
+        setup = benchmark.setup_of(scene)
+        given = {"device": benchmark.device, "dtype": benchmark.dtype, "copies": benchmark.copies}
 
         def measured(frames):
-            return _alone(
-                task(measure, scene=scene, setup=setup, frames=frames, device=device, dtype=dtype, started=time.time())
-            )
+            return _alone(task(measure, scene=scene, setup=setup, frames=frames, started=time.time(), **given))
 
         started = measured(0)["start_s"] if cold else None
         row = measured(benchmark.frames)
         share = row["bytes_per_s"] and row["bytes_per_s"] / max(self.bandwidth.values())
         named = {"scene": scene.name, "parameters": scene.parameters, "solver": setup.solver, "options": setup.options}
-        named |= {"label": label(setup), "device": device, "dtype": dtype}
+        named |= {"label": label(setup), **given}
         return {**named, **row, "share": share, "cold_start_s": started}
 
 

@@ -16,7 +16,7 @@ from .counts import compulsory_bytes, elements_of, launches_of
 _WARM_UP, _SECONDS, _FEWEST = 2, 10.0, 3
 
 
-def measure(scene, setup, frames, device, dtype, started):
+def measure(scene, setup, frames, device, dtype, started, copies=1):
     """Runs warm frames of a scene with a setup, and counts what a step has to do. All values are such that JSON has them.
 
     Args:
@@ -26,13 +26,15 @@ def measure(scene, setup, frames, device, dtype, started):
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
         started: ``time.time()`` when this process was asked for.
+        copies: How many of the scene run at once.
 
     Returns:
         dict: What is not known is None.
 
         - ``status``: "ok", "diverged" or "refused", and ``reason``, a sentence, of the first "".
         - ``vertices``, ``elements``: Of all terms. ``substeps``: Steps a frame. ``frames``: How many were timed.
-        - ``ms``, ``spread``: What a frame takes with its points on the host, median and quartiles [ms].
+        - ``ms``, ``spread``: What a frame takes with its points on the host, median and quartiles [ms]; ``cloths_per_s``:
+          copies over the median [1/s].
         - ``iterations``: Of a step, the mean over the frames that were timed.
         - ``ns``: Time of a frame over elements × iterations × substeps, the median [ns].
         - ``bytes``: What a step moves at least, see :func:`warpcloth.bench.counts.compulsory_bytes`; ``bytes_per_s``: Over the
@@ -42,14 +44,26 @@ def measure(scene, setup, frames, device, dtype, started):
           alone, with compiling what is in no cache, but without ``factorise_s``, that of constant matrices [s].
         - ``memory``: The most that was taken, of the process on a CPU and of Warp's memory pool on CUDA [bytes].
     """
-    names = ("vertices", "elements", "substeps", "ms", "spread", "iterations", "ns", "bytes", "bytes_per_s", "launches")
+    names = (
+        "vertices",
+        "elements",
+        "substeps",
+        "ms",
+        "spread",
+        "cloths_per_s",
+        "iterations",
+        "ns",
+        "bytes",
+        "bytes_per_s",
+        "launches",
+    )
     found = {"status": "ok", "reason": "", "frames": 0, **dict.fromkeys((*names, "start_s", "bind_s", "factorise_s", "memory"))}
     declared, device = SceneRef(**scene).load(), wp.get_device(device)
     began = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:
-            model = declared.build(device=device, dtype=dtype)
+            model = declared.build(device=device, dtype=dtype, copies=copies)
             stepper = Setup(**setup).record().bind(model)
         except ValueError as error:
             return found | {"status": "refused", "reason": str(error)}
@@ -90,6 +104,7 @@ def _warm(stepper, model, frames, elements):
         "frames": len(times),
         "ms": median,
         "spread": [low, high],
+        "cloths_per_s": 1e3 * model.copies / median,
         "iterations": mean,
         "ns": float(np.median(per_iteration)) if elements else None,
         "bytes": moved,

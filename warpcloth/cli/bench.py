@@ -12,13 +12,13 @@ EPILOG = """\
 Without SCENE every solver runs hanging of growing sizes, in a few minutes. Each row is measured in a process of its own, one
 after another; where no step is given it is that of run.
 
-ms: a warm frame with its points on the host, median and quartiles. ns: the same over elements of all terms × iterations (of
-Newton's method Newton iterations, of hierarchical PBD sweeps over all terms) × substeps. GB/s: bytes that a step moves at least
-over its time; positions in and out once, inverse masses and the arrays of all terms once an iteration, velocities in and out
-once. share: of what a copy moves on this device; small scenes stay in its caches, and may have more than 100 %. launches: of a
-step, kernels, fills and copies. start: from the start of a process to its first frame, with all kernels in the cache; compile:
-what it takes longer with none there. factor: constant matrices. MB: most memory, of the process on a CPU, of Warp's pool on
-CUDA.
+ms: a warm frame with its points on the host, median and quartiles; cloths/s: copies that make a frame in a second. ns: the same
+over elements of all terms × iterations (of Newton's method Newton iterations, of hierarchical PBD sweeps over all terms) ×
+substeps. GB/s: bytes that a step moves at least over its time; positions in and out once, inverse masses and the arrays of all
+terms once an iteration, velocities in and out once. share: of what a copy moves on this device; small scenes stay in its
+caches, and may have more than 100 %. launches: of a step, kernels, fills and copies. start: from the start of a process to its
+first frame, with all kernels in the cache; compile: what it takes longer with none there. factor: constant matrices. MB: most
+memory, of the process on a CPU, of Warp's pool on CUDA.
 
   warpcloth bench --json > before.json
   warpcloth bench hanging --solver xpbd -s substeps=4 iterations=20 --sizes 32 64 128
@@ -37,6 +37,7 @@ def add_arguments(parser):
     add("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
     add("--sizes", nargs="+", type=int, default=[], metavar="N", help="resolutions of the scene, as its parameter says them")
     add("--frames", type=int, default=20, metavar="N", help="to time at most, 20 where not given; 3 are enough after 10 s")
+    add("--copies", type=int, default=1, metavar="N", help="of the scene that run at once, 1 where not given")
     add("--csv", metavar="FILE", help="write a table")
     add("--compare", nargs=2, metavar=("OLD", "NEW"), help="print ratios of two results that --json printed")
 
@@ -45,6 +46,7 @@ def bench(arguments):
     if arguments.compare:
         return _compare(arguments)
     whole("frames", arguments.frames, 1)
+    whole("copies", arguments.copies, 1)
     for size in arguments.sizes:
         whole("sizes", size, 2)
     if arguments.csv:
@@ -79,7 +81,7 @@ def _benchmarks(arguments, device):
     from ..chart.tasks import SceneRef, Setup
     from ..solvers import SOLVERS
 
-    given = {"device": str(device), "dtype": arguments.dtype, "frames": arguments.frames}
+    given = {"device": str(device), "dtype": arguments.dtype, "frames": arguments.frames, "copies": arguments.copies}
     if arguments.scene is None:
         _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which it is for")
         return standard(**given)
@@ -147,7 +149,7 @@ def _write(arguments, run, device):
     print(as_json(facts) if arguments.json else _text(facts))
 
 
-_HEAD = ("ms a frame", "quartiles", "ns", "GB/s", "share", "launches", "start s", "compile s", "factor s", "MB", "")
+_HEAD = ("ms a frame", "quartiles", "cloths/s", "ns", "GB/s", "share", "launches", "start s", "compile s", "factor s", "MB", "")
 
 
 def _text(facts):
@@ -171,14 +173,21 @@ def _cells(row):
     numbers = (row["start_s"], compiling, row["factorise_s"] or None, row["memory"] and 1e-6 * row["memory"])
     return (
         *(_scene_of(row), row["label"], _number(row["ms"]), f"{low:.3g}–{high:.3g}"),
-        *(_number(row["ns"]), _number(1e-9 * row["bytes_per_s"]), f"{100.0 * row['share']:.2g} %", f"{row['launches']:.4g}"),
+        *(
+            _number(row["cloths_per_s"]),
+            _number(row["ns"]),
+            _number(1e-9 * row["bytes_per_s"]),
+            f"{100.0 * row['share']:.2g} %",
+            f"{row['launches']:.4g}",
+        ),
         *map(_number, numbers),
         row["reason"],
     )
 
 
 def _scene_of(row):
-    return " ".join([row["scene"], *(f"{name}={value}" for name, value in row["parameters"].items())])
+    copies = [f"×{row['copies']}"] if row["copies"] > 1 else []
+    return " ".join([row["scene"], *(f"{name}={value}" for name, value in row["parameters"].items()), *copies])
 
 
 def _number(value):
