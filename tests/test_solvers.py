@@ -318,7 +318,7 @@ def led(solver, copies=3, device="cpu", dtype="float64", **vary):
     """Copies of a damped cloth whose corners are led away, of different stiffness and gravity, bound."""
     corners = [0, 5]
     keyframes = square().mesh.points[corners] + np.linspace(0.0, 0.02, 5)[:, None, None] * [0.0, 1.0, 0.5]
-    scene = square(solver=solver, damping=0.01, fps=600.0, pins=wc.Pins(corners, keyframes))
+    scene = square(solver=solver, damping=0.01, fps=1200.0, pins=wc.Pins(corners, keyframes))
     vary |= {"Spring.stiffness": [50.0, 100.0, 200.0], "gravity": [[0, -9.81, 0], [0, -1.6, 0], [3.0, 0, 0]]}
     return solver.bind(scene.build(device=device, dtype=dtype, copies=copies, vary=vary))
 
