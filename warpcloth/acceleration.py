@@ -91,7 +91,7 @@ class _History:
 
     def _coefficients(self, slots, s, z):
         """a and b (B, pairs) of the pairs in ``slots``, the newest first, from their products s and z with ∇φ."""
-        raise NotImplementedError
+        raise NotImplementedError  # every method has its own
 
 
 class Anderson(_History):
