@@ -3,6 +3,7 @@
 Such a kernel is made of one function and one struct of arrays a term, each with those of the terms after it inside.
 """
 
+import math
 from functools import cache
 from typing import NamedTuple
 
@@ -21,7 +22,6 @@ class Part(NamedTuple):
         shared: Whether all elements share one stiffness.
         pairs: Slots of a vertex, for gathering, as first and as second of a pair, where incidences name the other vertex and
             have a rest state of their own, slot by slot; None where they name elements.
-        ordered: Whether the lowest vertex, for sweeping, is the first of all its elements.
         padded: Whether incidences that name elements have as many slots for each vertex, slot by slot.
     """
 
@@ -29,19 +29,34 @@ class Part(NamedTuple):
     damped: bool = False
     shared: bool = False
     pairs: tuple[int, int] | None = None
-    ordered: bool = False
     padded: bool = False
 
 
+def _copied(dtype):
+    """How a snippet copies ``from`` [0] … to ``to`` [0] …: type of a number, numbers, type of all, the copy itself.
+
+    Number by number: vectors and matrices copied as a whole keep the compiler from vectorising a loop.
+    """
+    number = f"wp::{getattr(dtype, '_wp_scalar_type_', dtype).__name__}"
+    shape = getattr(dtype, "_shape_", ())
+    kind = {0: number, 1: f"wp::vec_t<{shape and shape[0]}, {number}>", 2: f"wp::mat_t<{', '.join(map(str, shape))}, {number}>"}
+    numbers = math.prod(shape)
+    return number, numbers, kind[len(shape)], " ".join(f"to[{n}] = from[{n}];" for n in range(numbers))
+
+
 @cache
-def load(dtype, ndim=1):
+def load(dtype, ndim=1, stored=None):
     """The device function (a, i) → element i of contiguous memory, without the arithmetic of strides and negative indices.
 
-    A sweep over springs takes 0.8 of the time so.
+    A sweep over springs takes 0.8 of the time so. ``stored`` is the type of the array, if that is numbers alone.
     """
+    number, numbers, kind, copy = _copied(dtype)
 
-    @wp.func_native("return a.data[i];")
-    def load_element(a: wp.array(dtype=dtype, ndim=ndim), i: int) -> dtype: ...
+    @wp.func_native(
+        f"{kind} value; {number}* to = ({number}*)&value; "
+        f"const {number}* from = (const {number}*)a.data + {numbers} * size_t(i); {copy} return value;"
+    )
+    def load_element(a: wp.array(dtype=stored or dtype, ndim=ndim), i: int) -> dtype: ...
 
     return load_element
 
@@ -57,11 +72,14 @@ def load_shared(dtype):
 
 
 @cache
-def store(dtype):
+def store(dtype, stored=None):
     """The device function (a, i, value): a[i] = value, as :func:`load`."""
+    number, numbers, _kind, copy = _copied(dtype)
 
-    @wp.func_native("a.data[i] = value;")
-    def store_element(a: wp.array(dtype=dtype), i: int, value: dtype): ...
+    @wp.func_native(
+        f"{number}* to = ({number}*)a.data + {numbers} * size_t(i); const {number}* from = (const {number}*)&value; {copy}"
+    )
+    def store_element(a: wp.array(dtype=stored or dtype), i: int, value: dtype): ...
 
     return store_element
 
@@ -132,9 +150,9 @@ def of_corner(term: Term, dtype):
 def elements_of(part: Part, dtype):
     """The struct of what a kernel reads of one term.
 
-    Swept: from offsets[i] to offsets[i+1] are the elements of lowest vertex i. Gathered: so many incidences has vertex i, and
-    ``codes`` are K·element + corner, from offsets[i] on or, padded, of the first slot of all vertices, then of the second …; of
-    pairs the other vertex, -1 where there are no more.
+    Swept: block b has the pieces from offsets[b] to offsets[b+1], and ``codes`` are the first element of each and how many,
+    see :mod:`.blocks`. Gathered: so many incidences has vertex i, and ``codes`` are K·element + corner, from offsets[i] on or,
+    padded, of the first slot of all vertices, then of the second …; of pairs the other vertex, -1 where there are no more.
     """
 
     @wp.struct

@@ -1,5 +1,6 @@
 """The explicit step in one pass against forces and update apart, and frames against steps, to the bit."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,11 @@ from test_damping import damping_forces
 from test_solvers import SOLVERS, allocations, square
 
 import warpcloth as wc
+from warpcloth import blocks
+from warpcloth.blocks import in_blocks
 from warpcloth.incidences import gathered
 from warpcloth.operators import Gradient
-from warpcloth.passes import Gather, Sweep, by_lowest
+from warpcloth.passes import Gather, Sweep
 from warpcloth.solvers import explicit, solver
 from warpcloth.solvers.explicit import step_limits
 from warpcloth.status import Result
@@ -82,11 +85,14 @@ def apart(model, stepper, scheme, steps):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("scheme", ["symplectic", "forward"])
-@pytest.mark.parametrize("way", ["own", "gathered"])
+@pytest.mark.parametrize("way", ["own", "small blocks", "gathered"])
 @pytest.mark.parametrize("name", TERMS)
 def test_one_pass_is_forces_and_update(name, way, scheme, dtype, device, monkeypatch):
     if way == "gathered":  # of CUDA, but right on the CPU too
         monkeypatch.setattr(explicit, "Sweep", Gather)
+    if way == "small blocks":
+        monkeypatch.setattr(blocks, "NUMBERS", 60)
+        monkeypatch.setattr(blocks, "RUN", 3)
     scene, steps = declared(TERMS[name], fps=250.0), 5
     vary = {"gravity": [[0.0, -9.81, 0.0], [1.0, 2.0, 3.0]]}
     model = scene.build(device=device, dtype=dtype, copies=2, vary=vary)
@@ -134,19 +140,44 @@ def test_a_frame_allocates_nothing(name, device):
         assert allocations(tracker, lambda: [stepper.frame() for _ in range(3)]) == 0
 
 
+@pytest.mark.parametrize("copies", [1, 2])
+def test_blocks_have_every_element_once(copies, device, monkeypatch):
+    """In the block of its lowest vertex; runs have all vertices one higher from element to element; copies are alike."""
+    monkeypatch.setattr(blocks, "NUMBERS", 60)
+    monkeypatch.setattr(blocks, "RUN", 3)
+    scene = declared([SPRINGS, wc.DihedralBending(stiffness=1e-3), wc.NeoHookeanMembrane(stiffness=100.0)])
+    model = scene.build(device=device, copies=copies)
+    vertices, terms, numbers = in_blocks(model.terms, model.per_copy, copies)
+    assert vertices[0] == 0 and vertices[-1] == model.count and (np.diff(vertices) > 0).all()
+    assert np.isin(np.arange(copies) * N, vertices).all()
+    assert numbers <= 60
+    runs = 0
+    for before, after in zip(model.terms, terms, strict=True):
+        stencil = after.stencil.numpy()
+        assert sorted(map(tuple, stencil)) == sorted(map(tuple, before.stencil.numpy()))
+        offsets, codes = (array.numpy() for array in after.pieces)
+        firsts, counts = codes.reshape(-1, 2).T
+        assert np.array_equal(firsts, np.cumsum(np.abs(counts)) - np.abs(counts))
+        assert np.abs(counts).sum() == len(stencil)
+        for block, (first, last) in enumerate(itertools.pairwise(vertices)):
+            for first_element, count in codes.reshape(-1, 2)[offsets[block] : offsets[block + 1]]:
+                piece = stencil[first_element : first_element + abs(count)]
+                assert ((piece.min(axis=1) >= first) & (piece.min(axis=1) < last)).all()
+                if count > 0:
+                    runs += 1
+                    assert count >= 3 and (np.diff(piece, axis=0) == 1).all()
+    assert runs
+
+
 def test_what_is_in_order_is_not_copied(device):
-    """A sweep takes elements by their lowest vertex, as grids have their springs; others it copies in that order."""
+    """Elements are put in the order of a sweep once."""
     model = declared([SPRINGS, wc.DihedralBending(stiffness=1e-3)]).build(device=device)
     swept = Sweep(model, (model.vectors(), model.vectors()), 1e-3, True).model
-    copied = []
-    for before, after in zip(model.terms, swept.terms, strict=True):
-        lowest = after.stencil.numpy().min(axis=1)
-        assert (np.diff(lowest) >= 0).all()
-        assert np.array_equal(np.diff(after.ranges.numpy()), np.bincount(lowest, minlength=model.count))
-        copied.append(after.stencil is not before.stencil)
-        assert by_lowest(after, model.count).stencil is after.stencil
-    assert copied == [False, True]
-    assert swept.report()["bytes"] == model.report()["bytes"] + 2 * 4 * (model.count + 1)
+    pieces = sum(array.size for elements in swept.terms for array in elements.pieces)
+    assert swept.report()["bytes"] == model.report()["bytes"] + 4 * pieces
+    _vertices, again, _numbers = in_blocks(swept.terms, model.per_copy, 1)
+    for elements, same in zip(swept.terms, again, strict=True):
+        assert same.stencil is elements.stencil
 
 
 @pytest.mark.parametrize("spokes", [0, 10, 100])

@@ -74,7 +74,8 @@ class DeviceElements:
         damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
         origin: :class:`Origin` of a rest state that is set in each step, or None.
         cells: :class:`Cells` that the elements are the vertices of, or None.
-        ranges: Of elements in the order of their lowest vertices those of vertex i, ranges[i] to ranges[i+1], (N+1,); or None.
+        pieces: Of elements in blocks where the pieces of each begin, and the first element and the count of each; or None. See
+            :mod:`warpcloth.kernels.blocks`.
     """
 
     label: str
@@ -88,7 +89,7 @@ class DeviceElements:
     damping: wp.array | None = None
     origin: Origin | None = None
     cells: Cells | None = None
-    ranges: wp.array | None = None
+    pieces: tuple[wp.array, wp.array] | None = None
 
     @property
     def arguments(self):
@@ -99,7 +100,7 @@ class DeviceElements:
     def arrays(self):
         """All arrays of the term."""
         cells = [self.cells.offsets, self.cells.shape] if self.cells else []
-        return self.arguments + [array for array in (self.damping, self.ranges) if array is not None] + cells
+        return self.arguments + ([] if self.damping is None else [self.damping]) + [*(self.pieces or ())] + cells
 
     @property
     def count(self):

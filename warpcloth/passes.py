@@ -1,23 +1,13 @@
 """The explicit step in as few passes as its data allow: on the CPU one sweep over all elements, on CUDA one launch."""
 
-from dataclasses import replace
-
 import numpy as np
 import warp as wp
 
-from .incidences import chain, gathered, indices
+from .blocks import in_blocks
+from .incidences import chain, gathered
 from .kernels import explicit as kernels
 from .kernels.elements import Part
 from .operators import Gradient, fit_cells
-
-
-def by_lowest(elements, count):
-    """The same elements in the order of their lowest vertices, and the range of each vertex, (count + 1,) int32."""
-    lowest = elements.stencil.numpy().min(axis=1)
-    if (np.diff(lowest) < 0).any():
-        order = np.argsort(lowest, kind="stable")
-        elements, lowest = elements.reordered(order), lowest[order]
-    return replace(elements, ranges=indices(elements, np.searchsorted(lowest, np.arange(count + 1))))
 
 
 class Sweep:
@@ -34,16 +24,19 @@ class Sweep:
     """
 
     def __init__(self, model, state, h, symplectic):
-        swept = [elements if elements.cells else by_lowest(elements, model.count) for elements in model.terms]
-        self.model, self.state = model.with_terms(swept), state
-        cells, others = ([elements for elements in swept if (elements.cells is None) == apart] for apart in (False, True))
+        cells, others = ([elements for elements in model.terms if (elements.cells is None) == apart] for apart in (False, True))
         self._cells, self._gradient = Gradient(model, terms=cells), model.vectors()
-        parts = [_swept_part(elements) for elements in others]
+        vertices, others, numbers = in_blocks(others, model.per_copy, model.copies)
+        self.model, self.state = model.with_terms([*cells, *others]), state
+        damped = [elements.damping is not None for elements in others]
+        parts = [Part(each.term, own, 0 in each.stiffness.strides) for each, own in zip(others, damped, strict=True)]
         # Contracted as on CUDA, where a product is added without being rounded: springs then take 0.8 of the time.
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
         self._kernel = model.kernel(kernels.sweep, tuple(parts), model.dtype, symplectic, flags)
         self._chain = chain(parts, [_swept(elements) for elements in others], model.dtype)
-        self._given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, h]
+        scratch = [wp.zeros(size, dtype=model.dtype, device=model.device) for size in (numbers, numbers * any(damped))]
+        blocks = wp.array(vertices.astype(np.int32), dtype=wp.int32, device=model.device)
+        self._given = [self._chain, blocks, model.inverse_mass, model.gravity, h, *scratch]
 
     def launch(self, steps, after_step):
         """So many steps, with a call of ``after_step`` (x, v) after each."""
@@ -85,14 +78,9 @@ class Gather:
                     wp.copy(array, last)
 
 
-def _swept_part(elements):
-    """The :class:`warpcloth.kernels.elements.Part` of the elements of a sweep."""
-    stencil = elements.stencil.numpy()
-    ordered = bool((stencil[:, 0] == stencil.min(axis=1)).all())
-    return Part(elements.term, elements.damping is not None, 0 in elements.stiffness.strides, ordered=ordered)
-
-
 def _swept(elements):
     """What the struct of the elements of a sweep has, by name."""
-    found = {"offsets": elements.ranges, "stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
+    offsets, codes = elements.pieces
+    found = {"offsets": offsets, "codes": codes, "stencil": elements.stencil}
+    found |= {"stiffness": elements.stiffness, "rest": elements.rest}
     return found if elements.damping is None else found | {"damping": elements.damping}
