@@ -22,6 +22,8 @@ class Part(NamedTuple):
         shared: Whether all elements share one stiffness.
         pairs: Slots of a vertex, for gathering, as first and as second of a pair, where incidences name the other vertex and
             have a rest state of their own, slot by slot; None where they name elements.
+        rows: Slots of a vertex, for gathering, where incidences name the other vertices of a row of the matrix of a quadratic
+            energy, slot by slot, and ``stiffness`` is its numbers; 0 where they do not.
         padded: Whether incidences that name elements have as many slots for each vertex, slot by slot.
     """
 
@@ -29,6 +31,7 @@ class Part(NamedTuple):
     damped: bool = False
     shared: bool = False
     pairs: tuple[int, int] | None = None
+    rows: int = 0
     padded: bool = False
 
 

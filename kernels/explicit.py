@@ -12,7 +12,7 @@ import warp as wp
 from .assemble import types
 from .blocks import add_blocks
 from .elements import Part, chain_of, load, store
-from .gather import gather_terms
+from .gather import sum_at_vertices
 
 
 @cache
@@ -81,14 +81,14 @@ def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str):
 
 
 @cache
-def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool):
-    """Kernel over vertices: x, v after a step, a = g − ∇U/m.
+def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, lanes: int = 1):
+    """Kernel over vertices, ``lanes`` threads each: x, v after a step, a = g − ∇U/m.
 
     Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN
     stays.
     """
     vec3, _ = types(dtype)
-    total_of, step = gather_terms(parts, dtype), advance(dtype, symplectic)
+    total_of, step = sum_at_vertices(parts, dtype, lanes=lanes), advance(dtype, symplectic)
     vector, number, put = load(vec3), load(dtype), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"fast_math": fast})
@@ -104,14 +104,16 @@ def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool):
         x_after: wp.array(dtype=vec3),
         v_after: wp.array(dtype=vec3),
     ):
-        i = wp.tid()
-        total = total_of(chain, i, inverse_mass.shape[0], x, v, h)  # of pins too: what follows need not wait for w
+        thread = wp.tid()
+        total = total_of(thread, chain, inverse_mass.shape[0], x, v, h)  # of pins too: what follows need not wait for w
+        i = thread // lanes
         w = number(inverse_mass, i)
         place = vector(x, i)
         velocity = vector(v, i)
         if w > dtype(0.0):
             place, velocity = step(place, velocity, gravity[i // per_copy] - w * total, h)
-        put(x_after, i, place)
-        put(v_after, i, velocity)
+        if thread == i * lanes:
+            put(x_after, i, place)
+            put(v_after, i, velocity)
 
     return gather_vertices

@@ -9,10 +9,31 @@ from .elements import Part, chain_of, elements_of, load, load_shared, local_grad
 
 
 @cache
-def gather_term(part: Part, dtype, corrected: bool = False):
-    """The device function (elements, i, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term; with ``corrected`` ∂U/∂xᵢ at x + h v."""
+def sum_of_lanes(dtype, lanes: int):
+    """The device function (value) → its sum over the ``lanes`` threads, neighbours in a warp, that take one vertex."""
+    vec3, _ = types(dtype)
+    shuffle = "value.c[{0}] += __shfl_xor_sync(mask, value.c[{0}], n);"
+
+    @wp.func_native(
+        f"const unsigned mask = {(1 << lanes) - 1}u << (threadIdx.x & 31 & ~{lanes - 1}); "
+        f"for (int n = 1; n < {lanes}; n *= 2) {{ {' '.join(shuffle.format(c) for c in range(3))} }} return value;"
+    )
+    def sum_over_lanes(value: vec3) -> vec3: ...
+
+    return sum_over_lanes
+
+
+@cache
+def gather_term(part: Part, dtype, corrected: bool = False, lanes: int = 1):
+    """The device function (elements, i, lane, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term; with ``corrected`` the first
+    at x + h v.
+
+    Of ``lanes`` threads for a vertex each takes every so manieth element.
+    """
+    if part.rows:
+        return gather_rows(part, dtype, corrected, lanes)
     if part.pairs:
-        return gather_pairs(part, dtype, corrected)
+        return gather_pairs(part, dtype, corrected, lanes)
     vec3, _ = types(dtype)
     term = part.term
     K, damped, shared, padded = wp.constant(term.vertices), part.damped, part.shared, part.padded
@@ -24,7 +45,13 @@ def gather_term(part: Part, dtype, corrected: bool = False):
 
     @wp.func
     def total_of(
-        elements: elements_of(part, dtype), i: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype
+        elements: elements_of(part, dtype),
+        i: int,
+        lane: int,
+        count: int,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        h: dtype,
     ):
         total = vec3()
         beta = dtype(0.0)
@@ -32,9 +59,11 @@ def gather_term(part: Part, dtype, corrected: bool = False):
         if wp.static(shared):
             k = number(elements.stiffness, 0)
         slot = whole(elements.offsets, i)
-        left = whole(elements.offsets, i + 1) - slot
+        left = whole(elements.offsets, i + 1) - slot - lane
         if wp.static(padded):
-            slot = i
+            slot = lane * count + i
+        else:
+            slot += lane
         while left > 0:
             code = whole(elements.codes, slot)
             e = code // K
@@ -52,25 +81,26 @@ def gather_term(part: Part, dtype, corrected: bool = False):
                 k = number(elements.stiffness, e)
             total += force_of(r, code - K * e, local(k, beta, r, y, dy, h))
             if wp.static(padded):
-                slot += count
+                slot += lanes * count
             else:
-                slot += 1
-            left -= 1
+                slot += lanes
+            left -= lanes
         return total
 
     return total_of
 
 
 @cache
-def gather_pairs(part: Part, dtype, corrected: bool):
-    """The same of pairs, without a branch: what an empty slot gives, by whatever vertex, is left out of the sum.
+def gather_pairs(part: Part, dtype, corrected: bool, lanes: int):
+    """The same of pairs, without a branch: an empty slot pairs the vertex with itself, of stiffness 0.
 
     So all slots are read at once; one after another they take 1.2 times as long (H200, 64² vertices).
     """
     vec3, _ = types(dtype)
     term = part.term
     (firsts, seconds), damped, shared = part.pairs, part.damped, part.shared
-    firsts, slots = wp.constant(firsts), wp.constant(firsts + seconds)
+    slots = firsts + seconds
+    ragged, each, firsts, slots = slots % lanes > 0, wp.constant(-(-slots // lanes)), wp.constant(firsts), wp.constant(slots)
     moved = damped or corrected
     y_type = wp.types.matrix((term.rows, 3), dtype)
     (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype, corrected)
@@ -79,7 +109,13 @@ def gather_pairs(part: Part, dtype, corrected: bool):
 
     @wp.func
     def total_of(
-        elements: elements_of(part, dtype), i: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype
+        elements: elements_of(part, dtype),
+        i: int,
+        lane: int,
+        count: int,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        h: dtype,
     ):
         total = vec3()
         beta = dtype(0.0)
@@ -90,29 +126,70 @@ def gather_pairs(part: Part, dtype, corrected: bool):
         k = dtype(0.0)
         if wp.static(shared):
             k = number(elements.stiffness, 0)
-        for s in range(slots):
-            corner = wp.where(s < firsts, 0, 1)  # known to the compiler, and so are the weights
+        for n in range(each):
+            s = n * lanes + lane
+            if wp.static(ragged):
+                s = wp.min(s, slots - 1)
+            corner = wp.where(s < firsts, 0, 1)  # of one lane known to the compiler, and so are the weights
             slot = s * count + i
             code = whole(elements.codes, slot)
-            j = wp.max(code, 0)
+            if wp.static(ragged):
+                code = wp.where(n * lanes + lane < slots, code, -1 - i)
+            there = dtype(wp.where(code < 0, 0.0, 1.0))
+            j = wp.where(code < 0, -1 - code, code)
             r = rest_of(elements.rest, slot)
             y = part_of(r, corner, place) + part_of(r, 1 - corner, vector(x, j))
             dy = y_type()
             if wp.static(moved):
                 dy = part_of(r, corner, move) + part_of(r, 1 - corner, h * vector(v, j))
             if wp.static(damped):
-                beta = number(elements.damping, slot)
+                beta = there * number(elements.damping, slot)
             if wp.static(not shared):
                 k = number(elements.stiffness, slot)
-            force = force_of(r, corner, local(k, beta, r, y, dy, h))
-            total += wp.where(code >= 0, force, vec3())
+            total += force_of(r, corner, local(there * k, beta, r, y, dy, h))
         return total
 
     return total_of
 
 
 @cache
-def gather_terms(parts: tuple[Part, ...], dtype, corrected: bool = False):
+def gather_rows(part: Part, dtype, corrected: bool, lanes: int):
+    """The same of a quadratic energy by the rows of its matrix Q: ∂U/∂xᵢ = Σⱼ Qᵢⱼ (xⱼ − xᵢ), for rows that add up to 0."""
+    vec3, _ = types(dtype)
+    vector, whole, number = load(vec3), load(wp.int32), load(dtype)
+    slots = wp.constant(part.rows)
+
+    @wp.func
+    def total_of(
+        elements: elements_of(part, dtype),
+        i: int,
+        lane: int,
+        count: int,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        h: dtype,
+    ):
+        total = vec3()
+        place = vector(x, i)
+        move = vec3()
+        if wp.static(corrected):
+            move = h * vector(v, i)
+        s = lane
+        while s < slots:
+            slot = s * count + i
+            j = whole(elements.codes, slot)
+            apart = vector(x, j) - place
+            if wp.static(corrected):
+                apart += h * vector(v, j) - move
+            total += number(elements.stiffness, slot) * apart
+            s += lanes
+        return total
+
+    return total_of
+
+
+@cache
+def gather_terms(parts: tuple[Part, ...], dtype, corrected: bool = False, lanes: int = 1):
     """The same of all terms."""
     vec3, _ = types(dtype)
     chain_type = chain_of(parts, dtype)
@@ -120,24 +197,49 @@ def gather_terms(parts: tuple[Part, ...], dtype, corrected: bool = False):
     if not parts:
 
         @wp.func
-        def total_of_nothing(chain: chain_type, i: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype):
+        def total_of_nothing(
+            chain: chain_type, i: int, lane: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype
+        ):
             return vec3()
 
         return total_of_nothing
-    first, others = gather_term(parts[0], dtype, corrected), gather_terms(parts[1:], dtype, corrected)
+    first, others = gather_term(parts[0], dtype, corrected, lanes), gather_terms(parts[1:], dtype, corrected, lanes)
 
     @wp.func
-    def total_of(chain: chain_type, i: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype):
-        return first(chain.first, i, count, x, v, h) + others(chain.others, i, count, x, v, h)
+    def total_of(chain: chain_type, i: int, lane: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype):
+        return first(chain.first, i, lane, count, x, v, h) + others(chain.others, i, lane, count, x, v, h)
 
     return total_of
 
 
 @cache
-def gather_gradient(parts: tuple[Part, ...], dtype, corrected: bool = False):
-    """Kernel over vertices: adds ∂U/∂x [N] of all terms, at x or with ``corrected`` at x + d, to out."""
+def sum_at_vertices(parts: tuple[Part, ...], dtype, corrected: bool = False, lanes: int = 1):
+    """The device function (thread, chain, N, x, v, h) → that sum of vertex ``thread // lanes``, in all its threads."""
     vec3, _ = types(dtype)
-    total_of, vector, put = gather_terms(parts, dtype, corrected), load(vec3), store(vec3)
+    total_of = gather_terms(parts, dtype, corrected, lanes)
+    chain_type = chain_of(parts, dtype)
+    if lanes == 1:
+
+        @wp.func
+        def alone(thread: int, chain: chain_type, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype):
+            return total_of(chain, thread, 0, count, x, v, h)
+
+        return alone
+    sum_over = sum_of_lanes(dtype, lanes)
+
+    @wp.func
+    def together(thread: int, chain: chain_type, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), h: dtype):
+        i = thread // lanes
+        return sum_over(total_of(chain, i, thread - i * lanes, count, x, v, h))
+
+    return together
+
+
+@cache
+def gather_gradient(parts: tuple[Part, ...], dtype, corrected: bool = False, lanes: int = 1):
+    """Kernel over vertices, ``lanes`` threads each: adds ∂U/∂x [N] of all terms, at x or if ``corrected`` at x + d, to out."""
+    vec3, _ = types(dtype)
+    total_of, vector, put = sum_at_vertices(parts, dtype, corrected, lanes), load(vec3), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather(
@@ -146,7 +248,10 @@ def gather_gradient(parts: tuple[Part, ...], dtype, corrected: bool = False):
         d: wp.array(dtype=vec3),
         out: wp.array(dtype=vec3),
     ):
-        i = wp.tid()
-        put(out, i, vector(out, i) + total_of(chain, i, x.shape[0], x, d, dtype(1.0)))
+        thread = wp.tid()
+        total = total_of(thread, chain, x.shape[0], x, d, dtype(1.0))
+        i = thread // lanes
+        if thread == i * lanes:
+            put(out, i, vector(out, i) + total)
 
     return gather

@@ -68,6 +68,7 @@ class Term:
             not), and how stiff a spring between them would be, kₑ = 1; or None.
         project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices.
+        quadratic: Whether p is 0 and the weights of an element add up to 0: U is then quadratic in the differences of vertices.
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next four.
         constraint_gradient: (y, rest) → ∂C/∂y (M, 3).
         constraint_hessian: (y, rest) → ∂²C/∂y² (3M, 3M).
@@ -90,6 +91,7 @@ class Term:
     reach: Callable | None = None
     project: Any = None
     linear: bool = False
+    quadratic: bool = False
     constraint: Any = None
     constraint_gradient: Any = None
     constraint_hessian: Any = None

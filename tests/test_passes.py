@@ -35,7 +35,8 @@ TERMS = {
     "corotated": [wc.CorotatedMembrane(stiffness=100.0, damping=0.01)],
     "St. Venant-Kirchhoff": [wc.StVKMembrane(stiffness=100.0, damping=0.01)],
     "Neo-Hookean": [wc.NeoHookeanMembrane(stiffness=100.0)],
-    "quadratic bending": [wc.QuadraticBending(stiffness=1e-3, damping=1e-5)],
+    "quadratic bending": [wc.QuadraticBending(stiffness=1e-3)],
+    "damped quadratic bending": [wc.QuadraticBending(stiffness=1e-3, damping=1e-5)],
     "dihedral bending": [wc.DihedralBending(stiffness=1e-3, damping=1e-5)],
     "attachments": [wc.Attachment(vertices="corners", stiffness=10.0, damping=0.1)],
     "clusters": [wc.RigidCluster(vertices=[[0, 1, 2, 7], [20, 21, 28]], stiffness=1e3)],
@@ -188,7 +189,7 @@ def test_a_vertex_of_many_elements_does_not_blow_up_memory(spokes, device):
     edges = np.vstack([np.stack([chain - 1, chain], axis=1), np.stack([0 * star, star], axis=1)])
     mesh = wc.Mesh(np.random.default_rng(0).normal(size=(n, 3)), edges=edges)
     model = wc.Scene(mesh, masses=np.ones(n), terms=[wc.Spring(stiffness=1.0)]).build(device=device)
-    part, arrays = gathered(model.terms[0], model.count)
+    part, arrays = gathered(model, model.terms[0])
     assert part.pairs == (None if spokes else (1, 1)) and not part.padded
     assert len(arrays["codes"]) == (2 * len(edges) if spokes else 2 * n)
 

@@ -1093,7 +1093,7 @@ def test_gathering_is_scattering(term, dtype, device):
 
     factor = model.array(random.uniform(0.2, 1.0, elements.count), scalar)
     start = random.normal(scale=1e-3, size=(elements.count, *(() if term.project is None else (term.rows, 3))))
-    part, arrays = gathered(elements, model.count)
+    part, arrays = gathered(model, elements)
 
     def gathered_forces():
         out = model.vectors()

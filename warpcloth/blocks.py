@@ -9,8 +9,8 @@ import numpy as np
 
 from .incidences import indices
 
-NUMBERS = 3072  # of scratch, if no vertex needs more: 1024 springs, which fit into the first cache beside their vertices
-RUN = 16  # elements, from which on a run is faster than looking stencils up
+NUMBERS = 6144  # of scratch, if no vertex needs more: 2048 springs, which fit into the first cache
+RUN = 8  # elements, from which on a run is faster than looking stencils up
 
 
 def in_blocks(terms, per_copy, copies):

@@ -3,19 +3,25 @@
 import numpy as np
 import warp as wp
 
+from .kernels.assemble import constant_blocks
 from .kernels.elements import Part, chain_of, elements_of
 
 SLOTS = 16  # of pairs, which are compiled one by one
+# On CUDA so many threads take a vertex of meshes of so many vertices or less: a step of the springs of 64² takes 2.0 µs, not
+# 3.0, of 128² 2.2, not 3.1, of 256² as long and of larger ones longer.
+LANES, LANED = 4, 50_000
+CHUNK = 1 << 18  # elements whose blocks are added to a matrix at once
 
 
-def gathered(elements, count, damped=False):
+def gathered(model, elements, damped=False):
     """The :class:`warpcloth.kernels.elements.Part` of elements and what their struct has, by name, to gather over vertices.
 
     Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
     than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and what the element has
-    beside it at hand, unless the rest state is set, by element, in each step.
+    beside it at hand, unless the rest state is set, by element, in each step. Of a quadratic energy that is not damped the
+    incidences are the rows of its matrix.
     """
-    stencil = elements.stencil.numpy()
+    stencil, count = elements.stencil.numpy(), model.count
     part = Part(elements.term, damped, shared=0 in elements.stiffness.strides)
     arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
     if damped:
@@ -25,12 +31,11 @@ def gathered(elements, count, damped=False):
         slots = tuple(int(np.diff(offsets).max(initial=0)) for _order, _vertices, offsets in columns)
         if sum(slots) <= SLOTS and sum(slots) * count <= 2 * stencil.size:
             return part._replace(pairs=slots), _of_pairs(elements, columns, slots, count, arrays)
+    if elements.term.quadratic and not damped and (found := _of_matrix(model, elements)):
+        slots, rows = found
+        return part._replace(rows=slots), rows
     order, vertices, offsets = _rows(stencil.ravel(), count)
-    slots = int(np.diff(offsets).max(initial=0))
-    codes, padded = order, slots * count <= 2 * len(order)
-    if padded:
-        codes = np.full(slots * count, -1)
-        codes[(np.arange(len(order)) - offsets[vertices]) * count + vertices] = order
+    codes, padded = _slots(order, vertices, offsets, count)
     arrays |= {"offsets": indices(elements, offsets), "codes": indices(elements, codes)}
     return part._replace(padded=padded), arrays
 
@@ -41,10 +46,54 @@ def _rows(vertices, count):
     return order, vertices[order], np.searchsorted(vertices[order], np.arange(count + 1))
 
 
+def _slots(values, vertices, offsets, count):
+    """Values of incidences, one vertex after another, slot by slot if that is at most twice as many, and whether it is."""
+    slots = int(np.diff(offsets).max(initial=0))
+    if slots * count > 2 * len(values):
+        return values, False
+    padded = np.full(slots * count, -1, dtype=values.dtype)
+    padded[(np.arange(len(values)) - offsets[vertices]) * count + vertices] = values
+    return padded, True
+
+
+def _of_matrix(model, elements):
+    """How long the longest row of kAGᵀG is off the diagonal, and its rows, where 0 of the vertex itself makes all as long.
+
+    None if that makes them more than twice as many.
+    """
+    K, n, count = elements.term.vertices, model.per_copy, model.count
+    stencil = elements.stencil.numpy().astype(np.int64)
+
+    def entries_of(some):
+        """Rows of all copies, and row·n + column of one, of the entries off the diagonal, and where they are in the blocks."""
+        rows, columns = np.repeat(some, K, axis=1), np.tile(some, K)
+        apart = rows != columns
+        return rows[apart], (rows % n * n + columns % n)[apart], apart
+
+    entries = np.unique(entries_of(stencil[stencil[:, 0] < n])[1])
+    vertices, neighbours = np.divmod(entries, n)
+    firsts = np.searchsorted(vertices, np.arange(n + 1))
+    slots = int(np.diff(firsts).max(initial=0))
+    if slots * n > 2 * len(entries):
+        return None
+    slot = np.arange(len(entries)) - firsts[vertices]
+    codes = np.tile(np.arange(count), (slots, 1))
+    for copy in range(0, count, n):
+        codes[slot, copy + vertices] = copy + neighbours
+    numbers, blocks = np.zeros((slots, count)), wp.zeros((CHUNK, K * K), dtype=wp.float64, device=model.device)
+    kernel = model.kernel(constant_blocks, elements.term, model.dtype)
+    for first in range(0, elements.count, CHUNK):
+        some = slice(first, min(first + CHUNK, elements.count))
+        model.launch(kernel, some.stop - first, [array[some] for array in elements.arguments], [blocks])
+        rows, of_one, apart = entries_of(stencil[some])
+        np.add.at(numbers, (slot[np.searchsorted(entries, of_one)], rows), blocks.numpy()[: len(apart)][apart])
+    return slots, {"codes": indices(elements, codes.ravel()), "stiffness": model.array(numbers.ravel(), model.dtype)}
+
+
 def _of_pairs(elements, columns, slots, count, arrays):
     """The arrays of incidences that name the other vertex, those as first of a pair before those as second."""
     stencil = elements.stencil.numpy()
-    codes, source = np.full(sum(slots) * count, -1), np.zeros(sum(slots) * count, dtype=np.int64)
+    codes, source = -1 - np.tile(np.arange(count), sum(slots)), np.zeros(sum(slots) * count, dtype=np.int64)
     for corner, (order, vertices, offsets) in enumerate(columns):
         place = (corner * slots[0] + np.arange(len(order)) - offsets[vertices]) * count + vertices
         codes[place], source[place] = stencil[order, 1 - corner], order
@@ -62,6 +111,11 @@ def _of_incidences(array, source):
 def indices(elements, values):
     """Whole numbers (n,) on the device."""
     return wp.array(values.astype(np.int32), dtype=wp.int32, device=elements.stencil.device)
+
+
+def lanes(model):
+    """How many threads take a vertex."""
+    return LANES if model.device.is_cuda and model.count <= LANED else 1
 
 
 def chain(parts, arrays, dtype):

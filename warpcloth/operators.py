@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from .incidences import chain, gathered
+from .incidences import chain, gathered, lanes
 from .kernels import assemble, clusters, linear, reduce
 from .kernels.gather import gather_gradient
 
@@ -81,9 +81,10 @@ class Gradient:
     def __init__(self, model, corrected=False, terms=None):
         self.model, self.terms = model, model.terms if terms is None else terms
         if model.device.is_cuda:
-            self._found = [gathered(elements, model.count) for elements in self.terms]
+            self._found = [gathered(model, elements) for elements in self.terms]
             parts = tuple(part for part, _arrays in self._found)
-            self._gather = model.kernel(gather_gradient, parts, model.dtype, corrected) if parts else None
+            self._lanes = lanes(model)
+            self._gather = model.kernel(gather_gradient, parts, model.dtype, corrected, self._lanes) if parts else None
             self._chain = chain(parts, [arrays for _part, arrays in self._found], model.dtype)
         else:
             factory = assemble.scatter_gradient
@@ -97,7 +98,7 @@ class Gradient:
             for elements, kernel in zip(self.terms, self._scatters, strict=True):
                 model.launch(kernel, elements.count, [*elements.arguments, x, correction], [out])
         elif self._gather:
-            model.launch(self._gather, model.count, [self._chain, x, correction], [out])
+            model.launch(self._gather, model.count * self._lanes, [self._chain, x, correction], [out])
 
 
 class Energy:

@@ -142,5 +142,6 @@ QUADRATIC_BENDING = Term(
     hessian=hessian,
     project=project,
     linear=True,
+    quadratic=True,
     dissipation=Dissipation(change=spring.change, rest=damped_rest, term=DAMPED_QUADRATIC_BENDING),
 )
