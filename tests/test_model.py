@@ -19,7 +19,7 @@ from warpcloth.terms import TERMS as KINDS
 
 # 35 vertices, 82 edges, 48 triangles, 62 hinges, 4 corners: all counts differ.
 MESH = wc.Mesh.grid(7, 5, pattern="alternating")
-VERTICES, EDGES, HINGES = 35, 82, 62
+VERTICES, EDGES, HINGES, ATTACHED = 35, 82, 62, 23
 
 
 def scene(**fields):
@@ -676,7 +676,7 @@ mesh = wc.Mesh.grid(7, 5, pattern="alternating")
 terms = [wc.Spring(stiffness=100.0)]
 if declared == "all":
     terms += [wc.QuadraticBending(stiffness=1e-4), wc.DihedralBending(stiffness=1e-4)]
-    terms += [wc.Attachment(vertices="corners", stiffness=10.0)]
+    terms += [wc.Attachment(vertices=list(range(1, 24)), stiffness=10.0)]
 model = wc.Scene(mesh, density=0.1, terms=terms, pins=[0]).build(device=device)
 stepper = getattr(wc, solver)(substeps=8).bind(model)
 stepper.step()
@@ -728,4 +728,4 @@ def test_nothing_undeclared_exists(tmp_path, solver, declared, homes, names, dev
     # One array at least has a row for each element of what is declared, and none has one for anything else.
     assert EDGES in found["rows"]
     assert (HINGES in found["rows"]) == ("QuadraticBending" in names)
-    assert (4 in found["rows"]) == ("Attachment" in names)
+    assert (ATTACHED in found["rows"]) == ("Attachment" in names)
