@@ -19,7 +19,7 @@ from warpcloth.terms import TERMS as KINDS
 
 # 35 vertices, 82 edges, 48 triangles, 62 hinges, 4 corners: all counts differ.
 MESH = wc.Mesh.grid(7, 5, pattern="alternating")
-VERTICES, EDGES, HINGES, ATTACHED = 35, 82, 62, 23
+VERTICES, EDGES, HINGES, ATTACHED = 35, 82, 62, 33
 
 
 def scene(**fields):
@@ -676,7 +676,7 @@ mesh = wc.Mesh.grid(7, 5, pattern="alternating")
 terms = [wc.Spring(stiffness=100.0)]
 if declared == "all":
     terms += [wc.QuadraticBending(stiffness=1e-4), wc.DihedralBending(stiffness=1e-4)]
-    terms += [wc.Attachment(vertices=list(range(1, 24)), stiffness=10.0)]
+    terms += [wc.Attachment(vertices=list(range(1, 34)), stiffness=10.0)]
 model = wc.Scene(mesh, density=0.1, terms=terms, pins=[0]).build(device=device)
 stepper = getattr(wc, solver)(substeps=8).bind(model)
 stepper.step()
