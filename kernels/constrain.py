@@ -16,6 +16,7 @@ from functools import cache
 import warp as wp
 
 from .assemble import local_coordinate, types
+from .reduce import left_out
 from .rotation import epsilon
 from .term import Term
 
@@ -246,7 +247,7 @@ def pull(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: rows += J v."""
+    """Kernel over elements: rows += J v, of the copies that are active, see :func:`.reduce.left_out`."""
     vec3, _ = types(dtype)
     M, Q = wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
@@ -261,10 +262,13 @@ def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
         per_copy: int,
         first: int,
         rows_per_copy: int,
+        active: wp.array(dtype=wp.int32),
         # in and out
         rows: wp.array(dtype=dtype),
     ):
         e = wp.tid()
+        if left_out(active, e // per_copy):
+            return
         s = first_row(e, per_copy, first, rows_per_copy, Q)
         y = y_of(stencil, e, rest[e], v, v)
         if wp.static(scalar):
@@ -284,7 +288,7 @@ def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def scatter_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: out += Jᵀλ. For the CPU, where it runs in order."""
+    """Kernel over elements: out += Jᵀλ, of active copies. For the CPU, where it runs in order."""
     vec3, _ = types(dtype)
     K, M, Q = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
@@ -299,10 +303,13 @@ def scatter_rows(term: Term, dtype, scalar: bool, curved: bool):
         per_copy: int,
         first: int,
         rows_per_copy: int,
+        active: wp.array(dtype=wp.int32),
         # in and out
         out: wp.array(dtype=vec3),
     ):
         e = wp.tid()
+        if left_out(active, e // per_copy):
+            return
         r = rest[e]
         z = pull_of(slopes, lambdas, e, first_row(e, per_copy, first, rows_per_copy, Q))
         for i in range(K):
@@ -334,6 +341,7 @@ def gather_rows(term: Term, dtype, scalar: bool, curved: bool):
         per_copy: int,
         first: int,
         rows_per_copy: int,
+        active: wp.array(dtype=wp.int32),
         # in and out
         out: wp.array(dtype=vec3),
     ):
@@ -341,6 +349,8 @@ def gather_rows(term: Term, dtype, scalar: bool, curved: bool):
         total = vec3()
         for n in range(offsets[v], offsets[v + 1]):
             e = incidences[n] // K
+            if left_out(active, e // per_copy):
+                return
             w = weight(rest[e], incidences[n] - e * K)
             z = pull_of(slopes, lambdas, e, first_row(e, per_copy, first, rows_per_copy, Q))
             for m in range(M):

@@ -59,7 +59,7 @@ def add_blocks(dtype):
 
 @cache
 def multiply(dtype):
-    """Kernel over block rows: q = A p."""
+    """Kernel over block rows: q = A p, of the copies that are active."""
     vec3, mat33 = types(dtype)
 
     @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
@@ -68,9 +68,14 @@ def multiply(dtype):
         columns: wp.array(dtype=wp.int32),
         values: wp.array(dtype=mat33),
         p: wp.array(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # out
         q: wp.array(dtype=vec3),
     ):
         i = wp.tid()
+        if active[i // per_copy] == 0:
+            return
         total = vec3()
         for s in range(offsets[i], offsets[i + 1]):
             total += values[s] * p[columns[s]]

@@ -10,6 +10,14 @@ import warp as wp
 from .assemble import types
 
 
+@wp.func
+def left_out(active: wp.array(dtype=wp.int32), copy: int):
+    """Whether a copy is not among the active ones, (B,); none is left out where that is None."""
+    if active:
+        return active[copy] == 0
+    return False
+
+
 @cache
 def partial_sum():
     """Kernel over (copies, chunks): out[copy, chunk] = Σ values."""
@@ -27,12 +35,21 @@ def partial_sum():
 
 @cache
 def partial_dot(dtype):
-    """Kernel over (copies, chunks): out[copy, chunk] = Σ a·b over vertices."""
+    """Kernel over (copies, chunks): out[copy, chunk] = Σ a·b over vertices; of the copies that are active, if any are named."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def dot_chunks(a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), per_copy: int, out: wp.array2d(dtype=wp.float64)):
+    def dot_chunks(
+        a: wp.array(dtype=vec3),
+        b: wp.array(dtype=vec3),
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # out
+        out: wp.array2d(dtype=wp.float64),
+    ):
         copy, chunk = wp.tid()
+        if left_out(active, copy):
+            return
         total = wp.float64(0.0)
         for i in range(chunk, per_copy, out.shape[1]):
             total += wp.float64(wp.dot(a[copy * per_copy + i], b[copy * per_copy + i]))
@@ -43,11 +60,20 @@ def partial_dot(dtype):
 
 @cache
 def partial_product(dtype):
-    """Kernel over (copies, chunks): out[copy, chunk] = Σ a b of numbers."""
+    """Kernel over (copies, chunks): out[copy, chunk] = Σ a b of numbers; of the copies that are active, if any are named."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def multiply_chunks(a: wp.array(dtype=dtype), b: wp.array(dtype=dtype), per_copy: int, out: wp.array2d(dtype=wp.float64)):
+    def multiply_chunks(
+        a: wp.array(dtype=dtype),
+        b: wp.array(dtype=dtype),
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # out
+        out: wp.array2d(dtype=wp.float64),
+    ):
         copy, chunk = wp.tid()
+        if left_out(active, copy):
+            return
         total = wp.float64(0.0)
         for i in range(chunk, per_copy, out.shape[1]):
             total += wp.float64(a[copy * per_copy + i]) * wp.float64(b[copy * per_copy + i])

@@ -51,13 +51,13 @@ class ClusterRows:
         given = [cells.offsets, cells.shape, *self.elements.arguments, x, d, h, least, *self._where]
         self._launch("linearise_clusters", cells.count, given, [multipliers, self._rotations, *out])
 
-    def launch_apply(self, v, out):
-        """out += J v."""
+    def launch_apply(self, v, out, active=None):
+        """out += J v, of all copies."""
         given = [*self._shape(), self.elements.stencil, self.elements.rest, v, *self._where]
         self._launch("apply_cluster_rows", self.cells.count, given, [out])
 
-    def launch_transpose(self, rows, out):
-        """out += Jᵀ rows."""
+    def launch_transpose(self, rows, out, active=None):
+        """out += Jᵀ rows, of all copies."""
         given = [*self._shape(), self.elements.rest, rows, *self._where]
         self._launch("pull_clusters", self.cells.count, given, [self._pulls])
         self._launch("gather_pulls", len(self._incidences[0]) - 1, [*self._incidences, self._pulls], [out])

@@ -47,14 +47,14 @@ class TermRows:
         given = [*self.elements.arguments, model.inverse_mass, x, d, h, least, *self._where]
         model.launch(self._linearise, self.elements.count, given, [multipliers, self._slopes, *out])
 
-    def launch_apply(self, v, out):
-        """out += J v."""
-        given = [self.elements.stencil, self.elements.rest, self._slopes, v, *self._where]
+    def launch_apply(self, v, out, active=None):
+        """out += J v, of the copies that are ``active`` (B,), all of them where it is None."""
+        given = [self.elements.stencil, self.elements.rest, self._slopes, v, *self._where, active]
         self.model.launch(self._apply, self.elements.count, given, [out])
 
-    def launch_transpose(self, rows, out):
-        """out += Jᵀ rows."""
-        given = [*self._incidences, self.elements.stencil, self.elements.rest, self._slopes, rows, *self._where]
+    def launch_transpose(self, rows, out, active=None):
+        """out += Jᵀ rows, likewise."""
+        given = [*self._incidences, self.elements.stencil, self.elements.rest, self._slopes, rows, *self._where, active]
         dim = len(self._incidences[0]) - 1 if self._incidences else self.elements.count
         self.model.launch(self._transpose, dim, given, [out])
 
@@ -123,16 +123,16 @@ class Constraints:
         for part in self.parts:
             part.launch_linearise(x, d, self.h, self.least, *out)
 
-    def launch_apply(self, v, out):
-        """out += J v."""
+    def launch_apply(self, v, out, active=None):
+        """out += J v; of copies that are not ``active`` (B,), if that is given, less or nothing."""
         for part in self.parts:
-            part.launch_apply(v, out)
+            part.launch_apply(v, out, active)
 
-    def launch_moves(self, rows, out):
-        """out = W Jᵀ rows, (N,) vectors [m] for λ."""
+    def launch_moves(self, rows, out, active=None):
+        """out = W Jᵀ rows, (N,) vectors [m] for λ, likewise."""
         out.zero_()
         for part in self.parts:
-            part.launch_transpose(rows, out)
+            part.launch_transpose(rows, out, active)
         self.model.launch(self._weigh, self.model.count, [self.model.inverse_mass], [out])
 
     # As a matrix, see ConjugateGradients.
@@ -140,11 +140,11 @@ class Constraints:
     def prepare(self):
         """Nothing is left to find."""
 
-    def multiply(self, p, q):
-        """q = A p."""
-        self.launch_moves(p, self._vectors)
+    def multiply(self, p, q, active):
+        """q = A p, of the copies that are ``active`` (B,)."""
+        self.launch_moves(p, self._vectors, active)
         self.model.launch(self._scale, self.count, [self._compliance, p], [q])
-        self.launch_apply(self._vectors, q)
+        self.launch_apply(self._vectors, q, active)
 
     def invert_diagonal(self, out):
         """out = the inverse diagonal, 0 where that is 0."""

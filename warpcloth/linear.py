@@ -65,11 +65,11 @@ class ConjugateGradients:
 
     def _iterate(self, x):
         N, B, n = self.matrix.count, self.model.copies, self.matrix.per_copy
-        self.matrix.multiply(self.p, self.q)
-        self.sums.dot(self.p, self.q, self.pq)
+        self.matrix.multiply(self.p, self.q, self.active)
+        self.sums.dot(self.p, self.q, self.pq, self.active)
         scalars = [self.rz, self.pq, self.active, self.iteration, n]
         self._launch("advance", N, [self.preconditioner, self.p, self.q, *scalars], [x, self.r, self.z])
-        self.sums.dot(self.r, self.z, self.new_rz)
+        self.sums.dot(self.r, self.z, self.new_rz, self.active)
         self._launch("begin_check", 1, [], [self.iteration, self.proceed])
         given = [self.new_rz, self.pq, self.first, self.tolerance.array]
         changed = [self.rz, self.active, self.negative.array, self.ratio, self.proceed]

@@ -33,9 +33,9 @@ class Sums:
         self._largest = model.kernel(reduce.partial_largest, model.dtype)
         self._finish_largest = model.kernel(reduce.finish_largest)
 
-    def dot(self, a, b, out):
-        """out (B,) = Σ a·b over the vertices of each copy."""
-        self.model.launch(self._dot, self.partial.shape, [a, b, self.model.per_copy], [self.partial])
+    def dot(self, a, b, out, active=None):
+        """out (B,) = Σ a·b over the vertices of each copy; not set for those that are not ``active`` (B,), if that is given."""
+        self.model.launch(self._dot, self.partial.shape, [a, b, active, self.model.per_copy], [self.partial])
         self._add_chunks(0, out)
 
     def sum(self, values, per_copy, out, accumulate=0):
@@ -64,9 +64,9 @@ class RowSums(Sums):
         self._largest = model.kernel(reduce.partial_largest_number)
         self._finish_largest = model.kernel(reduce.finish_largest)
 
-    def dot(self, a, b, out):
-        """out (B,) = Σ a b of each copy."""
-        self.model.launch(self._dot, self.partial.shape, [a, b, self.per_copy], [self.partial])
+    def dot(self, a, b, out, active=None):
+        """out (B,) = Σ a b of each copy, as :meth:`Sums.dot`."""
+        self.model.launch(self._dot, self.partial.shape, [a, b, active, self.per_copy], [self.partial])
         self._add_chunks(0, out)
 
     def largest(self, values, out):
@@ -186,9 +186,10 @@ class Hessian:
         self._multiply = self.model.kernel(linear.multiply, self.model.dtype)
         self._invert_diagonal = self.model.kernel(linear.invert_diagonal, self.model.dtype)
 
-    def multiply(self, p, q):
-        """q = A p."""
-        self.model.launch(self._multiply, self.count, [self.offsets, self.columns, self.values, p], [q])
+    def multiply(self, p, q, active):
+        """q = A p, of the copies that are ``active`` (B,)."""
+        given = [self.offsets, self.columns, self.values, p, active, self.per_copy]
+        self.model.launch(self._multiply, self.count, given, [q])
 
     def invert_diagonal(self, out):
         """out = the inverse diagonal blocks."""
