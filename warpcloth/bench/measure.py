@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from ..capture import Mirror
 from ..chart.tasks import SceneRef, Setup
 from ..solvers.solver import Stepper
 from ..status import Result
@@ -69,7 +70,8 @@ def measure(scene, setup, frames, device, dtype, started, copies=1):
             return found | {"status": "refused", "reason": str(error)}
     wp.synchronize_device(device)
     bound = time.perf_counter() - began
-    _run_frame(stepper)
+    points = Mirror(stepper.state.x)
+    _run_frame(stepper, points)
     found |= {
         "vertices": model.count,
         "elements": elements_of(model),
@@ -79,21 +81,21 @@ def measure(scene, setup, frames, device, dtype, started, copies=1):
         "factorise_s": stepper.factorise_seconds,
     }
     if frames:
-        found |= _warm(stepper, model, frames, found["elements"])
+        found |= _warm(stepper, model, points, frames, found["elements"])
     found["memory"] = _memory(device)
     if not np.isfinite(stepper.state.x.numpy()).all() or Result.DIVERGED in stepper.results:
         return found | {"status": "diverged", "reason": f"diverged within {found['frames'] + _WARM_UP} frames"}
     return found
 
 
-def _warm(stepper, model, frames, elements):
+def _warm(stepper, model, points, frames, elements):
     """What the warm frames say."""
     for _ in range(_WARM_UP - 1):
-        _run_frame(stepper)
+        _run_frame(stepper, points)
     times, iterations = [], []
     while len(times) < frames and (len(times) < _FEWEST or sum(times) < _SECONDS):
         began = time.perf_counter()
-        iterations.append(_run_frame(stepper))
+        iterations.append(_run_frame(stepper, points))
         times.append(time.perf_counter() - began)
     substeps = stepper.steps_per_frame
     low, median, high = (1e3 * np.percentile(times, [25, 50, 75])).tolist()
@@ -109,12 +111,12 @@ def _warm(stepper, model, frames, elements):
         "ns": float(np.median(per_iteration)) if elements else None,
         "bytes": moved,
         "bytes_per_s": moved * substeps / (1e-3 * median),
-        "launches": launches_of(lambda: _run_frame(stepper)) / substeps,
+        "launches": launches_of(lambda: _run_frame(stepper, points)) / substeps,
     }
 
 
-def _run_frame(stepper):
-    """A frame, its points read on the host; the iterations of all its steps."""
+def _run_frame(stepper, points):
+    """A frame, its points read into memory of the host that is kept; the iterations of all its steps."""
     iterations = 0
     # Where a solver has frames of its own, all its steps have the same iterations.
     if type(stepper).frame is not Stepper.frame:
@@ -124,7 +126,7 @@ def _run_frame(stepper):
         for _ in range(stepper.steps_per_frame):
             stepper.step()
             iterations += stepper.iterations
-    stepper.state.x.numpy()
+    points.read()
     return iterations
 
 

@@ -77,6 +77,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
             if time.perf_counter() - began > limit:
                 raise Slow(f"stopped after {limit:g} s, in frame {frame} of {frames}")
     said = [watch.messages.get(copy, each.value if each in _FAILED else "") for copy, each in enumerate(stepper.results)]
+    said = [text.replace(f", copy {copy}:", ":") for copy, text in enumerate(said)]  # which is of the row, not of the map
     return Trial(points, watch.good, watch.fastest**2, said, list(stepper.results))
 
 
