@@ -81,15 +81,48 @@ def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str):
 
 
 @cache
+def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int = 1):
+    """The device function by which ``lanes`` threads set x, v of a vertex after a step, a = g − ∇U/m, in other arrays."""
+    vec3, _ = types(dtype)
+    total_of, step = sum_at_vertices(parts, dtype, lanes=lanes), advance(dtype, symplectic)
+    vector, number, put = load(vec3), load(dtype), store(vec3)
+
+    @wp.func
+    def gather_one(
+        thread: int,
+        chain: chain_of(parts, dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        gravity: wp.array(dtype=vec3),
+        per_copy: int,
+        h: dtype,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        x_after: wp.array(dtype=vec3),
+        v_after: wp.array(dtype=vec3),
+    ):
+        total = total_of(thread, chain, inverse_mass.shape[0], x, v, h)  # of pins too: what follows need not wait for w
+        i = thread // lanes
+        w = number(inverse_mass, i)
+        place = vector(x, i)
+        velocity = vector(v, i)
+        if w > dtype(0.0):
+            place, velocity = step(place, velocity, gravity[i // per_copy] - w * total, h)
+        if thread == i * lanes:
+            put(x_after, i, place)
+            put(v_after, i, velocity)
+
+    return gather_one
+
+
+@cache
 def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, lanes: int = 1):
-    """Kernel over vertices, ``lanes`` threads each: x, v after a step, a = g − ∇U/m.
+    """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
     Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN
     stays.
     """
     vec3, _ = types(dtype)
-    total_of, step = sum_at_vertices(parts, dtype, lanes=lanes), advance(dtype, symplectic)
-    vector, number, put = load(vec3), load(dtype), store(vec3)
+    gather_one = gather_vertex(parts, dtype, symplectic, lanes)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"fast_math": fast})
     def gather_vertices(
@@ -104,16 +137,63 @@ def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, lanes: 
         x_after: wp.array(dtype=vec3),
         v_after: wp.array(dtype=vec3),
     ):
-        thread = wp.tid()
-        total = total_of(thread, chain, inverse_mass.shape[0], x, v, h)  # of pins too: what follows need not wait for w
-        i = thread // lanes
-        w = number(inverse_mass, i)
-        place = vector(x, i)
-        velocity = vector(v, i)
-        if w > dtype(0.0):
-            place, velocity = step(place, velocity, gravity[i // per_copy] - w * total, h)
-        if thread == i * lanes:
-            put(x_after, i, place)
-            put(v_after, i, velocity)
+        gather_one(wp.tid(), chain, inverse_mass, gravity, per_copy, h, x, v, x_after, v_after)
 
     return gather_vertices
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+__syncthreads();
+#endif
+""")
+def wait_for_block(): ...
+
+
+@cache
+def gather_copies(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, threads: int):
+    """Kernel over (copies, threads): x, v after several steps. A copy is a block of ``threads``, which wait for one another.
+
+    x_other and v_other are where every other step ends; where nothing is damped v may be v_other.
+    """
+    vec3, _ = types(dtype)
+    gather_one, vector, put = gather_vertex(parts, dtype, symplectic), load(vec3), store(vec3)
+    threads = wp.constant(threads)
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=threads, module_options={"fast_math": fast})
+    def gather_each_copy(
+        chain: chain_of(parts, dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        gravity: wp.array(dtype=vec3),
+        per_copy: int,
+        h: dtype,
+        steps: int,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        # between
+        x_other: wp.array(dtype=vec3),
+        v_other: wp.array(dtype=vec3),
+    ):
+        copy, thread = wp.tid()
+        first = copy * per_copy + thread
+        end = (copy + 1) * per_copy
+        left = steps
+        while left > 0:
+            i = first
+            while i < end:
+                gather_one(i, chain, inverse_mass, gravity, per_copy, h, x, v, x_other, v_other)
+                i += threads
+            wait_for_block()
+            i = first
+            while i < end:
+                if left > 1:
+                    gather_one(i, chain, inverse_mass, gravity, per_copy, h, x_other, v_other, x, v)
+                else:  # the last of an odd number
+                    put(x, i, vector(x_other, i))
+                    put(v, i, vector(v_other, i))
+                i += threads
+            wait_for_block()
+            left -= 2
+
+    return gather_each_copy

@@ -10,7 +10,7 @@ from test_damping import damping_forces
 from test_solvers import SOLVERS, allocations, square
 
 import warpcloth as wc
-from warpcloth import blocks
+from warpcloth import blocks, incidences, passes
 from warpcloth.blocks import in_blocks
 from warpcloth.incidences import gathered
 from warpcloth.operators import Gradient
@@ -108,6 +108,50 @@ def test_one_pass_is_forces_and_update(name, way, scheme, dtype, device, monkeyp
     tolerance = steps * 64 * np.finfo(dtype).eps / stepper.h
     assert np.abs(v - exact_v).max() < tolerance
     assert np.abs(x - exact_x).max() < steps * stepper.h * tolerance
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize(
+    "name", ["nothing", "springs", "springs, the higher vertex first, each of its own stiffness", "damped springs"]
+)
+def test_steps_of_one_launch_are_steps(name, dtype, device, monkeypatch):
+    """Of CUDA, but right on the CPU too: an even number and an odd one, to the bit those of a launch each."""
+    monkeypatch.setattr(explicit, "Sweep", Gather)
+    monkeypatch.setattr(incidences, "LANED", 0)  # as of many copies
+    vary = {"gravity": [[0.0, -9.81, 0.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]}
+    model = declared(TERMS[name], pins=[0, 6], fps=250.0).build(device=device, dtype=dtype, copies=3, vary=vary)
+    states, launches = [], []
+    for sizes in ([4, 5], [1] * 9):
+        stepper = wc.Explicit(substeps=4, above_limit="allow").bind(model)
+        before = model.launches[0]
+        for steps in sizes:
+            stepper.launch_steps(steps)
+        launches.append(model.launches[0] - before)
+        states.append([array.numpy() for array in stepper.state])
+        monkeypatch.setattr(passes, "block_of", lambda model, parts: 0)
+    assert launches == [2, 9]
+    assert np.array_equal(*states)
+
+
+@pytest.mark.parametrize(
+    ("scene", "one"),
+    [
+        (declared([SPRINGS], pins=[0, 6]), True),
+        (declared([SPRINGS]), False),  # whose pins are led
+        (declared([SPRINGS, wc.QuadraticBending(stiffness=1e-3)], pins=None), False),
+        (declared(TERMS["clusters"], pins=None), False),
+        (wc.Scene(wc.Mesh.grid(33, 33), density=0.1, terms=[SPRINGS], duration=1.0), False),
+    ],
+)
+def test_which_copies_are_blocks(scene, one, device, monkeypatch):
+    model = scene.build(device=device)
+
+    def threads():
+        return Gather(model, (model.vectors(), model.vectors()), 1e-3, True)._threads
+
+    assert wp.get_device(device).is_cpu or not threads()
+    monkeypatch.setattr(incidences, "LANED", 0)
+    assert bool(threads()) == one
 
 
 LAUNCHED = [name for name, made in SOLVERS.items() if isinstance(made, (wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD))]

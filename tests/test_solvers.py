@@ -13,7 +13,10 @@ from nets import net
 
 import warpcloth as wc
 from warpcloth.capture import Segment, on_host
-from warpcloth.solvers.explicit import step_limits
+from warpcloth.constraints import Constraints
+from warpcloth.operators import Hessian, RowSums, Sums
+from warpcloth.solvers import explicit
+from warpcloth.solvers.explicit import limit_in_motion, step_limits
 from warpcloth.status import Result
 
 EPS = np.finfo(np.float64).eps
@@ -70,6 +73,37 @@ def square(n=6, solver=None, damping=None, **scene):
     if isinstance(solver, wc.ProjectiveDynamics):  # the angle of a hinge is no distance
         terms.pop()
     return wc.Scene(mesh, density=0.1, terms=terms, **scene)
+
+
+RANDOM = np.random.default_rng(5)
+UNLIKE = {
+    "stiffness and gravity": {
+        "Spring.stiffness": [50.0, 100.0, 200.0],
+        "gravity": [[0, -9.81, 0], [0, -1.6, 0], [3.0, 0, 0]],
+    },
+    "density, bending and damping": {
+        "density": [0.05, 0.1, 0.2],
+        "QuadraticBending.stiffness": [0.0, 1e-4, 1e-3],
+        "Spring.damping": [0.0, 0.01, 0.05],
+    },
+    "masses and start": {
+        "masses": RANDOM.uniform(0.002, 0.004, (3, 36)),
+        "positions": square().mesh.points + RANDOM.normal(scale=0.01, size=(3, 36, 3)),
+        "velocities": RANDOM.normal(scale=0.1, size=(3, 36, 3)),
+    },
+}
+
+
+def one_of(scene, vary, copy):
+    """The scene that is one of the copies."""
+    for name, values in vary.items():
+        label, _, field = name.rpartition(".")
+        if label:
+            terms = [replace(each, **{field: values[copy]}) if each.label == label else each for each in scene.terms]
+            scene = replace(scene, terms=terms)
+        else:
+            scene = replace(scene, **{name: values[copy]}, **({"density": None} if name == "masses" else {}))
+    return scene
 
 
 @pytest.mark.parametrize("omega_h", [0.1, 1.0, 1.9])
@@ -208,6 +242,33 @@ def test_a_sheet_at_rest_stays_there(name, dtype, device):
     assert np.linalg.norm(np.linalg.solve(inertia, L)) < 0.1 * eps / stepper.h
 
 
+VARIED = {
+    "nothing": (2, {}),
+    "where they are": (2, {"gravity": RANDOM.normal(size=(2, 3)), "velocities": RANDOM.normal(size=(2, 36, 3))}),
+    "density": (3, {"density": [0.1, 0.3, 0.1]}),
+    "stiffness": (3, {"Spring.stiffness": [100.0, 100.0, 400.0]}),
+    "damping": (2, {"Spring.damping": [0.1, 0.0]}),
+}
+
+
+@pytest.mark.parametrize("name", VARIED)
+def test_limits_of_copies_are_the_least_of_each(name, device, monkeypatch):
+    """Found once for those that are alike, whatever number of them there is; and the quick one by itself."""
+    (copies, vary), built = VARIED[name], {"device": device, "dtype": "float64"}
+    scene = square(pins="corners", damping=0.05)
+    alone = np.array([step_limits(one_of(scene, vary, copy).build(**built)) for copy in range(copies)])
+    searches = []
+    monkeypatch.setattr(explicit, "_at_rest", lambda *given, before=explicit._at_rest: searches.append(1) or before(*given))
+    model = scene.build(copies=copies, vary=vary, **built)
+    assert step_limits(model) == tuple(alone.min(axis=0))
+    assert len(searches) == len(np.unique(alone, axis=0))
+    assert limit_in_motion(model) == alone[:, 1].min()
+    # Below the second a step is stable about the rest shape too: no need to look for the first.
+    fps = 1.0 / (0.999 * alone[:, 1].min())
+    wc.Explicit(substeps=1).bind(replace(scene, fps=fps, duration=1 / fps).build(copies=copies, vary=vary, **built))
+    assert len(searches) == len(np.unique(alone, axis=0)) and (alone[:, 1] <= alone[:, 0]).all()
+
+
 @pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1)])
 def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
     with pytest.raises(ValueError, match="cannot take Spring with infinite stiffness; PBD"):
@@ -262,6 +323,35 @@ def test_options_are_checked(make, message):
         make()
 
 
+@pytest.mark.parametrize("kind", ["hessian", "constraints"])
+def test_copies_that_are_done_are_left_out(kind, device):
+    """Of a product with the matrix, and of its sums: those that are active have theirs, what the others hold is as it was."""
+    model = square(positions=square().mesh.points + RANDOM.normal(scale=0.01, size=(36, 3))).build(
+        device=device, dtype="float64", copies=3
+    )
+    if kind == "hessian":
+        matrix, sums = Hessian(model), Sums(model)
+        matrix.assemble(model.positions, 1.0)
+    else:
+        matrix = Constraints(model, 0.01, curved=False)
+        matrix.launch_linearise(model.positions, model.vectors())
+        sums = RowSums(model, matrix.per_copy)
+    matrix.prepare()
+    p = RANDOM.normal(size=(3, *np.shape(matrix.matrices()[0])[:1]))
+    given = wp.array(p.reshape(matrix.count, -1).squeeze(), dtype=matrix.vector, device=device)
+    product, active = wp.zeros_like(given), wp.array([1, 0, 1], dtype=wp.int32, device=device)
+    matrix.multiply(given, product, active)
+    exact = np.array([each @ one for each, one in zip(matrix.matrices(), p, strict=True)])
+    found = product.numpy().reshape(3, -1)
+    # Rounding of sums of up to 100 terms.
+    assert np.allclose(found[[0, 2]], exact[[0, 2]], rtol=0.0, atol=100 * EPS * np.abs(exact).max())
+    assert not np.allclose(found[1], exact[1], rtol=1e-3, atol=0.0)
+    out = wp.full(3, np.nan, dtype=wp.float64, device=device)
+    sums.dot(given, given, out, active)
+    assert np.allclose(out.numpy()[[0, 2]], (p**2).sum(axis=1)[[0, 2]], rtol=100 * EPS)
+    assert not np.isclose(out.numpy()[1], (p[1] ** 2).sum())
+
+
 def test_a_frame_is_a_whole_number_of_steps(device):
     with pytest.raises(ValueError, match="a frame must be a whole number of steps"):
         wc.Newton(dt=0.01).bind(square().build(device=device))
@@ -299,19 +389,20 @@ def test_the_same_run_gives_the_same_bits(name, dtype, device):
     assert np.array_equal(run(), run())
 
 
+@pytest.mark.parametrize("unlike", UNLIKE)
 @pytest.mark.parametrize("name", SOLVERS)
-def test_copies_run_as_if_alone(name, device):
-    """Every reduction is per copy: copies of different stiffness and gravity do not notice one another."""
-    stiffness, gravity = [50.0, 100.0, 200.0], [[0, -9.81, 0], [0, -1.6, 0], [3.0, 0, 0]]
-    vary = {"Spring.stiffness": stiffness, "gravity": gravity}
-    solver, base = SOLVERS[name], square(solver=SOLVERS[name], fps=600.0, pins="corners")
-    batch = wc.simulate(base, solver, device=device, dtype="float64", frames=10, copies=3, vary=vary).points
+def test_copies_run_as_if_alone(name, unlike, device):
+    """Every reduction is per copy: copies that differ do not notice one another."""
+    vary, solver = UNLIKE[unlike], SOLVERS[name]
+    velocities = np.random.default_rng(6).normal(scale=0.1, size=(36, 3))
+    base = square(solver=solver, fps=600.0, pins="corners", velocities=velocities)
+    kept = {"device": device, "dtype": "float64", "frames": 10}
+    batch = wc.simulate(base, solver, copies=3, vary=vary, **kept).points
     for copy in range(3):
-        terms = [wc.Spring(pairs=("structural", "shear"), stiffness=stiffness[copy]), *base.terms[1:]]
-        alone = replace(base, terms=terms, gravity=gravity[copy])
-        points = wc.simulate(alone, solver, device=device, dtype="float64", frames=10).points
+        points = wc.simulate(one_of(base, vary, copy), solver, **kept).points
         # Factorising all copies at once eliminates in another order, hence not the same bits there.
         assert np.abs(batch[:, copy] - points).max() < 1e-9
+    assert np.ptp(batch[-1], axis=0).max() > 1e-5, "the copies are not alike"
 
 
 def led(solver, copies=3, device="cpu", dtype="float64", **vary):
@@ -457,6 +548,13 @@ def test_the_state_is_shared_without_copies(shared, device):
     after = np.asarray(points.cpu() if hasattr(points, "cpu") else points)
     assert np.array_equal(after, seen(stepper)[0])
     assert not np.array_equal(after, before)
+
+
+def test_the_array_interface_names_the_memory(device):
+    """As (B·n, 3) numbers that may be written, on CUDA as on the CPU."""
+    for array in led(SOLVERS["explicit"], device=device, dtype="float32").state:
+        found = array.__array_interface__ if array.device.is_cpu else array.__cuda_array_interface__
+        assert found["data"] == (array.ptr, False) and found["shape"] == (3 * 36, 3) and found["typestr"] == "<f4"
 
 
 def test_what_numpy_writes_is_the_state(device):

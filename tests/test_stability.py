@@ -22,6 +22,7 @@ from warpcloth.chart.sweep import Store, sweep
 from warpcloth.chart.tasks import SceneRef, Setup
 from warpcloth.cli import _parser, main
 from warpcloth.cli.stability import _survey
+from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
 
 DOCS = Path(__file__).parents[1] / "docs" / "stability.md"
@@ -359,6 +360,19 @@ def test_rows_are_copies_and_either_axis_can_be_a_row(device):
         within = first[i][1][2]
         assert alone["verdict"] == within["verdict"] and alone["step"] == within["step"]
         assert alone["growth"] == pytest.approx(within["growth"], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_row_of_copies_is_its_cells(name, device):
+    """Of each method, though some copies diverge or take many more iterations than others."""
+    setup, factors = [asdict(Setup(name))], [1e-2, 1.0, 1e4]
+    given = {"steps": 12, "reference": False, "device": device}
+    (row,) = measure(asdict(HANGING), setup, {"dt": 1e-2}, "stiffness", factors, **given)
+    cells = [measure(asdict(HANGING), setup, {"stiffness": factor}, "dt", [1e-2], **given)[0][0] for factor in factors]
+    for within, alone in zip(row, cells, strict=True):
+        # Levels of a hierarchy and factors of all copies at once are of other rounding.
+        assert within == {**alone, "growth": pytest.approx(alone["growth"], rel=1e-9)}
+    assert [cell["status"] for cell in row] == (["ok", *["diverged"] * 2] if name == "explicit" else ["ok"] * 3)
 
 
 @pytest.mark.parametrize("name", ["stiffness", "mass-ratio", "compression"])

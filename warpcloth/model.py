@@ -107,6 +107,21 @@ class DeviceElements:
         """Elements of all copies, B·E."""
         return len(self.stencil)
 
+    def of_copy(self, copy, vertices):
+        """Those of one copy of so many vertices, as of a model of it alone."""
+        part, device = slice(copy * self.per_copy, (copy + 1) * self.per_copy), self.stencil.device
+        changed = {"stencil": wp.array(self.stencil.numpy()[part] - copy * vertices, dtype=wp.int32, device=device)}
+        changed |= {"stiffness": self.stiffness[part], "rest": self.rest[part]}
+        if self.damping is not None:
+            changed["damping"] = self.damping[part]
+        if self.cells is not None:
+            C = self.cells.per_copy
+            offsets = self.cells.offsets.numpy()[copy * C : (copy + 1) * C + 1] - part.start
+            changed["cells"] = replace(
+                self.cells, offsets=wp.array(offsets, dtype=wp.int32, device=device), shape=self.cells.shape[part]
+            )
+        return replace(self, **changed)
+
     def softened(self):
         """The same elements with a stiffness of 1 where it is infinite."""
         stiffness = self.stiffness.numpy()
@@ -228,6 +243,18 @@ class Model:
         """This model with other :class:`DeviceElements`, all else shared."""
         other = shallow_copy(self)
         other.terms = tuple(terms)
+        return other
+
+    def alone(self, copy):
+        """A model of one copy, whose arrays are parts of those of this one."""
+        if self.copies == 1:
+            return self
+        other, n = shallow_copy(self), self.per_copy
+        part = slice(copy * n, (copy + 1) * n)
+        other.copies, other.count, other.gravity = 1, n, self.gravity[copy : copy + 1]
+        for name in ("positions", "velocities", "mass", "inverse_mass"):
+            setattr(other, name, getattr(self, name)[part])
+        other.terms = tuple(elements.of_copy(copy, n) for elements in self.terms)
         return other
 
     def array(self, values, dtype):

@@ -3,6 +3,7 @@
 import math
 import warnings
 from dataclasses import dataclass
+from hashlib import sha256
 
 import numpy as np
 
@@ -54,6 +55,8 @@ class Explicit(Step):
         return stepper
 
     def _refuse_unstable(self, model, h):
+        if self.scheme == "symplectic" and h < limit_in_motion(model):
+            return  # below that about the rest shape too
         rest, motion = step_limits(model)
         fewest = int(1.0 / (model.scene.fps * rest)) + 1 if rest > 0.0 else 0
         allow = 'above_limit="allow" runs it all the same'
@@ -92,21 +95,62 @@ def step_limits(model):
         ValueError: If a stiffness is infinite.
     """
     refuse_hard(model, "Explicit")
-    rest_shape = model.array(np.tile(model.scene.mesh.points, (model.copies, 1)), model.vec3)
-    taut = [elements.taut(model.scene.mesh.points) for elements in model.terms]
-    K, k = _over_mass(model, taut, rest_shape)
+    found = [(_at_rest(*stiff), _in_motion(*stiff)) for stiff in map(_linearised, _unlike(model))]
+    return tuple(min(limits) for limits in zip(*found, strict=True))
+
+
+def limit_in_motion(model):
+    """The second of :func:`step_limits`, which is the smaller and far quicker to find.
+
+    Raises:
+        ValueError: If a stiffness is infinite.
+    """
+    refuse_hard(model, "Explicit")
+    return min(_in_motion(*_linearised(one)) for one in _unlike(model))
+
+
+def _unlike(model):
+    """A model of one copy for each kind of copy that has limits of its own."""
+    B = model.copies
+    arrays = [model.inverse_mass, *(array for each in model.terms for array in (each.stiffness, each.rest, each.damping))]
+    rows = [array.numpy().reshape(B, -1) for array in arrays if array is not None and 0 not in array.strides]
+    first = {}
+    for copy in range(B):
+        first.setdefault(sha256(b"".join(row[copy].tobytes() for row in rows)).digest(), copy)
+    return [model.alone(copy) for copy in first.values()]
+
+
+def _linearised(model):
+    """∂²U/∂x² about the rest shape, and that of the dissipation, or None, each an assembled :class:`Hessian`."""
+    x = model.array(model.scene.mesh.points, model.vec3)
+    found = [Hessian(model, terms=[elements.taut(model.scene.mesh.points) for elements in model.terms]), None]
     damping = dissipations(model, 1.0)  # of stiffness β, and at rest the Hessian is that of a linear damper
-    if not damping:
-        return float(_root(_largest(K)[0], 0.0)), float(_root(k, 0.0).min(initial=np.inf))
-    Past(model, damping).launch(rest_shape)
-    C, c = _over_mass(model, damping, rest_shape)
+    if damping:
+        Past(model, damping).launch(x)
+        found[1] = Hessian(model, terms=damping)
+    for hessian in filter(None, found):
+        hessian.assemble(x, 0.0)
+    return found
+
+
+def _at_rest(stiff, damping):
+    """The first of :func:`step_limits`."""
+    K = _over_mass(stiff)
+    if damping is None:
+        return float(_root(_largest(K)[0], 0.0))
+    C = _over_mass(damping)
     h = _root(*(_largest(matrix)[0] for matrix in (K, C)))
     for _ in range(20):  # the first is too small, all others, by Rayleigh's principle, too large and falling
         _value, u = _largest(h * h * K + 2.0 * h * C)
         before, h = h, _root(u @ K @ u, u @ C @ u)
         if abs(h - before) <= 1e-6 * h:
             break
-    return float(h), float(_root(k, c).min(initial=np.inf))
+    return float(h)
+
+
+def _in_motion(stiff, damping):
+    """The second of :func:`step_limits`."""
+    return float(_root(_bounds(stiff), 0.0 if damping is None else _bounds(damping)).min(initial=np.inf))
 
 
 def fewest_substeps(fps, rest, motion):
@@ -120,22 +164,24 @@ def _root(k, c):
         return np.divide(4.0, c + np.sqrt(c * c + 4.0 * np.maximum(k, 0.0)))
 
 
-def _over_mass(model, terms, x):
-    """M^-½ ∂²U/∂x² M^-½ of ``terms`` at x as a scipy matrix (3N, 3N), and Gershgorin's bound of each row (N,) [1/s²]."""
+def _over_mass(hessian):
+    """M^-½ A M^-½ as a scipy matrix (3n, 3n) [1/s²]."""
     from scipy.sparse import diags
 
-    hessian = Hessian(model, terms=terms)
-    hessian.assemble(x, 0.0)
-    inverse_mass = model.inverse_mass.numpy().astype(np.float64)
-    root = diags(np.repeat(np.sqrt(inverse_mass), 3))
-    rows = np.zeros(model.count)
+    root = diags(np.repeat(np.sqrt(hessian.model.inverse_mass.numpy().astype(np.float64)), 3))
+    return (root @ hessian.matrix() @ root).tocsr()
+
+
+def _bounds(hessian):
+    """Gershgorin's bound of each row of the same (n,) [1/s²]."""
+    rows = np.zeros(hessian.model.count)
     for elements, blocks in zip(hessian.terms, hessian.blocks, strict=True):
         K = elements.term.vertices
         sizes = np.abs(blocks.numpy().astype(np.float64))
         # √(‖·‖₁‖·‖∞) is no less than the spectral norm, equal to it along the axes and diagonals of a grid, and cheap.
         norms = np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)).reshape(-1, K, K).sum(axis=2)
         np.add.at(rows, elements.stencil.numpy(), norms)
-    return (root @ hessian.matrix() @ root).tocsr(), rows * inverse_mass
+    return rows * hessian.model.inverse_mass.numpy()
 
 
 def _largest(matrix):
