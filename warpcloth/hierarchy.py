@@ -102,7 +102,7 @@ def levels(model, most=None):
 def _finest(model, free):
     """The bounds of a model's terms, (soft, hard): a hard bound must not be merged with a soft one of another length."""
     n, soft, hard = model.per_copy, [], []
-    points = model.scene.mesh.points
+    points = model.rest_points
     for elements in model.terms:
         if elements.term.reach is None:
             continue

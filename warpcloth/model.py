@@ -14,6 +14,7 @@ from .kernels.assemble import types
 from .kernels.term import Term
 from .precision import cast, refuse_coarse
 from .scene import refuse_far_pins
+from .selection import distinct_vertices
 
 _PINNED = 1e3  # what a pinned vertex of a cell counts, in masses of the rest of the cell: it does not move, so the cell must
 
@@ -155,6 +156,11 @@ class DeviceElements:
         origin = self.origin and replace(self.origin, rest=put(self.origin.rest), share=put(self.origin.share))
         return replace(self, **changed, origin=origin, cells=cells)
 
+    def by_lowest(self):
+        """The same elements in the order of their lowest vertices; themselves where that is theirs."""
+        lowest = self.stencil.numpy().min(axis=1)
+        return self.reordered(np.argsort(lowest, kind="stable")) if (np.diff(lowest) < 0).any() else self
+
     def taut(self, points):
         """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
         if not self.term.slack:
@@ -185,6 +191,10 @@ class Model:
         vary: What differs between the copies, by name, each with B entries: ``"gravity"`` (B, 3), ``"density"`` (B,),
             ``"masses"`` (B, n), ``"positions"`` and ``"velocities"`` (B, n, 3), and of terms, by their name or class,
             ``"Spring.stiffness"`` and ``"Spring.damping"``, (B,) or (B, E).
+        order: The scene's vertices in the order that the model has them in, (n,), such as
+            :func:`warpcloth.ordering.near_order` gives; elements are then in the order of their lowest vertices there. All
+            arguments here, and what is said of them, have the scene's own order, and all attributes and what solvers make of
+            them have this one; :meth:`in_scene_order` leads back. None keeps the scene's, of vertices and elements.
 
     Attributes:
         positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
@@ -192,6 +202,9 @@ class Model:
         gravity: (B,) vectors [m/s²].
         pins, keyframes: Moved pins (p,) and their places (F, p) [m], or None.
         terms: One :class:`DeviceElements` for each declared term.
+        rest_points: Rest shape of one copy, (n, 3) [m].
+        order: As given, int32, or None.
+        places: Where each vertex of the scene is in a copy, (n,) int32; None without an order.
         kernels: Names of the kernels that solvers asked for.
         launches: How many launches there have been, a list of one that models of other terms share.
 
@@ -199,7 +212,7 @@ class Model:
         ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
     """
 
-    def __init__(self, scene, device="cpu", dtype="float32", copies=1, vary=None):
+    def __init__(self, scene, device="cpu", dtype="float32", copies=1, vary=None, order=None):
         choice("dtype", dtype, tuple(DTYPES))
         whole("copies", copies, 1)
         copies = int(copies)
@@ -210,6 +223,10 @@ class Model:
         self.per_copy = len(scene.mesh.points)
         self.count = copies * self.per_copy
         self.kernels, self.launches = set(), [0]
+        self.order = self.places = None
+        self.rest_points = scene.mesh.points
+        if order is not None:
+            self._set_order(order)
         vary = _Varied({} if vary is None else vary, copies)
 
         masses = self._varied_masses(vary)
@@ -234,10 +251,27 @@ class Model:
             refuse_coarse(
                 scene.mesh, places, self.numpy_dtype, lambda frame, i: f"keyframe {frame} of pinned vertex {vertices[i]}"
             )
-            self.pins = wp.array(vertices, dtype=wp.int32, device=self.device)
+            self.pins = wp.array(self._placed(vertices), dtype=wp.int32, device=self.device)
             self.keyframes = self.array(places, self.vec3)
         self.terms = tuple(self._on_device(term, positions, vary) for term in scene.terms)
         vary.refuse_rest()
+
+    def _set_order(self, order):
+        self.order = distinct_vertices("order", order, self.scene.mesh)
+        if len(self.order) != self.per_copy:
+            raise ValueError(f"order names {len(self.order)} vertices; it must name each of the {self.per_copy} once")
+        self.places = np.argsort(self.order).astype(np.int32)
+        self.rest_points = self.scene.mesh.points[self.order]
+
+    def _placed(self, vertices):
+        """Where vertices of the scene are in a copy."""
+        return vertices if self.places is None else self.places[vertices]
+
+    def in_scene_order(self, values):
+        """NumPy ``values`` of all vertices (B·n, …) in the order of the scene; the same array where that is the model's."""
+        if self.places is None:
+            return values
+        return values.reshape(self.copies, self.per_copy, *values.shape[1:])[:, self.places].reshape(values.shape)
 
     def with_terms(self, terms):
         """This model with other :class:`DeviceElements`, all else shared."""
@@ -286,6 +320,8 @@ class Model:
     def _put(self, name, unit, values, dtype, each="vertex", infinite=False):
         """Values (B, count, …) on the device, one row after another, as :func:`warpcloth.precision.cast` lets them be."""
         held = cast(name, unit, values, self.numpy_dtype, lambda copy, i: self._place(each, copy, i), infinite)
+        if each == "vertex" and self.order is not None:
+            held = held[:, self.order]
         return self.array(held.reshape(-1, *held.shape[2:]), dtype)
 
     def _place(self, each, copy, i):
@@ -315,7 +351,10 @@ class Model:
         copies = [term.elements(self.scene.mesh, start) for start in (positions if vary.has("positions") else positions[:1])]
         one = copies[0]
         E = len(one.stencil)
-        stencil = one.stencil[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
+        vertices = self._placed(one.stencil)
+        if self.order is not None and vertices.shape[1] == 2:
+            vertices = np.sort(vertices, axis=1)  # a pair has no direction, and sweeps save a comparison
+        stencil = vertices[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
         rest = np.stack([copy.rest for copy in copies] * (self.copies // len(copies)))
         stiffness = vary.take_of_elements("stiffness", one, E if one.cells is None else len(one.cells) - 1)
         for copy, e in np.argwhere(~(stiffness >= 0.0))[:1]:
@@ -331,7 +370,7 @@ class Model:
             cells, rest = self._cells(one)
             if stiffness.shape[1] > 1:
                 stiffness = np.repeat(stiffness, np.diff(one.cells), axis=1)
-        return DeviceElements(
+        found = DeviceElements(
             label=one.label,
             kind=one.kind,
             term=one.term,
@@ -343,6 +382,7 @@ class Model:
             damping=self._broadcast(f"{one.label}.damping", damping, E) if damping.any() else None,
             cells=cells,
         )
+        return found if self.order is None or cells else found.by_lowest()
 
     def _cells(self, elements):
         """:class:`Cells` of a term's :class:`warpcloth.terms.Elements`, and its rest state with the masses, (B, E, P)."""
@@ -350,9 +390,10 @@ class Model:
         sizes = np.diff(elements.cells)
         shape = (self.copies, self.per_copy)
         mass, inverse = (array.numpy().astype(np.float64).reshape(shape) for array in (self.mass, self.inverse_mass))
-        weight = np.where(inverse > 0.0, mass, 0.0)[:, vertices]
+        places = self._placed(vertices)
+        weight = np.where(inverse > 0.0, mass, 0.0)[:, places]
         body = np.repeat(np.add.reduceat(weight, firsts, axis=1), sizes, axis=1)
-        weight = np.where(inverse[:, vertices] > 0.0, weight, np.where(body > 0.0, _PINNED * body, 1.0))
+        weight = np.where(inverse[:, places] > 0.0, weight, np.where(body > 0.0, _PINNED * body, 1.0))
         points = np.broadcast_to(self.scene.mesh.points[vertices], (self.copies, len(vertices), 3))
         points = points - np.repeat(points[:, firsts], sizes, axis=1)
         total = np.add.reduceat(weight, firsts, axis=1)
@@ -361,7 +402,7 @@ class Model:
         cells = Cells(
             wp.array(offsets.astype(np.int32), dtype=wp.int32, device=self.device),
             len(sizes),
-            self._put(f"{elements.label}: shape", "m", points - np.repeat(centre, sizes, axis=1), self.vec3),
+            self._put(f"{elements.label}: shape", "m", points - np.repeat(centre, sizes, axis=1), self.vec3, "element"),
         )
         rest = np.zeros((*weight.shape, elements.term.parameters))
         rest[..., -1] = weight

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from .capture import on_host
+from .ordering import worthwhile_order
 from .status import Result, Status
 
 
@@ -77,7 +78,7 @@ def simulate(
     # First, for it refuses a wrong output before anything compiles.
     recorder = None if output is None else _File(scene, output, single_file)
     start = time.perf_counter()
-    model = scene.build(device=device, dtype=dtype, copies=copies, vary=vary)
+    model = scene.build(device=device, dtype=dtype, copies=copies, vary=vary, order=worthwhile_order(scene, solver))
     stepper = solver.bind(model)
     timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds, "frames": []}
     recorder = recorder or _Memory(model, frames)
@@ -105,9 +106,11 @@ def simulate(
 
 
 def _frame(stepper):
-    """Points and velocities on the host, (B·n, 3)."""
-    on_host(stepper.model.device, "reading a frame")
-    return np.array(stepper.state.x.numpy()), np.array(stepper.state.v.numpy())  # on the CPU numpy() is a view
+    """Points and velocities on the host, (B·n, 3), in the order of the scene."""
+    model = stepper.model
+    on_host(model.device, "reading a frame")
+    # A copy in any case: on the CPU numpy() is a view.
+    return tuple(np.array(model.in_scene_order(array.numpy()), order="C") for array in stepper.state)
 
 
 class Watch:
@@ -118,6 +121,8 @@ class Watch:
     can swing a cloth up without end), plus l a second, below which nothing is called fast. Of hard constraints the start
     counts with what closes their gap in one step. Ten times that is called diverged, and so are what is not finite and a step
     of the solver that says so: a diverging run grows by a factor a step and passes any such bound at once.
+
+    Frames come in the order of the scene.
 
     Args:
         model: The :class:`warpcloth.model.Model`.
@@ -138,10 +143,9 @@ class Watch:
         self.worst_strain, self.messages = 0.0, {}
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.fastest = np.zeros(model.copies)
-        points, velocities = (array.numpy().astype(np.float64) for array in (model.positions, model.velocities))
-        self.mass = (
-            np.where(model.inverse_mass.numpy() > 0.0, model.mass.numpy(), 0.0).reshape(model.copies, -1).astype(np.float64)
-        )
+        start = (model.positions, model.velocities, model.mass, model.inverse_mass)
+        points, velocities, mass, inverse = (model.in_scene_order(array.numpy()).astype(np.float64) for array in start)
+        self.mass = np.where(inverse > 0.0, mass, 0.0).reshape(model.copies, -1)
         self.total = np.where(self.mass.any(axis=1), self.mass.sum(axis=1), 1.0)
         self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         size = np.linalg.norm(np.ptp(points.reshape(model.copies, -1, 3), axis=1), axis=1)

@@ -15,6 +15,8 @@ from .operators import fit_cells
 # By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
 # the largest n of its vertices. Jacobi: the plain sum.
 SWEEPS = ("vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential")
+# Gauss–Seidel: what an element sees depends on those before it.
+IN_PLACE = ("coloured", "sequential")
 
 
 def colours(constraints, free):
@@ -83,7 +85,7 @@ class Sweep:
     def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None, correction=None):
         self.model, self.x, self.h, self.relaxation = model, x, h, relaxation
         self.spread = spread or 1
-        self.in_place, self.ordered = kind in ("coloured", "sequential"), kind == "sequential"
+        self.in_place, self.ordered = kind in IN_PLACE, kind == "sequential"
         self.correction = model.vectors() if correction is None else correction
         self.elements, self.ranges = list(model.terms), [[(0, (elements.cells or elements).count)] for elements in model.terms]
         if kind == "coloured":

@@ -142,7 +142,7 @@ class ADMMStepper(Stepper):
         if elements.term.project is not None:
             return model.constant(1.0, elements.count)
         scale = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
-        rest_shape = model.array(np.tile(model.scene.mesh.points, (model.copies, 1)), model.vec3)
+        rest_shape = model.array(np.tile(model.rest_points, (model.copies, 1)), model.vec3)
         kernel = model.kernel(kernels.stiffness_scale, elements.term, model.dtype)
         model.launch(kernel, elements.count, [*elements.arguments, rest_shape], [scale])
         found = scale.numpy()

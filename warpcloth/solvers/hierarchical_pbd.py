@@ -44,6 +44,8 @@ class HierarchicalPBD(Step):
         ValueError: If an option breaks a rule.
     """
 
+    ordered = True
+
     iterations: int = 20
     coarse_iterations: int = 5
     levels: int | None = None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ..checks import choice, number, whole
 from ..damping import Past
-from ..sweeps import SWEEPS, Sweep, refuse_unprojectable
+from ..sweeps import IN_PLACE, SWEEPS, Sweep, refuse_unprojectable
 from .solver import LaunchedStepper, Step, require_model
 
 
@@ -52,6 +52,10 @@ class PBD(Step):
         choice("stiffness", self.stiffness, ("per-sweep", "per-step"))
         if self.sweep != "vertex-averaged" and self.alpha != 0.0:
             raise ValueError(f"alpha is {self.alpha:g}; it belongs to sweep='vertex-averaged' and must be 0 without")
+
+    @property
+    def ordered(self):
+        return self.sweep in IN_PLACE
 
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.

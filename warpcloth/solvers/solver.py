@@ -1,7 +1,7 @@
 """What all solvers share: the options of the step and the state of a bound solver."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -31,10 +31,13 @@ class Step:
     Attributes:
         dt: Step [s]; 1/(fps·dt) must be a whole number.
         substeps: Steps a frame.
+        ordered: Whether the result depends on the order of elements by more than rounding.
 
     Raises:
         ValueError: If both or neither are given, or they are not above 0.
     """
+
+    ordered: ClassVar[bool] = False
 
     dt: float | None = None
     substeps: int | None = None

@@ -12,7 +12,7 @@ from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..operators import Gradient, Sums
 from ..status import Result
-from ..sweeps import Sweep, refuse_unprojectable
+from ..sweeps import IN_PLACE, Sweep, refuse_unprojectable
 from .solver import ImplicitStep, LaunchedStepper, refuse_hard, require_model
 
 
@@ -69,6 +69,10 @@ class XPBD(ImplicitStep):
                 f'iterations is {self.iterations}; with integrator="midpoint" sweeps go forward and backward in turn, '
                 "so that it must be even"
             )
+
+    @property
+    def ordered(self):
+        return self.sweep in IN_PLACE
 
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.

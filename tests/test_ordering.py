@@ -1,0 +1,243 @@
+"""Vertices renumbered for memory: what a run gives is in the scene's own order, the same but for rounding."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth import ordering, scene_files
+from warpcloth.cli import main
+from warpcloth.ordering import near_order, spread, worthwhile_order
+from warpcloth.scenes import flag, hanging
+from warpcloth.usd import FrameSequence
+
+RANDOM = np.random.default_rng(2)
+
+
+def shuffled(scene, seed=0):
+    """A scene of springs and bending with its vertices at random places, and which vertex each is in the other."""
+    mesh = scene.mesh
+    order = np.random.default_rng(seed).permutation(len(mesh.points))
+    places = np.argsort(order)
+    springs, bending = scene.terms
+    changed = wc.Scene(
+        wc.Mesh(mesh.points[order], places[mesh.triangles]),
+        density=0.1,
+        positions=scene.positions[order],
+        terms=[replace(springs, pairs=places[springs.stencil(mesh)]), bending],
+        pins=wc.Pins(places[scene.pins.vertices], scene.pins.keyframes),
+        duration=scene.duration,
+    )
+    return changed, order
+
+
+@pytest.fixture
+def always(monkeypatch):
+    """Small meshes are renumbered too."""
+    monkeypatch.setattr(ordering, "LEAST", 0)
+
+
+@pytest.mark.parametrize("pattern", ["diagonal", "alternating", "equilateral"])
+def test_neighbours_of_a_shuffled_grid_come_near(pattern):
+    """Edges stay within a level of Cuthill and McKee's or lead to the next; from a corner a level is less than 2n vertices."""
+    n = 24
+    grid = wc.Mesh.grid(n, n, pattern=pattern)
+    places = RANDOM.permutation(n * n)
+    mesh = wc.Mesh(grid.points[np.argsort(places)], places[grid.triangles])
+    order = near_order(mesh)
+    assert np.array_equal(np.sort(order), np.arange(n * n))
+    assert np.abs(np.diff(np.argsort(order)[mesh.edges], axis=1)).max() < 4 * n
+    # Of two places at random |i − j| is n²/3 in the mean; two levels of 2n at most leave less.
+    assert spread(mesh, order) < 2 * n < 0.9 * n * n / 3 < spread(mesh)
+
+
+def test_parts_that_do_not_hang_together_are_all_there():
+    mesh = wc.Mesh(RANDOM.normal(size=(7, 3)), edges=[[6, 0], [2, 4]])
+    assert np.array_equal(np.sort(near_order(mesh)), np.arange(7))
+
+
+@pytest.mark.parametrize(
+    ("solver", "wanted"),
+    [
+        (wc.Explicit(substeps=1), True),
+        (wc.ProjectiveDynamics(substeps=1), True),
+        (wc.PBD(substeps=1, sweep="jacobi"), True),
+        (wc.XPBD(substeps=1, sweep="constraint-averaged"), True),
+        (wc.PBD(substeps=1), False),
+        (wc.PBD(substeps=1, sweep="sequential"), False),
+        (wc.XPBD(substeps=1), False),
+        (wc.HierarchicalPBD(substeps=1), False),
+    ],
+    ids=lambda value: getattr(value, "sweep", type(value).__name__),
+)
+def test_only_what_gains_and_does_not_change_is_renumbered(solver, wanted, monkeypatch):
+    ordered = hanging.scene(n=16)
+    random, _order = shuffled(ordered)
+    assert worthwhile_order(random, solver) is None  # so few
+    monkeypatch.setattr(ordering, "LEAST", 256)
+    assert (worthwhile_order(random, solver) is not None) == wanted
+    assert worthwhile_order(ordered, solver) is None
+
+
+SOLVERS = {
+    "explicit": wc.Explicit(substeps=64),
+    "newton": wc.Newton(substeps=4, tolerance=1e-10),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=4),
+    "admm": wc.ADMM(substeps=4),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=4),
+    "pbd, averaged": wc.PBD(substeps=4, sweep="vertex-averaged"),
+}
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_any_order_gives_the_same_motion(solver, copies, device):
+    """Of everything that a scene names by vertex or element, and that copies vary; the order need not be a good one.
+
+    float64 rounds by 1e-16, and iterations end at different roundings.
+    """
+    mesh = wc.Mesh.grid(6, 5, pattern="alternating")
+    n, edges = len(mesh.points), len(mesh.edges)
+    random = np.random.default_rng(5)
+    positions = mesh.points * [1.01, 1.0, 1.02]
+    keyframes = positions[[4, 0]] + 0.01 * np.arange(6)[:, None, None] * [1.0, 2.0, 0.0]
+    scene = wc.Scene(
+        mesh,
+        masses=random.uniform(1e-3, 2e-3, n),
+        positions=positions,
+        velocities=random.normal(scale=0.1, size=(n, 3)),
+        terms=[
+            wc.Spring(stiffness=random.uniform(50.0, 100.0, edges), rest_lengths=random.uniform(0.19, 0.21, edges)),
+            wc.QuadraticBending(stiffness=random.uniform(1e-4, 1e-3, len(mesh.hinges))),
+            wc.Attachment(vertices=[7, 29], targets=[[0.0, 0.5, 0.0], [1.0, 0.2, 1.0]], stiffness=[1.0, 2.0]),
+        ],
+        pins=wc.Pins([4, 0], keyframes),
+        duration=0.1,
+    )
+    vary = (
+        None
+        if copies == 1
+        else {
+            "masses": random.uniform(1e-3, 2e-3, (copies, n)),
+            "Spring.stiffness": random.uniform(50.0, 100.0, (copies, edges)),
+            "velocities": random.normal(scale=0.1, size=(copies, n, 3)),
+        }
+    )
+    build = {"device": device, "dtype": "float64", "copies": copies, "vary": vary}
+    found = []
+    for order in (None, random.permutation(n)):
+        stepper = SOLVERS[solver].bind(scene.build(order=order, **build))
+        for _ in range(6):
+            stepper.frame()
+        found.append([stepper.model.in_scene_order(array.numpy()) for array in stepper.state])
+    for as_declared, renumbered in zip(*found, strict=True):
+        np.testing.assert_allclose(renumbered, as_declared, rtol=0, atol=1e-9)
+
+
+def test_bodies_move_the_same_in_any_order(device):
+    """Rigid clusters name vertices body by body, and their rest shape is about the centre of their masses."""
+    mesh = wc.Mesh.grid(6, 5)
+    scene = wc.Scene(
+        mesh,
+        masses=RANDOM.uniform(1e-3, 2e-3, 30),
+        terms=[wc.Spring(stiffness=50.0), wc.RigidCluster(vertices=[[0, 1, 7, 6], [29, 28, 22]], stiffness=1e3)],
+        pins=[0],
+    )
+    found = []
+    for order in (None, RANDOM.permutation(30)):
+        stepper = wc.Explicit(substeps=32).bind(scene.build(device=device, dtype="float64", order=order))
+        for _ in range(6):
+            stepper.frame()
+        found.append(stepper.model.in_scene_order(stepper.state.x.numpy()))
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_frames_come_in_the_order_of_the_scene(copies, always, device):
+    """A shuffled flag moves as the flag, vertex by vertex, though the model has them in another order."""
+    plain = flag.scene(nx=12, ny=8, duration=0.2)
+    random, order = shuffled(plain)
+    solver = wc.Explicit(substeps=64)
+    assert worthwhile_order(random, solver) is not None
+    run = {"device": device, "dtype": "float64", "copies": copies}
+    expected, found = (wc.simulate(scene, solver, **run) for scene in (replace(plain, density=0.1), random))
+    np.testing.assert_allclose(found.points, expected.points[..., order, :], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(found.velocities, expected.velocities[..., order, :], rtol=0, atol=1e-9)
+    assert found.worst_strain == pytest.approx(expected.worst_strain, rel=1e-9)
+
+
+@pytest.mark.parametrize("ending", ["usdc", "usdz"])
+def test_files_are_in_the_order_of_the_scene(ending, always, tmp_path, device):
+    """Written, read, and run again from what was read."""
+    random, _order = shuffled(flag.scene(nx=12, ny=8, duration=0.1))
+    solver, output = wc.Explicit(substeps=64), tmp_path / f"out.{ending}"
+    kept = wc.simulate(random, solver, device=device)
+    wc.simulate(random, solver, device=device, output=str(output))
+    mesh = wc.Mesh.load(output)
+    assert np.array_equal(mesh.triangles, random.mesh.triangles)
+    assert np.array_equal(np.asarray(FrameSequence(output)), kept.points)
+    again = wc.simulate(replace(random, mesh=wc.Mesh(random.mesh.points, mesh.triangles)), solver, device=device)
+    assert np.array_equal(again.points, kept.points)
+
+
+def test_a_vertex_that_is_not_finite_has_its_own_number(always, device):
+    """float32 does not hold the forces of the second step on a vertex that flies off, and on its neighbours."""
+    random, _order = shuffled(flag.scene(nx=12, ny=8, duration=0.1))
+    springs = random.terms[0]
+    free = np.setdiff1d(np.arange(96), random.pins.vertices)
+    pairs = springs.stencil(random.mesh)
+    ends = {vertex: np.intersect1d(pairs[(pairs == vertex).any(axis=1)], free)[0] for vertex in free.tolist()}
+    vertex = max(ends, key=ends.get)
+    velocities = np.zeros((96, 3))
+    velocities[vertex] = 1e38
+    stray = replace(random, velocities=velocities, terms=[springs])
+    status = wc.simulate(stray, wc.Explicit(substeps=2, above_limit="allow"), device=device).status
+    assert status.message == f"diverged in frame 1: vertex {ends[vertex]} is not finite"
+
+
+SCENE = """
+import numpy as np
+import warpcloth as wc
+
+def scene():
+    grid = wc.Mesh.grid(9, 9)
+    places = np.random.default_rng(4).permutation(81)
+    mesh = wc.Mesh(grid.points[np.argsort(places)], places[grid.triangles])
+    return wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=50.0)], pins=[int(places[0])], duration=0.1)
+"""
+
+
+def test_the_command_renumbers_a_model_that_it_has_built_already(tmp_path, always, capfd, monkeypatch):
+    """Of explicit steps that it chooses it builds one, to find their limits."""
+    built = []
+    build = wc.Scene.build
+    monkeypatch.setattr(wc.Scene, "build", lambda scene, **options: built.append(build(scene, **options)) or built[-1])
+    (tmp_path / "sheet.py").write_text(SCENE)
+    output = tmp_path / "out.usdc"
+    assert main(["run", str(tmp_path / "sheet.py"), "--solver", "explicit", "--json", "-o", str(output)]) == 0
+    substeps = json.loads(capfd.readouterr().out)["options"]["substeps"]
+    assert len(built) == 1 and built[0].order is not None
+    scene = scene_files.find_source(str(tmp_path / "sheet.py")).scene({})
+    monkeypatch.setattr(ordering, "LEAST", 1000)
+    expected = wc.simulate(scene, wc.Explicit(substeps=substeps)).points
+    # Of float32 every step rounds; a tenth of a second of a swing multiplies that by little.
+    np.testing.assert_allclose(np.asarray(FrameSequence(output)), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("order", "message"),
+    [
+        (np.arange(34), "order names 34 vertices; it must name each of the 35 once"),
+        ([0, 0, *range(1, 34)], "order names vertex 0 twice; each may stand once"),
+        (np.arange(1, 36), "order[34] is 35; it must lie in 0 … 34"),
+        (np.ones((35, 2)), "order has shape (35, 2) and type float64; it must be a list of whole numbers"),
+    ],
+    ids=["too few", "twice", "beyond", "no list"],
+)
+def test_an_order_that_is_none_is_refused(order, message):
+    sheet = wc.Scene(wc.Mesh.grid(7, 5), density=0.1, terms=[wc.Spring(stiffness=1.0)])
+    with pytest.raises(ValueError) as error:
+        sheet.build(order=order)
+    assert str(error.value) == message
