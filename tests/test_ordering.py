@@ -11,6 +11,8 @@ from warpcloth import ordering, scene_files
 from warpcloth.cli import main
 from warpcloth.ordering import near_order, spread, worthwhile_order
 from warpcloth.scenes import flag, hanging
+from warpcloth.simulate import Watch
+from warpcloth.solvers.explicit import step_limits
 from warpcloth.usd import FrameSequence
 
 RANDOM = np.random.default_rng(2)
@@ -152,6 +154,33 @@ def test_bodies_move_the_same_in_any_order(device):
             stepper.frame()
         found.append(stepper.model.in_scene_order(stepper.state.x.numpy()))
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-11)
+
+
+def test_what_is_found_of_a_scene_is_the_same_in_any_order(device):
+    """Limits of the step, of terms that are at rest in the rest shape; and what a run is watched by."""
+    mesh = wc.Mesh.grid(6, 5, pattern="equilateral")
+    mesh = wc.Mesh(mesh.points + RANDOM.normal(scale=0.02, size=(30, 3)), mesh.triangles)
+    terms = [wc.StrainLimit(stiffness=50.0, least=0.9, most=1.1), wc.DihedralBending(stiffness=1e-3)]
+    scene = wc.Scene(mesh, masses=RANDOM.uniform(1e-3, 2e-3, 30), terms=terms, pins=[0, 5])
+    one, other = (scene.build(device=device, dtype="float64", order=order) for order in (None, RANDOM.permutation(30)))
+    np.testing.assert_allclose(step_limits(other), step_limits(one), rtol=1e-4)  # to which eigenvalues are found
+    assert np.array_equal(Watch(other, 0.01).mass, Watch(one, 0.01).mass)
+
+
+def test_elements_follow_their_vertices(device):
+    """In the order of their lowest vertices, which of pairs come first; what each has goes with it."""
+    scene, _order = shuffled(flag.scene(nx=6, ny=5))
+    stiffness = np.arange(1.0, 1.0 + len(scene.terms[0].pairs))
+    scene = replace(scene, terms=[replace(scene.terms[0], stiffness=stiffness), scene.terms[1]])
+    order = near_order(scene.mesh)
+    springs, hinges = scene.build(device=device, copies=2, order=order).terms
+    for elements in (springs, hinges):
+        assert (np.diff(elements.stencil.numpy().min(axis=1)) >= 0).all()
+    stencil = springs.stencil.numpy()
+    assert (stencil[:, 0] < stencil[:, 1]).all()
+    half = len(stiffness)
+    found = dict(zip(map(frozenset, order[stencil[half:] - 30].tolist()), springs.stiffness.numpy()[half:], strict=True))
+    assert found == dict(zip(map(frozenset, scene.terms[0].pairs.tolist()), stiffness, strict=True))
 
 
 @pytest.mark.parametrize("copies", [1, 2])
