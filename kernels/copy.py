@@ -1,8 +1,10 @@
-"""A copy from array to array, to measure what a kernel can move at most."""
+"""Copies from array to array: rows, to measure what a kernel can move at most, and vertices in another order."""
 
 from functools import cache
 
 import warp as wp
+
+from .assemble import types
 
 
 @cache
@@ -20,3 +22,23 @@ def copy_rows():
         out[i] = source[i]
 
     return copy_each_row
+
+
+@cache
+def take_vertices(dtype):
+    """Kernel over the vertices of all copies: out = the values of each copy at places (n,)."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def take_each_vertex(
+        # in
+        values: wp.array(dtype=vec3),
+        places: wp.array(dtype=wp.int32),
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        n = places.shape[0]
+        out[i] = values[i // n * n + places[i % n]]
+
+    return take_each_vertex

@@ -1,14 +1,19 @@
 """The frame loop: a scene and a solver in, an animation out."""
 
 import time
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from .capture import on_host
+from .frames import frames_of, state_of
 from .ordering import worthwhile_order
 from .status import Result, Status
+
+# Frames that a device computes beyond the one that is watched and written: one to go on with, one where writing a chunk of
+# them takes longer than a frame.
+AHEAD = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,33 +89,23 @@ def simulate(
     recorder = recorder or _Memory(model, frames)
     watch = Watch(model, stepper.h)
     try:
-        recorder.append(*_frame(stepper))
+        recorder.append(*state_of(stepper))
         if progress is not None:
             progress(0, frames)
-        for frame in range(1, frames + 1):
-            began = time.perf_counter()
-            stepper.frame()
-            points, velocities = _frame(stepper)
-            timings["frames"].append(time.perf_counter() - began)
-            if not watch.passes(frame, points, velocities, stepper.results):
-                break
-            recorder.append(points, velocities)
-            if progress is not None:
-                progress(frame, frames)
+        with closing(frames_of(stepper, frames, AHEAD if model.device.is_cuda else 0)) as found:
+            for number, frame in enumerate(found, start=1):
+                timings["frames"].append(frame.seconds)
+                if not watch.passes(number, frame.points, frame.velocities, frame.results):
+                    break
+                recorder.append(frame.points, frame.velocities)
+                if progress is not None:
+                    progress(number, frames)
     finally:
         recorder.close()
-    status = watch.status(stepper)
+    status = watch.status(frame.results, frame.residual)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     return Animation(points, velocities, times, status, timings, watch.worst_strain, output)
-
-
-def _frame(stepper):
-    """Points and velocities on the host, (B·n, 3), in the order of the scene."""
-    model = stepper.model
-    on_host(model.device, "reading a frame")
-    # A copy in any case: on the CPU numpy() is a view.
-    return tuple(np.array(model.in_scene_order(array.numpy()), order="C") for array in stepper.state)
 
 
 class Watch:
@@ -210,10 +205,10 @@ class Watch:
         self.worst_strain = max(self.worst_strain, float(strain.max(initial=0.0)))
         return True
 
-    def status(self, stepper):
-        """The :class:`Status` of the run."""
-        results = [Result.DIVERGED if copy in self.messages else result for copy, result in enumerate(stepper.results)]
-        worst, residual = results[0], float(stepper.residual.max())
+    def status(self, results, residual):
+        """The :class:`Status` of a run whose copies ended with these."""
+        results = [Result.DIVERGED if copy in self.messages else result for copy, result in enumerate(results)]
+        worst, residual = results[0], float(residual.max())
         for result in results[1:]:
             worst = worst.worse(result)
         message = worst.value

@@ -1,0 +1,137 @@
+"""The frames of a run on the host, in the order of the scene; computed ahead where the host would keep the device waiting."""
+
+import itertools
+import time
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from .capture import on_host
+from .kernels.copy import take_vertices
+
+
+class Frame(NamedTuple):
+    """A frame, and what its stepper said of it.
+
+    Attributes:
+        points: (B·n, 3) [m], in the order of the scene; as the velocities an array of its own.
+        velocities: (B·n, 3) [m/s].
+        results: The worst :class:`warpcloth.status.Result` of each copy until then, a list of B.
+        residual: The largest residual of each copy until then, (B,).
+        seconds: What computing it took; on CUDA as its clock says.
+    """
+
+    points: np.ndarray
+    velocities: np.ndarray
+    results: list
+    residual: np.ndarray
+    seconds: float
+
+
+def frames_of(stepper, count, ahead):
+    """The next frames of a stepper, as a generator that must be closed: it waits for what is still being computed.
+
+    While one is in use a thread computes those after it. The first is computed alone, for it may record graphs, beside which
+    the device takes nothing else.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`; closed early it has gone on further than the last frame taken.
+        count: How many.
+        ahead: The most that are computed beyond the one in use; 0 computes each when it is asked for, without a thread.
+    """
+    kind = _DeviceCopy if stepper.model.device.is_cuda else _HostCopy
+    copies = itertools.cycle([kind(stepper) for _ in range(max(ahead, 1))])
+
+    def compute():
+        copy = next(copies)
+        copy.frame()
+        return copy, list(stepper.results), np.array(stepper.residual)
+
+    def taken(copy, results, residual):
+        points, velocities, seconds = copy.take()
+        return Frame(points, velocities, results, residual, seconds)
+
+    first = taken(*compute())
+    if ahead == 0:
+        yield first
+        for _ in range(count - 1):
+            yield taken(*compute())
+        return
+    with ThreadPoolExecutor(1, thread_name_prefix="frames") as pool:
+        try:
+            pending = deque(pool.submit(compute) for _ in range(min(ahead, count - 1)))
+            yield first
+            for left in range(count - 1, 0, -1):
+                found = taken(*pending.popleft().result())
+                if left > ahead:
+                    pending.append(pool.submit(compute))  # in the buffers that are free now
+                yield found
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def state_of(stepper):
+    """Points and velocities as they are now, (B·n, 3) each, in the order of the scene, as arrays of their own."""
+    model = stepper.model
+    on_host(model.device, "reading a frame")
+    return tuple(np.array(model.in_scene_order(array.numpy())) for array in stepper.state)  # on the CPU numpy() is a view
+
+
+class _HostCopy:
+    """A frame that is computed on the host."""
+
+    def __init__(self, stepper):
+        self.stepper = stepper
+
+    def frame(self):
+        began = time.perf_counter()
+        self.stepper.frame()
+        self._state = state_of(self.stepper)
+        self._seconds = time.perf_counter() - began
+
+    def take(self):
+        return *self._state, self._seconds
+
+
+class _DeviceCopy:
+    """A frame on its way from the device: x and v put in the order of the scene, and copied from there by a second stream.
+
+    So the next frame begins while this one is copied, and who takes it waits for its event alone.
+    """
+
+    def __init__(self, stepper):
+        self.stepper = stepper
+        model, device = stepper.model, stepper.model.device
+        on_host(device, "reading a frame")
+        self._stream = wp.Stream(device)
+        self._began, self._ended = (wp.Event(device, enable_timing=True) for _ in range(2))
+        self._copied = wp.Event(device)
+        self._found = [model.vectors() for _ in stepper.state]
+        self._host = [wp.empty_like(array, device="cpu", pinned=True) for array in self._found]
+        self._places = None
+        if model.places is not None:
+            self._places = wp.array(model.places, dtype=wp.int32, device=device)
+            self._take = model.kernel(take_vertices, model.dtype)
+
+    def frame(self):
+        model, stream = self.stepper.model, self.stepper.model.device.stream
+        stream.record_event(self._began)
+        self.stepper.frame()
+        for array, found in zip(self.stepper.state, self._found, strict=True):
+            if self._places is None:
+                wp.copy(found, array)
+            else:
+                model.launch(self._take, model.count, [array, self._places], [found])
+        stream.record_event(self._ended)
+        self._stream.wait_event(self._ended)
+        for found, host in zip(self._found, self._host, strict=True):
+            wp.copy(host, found, stream=self._stream)
+        self._stream.record_event(self._copied)
+
+    def take(self):
+        wp.synchronize_event(self._copied)
+        seconds = 1e-3 * wp.get_event_elapsed_time(self._began, self._ended, synchronize=False)
+        return *(np.array(host.numpy()) for host in self._host), seconds
