@@ -9,7 +9,7 @@ import pytest
 import warpcloth as wc
 from warpcloth import ordering, scene_files
 from warpcloth.cli import main
-from warpcloth.ordering import near_order, spread, worthwhile_order
+from warpcloth.ordering import near_order, spread, order_of_run
 from warpcloth.scenes import flag, hanging
 from warpcloth.simulate import Watch
 from warpcloth.solvers.explicit import step_limits
@@ -77,10 +77,10 @@ def test_parts_that_do_not_hang_together_are_all_there():
 def test_only_what_gains_and_does_not_change_is_renumbered(solver, wanted, monkeypatch):
     ordered = hanging.scene(n=16)
     random, _order = shuffled(ordered)
-    assert worthwhile_order(random, solver) is None  # so few
+    assert order_of_run(random, solver) is None  # so few
     monkeypatch.setattr(ordering, "LEAST", 256)
-    assert (worthwhile_order(random, solver) is not None) == wanted
-    assert worthwhile_order(ordered, solver) is None
+    assert (order_of_run(random, solver) is not None) == wanted
+    assert order_of_run(ordered, solver) is None
 
 
 SOLVERS = {
@@ -189,7 +189,7 @@ def test_frames_come_in_the_order_of_the_scene(copies, always, device):
     plain = flag.scene(nx=12, ny=8, duration=0.2)
     random, order = shuffled(plain)
     solver = wc.Explicit(substeps=64)
-    assert worthwhile_order(random, solver) is not None
+    assert order_of_run(random, solver) is not None
     run = {"device": device, "dtype": "float64", "copies": copies}
     expected, found = (wc.simulate(scene, solver, **run) for scene in (replace(plain, density=0.1), random))
     np.testing.assert_allclose(found.points, expected.points[..., order, :], rtol=0, atol=1e-11)
@@ -224,6 +224,21 @@ def test_a_vertex_that_is_not_finite_has_its_own_number(always, device):
     stray = replace(random, velocities=velocities, terms=[springs])
     status = wc.simulate(stray, wc.Explicit(substeps=2, above_limit="allow"), device=device).status
     assert status.message == f"diverged in frame 1: vertex {ends[vertex]} is not finite"
+
+
+@pytest.mark.parametrize(("weights", "energy"), [("clamped", "spokes"), ("cotangent", "spokes_and_rims")])
+def test_a_deformation_is_the_same(weights, energy, monkeypatch, device):
+    """Its points, rotations and energies, with handles among the vertices; the systems are solved to rounding."""
+    random, _order = shuffled(flag.scene(nx=12, ny=8))
+    handles = random.mesh.select("x < 0.1 or x > 0.85")
+    targets = random.mesh.points[handles] * [1.0, 1.0, 0.8] + [0.0, 0.1, 0.0] * (random.mesh.points[handles, :1] > 0.5)
+    found = []
+    for least in (1000, 0):
+        monkeypatch.setattr(ordering, "LEAST", least)
+        arap = wc.Arap(random.mesh, handles, weights=weights, energy=energy, device=device)
+        found.append(arap.solve(targets, iterations=10, tolerance=0.0))
+    for name in ("points", "rotations", "energies"):
+        np.testing.assert_allclose(*(getattr(each, name) for each in found), rtol=0, atol=1e-10)
 
 
 SCENE = """

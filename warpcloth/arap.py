@@ -14,6 +14,7 @@ from .kernels.assemble import types
 from .linear import constant_factor
 from .model import DTYPES
 from .operators import CHUNKS
+from .ordering import worthwhile_order
 from .rotation import kabsch
 from .selection import distinct_vertices
 
@@ -130,7 +131,9 @@ class Arap:
         self.parts = self._connected(adjacency)
 
         # The free vertices come first, so that what the system solves for is a slice of every array.
-        self._order = np.concatenate([np.delete(np.arange(n), self.handles), self.handles])
+        near = worthwhile_order(mesh)
+        vertices = np.arange(n) if near is None else near
+        self._order = np.concatenate([vertices[~np.isin(vertices, self.handles)], self.handles])
         self._place = np.argsort(self._order)
         system = self.laplacian[self._order[:f]]
         self._coupling = system[:, self.handles]
@@ -264,19 +267,21 @@ class Arap:
             moments = np.stack([c1 * e1 - c2 * e2, c2 * e2 - c0 * e0, c0 * e0 - c1 * e1], axis=1)
             # The moments of a triangle are the same in the cells of its three vertices.
             entries = np.repeat(triangles, 3, axis=1).ravel(), np.tile(triangles, 3).ravel(), np.tile(moments, (1, 3, 1))
-            elements, kernel, weights = triangles, cells.triangle_energy, self._array(cotangents, vec3)
+            elements, kernel, weights, kind = triangles, cells.triangle_energy, cotangents, vec3
         else:
             i, j = pairs.T
             moments = w[:, None] * (rest[j] - rest[i])
             entries = np.r_[i, i, j, j], np.r_[j, i, i, j], np.concatenate([moments, -moments, -moments, moments])
-            elements, kernel, weights = pairs, cells.edge_energy, self._array(w, self._scalar)
+            elements, kernel, weights, kind = pairs, cells.edge_energy, w, self._scalar
         cell, member, moments = _summed(place[entries[0]], place[entries[1]], entries[2].reshape(-1, 3), n)
         rows = self._compressed(cell, member, moments, n)
         # Every edge is in 2 cells, or every side of a triangle in 3, so that the sum over cells is that often L x = b.
         columns = self._compressed(member, cell, moments / (3 if rims else 2), n)
 
         index = wp.types.vector(elements.shape[1], wp.int32)
-        elements = wp.array(place[elements].astype(np.int32), dtype=index, device=self.device)
+        elements = place[elements].astype(np.int32)
+        order = np.argsort(elements.min(axis=1), kind="stable")  # so that neighbours are read one after another
+        elements, weights = wp.array(elements[order], dtype=index, device=self.device), self._array(weights[order], kind)
         energies = self._zeros(len(elements), wp.float64)
         partial = self._zeros((1, CHUNKS if self.device.is_cuda else 1), wp.float64)
         placed = self._array(rest[self._order], vec3)

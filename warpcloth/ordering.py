@@ -32,17 +32,22 @@ def spread(mesh, order=None):
     return float(np.abs(np.diff(places[mesh.edges], axis=1)).mean())
 
 
-def worthwhile_order(scene, solver):
-    """`near_order` of a scene's mesh where a run gains by it, else None.
+def worthwhile_order(mesh):
+    """`near_order` of a mesh of :data:`LEAST` vertices or more where edges then span less than half as much, else None."""
+    if len(mesh.points) < LEAST:
+        return None
+    order = near_order(mesh)
+    return order if spread(mesh, order) < 0.5 * spread(mesh) else None
 
-    It gains from :data:`LEAST` vertices on where edges then span less than half as much. Methods whose result depends on the
-    order of elements, Gauss–Seidel sweeps, keep that of the scene, for theirs would change by more than rounding.
+
+def order_of_run(scene, solver):
+    """The order of vertices that a run of a scene has, see `worthwhile_order`; None where it keeps that of the scene.
+
+    Methods whose result depends on the order of elements, Gauss–Seidel sweeps, keep it, for theirs would change by more than
+    rounding.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
         solver: Options such as ``Explicit(substeps=160)``.
     """
-    if solver.ordered or len(scene.mesh.points) < LEAST:
-        return None
-    order = near_order(scene.mesh)
-    return order if spread(scene.mesh, order) < 0.5 * spread(scene.mesh) else None
+    return None if solver.ordered else worthwhile_order(scene.mesh)

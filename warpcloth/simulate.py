@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from .frames import frames_of, state_of
-from .ordering import worthwhile_order
+from .ordering import order_of_run
 from .status import Result, Status
 
 # Frames that a device computes beyond the one that is watched and written: one to go on with, one where writing a chunk of
@@ -83,7 +83,7 @@ def simulate(
     # First, for it refuses a wrong output before anything compiles.
     recorder = None if output is None else _File(scene, output, single_file)
     start = time.perf_counter()
-    model = scene.build(device=device, dtype=dtype, copies=copies, vary=vary, order=worthwhile_order(scene, solver))
+    model = scene.build(device=device, dtype=dtype, copies=copies, vary=vary, order=order_of_run(scene, solver))
     stepper = solver.bind(model)
     timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds, "frames": []}
     recorder = recorder or _Memory(model, frames)

@@ -215,11 +215,11 @@ def solver_setup(arguments, scene, device, limits=False):
         return _Setup(solver, solver, "by default about 1/240 s")
     if step_given and not limits:
         return _Setup(solver, solver)
-    from ..ordering import worthwhile_order
+    from ..ordering import order_of_run
     from ..solvers.explicit import fewest_substeps, step_limits
 
     began = time.perf_counter()
-    model = scene.build(device=device, dtype=arguments.dtype, order=worthwhile_order(scene, solver))
+    model = scene.build(device=device, dtype=arguments.dtype, order=order_of_run(scene, solver))
     rest, motion = step_limits(model)
     setup = _Setup(solver, solver, None, model, (rest, motion), time.perf_counter() - began)
     if not step_given:
