@@ -9,7 +9,7 @@ import pytest
 import warpcloth as wc
 from warpcloth import ordering, scene_files
 from warpcloth.cli import main
-from warpcloth.ordering import near_order, spread, order_of_run
+from warpcloth.ordering import near_order, order_of_run, spread
 from warpcloth.scenes import flag, hanging
 from warpcloth.simulate import Watch
 from warpcloth.solvers.explicit import step_limits

@@ -1,4 +1,4 @@
-"""The frames of a run on the host, in the order of the scene; computed ahead where the host would keep the device waiting."""
+"""The frames of a run on the host, in the order of the scene, computed ahead of who watches and writes them."""
 
 import itertools
 import time

@@ -353,7 +353,7 @@ class Model:
         E = len(one.stencil)
         vertices = self._placed(one.stencil)
         if self.order is not None and vertices.shape[1] == 2:
-            vertices = np.sort(vertices, axis=1)  # a pair has no direction, and sweeps save a comparison
+            vertices = np.sort(vertices, axis=1)  # a pair has no direction, and those of one are faster
         stencil = vertices[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
         rest = np.stack([copy.rest for copy in copies] * (self.copies // len(copies)))
         stiffness = vary.take_of_elements("stiffness", one, E if one.cells is None else len(one.cells) - 1)

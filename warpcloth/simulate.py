@@ -1,5 +1,6 @@
 """The frame loop: a scene and a solver in, an animation out."""
 
+import os
 import time
 from contextlib import closing
 from dataclasses import dataclass
@@ -10,10 +11,6 @@ import warp as wp
 from .frames import frames_of, state_of
 from .ordering import order_of_run
 from .status import Result, Status
-
-# Frames that a device computes beyond the one that is watched and written: one to go on with, one where writing a chunk of
-# them takes longer than a frame.
-AHEAD = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +52,10 @@ def simulate(
 ):
     """Runs a scene with a solver.
 
+    Large meshes whose neighbours are far apart in memory are renumbered for the run, see
+    :func:`warpcloth.ordering.order_of_run`; what comes out has the order of the scene. While a frame is written the next one
+    is computed.
+
     Args:
         scene: The :class:`warpcloth.Scene`.
         solver: Its options, such as ``wc.Newton(dt=1/240)``.
@@ -92,7 +93,7 @@ def simulate(
         recorder.append(*state_of(stepper))
         if progress is not None:
             progress(0, frames)
-        with closing(frames_of(stepper, frames, AHEAD if model.device.is_cuda else 0)) as found:
+        with closing(frames_of(stepper, frames, _ahead(model.device, output))) as found:
             for number, frame in enumerate(found, start=1):
                 timings["frames"].append(frame.seconds)
                 if not watch.passes(number, frame.points, frame.velocities, frame.results):
@@ -106,6 +107,18 @@ def simulate(
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     return Animation(points, velocities, times, status, timings, watch.worst_strain, output)
+
+
+def _ahead(device, output):
+    """How many frames are computed beyond the one that is watched and written.
+
+    On CUDA two: one to go on with, and one for when writing a chunk takes longer than a frame. On the CPU one, where there is a
+    file to write and a core to spare; frames in memory are only watched.
+    """
+    if device.is_cuda:
+        return 2
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return int(output is not None and cores > 1)
 
 
 class Watch:

@@ -1,7 +1,7 @@
 """What all solvers share: the options of the step and the state of a bound solver."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -37,7 +37,7 @@ class Step:
         ValueError: If both or neither are given, or they are not above 0.
     """
 
-    ordered: ClassVar[bool] = False
+    ordered = False
 
     dt: float | None = None
     substeps: int | None = None
