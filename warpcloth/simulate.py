@@ -146,8 +146,8 @@ class Watch:
 
     def __init__(self, model, h, slowest=1.0):
         scene = model.scene
-        self.model, self.edges = model, scene.mesh.edges
-        self.rest = scene.mesh.edge_lengths
+        self.model, self.rest = model, scene.mesh.edge_lengths[scene.mesh.edge_lengths > 0.0]
+        self.ends = scene.mesh.edges[scene.mesh.edge_lengths > 0.0].T.astype(np.intp)
         self.worst_strain, self.messages = 0.0, {}
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.fastest = np.zeros(model.copies)
@@ -166,7 +166,8 @@ class Watch:
 
     def _speed(self, velocities):
         """Mass-weighted root mean square speed of the free vertices of each copy [m/s]."""
-        squares = (velocities.astype(np.float64) ** 2).sum(axis=-1).reshape(self.model.copies, -1)
+        velocities = velocities.astype(np.float64)
+        squares = np.einsum("ij,ij->i", velocities, velocities).reshape(self.model.copies, -1)
         return np.sqrt((self.mass * squares).sum(axis=1) / self.total)
 
     def _stored_speed(self, h):
@@ -187,7 +188,7 @@ class Watch:
     def passes(self, frame, points, velocities, results):
         """Whether any copy is still good; marks those that no longer are, and puts NaN in their place."""
         B, n = self.model.copies, self.model.per_copy
-        finite = (np.isfinite(points) & np.isfinite(velocities)).all(axis=1).reshape(B, n)
+        finite = (np.isfinite(points) & np.isfinite(velocities)).reshape(B, 3 * n)
         with np.errstate(over="ignore", invalid="ignore"):
             speed, gained = self._speed(velocities), self.gravity * frame / self.model.scene.fps + self.pins * frame
         limit = 10.0 * (self.start + gained)
@@ -197,7 +198,7 @@ class Watch:
             where = f"diverged in frame {frame}" + (f", copy {copy}" if B > 1 else "")
             wrong = np.flatnonzero(~finite[copy])
             if len(wrong):
-                self.messages[copy] = f"{where}: vertex {wrong[0]} is not finite"
+                self.messages[copy] = f"{where}: vertex {wrong[0] // 3} is not finite"
             elif not stepped[copy]:
                 self.messages[copy] = f"{where}: the forces of a step are not finite"
             else:
@@ -211,10 +212,11 @@ class Watch:
             array.reshape(B, n, 3)[~self.alive] = np.nan
         if not self.alive.any():
             return False
-        ends = points.astype(np.float64).reshape(B, n, 3)[self.alive][:, self.edges]
-        lengths = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            strain = np.abs(lengths / self.rest - 1.0)[:, self.rest > 0.0]
+        squares = np.zeros((int(self.alive.sum()), len(self.rest)))
+        for column in np.moveaxis(points.reshape(B, n, 3)[self.alive], -1, 0):  # a fifteenth of the time of rows of three
+            column = column.astype(np.float64)
+            squares += (column.take(self.ends[1], axis=1) - column.take(self.ends[0], axis=1)) ** 2
+        strain = np.abs(np.sqrt(squares) / self.rest - 1.0)
         self.worst_strain = max(self.worst_strain, float(strain.max(initial=0.0)))
         return True
 

@@ -149,10 +149,15 @@ def vertex_normals(points, triangles):
     Returns:
         np.ndarray: (n, 3) float64.
     """
-    origin = points[triangles[:, 0]]
-    doubled_areas = np.cross(points[triangles[:, 1]] - origin, points[triangles[:, 2]] - origin)
-    corners = triangles.T.ravel()
-    return _unit(np.stack([np.bincount(corners, np.tile(n, 3), len(points)) for n in doubled_areas.T], axis=1))
+    # Columns one by one: NumPy takes twice as long for rows of three.
+    corners = triangles.T.astype(np.intp)
+    columns = [np.ascontiguousarray(column) for column in np.asarray(points).T]
+    a, b = ([column.take(end) - column.take(corners[0]) for column in columns] for end in corners[1:])
+    sums = []
+    for i, j in ((1, 2), (2, 0), (0, 1)):
+        doubled_areas = a[i] * b[j] - a[j] * b[i]
+        sums.append(sum(np.bincount(corner, doubled_areas, len(points)) for corner in corners))
+    return _unit(np.stack(sums, axis=1))
 
 
 def _unit(vectors):
