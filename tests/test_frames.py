@@ -183,3 +183,16 @@ def test_an_interrupt_keeps_the_frames_until_then(frame, tmp_path, device, monke
     with pytest.raises(KeyboardInterrupt):
         wc.simulate(hanging.scene(n=8), SOLVERS["explicit"], output=str(output), device=device, progress=interrupted)
     assert len(FrameSequence(output)) == frame + 1 and not threads()
+
+
+@pytest.mark.parametrize(("output", "cores", "expected"), [(None, 2, 0), ("out.usdc", 2, 1), ("out.usdc", 1, 0)])
+def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_path, device, monkeypatch):
+    """On CUDA two frames are computed ahead in any case."""
+    asked, module = [], sys.modules["warpcloth.simulate"]
+    monkeypatch.setattr(module.os, "sched_getaffinity", lambda _process: set(range(cores)), raising=False)
+    monkeypatch.setattr(
+        module, "frames_of", lambda stepper, count, ahead: asked.append(ahead) or frames_of(stepper, count, ahead)
+    )
+    path = None if output is None else str(tmp_path / output)
+    wc.simulate(hanging.scene(n=8), SOLVERS["explicit"], output=path, device=device, frames=2)
+    assert asked == [2 if device.startswith("cuda") else expected]
