@@ -15,6 +15,7 @@ from .kernels.term import Term
 from .precision import cast, refuse_coarse
 from .scene import refuse_far_pins
 from .selection import distinct_vertices
+from .team import Team
 
 _PINNED = 1e3  # what a pinned vertex of a cell counts, in masses of the rest of the cell: it does not move, so the cell must
 
@@ -108,21 +109,6 @@ class DeviceElements:
         """Elements of all copies, B·E."""
         return len(self.stencil)
 
-    def of_copy(self, copy, vertices):
-        """Those of one copy of so many vertices, as of a model of it alone."""
-        part, device = slice(copy * self.per_copy, (copy + 1) * self.per_copy), self.stencil.device
-        changed = {"stencil": wp.array(self.stencil.numpy()[part] - copy * vertices, dtype=wp.int32, device=device)}
-        changed |= {"stiffness": self.stiffness[part], "rest": self.rest[part]}
-        if self.damping is not None:
-            changed["damping"] = self.damping[part]
-        if self.cells is not None:
-            C = self.cells.per_copy
-            offsets = self.cells.offsets.numpy()[copy * C : (copy + 1) * C + 1] - part.start
-            changed["cells"] = replace(
-                self.cells, offsets=wp.array(offsets, dtype=wp.int32, device=device), shape=self.cells.shape[part]
-            )
-        return replace(self, **changed)
-
     def softened(self):
         """The same elements with a stiffness of 1 where it is infinite."""
         stiffness = self.stiffness.numpy()
@@ -161,6 +147,18 @@ class DeviceElements:
         lowest = self.stencil.numpy().min(axis=1)
         return self.reordered(np.argsort(lowest, kind="stable")) if (np.diff(lowest) < 0).any() else self
 
+    def share(self, first, count):
+        """Those of ``count`` of the copies from ``first`` on, as a model of these alone has them."""
+        E = self.per_copy
+        chosen = slice(first * E, (first + count) * E)
+        changed = {name: getattr(self, name)[chosen] for name in ("stiffness", "rest")}
+        if self.damping is not None:
+            changed["damping"] = self.damping[chosen]
+        cells = self.cells
+        if cells:
+            cells = replace(cells, offsets=cells.offsets[: count * cells.per_copy + 1], shape=cells.shape[chosen])
+        return replace(self, **changed, stencil=self.stencil[: count * E], cells=cells)
+
     def taut(self, points):
         """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
         if not self.term.slack:
@@ -195,6 +193,7 @@ class Model:
             :func:`warpcloth.ordering.near_order` gives; elements are then in the order of their lowest vertices there. All
             arguments here, and what is said of them, have the scene's own order, and all attributes and what solvers make of
             them have this one; :meth:`in_scene_order` leads back. None keeps the scene's, of vertices and elements.
+        threads: Of this process that share the steps, on the CPU.
 
     Attributes:
         positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
@@ -207,17 +206,20 @@ class Model:
         places: Where each vertex of the scene is in a copy, (n,) int32; None without an order.
         kernels: Names of the kernels that solvers asked for.
         launches: How many launches there have been, a list of one that models of other terms share.
+        team: The :class:`warpcloth.team.Team` of its threads.
+        state: x and v that steps move on, if not arrays of their own; or None.
 
     Raises:
         ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
     """
 
-    def __init__(self, scene, device="cpu", dtype="float32", copies=1, vary=None, order=None):
+    def __init__(self, scene, device="cpu", dtype="float32", copies=1, vary=None, order=None, threads=1):
         choice("dtype", dtype, tuple(DTYPES))
         whole("copies", copies, 1)
         copies = int(copies)
         self.scene, self.copies = scene, copies
         self.device = wp.get_device(device)
+        self.team, self.state = Team(threads, self.device), None
         self.dtype, self.numpy_dtype = DTYPES[dtype]
         self.vec3, self.mat33 = types(self.dtype)
         self.per_copy = len(scene.mesh.points)
@@ -281,14 +283,18 @@ class Model:
 
     def alone(self, copy):
         """A model of one copy, whose arrays are parts of those of this one."""
-        if self.copies == 1:
-            return self
-        other, n = shallow_copy(self), self.per_copy
-        part = slice(copy * n, (copy + 1) * n)
-        other.copies, other.count, other.gravity = 1, n, self.gravity[copy : copy + 1]
+        return self if self.copies == 1 else self.share(copy, 1)
+
+    def share(self, first, count, state=None):
+        """A model of ``count`` of the copies from ``first`` on, for one thread; x and v are theirs of ``state``, if given."""
+        n = self.per_copy
+        other, of_copies, of_vertices = shallow_copy(self), slice(first, first + count), slice(first * n, (first + count) * n)
+        other.copies, other.count, other.team = count, count * n, Team(1, self.device)
         for name in ("positions", "velocities", "mass", "inverse_mass"):
-            setattr(other, name, getattr(self, name)[part])
-        other.terms = tuple(elements.of_copy(copy, n) for elements in self.terms)
+            setattr(other, name, getattr(self, name)[of_vertices])
+        other.gravity = self.gravity[of_copies]
+        other.state = state and tuple(array[of_vertices] for array in state)
+        other.terms = tuple(elements.share(first, count) for elements in self.terms)
         return other
 
     def array(self, values, dtype):

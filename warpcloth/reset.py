@@ -29,9 +29,8 @@ class Reset:
                 "reset takes no positions or velocities with integrator='bdf2', which knows what was before the start of the "
                 "model alone; 'euler' and 'midpoint' take them"
             )
-        mask = self._mask(mask)
-        x = model.positions if positions is None else self._places("positions", "m", positions)
-        v = model.velocities if velocities is None else self._places("velocities", "m/s", velocities)
+        mask, x, v = self.on_device(mask, positions, velocities)
+        x, v = model.positions if x is None else x, model.velocities if v is None else v
         given = [mask, model.inverse_mass, model.per_copy, model.positions, x, v, *integrator.started]
         worst = stepper.worst and stepper.worst.array
         model.launch(self._kernel, model.count, given, [*stepper.state, *integrator.past, stepper.count, worst])
@@ -41,6 +40,17 @@ class Reset:
             stepper.results = [
                 Result.COMPLETED if again else result for result, again in zip(stepper.results, chosen, strict=True)
             ]
+
+    def on_device(self, mask, positions, velocities):
+        """The mask (B,), and positions and velocities (B·n,) vectors or None, as Warp arrays.
+
+        Raises:
+            ValueError: If one of them breaks a rule.
+        """
+        mask = self._mask(mask)
+        x = None if positions is None else self._places("positions", "m", positions)
+        v = None if velocities is None else self._places("velocities", "m/s", velocities)
+        return mask, x, v
 
     def _mask(self, mask):
         """The mask on the device, (B,)."""

@@ -139,11 +139,11 @@ class Scene:
         """The axis that gravity is along, "Y" or "Z"; "Y" without gravity."""
         return "Z" if abs(self.gravity[2]) > abs(self.gravity[1]) else "Y"
 
-    def build(self, device="cpu", dtype="float32", copies=1, vary=None, order=None):
+    def build(self, device="cpu", dtype="float32", copies=1, vary=None, order=None, threads=1):
         """The scene on a device, see :class:`warpcloth.model.Model`."""
         from .model import Model
 
-        return Model(self, device=device, dtype=dtype, copies=copies, vary=vary, order=order)
+        return Model(self, device=device, dtype=dtype, copies=copies, vary=vary, order=order, threads=threads)
 
     def __str__(self):
         mesh, pins = self.mesh, self.pins

@@ -49,6 +49,7 @@ def simulate(
     vary=None,
     single_file=False,
     progress=None,
+    threads=1,
 ):
     """Runs a scene with a solver.
 
@@ -68,6 +69,7 @@ def simulate(
         vary: See :class:`warpcloth.model.Model`.
         single_file: Whether ``output`` is to be one file in the end, with nothing beside it.
         progress: Function called with (frame, frames) once each frame is kept, from 0, the start, on; or None.
+        threads: See :class:`warpcloth.model.Model`.
 
     Returns:
         :class:`Animation`. A run that diverges ends with its last good frame and says so in ``status``. Of several copies the
@@ -84,7 +86,9 @@ def simulate(
     # First, for it refuses a wrong output before anything compiles.
     recorder = None if output is None else _File(scene, output, single_file)
     start = time.perf_counter()
-    model = scene.build(device=device, dtype=dtype, copies=copies, vary=vary, order=order_of_run(scene, solver))
+    model = scene.build(
+        device=device, dtype=dtype, copies=copies, vary=vary, order=order_of_run(scene, solver), threads=threads
+    )
     stepper = solver.bind(model)
     timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds, "frames": []}
     recorder = recorder or _Memory(model, frames)

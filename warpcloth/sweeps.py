@@ -172,7 +172,7 @@ class Sweep:
         model.launch(self._apply, model.count, [self._scale], [self._total, self.correction])
 
     def _launch_in_place(self, backward):
-        model = self.model
+        model, team = self.model, self.model.team
         way = -1 if backward else 1
         for i in range(len(self.elements))[::way]:
             elements = self.elements[i]
@@ -180,15 +180,18 @@ class Sweep:
             of_cells = [cells.offsets, cells.shape] if cells else []
             each = (cells or elements).per_copy if self.ordered else 1
             for first, count in self.ranges[i][::way]:
+                before, part = team.part(count // each)
                 given = [
                     *of_cells,
                     *elements.arguments,
                     model.inverse_mass,
                     self.x,
-                    first,
+                    first + before * each,
                     way * each,
                     self.h,
                     self.spread,
                     self.relaxation,
                 ]
-                model.launch(self._kernels[i], count // each, given, [self.multipliers[i], self.correction])
+                if part:
+                    model.launch(self._kernels[i], part, given, [self.multipliers[i], self.correction])
+                team.launch_meeting(model)

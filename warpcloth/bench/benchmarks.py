@@ -27,6 +27,7 @@ class Benchmark:
         dtype: ``"float32"`` or ``"float64"``.
         frames: To time at most.
         copies: How many of the scene run at once.
+        threads: That share the steps, on the CPU.
     """
 
     scene: SceneRef
@@ -36,6 +37,7 @@ class Benchmark:
     dtype: str = "float32"
     frames: int = 20
     copies: int = 1
+    threads: int = 1
 
     def scenes(self):
         """The scene of each size.
@@ -82,7 +84,7 @@ class Run:
     Attributes:
         total: How many rows there will be.
         rows: Those that are measured: what :func:`warpcloth.bench.measure.measure` returns, with ``scene``, ``parameters``,
-            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``benchmark`` (its place), ``share``
+            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``threads``, ``benchmark`` (its place), ``share``
             (``bytes_per_s`` over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with no kernel
             in any cache.
         bandwidth: What :func:`warpcloth.bench.bandwidth.measure` returns.
@@ -106,7 +108,7 @@ class Run:
 
     def _row(self, benchmark, scene, cold):
         setup = benchmark.setup_of(scene)
-        given = {"device": benchmark.device, "dtype": benchmark.dtype, "copies": benchmark.copies}
+        given = {"device": benchmark.device, "dtype": benchmark.dtype, "copies": benchmark.copies, "threads": benchmark.threads}
 
         def measured(frames):
             return _alone(task(measure, scene=scene, setup=setup, frames=frames, started=time.time(), **given))

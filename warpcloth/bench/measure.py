@@ -9,7 +9,6 @@ import warp as wp
 
 from ..capture import Mirror
 from ..chart.tasks import SceneRef, Setup
-from ..solvers.solver import Stepper
 from ..status import Result
 from .counts import compulsory_bytes, elements_of, launches_of
 
@@ -17,7 +16,7 @@ from .counts import compulsory_bytes, elements_of, launches_of
 _WARM_UP, _SECONDS, _FEWEST = 2, 10.0, 3
 
 
-def measure(scene, setup, frames, device, dtype, started, copies=1):
+def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
     """Runs warm frames of a scene with a setup, and counts what a step has to do. All values are such that JSON has them.
 
     Args:
@@ -28,6 +27,7 @@ def measure(scene, setup, frames, device, dtype, started, copies=1):
         dtype: ``"float32"`` or ``"float64"``.
         started: ``time.time()`` when this process was asked for.
         copies: How many of the scene run at once.
+        threads: That share the steps, on the CPU.
 
     Returns:
         dict: What is not known is None.
@@ -64,7 +64,7 @@ def measure(scene, setup, frames, device, dtype, started, copies=1):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:
-            model = declared.build(device=device, dtype=dtype, copies=copies)
+            model = declared.build(device=device, dtype=dtype, copies=copies, threads=threads)
             stepper = Setup(**setup).record().bind(model)
         except ValueError as error:
             return found | {"status": "refused", "reason": str(error)}
@@ -118,8 +118,7 @@ def _warm(stepper, model, points, frames, elements):
 def _run_frame(stepper, points):
     """A frame, its points read into memory of the host that is kept; the iterations of all its steps."""
     iterations = 0
-    # Where a solver has frames of its own, all its steps have the same iterations.
-    if type(stepper).frame is not Stepper.frame:
+    if stepper.uniform:
         stepper.frame()
         iterations = stepper.steps_per_frame * stepper.iterations
     else:

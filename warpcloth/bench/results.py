@@ -9,11 +9,25 @@ import numpy as np
 from ..outputs import TEXT, Output
 
 # What tells a row from another, in two results.
-_SAME = ("scene", "parameters", "solver", "options", "device", "dtype", "copies")
+_SAME = ("scene", "parameters", "solver", "options", "device", "dtype", "copies", "threads")
 # What a CSV has of a row, in this order; what is not known is empty.
 COLUMNS = (
-    *("scene", "parameters", "solver", "options", "device", "dtype", "copies", "status", "reason", "vertices", "elements"),
-    *("substeps", "iterations", "frames", "ms", "ms_low", "ms_high", "cloths_per_s", "ns", "bytes", "bytes_per_s", "share"),
+    *("scene", "parameters", "solver", "options", "device", "dtype", "copies", "threads", "status", "reason"),
+    *(
+        "vertices",
+        "elements",
+        "substeps",
+        "iterations",
+        "frames",
+        "ms",
+        "ms_low",
+        "ms_high",
+        "cloths_per_s",
+        "ns",
+        "bytes",
+        "bytes_per_s",
+        "share",
+    ),
     "launches",
     *("start_s", "cold_start_s", "bind_s", "factorise_s", "memory"),
 )
@@ -106,7 +120,7 @@ def read(path):
     """
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
-        found["rows"] = [{"copies": 1, **row} for row in found["rows"]]  # of before there were more
+        found["rows"] = [{"copies": 1, "threads": 1, **row} for row in found["rows"]]  # of before there were more
         known = {*_SAME, "label", "status", "ms", "spread", "launches", "bytes", "start_s", "memory"}
         if all(known <= set(row) for row in found["rows"]) and {"device", "processor"} <= set(found["machine"]):
             return found

@@ -113,6 +113,10 @@ def _parser():
     for sub in (runs, info, deforms, analyzes, compares, chooses, benches):
         sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print one JSON object")
+    for sub in (runs, benches):
+        sub.add_argument(
+            "--threads", type=int, default=1, metavar="N", help="that share the steps on the CPU, 1 where not given"
+        )
     for sub in (runs, info, deforms, analyzes, chooses, benches):
         sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
     for sub in (runs, deforms):

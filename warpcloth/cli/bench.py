@@ -47,6 +47,7 @@ def bench(arguments):
         return _compare(arguments)
     whole("frames", arguments.frames, 1)
     whole("copies", arguments.copies, 1)
+    whole("threads", arguments.threads, 1)
     for size in arguments.sizes:
         whole("sizes", size, 2)
     if arguments.csv:
@@ -81,7 +82,13 @@ def _benchmarks(arguments, device):
     from ..chart.tasks import SceneRef, Setup
     from ..solvers import SOLVERS
 
-    given = {"device": str(device), "dtype": arguments.dtype, "frames": arguments.frames, "copies": arguments.copies}
+    given = {
+        "device": str(device),
+        "dtype": arguments.dtype,
+        "frames": arguments.frames,
+        "copies": arguments.copies,
+        "threads": arguments.threads,
+    }
     if arguments.scene is None:
         _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which it is for")
         return standard(**given)
@@ -187,6 +194,7 @@ def _cells(row):
 
 def _scene_of(row):
     copies = [f"×{row['copies']}"] if row["copies"] > 1 else []
+    copies += [f"{row['threads']} threads"] if row["threads"] > 1 else []
     return " ".join([row["scene"], *(f"{name}={value}" for name, value in row["parameters"].items()), *copies])
 
 

@@ -43,6 +43,7 @@ def run(arguments):
             frames=frames,
             single_file=arguments.single_file,
             progress=progress,
+            threads=arguments.threads,
         )
     except KeyboardInterrupt:
         raise Interrupted(progress.interrupted(arguments.output)) from None
@@ -64,6 +65,7 @@ def run(arguments):
         **_solver_facts(arguments, setup, scene.fps),
         "device": str(device),
         "dtype": arguments.dtype,
+        "threads": arguments.threads,
         "file": arguments.output,
         "frames_folder": frames_folder_of(arguments),
     }
@@ -219,7 +221,9 @@ def solver_setup(arguments, scene, device, limits=False):
     from ..solvers.explicit import fewest_substeps, step_limits
 
     began = time.perf_counter()
-    model = scene.build(device=device, dtype=arguments.dtype, order=order_of_run(scene, solver))
+    model = scene.build(
+        device=device, dtype=arguments.dtype, order=order_of_run(scene, solver), threads=getattr(arguments, "threads", 1)
+    )
     rest, motion = step_limits(model)
     setup = _Setup(solver, solver, None, model, (rest, motion), time.perf_counter() - began)
     if not step_given:

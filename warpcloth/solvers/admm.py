@@ -65,7 +65,7 @@ class ADMM(ImplicitStep):
         """
         refuse_cells(model, "ADMM")
         refuse_hard(model, "ADMM")
-        return ADMMStepper(self, model)
+        return self._on(ADMMStepper, model)
 
 
 class ADMMStepper(Stepper):

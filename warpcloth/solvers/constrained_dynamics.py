@@ -88,7 +88,7 @@ class ConstrainedDynamics(ImplicitStep):
             instead = "stabilisation='geometric-stiffness' can, or give a finite stiffness"
             refuse_hard(model, "ConstrainedDynamics with stabilisation='line-search'", instead)
         refuse_unconstrained(model)
-        return ConstrainedDynamicsStepper(self, model)
+        return self._on(ConstrainedDynamicsStepper, model)
 
 
 def refuse_unconstrained(model):

@@ -49,7 +49,7 @@ class Explicit(Step):
             ValueError: If the step is above the limit and that is not allowed, or a stiffness is infinite.
         """
         refuse_hard(model, "Explicit")
-        stepper = ExplicitStepper(self, model)
+        stepper = self._on(ExplicitStepper, model)
         if self.above_limit == "refuse":
             self._refuse_unstable(model, stepper.h)
         return stepper

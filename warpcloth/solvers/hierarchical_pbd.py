@@ -1,6 +1,7 @@
 """Hierarchical position based dynamics: PBD that first moves few vertices far, then more and more of them a little."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import warp as wp
 
@@ -59,6 +60,10 @@ class HierarchicalPBD(Step):
             whole("levels", self.levels, 0)
         number("relaxation", self.relaxation, above=0.0)
 
+    @property
+    def divides(self):
+        return True
+
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
 
@@ -67,7 +72,7 @@ class HierarchicalPBD(Step):
         """
         require_model(model)
         refuse_unprojectable(model, "HierarchicalPBD")
-        return HierarchicalPBDStepper(self, model)
+        return self._on(HierarchicalPBDStepper, model)
 
 
 class HierarchicalPBDStepper(LaunchedStepper):
@@ -99,12 +104,13 @@ class HierarchicalPBDStepper(LaunchedStepper):
 
     def _launch_start(self):
         """The prediction, and the levels from the coarsest on."""
-        self.launch_prediction()
-        self.sweep.launch_start()
+        team = self.model.team
+        team.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
         for sweep, followers in reversed(self._coarse):
             for _ in range(self.options.coarse_iterations):
                 sweep.launch()
-            self.model.launch(*followers)
+            team.launch_alone(self.model, partial(self.model.launch, *followers))
 
     def _launch_last(self):
-        self.launch_finish(self.sweep.correction)
+        if self.model.team.leads:
+            self.launch_finish(self.sweep.correction)

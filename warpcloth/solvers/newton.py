@@ -51,7 +51,7 @@ class Newton(ImplicitStep):
             ValueError: If a term has infinite stiffness.
         """
         refuse_hard(model, "Newton")
-        return NewtonStepper(self, model)
+        return self._on(NewtonStepper, model)
 
 
 class NewtonStepper(Stepper):

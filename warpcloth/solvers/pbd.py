@@ -57,6 +57,10 @@ class PBD(Step):
     def ordered(self):
         return self.sweep in IN_PLACE
 
+    @property
+    def divides(self):
+        return self.sweep == "coloured"
+
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
 
@@ -65,7 +69,7 @@ class PBD(Step):
         """
         require_model(model)
         refuse_unprojectable(model, "PBD")
-        return PBDStepper(self, model)
+        return self._on(PBDStepper, model)
 
 
 class PBDStepper(LaunchedStepper):
@@ -85,8 +89,8 @@ class PBDStepper(LaunchedStepper):
         self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
 
     def _launch_start(self):
-        self.launch_prediction()
-        self.sweep.launch_start()
+        self.model.team.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
 
     def _launch_last(self):
-        self.launch_finish(self.sweep.correction)
+        if self.model.team.leads:
+            self.launch_finish(self.sweep.correction)

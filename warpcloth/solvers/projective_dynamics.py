@@ -70,7 +70,7 @@ class ProjectiveDynamics(ImplicitStep):
         """
         refuse_hard(model, "ProjectiveDynamics")
         refuse_without_projection(model, "ProjectiveDynamics")
-        return ProjectiveDynamicsStepper(self, model)
+        return self._on(ProjectiveDynamicsStepper, model)
 
 
 class ProjectiveDynamicsStepper(Stepper):

@@ -1,6 +1,7 @@
 """What all solvers share: the options of the step and the state of a bound solver."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,27 @@ class Step:
 
     dt: float | None = None
     substeps: int | None = None
+
+    @property
+    def divides(self):
+        """Whether several threads can share the steps of one cloth."""
+        return False
+
+    def _on(self, stepper, model):
+        """The :class:`Stepper` of type ``stepper`` on a model, or of copies for several threads one for each of these.
+
+        Raises:
+            ValueError: If several threads are to share one cloth, and cannot.
+        """
+        threads = model.team.threads
+        if threads > 1 and model.copies > 1:
+            return ThreadedStepper(self, stepper, model)
+        if threads > 1 and not self.divides:
+            raise ValueError(
+                f"threads is {threads} with one copy, whose steps {type(self).__name__} cannot divide as it is set; "
+                "Explicit and HierarchicalPBD can, and PBD and XPBD with sweep='coloured'; copies are shared out with every solver"
+            )
+        return stepper(self, model)
 
     def __post_init__(self):
         if (self.dt is None) == (self.substeps is None):
@@ -108,6 +130,7 @@ class Stepper:
 
     factorise_seconds = 0.0
     iterations = 1
+    uniform = False  # Whether all steps have as many iterations
     worst = None  # Mirror of the residuals of methods that keep the largest on the device, (B,)
 
     def __init__(self, options, model, integrator="euler"):
@@ -116,7 +139,7 @@ class Stepper:
         self.options, self.model = options, model
         self.steps_per_frame = options.per_frame(fps)
         self.h = 1.0 / (fps * self.steps_per_frame)
-        self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
+        self.state = State(*(model.state or (wp.clone(model.positions), wp.clone(model.velocities))))
         self.results, self.residual = [Result.COMPLETED] * model.copies, np.zeros(model.copies)
         self.count = None if model.pins is None else wp.zeros(model.copies, dtype=wp.int32, device=model.device)
         self._reset = None
@@ -148,6 +171,9 @@ class Stepper:
     def step(self):
         """One step of h."""
         raise NotImplementedError  # every solver has its own
+
+    def prepare_frame(self):
+        """What `frame` records when it is first called, which is for the main thread alone."""
 
     def frame(self):
         """One frame, to the bit what ``steps_per_frame`` times `step` makes."""
@@ -188,18 +214,26 @@ class LaunchedStepper(Stepper):
     The constructor ends with `record`, and ``integrator.start()`` if it takes an integrator.
     """
 
+    uniform = True
+
     def record(self, *parts):
         """Records a step.
 
         Args:
-            parts: Pairs of a function that launches, and of how many times it runs.
+            parts: Pairs of a function that launches, what is for the thread of the team that it is called as, and of how many
+                times it runs.
         """
-        device, launches = self.model.device, self.model.launches
+        launches = self.model.launches
         self._parts, self._step, self._frame, self._size = parts, [], None, 0
         for launch, times in parts:
             before = launches[0]
-            self._step.append((Segment(device, launch), times))
-            self._size += (launches[0] - before) * times
+            self._step.append((self._segments(launch), times))
+            self._size += (launches[0] - before) // self.model.team.threads * times
+
+    def _segments(self, launch):
+        """The segment of each thread."""
+        team = self.model.team
+        return [Segment(self.model.device, team.as_thread(thread, launch)) for thread in range(team.threads)]
 
     def launch_steps(self, steps):
         """So many steps."""
@@ -210,30 +244,93 @@ class LaunchedStepper(Stepper):
 
     def _record_frame(self):
         """Segments of a frame, and how many times each is replayed, recorded when a frame is first asked for."""
-        steps, device = self.steps_per_frame, self.model.device
+        steps = self.steps_per_frame
         chunk = min(steps, LAUNCHES // max(self._size, 1))
         if chunk < 2:
             return self._step * steps
         graphs, rest = divmod(steps, chunk)
-        frame = [(Segment(device, lambda: self.launch_steps(chunk)), graphs)]
-        return frame + ([(Segment(device, lambda: self.launch_steps(rest)), 1)] if rest else [])
+        frame = [(self._segments(lambda: self.launch_steps(chunk)), graphs)]
+        return frame + ([(self._segments(lambda: self.launch_steps(rest)), 1)] if rest else [])
 
     def _replay(self, segments):
-        for segment, times in segments:
-            for _ in range(times):
-                segment()
+        team = self.model.team
+        if team.threads == 1:
+            self._replay_part(segments, 0)
+        else:
+            team.run([partial(self._replay_part, segments, thread) for thread in range(team.threads)])
         self.note()
+
+    def _replay_part(self, segments, thread):
+        for of_threads, times in segments:
+            for _ in range(times):
+                of_threads[thread]()
 
     def step(self):
         self._replay(self._step)
 
-    def frame(self):
+    def prepare_frame(self):
         if self._frame is None:
             self._frame = self._record_frame()
+
+    def frame(self):
+        self.prepare_frame()
         self._replay(self._frame)
 
     def note(self):
         """Takes down how the steps since the last call ended; of methods that have no residual nothing."""
+
+
+class ThreadedStepper(Stepper):
+    """Several copies for several threads: a stepper of its own, on neighbouring copies, in each.
+
+    Args:
+        options: Of the solver.
+        stepper: The type of its steppers.
+        model: The model.
+
+    Attributes:
+        shares: The stepper of each thread, whose state is a part of ``state``.
+    """
+
+    def __init__(self, options, stepper, model):
+        self.options, self.model, self._reset = options, model, None
+        self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
+        shares = min(model.team.threads, model.copies)
+        ends = [model.copies * share // shares for share in range(shares + 1)]
+        self._copies = list(zip(ends[:-1], ends[1:], strict=True))
+        self.shares = [stepper(options, model.share(first, end - first, self.state)) for first, end in self._copies]
+        first = self.shares[0]
+        self.steps_per_frame, self.h, self.he, self.uniform = first.steps_per_frame, first.h, first.he, first.uniform
+        self.factorise_seconds = sum(share.factorise_seconds for share in self.shares)
+
+    @property
+    def results(self):
+        return [result for share in self.shares for result in share.results]
+
+    @property
+    def residual(self):
+        return np.concatenate([share.residual for share in self.shares])
+
+    @property
+    def iterations(self):
+        return max(share.iterations for share in self.shares)
+
+    def step(self):
+        self.model.team.run([share.step for share in self.shares])
+
+    def frame(self):
+        for share in self.shares:
+            share.prepare_frame()
+        self.model.team.run([share.frame for share in self.shares])
+
+    def reset(self, mask=None, positions=None, velocities=None):
+        if self._reset is None:
+            self._reset = Reset(self)
+        mask, positions, velocities = self._reset.on_device(mask, positions, velocities)
+        n = self.model.per_copy
+        for share, (first, end) in zip(self.shares, self._copies, strict=True):
+            places = [None if given is None else given[first * n : end * n] for given in (positions, velocities)]
+            share.reset(mask[first:end], *places)
 
 
 def require_model(model):

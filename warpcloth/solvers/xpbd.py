@@ -74,6 +74,10 @@ class XPBD(ImplicitStep):
     def ordered(self):
         return self.sweep in IN_PLACE
 
+    @property
+    def divides(self):
+        return self.sweep == "coloured"
+
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
 
@@ -86,7 +90,7 @@ class XPBD(ImplicitStep):
                 model, f"XPBD with integrator={self.integrator!r}", "integrator='euler' can, or give a finite stiffness"
             )
         refuse_unprojectable(model, "XPBD")
-        return XPBDStepper(self, model)
+        return self._on(XPBDStepper, model)
 
 
 class XPBDStepper(LaunchedStepper):
@@ -125,8 +129,7 @@ class XPBDStepper(LaunchedStepper):
         self.integrator.start()
 
     def _launch_start(self):
-        self.launch_prediction()
-        self.sweep.launch_start()
+        self.model.team.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
 
     def _launch_sweep(self):
         """One sweep, or one forward and one backward."""
@@ -136,13 +139,19 @@ class XPBDStepper(LaunchedStepper):
 
     def _launch_last(self):
         """The last sweep, the force that it leaves unbalanced, and the end of the step."""
-        model, d = self.model, self.sweep.correction
-        self._force.zero_()
+        team = self.model.team
         if self._gradient is None:
-            self._launch_momentum(-1.0)
+            team.launch_alone(self.model, self._force.zero_, lambda: self._launch_momentum(-1.0))
             self.sweep.launch()
         else:
             self._launch_sweep()
+        if team.leads:
+            self._launch_end()
+
+    def _launch_end(self):
+        model, d = self.model, self.sweep.correction
+        if self._gradient is not None:
+            self._force.zero_()
             self._gradient.add(self.state.x, self._force, d)
         self._launch_momentum(1.0)
         self._sums.largest(model.inverse_mass, self._force, self._acceleration)
