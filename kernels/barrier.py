@@ -4,9 +4,9 @@ from functools import cache
 
 import warp as wp
 
-# Of an array: threads that have come, how often all had, and whether they need wait no more; each in a cache line of its own.
+# Of an array: threads that have come, how often all had, and whether they wait no more; each in a cache line of its own.
 COME, MET, ABANDONED, NUMBERS = 0, 16, 32, 48
-# Looks before the core is left to others, some microseconds: who waits for a thread that has no core shall not keep it from one.
+# Looks before the core is left to others, some microseconds: a thread that is waited for may have none.
 _LOOKS = 4000
 
 

@@ -84,9 +84,9 @@ class Run:
     Attributes:
         total: How many rows there will be.
         rows: Those that are measured: what :func:`warpcloth.bench.measure.measure` returns, with ``scene``, ``parameters``,
-            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``threads``, ``benchmark`` (its place), ``share``
-            (``bytes_per_s`` over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with no kernel
-            in any cache.
+            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``threads``, ``benchmark`` (its place),
+            ``share`` (``bytes_per_s`` over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with
+            no kernel in any cache.
         bandwidth: What :func:`warpcloth.bench.bandwidth.measure` returns.
     """
 

@@ -11,6 +11,7 @@ from ..checks import choice
 from ..damping import Past, dissipations
 from ..operators import Hessian
 from ..passes import Gather, Sweep
+from ..ranges import Ranges
 from .solver import LaunchedStepper, Step, refuse_hard
 
 
@@ -37,6 +38,10 @@ class Explicit(Step):
         super().__post_init__()
         choice("scheme", self.scheme, ("symplectic", "forward"))
         choice("above_limit", self.above_limit, ("refuse", "allow"))
+
+    @property
+    def divides(self):
+        return True
 
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
@@ -205,16 +210,41 @@ class ExplicitStepper(LaunchedStepper):
     """:class:`Explicit` on a model.
 
     Attributes:
-        passes: The :class:`warpcloth.passes.Sweep` or :class:`warpcloth.passes.Gather` that a step is.
+        passes: The :class:`warpcloth.passes.Sweep` or :class:`warpcloth.passes.Gather` that a step is, or for several threads
+            the :class:`warpcloth.ranges.Ranges`.
     """
 
     def __init__(self, options, model):
         super().__init__(options, model)
-        kind = Gather if model.device.is_cuda else Sweep
-        self.passes = kind(model, self.state, self.h, options.scheme == "symplectic")
+        symplectic = options.scheme == "symplectic"
+        if model.team.threads > 1:
+            _refuse_undivided(model)
+            self.passes = Ranges(model, self.state, self.h, symplectic, self.count)
+        else:
+            self.passes = (Gather if model.device.is_cuda else Sweep)(model, self.state, self.h, symplectic)
         self.model = self.passes.model
         self.past = Past(self.model, self.model.terms)  # none: what is damped is so within the pass
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):
-        self.passes.launch(steps, lambda x, v: self.launch_pins(x=x, v=v))
+        if isinstance(self.passes, Ranges):
+            self.passes.launch(steps, self.launch_pins_of)
+        else:
+            self.passes.launch(steps, lambda x, v: self.launch_pins(x=x, v=v))
+
+
+def _refuse_undivided(model):
+    """Refuses one cloth that has no range for each thread.
+
+    Raises:
+        ValueError: Naming the term, or both numbers.
+    """
+    threads = model.team.threads
+    for elements in model.terms:
+        if elements.cells:
+            raise ValueError(
+                f"threads is {threads} with one copy, whose {elements.label} Explicit cannot divide; threads=1 can, or PBD "
+                "and XPBD, and copies are shared out with every solver"
+            )
+    if threads > model.count:
+        raise ValueError(f"threads is {threads} for {model.count} vertices; there must be one for each at least")

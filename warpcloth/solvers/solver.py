@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -60,7 +61,7 @@ class Step:
         if threads > 1 and not self.divides:
             raise ValueError(
                 f"threads is {threads} with one copy, whose steps {type(self).__name__} cannot divide as it is set; "
-                "Explicit and HierarchicalPBD can, and PBD and XPBD with sweep='coloured'; copies are shared out with every solver"
+                "Explicit and HierarchicalPBD can, PBD and XPBD with sweep='coloured', and with several copies every solver"
             )
         return stepper(self, model)
 
@@ -150,14 +151,18 @@ class Stepper:
 
     def launch_pins(self, parts=1, x=None, v=None):
         """Moves the pins that have keyframes on by h/``parts``, the same in all calls, in x and v if not in the state."""
-        model = self.model
+        x, v = self.state.x if x is None else x, self.state.v if v is None else v
+        self.launch_pins_of(self.model, self.count, x, v, parts)
+
+    def launch_pins_of(self, model, count, x, v, parts=1):
+        """The same of a model, whose count of steps and whose x and v these are."""
         if model.pins is None:
             return
         dim = (model.copies, len(model.pins))
-        move, count = model.kernel(kernels.move_pins, model.dtype), model.kernel(kernels.count_step)
-        given = [model.pins, model.keyframes, self.count, parts * self.steps_per_frame, model.per_copy, self.h / parts]
-        model.launch(move, dim, given, [self.state.x if x is None else x, self.state.v if v is None else v])
-        model.launch(count, model.copies, [], [self.count])
+        move, add_one = model.kernel(kernels.move_pins, model.dtype), model.kernel(kernels.count_step)
+        given = [model.pins, model.keyframes, count, parts * self.steps_per_frame, model.per_copy, self.h / parts]
+        model.launch(move, dim, given, [x, v])
+        model.launch(add_one, model.copies, [], [count])
 
     def launch_prediction(self):
         """x = x̃, and the pins where they are then."""
@@ -297,7 +302,7 @@ class ThreadedStepper(Stepper):
         self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
         shares = min(model.team.threads, model.copies)
         ends = [model.copies * share // shares for share in range(shares + 1)]
-        self._copies = list(zip(ends[:-1], ends[1:], strict=True))
+        self._copies = list(pairwise(ends))
         self.shares = [stepper(options, model.share(first, end - first, self.state)) for first, end in self._copies]
         first = self.shares[0]
         self.steps_per_frame, self.h, self.he, self.uniform = first.steps_per_frame, first.h, first.he, first.uniform

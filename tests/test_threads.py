@@ -1,0 +1,212 @@
+"""Threads: what they share is to the bit what one makes, or the same in every run; failures and interrupts come back."""
+
+import _thread
+import gc
+import json
+import threading
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+from test_passes import SPRINGS, TERMS, declared
+from test_solvers import SOLVERS, allocations, square
+
+import warpcloth as wc
+from warpcloth.capture import Segment
+from warpcloth.cli import main
+from warpcloth.solvers import solver as solvers
+from warpcloth.team import Team
+
+VARY = {"Spring.stiffness": [50.0, 80.0, 100.0], "gravity": [[0.0, -9.8, 0.0], [0.0, -5.0, 1.0], [2.0, -3.0, 0.0]]}
+HARD = wc.Spring(stiffness=np.inf)
+# What steps of one cloth are divided by, colours of sweeps or ranges of vertices, and the cloth that they are of.
+DIVIDED = {
+    "explicit": (wc.Explicit(substeps=8), [SPRINGS]),
+    "pbd": (wc.PBD(substeps=7, iterations=4), [SPRINGS, wc.DihedralBending(stiffness=1e-3)]),
+    "pbd with clusters": (wc.PBD(substeps=7, iterations=4), [HARD, wc.RigidCluster(vertices=[[0, 1, 2, 7]], stiffness=np.inf)]),
+    "hierarchical pbd": (wc.HierarchicalPBD(substeps=7, iterations=2, coarse_iterations=2), [SPRINGS]),
+    "xpbd": (wc.XPBD(substeps=7, iterations=4), [replace(SPRINGS, damping=0.01), wc.QuadraticBending(stiffness=1e-4)]),
+    "xpbd hard": (wc.XPBD(substeps=7, iterations=4), [HARD]),
+    "xpbd midpoint": (wc.XPBD(substeps=7, iterations=4, integrator="midpoint"), [SPRINGS]),
+    "xpbd bdf2": (wc.XPBD(substeps=7, iterations=4, integrator="bdf2"), [SPRINGS]),
+}
+
+
+@pytest.fixture(autouse=True)
+def _cpu(device):
+    if not wp.get_device(device).is_cpu:
+        pytest.skip("threads are for the CPU")
+
+
+def bits(stepper):
+    return [array.numpy().copy() for array in stepper.state] + [stepper.residual]
+
+
+def same(steppers):
+    expected, *others = [bits(stepper) for stepper in steppers]
+    return all(np.array_equal(a, b) for other in others for a, b in zip(expected, other, strict=True))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_copies_shared_out_are_those_of_one_thread(name, device):
+    """To the bit, of uneven shares and of more threads than copies; when some are put back, too."""
+    record = replace(SOLVERS[name], substeps=2)
+    scene = square(solver=record, damping=0.01, fps=300.0, pins="corners")
+    steppers = [record.bind(scene.build(device=device, copies=3, vary=VARY, threads=threads)) for threads in (1, 2, 5)]
+    places = np.tile(scene.mesh.points + 0.01, (3, 1, 1))
+    given = {"positions": None if "bdf2" in name else places}
+    for stepper in steppers:
+        stepper.frame()
+        stepper.step()
+        stepper.reset(np.array([True, False, True]), **given)
+        stepper.step()
+    assert same(steppers)
+    for stepper in steppers[1:]:
+        assert stepper.results == steppers[0].results and stepper.iterations == steppers[0].iterations
+        assert (stepper.h, stepper.steps_per_frame) == (steppers[0].h, 2)
+
+
+@pytest.mark.parametrize("launches", [1, 10_000])
+@pytest.mark.parametrize("name", [name for name in DIVIDED if name != "explicit"])
+def test_colours_shared_out_are_those_of_one_thread(name, launches, device, monkeypatch):
+    """To the bit, with more threads than the smaller colours have elements, and pins that move."""
+    monkeypatch.setattr(solvers, "LAUNCHES", launches)
+    record, terms = DIVIDED[name]
+    steppers = [record.bind(declared(terms, fps=60.0).build(device=device, threads=threads)) for threads in (1, 2, 3)]
+    for stepper in steppers:
+        for _ in range(2):
+            stepper.frame()
+        stepper.step()
+    assert same(steppers)
+
+
+@pytest.mark.parametrize("launches", [1, 20])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", [name for name in TERMS if name not in ("clusters", "several")])
+def test_ranges_move_as_the_whole(name, dtype, launches, device, monkeypatch):
+    """The same but for the order of sums, and in every run the same bits; with pins that move, and from any place."""
+    monkeypatch.setattr(solvers, "LAUNCHES", launches)
+    scene, record = declared(TERMS[name], fps=50.0), wc.Explicit(substeps=20, above_limit="allow")
+    steppers = [record.bind(scene.build(device=device, dtype=dtype, threads=threads)) for threads in (1, 2, 2, 3)]
+    places = scene.positions[None] + 0.002 * np.sin(np.arange(scene.positions.size)).reshape(1, -1, 3)
+    for stepper in steppers:
+        stepper.frame()
+        stepper.step()
+        stepper.reset(positions=places)
+        stepper.step()
+        stepper.step()
+        stepper.frame()
+    assert same(steppers[1:3])
+    # As in test_passes, of 43 steps.
+    tolerance = 43 * 64 * np.finfo(dtype).eps / steppers[0].h
+    for stepper in steppers[1:]:
+        assert np.abs(stepper.state.v.numpy() - steppers[0].state.v.numpy()).max() < tolerance
+        assert np.abs(stepper.state.x.numpy() - steppers[0].state.x.numpy()).max() < 43 * stepper.h * tolerance
+
+
+@pytest.mark.parametrize("name", DIVIDED)
+def test_threads_allocate_nothing(name, device):
+    record, terms = DIVIDED[name]
+    for copies in (1, 2):
+        stepper = record.bind(declared(terms, fps=60.0).build(device=device, copies=copies, threads=2))
+        stepper.frame()
+        with wp.ScopedMemoryTracker("frames", print=False) as tracker:
+            assert allocations(tracker, lambda stepper=stepper: [stepper.frame() for _ in range(2)]) == 0
+
+
+def failing(team, model):
+    """What waits for all threads, and what fails before it does."""
+    segment = Segment(model.device, lambda: team.launch_meeting(model))
+
+    def fail():
+        raise ArithmeticError("of a thread")
+
+    return [segment, fail]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_a_thread_raises_reaches_the_caller(order, device):
+    """And whoever waits for it is let go; afterwards all is as before."""
+    model = square().build(device=device, threads=2)
+    team = model.team
+    wait, fail = failing(team, model)
+    for _ in range(3):
+        with pytest.raises(ArithmeticError, match="of a thread"):
+            team.run([wait, fail][::order])
+        team.run([wait, wait])
+
+
+def test_an_interrupt_waits_for_the_threads(device):
+    """It comes when all have ended, whoever waits for whom, and the next frame runs."""
+    model = square().build(device=device, threads=2)
+    team, ended, started = model.team, [], threading.Event()
+    wait, _fail = failing(team, model)
+
+    def late():
+        started.wait(10.0)
+        _thread.interrupt_main()
+        wait()
+        ended.append(True)
+
+    def early():
+        started.set()
+        wait()
+        ended.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        team.run([early, late])
+    assert len(ended) == 2
+    team.run([wait, wait])
+
+
+def test_threads_that_nobody_needs_end(device):
+    before = threading.enumerate()
+    model = square().build(device=device, threads=2, copies=2)
+    wc.PBD(substeps=1).bind(model).frame()
+    started = [thread for thread in threading.enumerate() if thread not in before]
+    assert started
+    del model
+    gc.collect()
+    for thread in started:
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Team(2, SimpleNamespace(is_cpu=False)), "threads is 2 on .*; more than 1 is for device='cpu'"),
+        (lambda: square().build(threads=0), "threads is 0; it must be a whole number of 1 or more"),
+        (lambda: wc.Newton(substeps=1).bind(square().build(threads=2)), "one copy, whose steps Newton cannot divide"),
+        (
+            lambda: wc.XPBD(substeps=1, sweep="constraint-averaged").bind(square().build(threads=2)),
+            "PBD and XPBD with sweep='coloured'",
+        ),
+        (
+            lambda: wc.Explicit(substeps=500).bind(declared(TERMS["clusters"]).build(threads=2)),
+            "whose RigidCluster Explicit cannot divide",
+        ),
+        (lambda: wc.Explicit(substeps=500).bind(square(2).build(threads=5)), "threads is 5 for 4 vertices"),
+    ],
+)
+def test_what_threads_cannot_do_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_simulate_and_the_commands_take_threads(device, tmp_path, capsys):
+    scene = square(pins="corners", fps=300.0)
+    record = wc.XPBD(substeps=2, iterations=3)
+    one, two = (wc.simulate(scene, record, device=device, frames=3, threads=threads) for threads in (1, 2))
+    assert np.array_equal(one.points, two.points)
+    command = ["-p", "n=5", "--solver", "explicit", "--frames", "2", "--json", "--threads", "2"]
+    assert main(["run", "hanging", *command, "-o", str(tmp_path / "out.usdc")]) == 0
+    out = capsys.readouterr().out
+    assert json.loads(out[out.index("{") :])["threads"] == 2
+    assert main(["bench", "hanging", *command]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    assert row["threads"] == 2 and row["launches"] > 1.0
+    assert main(["run", "hanging", "-p", "n=5", "--threads", "2", "-o", str(tmp_path / "no.usdc")]) == 2
+    assert "Newton cannot divide" in capsys.readouterr().err
