@@ -19,6 +19,7 @@ from warpcloth.cli import main
 from warpcloth.solvers import solver as solvers
 from warpcloth.team import Team
 
+pytestmark = pytest.mark.filterwarnings("ignore:threads is . on . cores")
 VARY = {"Spring.stiffness": [50.0, 80.0, 100.0], "gravity": [[0.0, -9.8, 0.0], [0.0, -5.0, 1.0], [2.0, -3.0, 0.0]]}
 HARD = wc.Spring(stiffness=np.inf)
 # What steps of one cloth are divided by, colours of sweeps or ranges of vertices, and the cloth that they are of.
@@ -173,6 +174,11 @@ def test_threads_that_nobody_needs_end(device):
     for thread in started:
         thread.join(10.0)
         assert not thread.is_alive()
+
+
+def test_more_threads_than_cores_warn(device):
+    with pytest.warns(UserWarning, match="threads is 1000 on .* cores; more threads than cores are slower"):
+        square().build(device=device, threads=1000)
 
 
 @pytest.mark.parametrize(

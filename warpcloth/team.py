@@ -1,8 +1,10 @@
 """Threads of this process that replay graphs side by side on the CPU: Warp leaves Python alone meanwhile."""
 
 import ctypes
+import os
 import sys
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import warp as wp
@@ -17,12 +19,20 @@ def _leave():
     return ctypes.cast(function, ctypes.c_void_p).value
 
 
+def _cores():
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Team:
     """Threads that share the work on a model.
 
     Args:
         threads: How many.
         device: The Warp device.
+
+    Warns:
+        UserWarning: If there are fewer cores.
 
     Raises:
         ValueError: If ``threads`` is below 1, or above on another device than the CPU.
@@ -35,6 +45,8 @@ class Team:
             return
         if not device.is_cpu:
             raise ValueError(f"threads is {threads} on {device}, which has its own; more than 1 is for device='cpu'")
+        if self.threads > _cores():
+            warnings.warn(f"threads is {threads} on {_cores()} cores; more threads than cores are slower", stacklevel=4)
         self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth")
         self._meeting = wp.zeros(kernels.NUMBERS, dtype=wp.int32, device=device)
         self._leave = _leave()

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -57,6 +56,8 @@ class Step:
         """
         threads = model.team.threads
         if threads > 1 and model.copies > 1:
+            from .threaded import ThreadedStepper
+
             return ThreadedStepper(self, stepper, model)
         if threads > 1 and not self.divides:
             raise ValueError(
@@ -259,10 +260,7 @@ class LaunchedStepper(Stepper):
 
     def _replay(self, segments):
         team = self.model.team
-        if team.threads == 1:
-            self._replay_part(segments, 0)
-        else:
-            team.run([partial(self._replay_part, segments, thread) for thread in range(team.threads)])
+        team.run([partial(self._replay_part, segments, thread) for thread in range(team.threads)])
         self.note()
 
     def _replay_part(self, segments, thread):
@@ -283,59 +281,6 @@ class LaunchedStepper(Stepper):
 
     def note(self):
         """Takes down how the steps since the last call ended; of methods that have no residual nothing."""
-
-
-class ThreadedStepper(Stepper):
-    """Several copies for several threads: a stepper of its own, on neighbouring copies, in each.
-
-    Args:
-        options: Of the solver.
-        stepper: The type of its steppers.
-        model: The model.
-
-    Attributes:
-        shares: The stepper of each thread, whose state is a part of ``state``.
-    """
-
-    def __init__(self, options, stepper, model):
-        self.options, self.model, self._reset = options, model, None
-        self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
-        shares = min(model.team.threads, model.copies)
-        ends = [model.copies * share // shares for share in range(shares + 1)]
-        self._copies = list(pairwise(ends))
-        self.shares = [stepper(options, model.share(first, end - first, self.state)) for first, end in self._copies]
-        first = self.shares[0]
-        self.steps_per_frame, self.h, self.he, self.uniform = first.steps_per_frame, first.h, first.he, first.uniform
-        self.factorise_seconds = sum(share.factorise_seconds for share in self.shares)
-
-    @property
-    def results(self):
-        return [result for share in self.shares for result in share.results]
-
-    @property
-    def residual(self):
-        return np.concatenate([share.residual for share in self.shares])
-
-    @property
-    def iterations(self):
-        return max(share.iterations for share in self.shares)
-
-    def step(self):
-        self.model.team.run([share.step for share in self.shares])
-
-    def frame(self):
-        for share in self.shares:
-            share.prepare_frame()
-        self.model.team.run([share.frame for share in self.shares])
-
-    def reset(self, mask=None, positions=None, velocities=None):
-        if self._reset is None:
-            self._reset = Reset(self)
-        mask, positions, velocities = self._reset.on_device(mask, positions, velocities)
-        n = self.model.per_copy
-        for share, (first, end) in zip(self.shares, self._copies, strict=True):
-            places = [None if given is None else given[first * n : end * n] for given in (positions, velocities)]
-            share.reset(mask[first:end], *places)
 
 
 def require_model(model):
