@@ -131,7 +131,7 @@ def row(n, ms, substeps=4, benchmark=0, solver="xpbd", status="ok", wide=0.1, **
     found = {"scene": "hanging", "parameters": {"n": n}, "solver": solver, "options": {"substeps": substeps, "iterations": 5}}
     found |= {"label": f"{solver} {substeps}×5", "device": "cpu", "dtype": "float32", "benchmark": benchmark, "status": status}
     found |= {"reason": "", "vertices": n * n, "substeps": substeps, "iterations": 5.0, "ms": ms, "spread": None, "bytes": 100}
-    found |= {"launches": 10.0, "start_s": 1.0, "memory": 1000, "copies": 1, "cloths_per_s": ms and 1e3 / ms}
+    found |= {"launches": 10.0, "start_s": 1.0, "memory": 1000, "copies": 1, "threads": 1, "cloths_per_s": ms and 1e3 / ms}
     return found | ({"spread": [(1 - wide) * ms, (1 + wide) * ms]} if ms else {}) | more
 
 
@@ -173,7 +173,9 @@ def folder(tmp_path, monkeypatch):
     """A folder with results old.json, new.json and such that are none."""
     monkeypatch.chdir(tmp_path)
     files = {"old": json.dumps(OLD), "new": json.dumps(NEW), "alone": json.dumps(result(row(5, 1.0)))}
-    files["before"] = json.dumps(result(*({k: v for k, v in each.items() if k != "copies"} for each in OLD["rows"])))
+    files["before"] = json.dumps(
+        result(*({k: v for k, v in each.items() if k not in ("copies", "threads")} for each in OLD["rows"]))
+    )
     files |= {"text": "no result", "list": "[]", "rows": '{"rows": [{}], "machine": {}}', "number": '{"rows": 3}'}
     for name, text in files.items():
         (tmp_path / f"{name}.json").write_text(text, encoding="utf-8")
