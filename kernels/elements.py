@@ -177,12 +177,22 @@ class Nothing:
     unused: int
 
 
+def chain_of(parts: tuple[Part, ...], dtype, struct_of=elements_of):
+    """The struct of what a kernel reads of all terms: that of the first, and the chain of the others.
+
+    Args:
+        parts: What tells the terms apart.
+        dtype: A Warp scalar type.
+        struct_of: (part, dtype) → the struct of one.
+    """
+    return _chain(tuple(struct_of(part, dtype) for part in parts))
+
+
 @cache
-def chain_of(parts: tuple[Part, ...], dtype):
-    """The struct of what a kernel reads of all terms: that of the first, and the chain of the others."""
-    if not parts:
+def _chain(structs):
+    if not structs:
         return Nothing
-    first_type, others_type = elements_of(parts[0], dtype), chain_of(parts[1:], dtype)
+    first_type, others_type = structs[0], _chain(structs[1:])
 
     @wp.struct
     class Chain:

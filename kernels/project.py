@@ -60,8 +60,9 @@ def spread_compliance(dtype):
 
 
 @cache
-def multiplier(term: Term, dtype, scalar: bool, per_step: bool):
-    """The device function (y, rest, inverse masses w of the corners, α̃, λ, sweeps) → (Δλ, rows (M, 3)).
+def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: bool = True):
+    """The device function (y, rest, inverse masses w of the corners, α̃, λ, sweeps) → (Δλ, rows (M, 3)); λ 0 if not
+    ``multipliers``.
 
     Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]. Where G W Gᵀ is no multiple of I its mean diagonal stands for w when spreading.
     """
@@ -76,7 +77,7 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool):
         raise NotImplementedError(f"{term.name} projects {term.rows} rows; two at most")
 
     @wp.func
-    def of_projection(y: y_type, r: rest_type, w: corners, compliance: dtype, multipliers: y_type, sweeps: int):
+    def of_projection(y: y_type, r: rest_type, w: corners, compliance: dtype, before: y_type, sweeps: int):
         system = square()
         for i in range(K):
             system += w[i] * wp.outer(weight(r, i), weight(r, i))
@@ -84,18 +85,21 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool):
         rows = y_type()
         if wp.static(per_step):
             compliance = spread(mean, compliance, sweeps)
-        if wp.isfinite(compliance) and mean != dtype(0.0):
-            for m in range(M):
-                system[m, m] = system[m, m] + compliance
-            gap = project(y, r) - y - compliance * multipliers
-            if wp.static(term.rows == 1):
-                rows = gap / system[0, 0]
-            else:
+        moves = wp.isfinite(compliance) and mean != dtype(0.0)
+        gap = project(y, r) - y
+        if wp.static(multipliers):
+            gap -= compliance * before
+        if wp.static(term.rows == 1):  # without a branch, so that a GPU may take several constraints at once
+            rows = wp.where(moves, (dtype(1.0) / (system[0, 0] + compliance)) * gap, rows)
+        else:
+            if moves:
+                for m in range(M):
+                    system[m, m] = system[m, m] + compliance
                 rows = pseudo_inverse2(system) * gap
         return rows, rows
 
     @wp.func
-    def of_constraint(y: y_type, r: rest_type, w: corners, compliance: dtype, multipliers: dtype, sweeps: int):
+    def of_constraint(y: y_type, r: rest_type, w: corners, compliance: dtype, before: dtype, sweeps: int):
         g = constraint_gradient(y, r)
         total = dtype(0.0)
         for i in range(K):
@@ -107,7 +111,7 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool):
         if wp.static(per_step):
             compliance = spread(total, compliance, sweeps)
         if wp.isfinite(compliance) and total != dtype(0.0):
-            change = -(constraint(y, r) + compliance * multipliers) / (total + compliance)
+            change = -(constraint(y, r) + compliance * before) / (total + compliance)
         return change, g * change
 
     return of_constraint if scalar else of_projection
@@ -186,79 +190,6 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
             wp.atomic_add(out, stencil[e, i], (inverse_mass[stencil[e, i]] * factor[e]) * move)
 
     return scatter
-
-
-@cache
-def gather_correction(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
-    """Kernel over vertices: the same sum in a fixed order, through :attr:`warpcloth.model.DeviceElements.incidences`.
-
-    It leaves λ as it is: :func:`advance_multipliers` follows.
-    """
-    vec3, _ = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
-    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
-    change, weight = element_change(term, dtype, scalar, per_step), term.weight
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def gather(
-        offsets: wp.array(dtype=wp.int32),
-        incidences: wp.array(dtype=wp.int32),
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
-        rest: wp.array(dtype=rest_type),
-        inverse_mass: wp.array(dtype=dtype),
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        h: dtype,
-        sweeps: int,
-        factor: wp.array(dtype=dtype),
-        lambdas: wp.array(dtype=lambda_type),
-        # in and out
-        out: wp.array(dtype=vec3),
-    ):
-        v = wp.tid()
-        total = vec3()
-        for n in range(offsets[v], offsets[v + 1]):
-            e = incidences[n] // K
-            r = rest[e]
-            before = lambda_type(dtype(0.0))
-            if wp.static(multipliers):
-                before = lambdas[e]
-            _more, rows = change(stencil, e, stiffness[e], r, inverse_mass, x, d, h, before, sweeps)
-            w = weight(r, incidences[n] - e * K)
-            for m in range(M):
-                total += (factor[e] * w[m]) * rows[m]
-        out[v] = out[v] + inverse_mass[v] * total
-
-    return gather
-
-
-@cache
-def advance_multipliers(term: Term, dtype, scalar: bool):
-    """Kernel over elements, after :func:`gather_correction` and before its sum is applied: λ += factorₑ Δλ."""
-    vec3, _ = types(dtype)
-    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
-    change = element_change(term, dtype, scalar, False)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def advance(
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
-        rest: wp.array(dtype=rest_type),
-        inverse_mass: wp.array(dtype=dtype),
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        h: dtype,
-        sweeps: int,
-        factor: wp.array(dtype=dtype),
-        # in and out
-        lambdas: wp.array(dtype=lambda_type),
-    ):
-        e = wp.tid()
-        more, _rows = change(stencil, e, stiffness[e], rest[e], inverse_mass, x, d, h, lambdas[e], sweeps)
-        lambdas[e] = lambdas[e] + factor[e] * more
-
-    return advance
 
 
 @wp.func

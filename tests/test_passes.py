@@ -10,9 +10,11 @@ from test_damping import damping_forces
 from test_solvers import SOLVERS, allocations, square
 
 import warpcloth as wc
-from warpcloth import blocks, incidences, passes
+from warpcloth import blocks, incidences, jacobi, passes, sweeps
 from warpcloth.blocks import in_blocks
+from warpcloth.damping import Past, damped_terms
 from warpcloth.incidences import gathered
+from warpcloth.jacobi import Scatter
 from warpcloth.operators import Gradient
 from warpcloth.passes import Gather, Sweep
 from warpcloth.solvers import explicit, solver
@@ -183,6 +185,54 @@ def test_a_frame_allocates_nothing(name, device):
     stepper.frame()
     with wp.ScopedMemoryTracker("frames", print=False) as tracker:
         assert allocations(tracker, lambda: [stepper.frame() for _ in range(3)]) == 0
+
+
+SWEEPS = {
+    "plain": {"kind": "jacobi"},
+    "averaged by vertex": {"kind": "vertex-averaged", "alpha": 1.0},
+    "averaged by constraint": {"kind": "constraint-averaged"},
+    "stiffness per step": {"kind": "vertex-averaged", "spread": 4},
+    "multipliers": {"kind": "constraint-averaged", "multipliers": True},
+    "scalar constraints": {"kind": "constraint-averaged", "multipliers": True, "scalar": True},
+}
+PROJECTED = {name: terms for name, terms in TERMS.items() if name not in ("St. Venant-Kirchhoff", "Neo-Hookean")}
+PROJECTED["corotated"] = [wc.CorotatedMembrane(stiffness=100.0)]
+
+
+@pytest.mark.parametrize(
+    ("options", "dtype"),
+    [
+        pytest.param(options, dtype, id=f"{name}-{dtype}")
+        for name, options in SWEEPS.items()
+        for dtype in (("float32", "float64") if name in ("plain", "multipliers") else ("float32",))
+    ],
+)
+@pytest.mark.parametrize("name", PROJECTED)
+def test_jacobi_sweeps_gather_what_they_scatter(name, options, dtype, device, monkeypatch):
+    """d and λ, whether sweeps run one by one, which copies what they leave in the other arrays back, or in pairs."""
+    scene, steps, h = declared(PROJECTED[name]), 3, 0.02
+    model = scene.build(device=device, dtype=dtype, copies=2)
+    model = model.with_terms(damped_terms(model, h))
+    Past(model, model.terms).launch(model.positions)  # sets the rest state of what is damped, by element
+    d, found = model.array(RANDOM.normal(scale=0.01, size=(model.count, 3)), model.vec3), []
+    for way, pairs in ((Scatter, False), (jacobi.Gather, False), (jacobi.Gather, True)):
+        monkeypatch.setattr(sweeps, "Scatter", way)
+        monkeypatch.setattr(sweeps, "Gather", way)
+        made = sweeps.Sweep(model, model.positions, h, relaxation=0.1, **options)
+        made.correction.assign(d)
+        made.launch_start()
+        assert not made.correction.numpy().any()
+        made.correction.assign(d)
+        for launch, times in made.parts(steps) if pairs else [(made.launch, steps)]:
+            for _ in range(times):
+                launch()
+        found.append([made.correction.numpy(), *(array.numpy() for array in made.multipliers if array is not None)])
+    assert not np.array_equal(found[0][0], d.numpy()) or name == "nothing"
+    # A sweep moves a vertex by ω of what its constraints ask for, of y that are wrong by a few roundings of places; λ is that
+    # times the mass. The same kernels make the same bits.
+    for scattered, gathered_, paired in zip(*found, strict=True):
+        assert np.array_equal(gathered_, paired)
+        assert np.abs(scattered - gathered_).max() <= steps * 8 * np.finfo(dtype).eps * max(np.abs(scattered).max(), 0.1)
 
 
 @pytest.mark.parametrize("copies", [1, 2])

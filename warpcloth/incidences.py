@@ -5,6 +5,7 @@ import warp as wp
 
 from .kernels.assemble import constant_blocks
 from .kernels.elements import Part, chain_of, elements_of
+from .kernels.jacobi import rows_of
 
 SLOTS = 16  # of pairs, which are compiled one by one
 # On CUDA so many threads take a vertex of meshes of so many vertices or less: a step of the springs of 64² takes 2.0 µs, not
@@ -21,23 +22,77 @@ def gathered(model, elements, damped=False):
     beside it at hand, unless the rest state is set, by element, in each step. Of a quadratic energy that is not damped the
     incidences are the rows of its matrix.
     """
-    stencil, count = elements.stencil.numpy(), model.count
     part = Part(elements.term, damped, shared=0 in elements.stiffness.strides)
     arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
     if damped:
         arrays["damping"] = elements.damping
-    if stencil.shape[1] == 2 and elements.origin is None:
-        columns = [_rows(stencil[:, corner], count) for corner in range(2)]
-        slots = tuple(int(np.diff(offsets).max(initial=0)) for _order, _vertices, offsets in columns)
-        if sum(slots) <= SLOTS and sum(slots) * count <= 2 * stencil.size:
-            return part._replace(pairs=slots), _of_pairs(elements, columns, slots, count, arrays)
+    if found := _pairs(elements, model.count):
+        slots, codes, source = found
+        codes = np.where(codes < 0, -1 - np.arange(model.count), codes)
+        others = {name: _of_incidences(array, source.ravel()) for name, array in arrays.items() if name != "stencil"}
+        return part._replace(pairs=slots), {**others, "codes": indices(elements, codes.ravel())}
     if elements.term.quadratic and not damped and (found := _of_matrix(model, elements)):
         slots, rows = found
         return part._replace(rows=slots), rows
-    order, vertices, offsets = _rows(stencil.ravel(), count)
+    return _by_element(elements, model.count, part, arrays)
+
+
+def gathered_in_rows(elements, count, pairs, **others):
+    """The same for Jacobi sweeps: incidences of pairs in rows, see :func:`warpcloth.kernels.jacobi.rows_of`, or by element.
+
+    Args:
+        elements: :class:`warpcloth.model.DeviceElements`.
+        count: Vertices, N.
+        pairs: Whether incidences may name the other vertex in place of the element.
+        others: What else goes along, by name, numbers (B·E,) of the elements.
+    """
+    part = Part(elements.term, shared=0 in elements.stiffness.strides)
+    arrays = {"stiffness": elements.stiffness, "rest": elements.rest, **others}
+    if not pairs or not (found := _pairs(elements, count)):
+        return _by_element(elements, count, part, {"stencil": elements.stencil, **arrays})
+    slots, codes, source = found
+    rows, width = rows_of(sum(slots))
+    empty = ((0, rows * width - sum(slots)), (0, 0))
+    codes, source = np.pad(codes, empty, constant_values=-1), np.pad(source, empty)
+
+    def in_rows(values):
+        """Values (slots, N) or (slots, N, P) as they are stored: of each row P times the slots of each vertex."""
+        parts = values.reshape(rows, width, count, -1).transpose(0, 3, 2, 1)
+        return np.ascontiguousarray(parts).reshape(-1, *values.shape[2:])
+
+    found = {"codes": indices(elements, in_rows(codes))}
+    for name, array in arrays.items():
+        shared = 0 in array.strides
+        found[name] = array if shared else wp.array(in_rows(array.numpy()[source]), dtype=array.dtype, device=array.device)
+    return part._replace(pairs=slots), found
+
+
+def _by_element(elements, count, part, arrays):
+    """The part and the arrays of incidences that name elements."""
+    order, vertices, offsets = _rows(elements.stencil.numpy().ravel(), count)
     codes, padded = _slots(order, vertices, offsets, count)
     arrays |= {"offsets": indices(elements, offsets), "codes": indices(elements, codes)}
     return part._replace(padded=padded), arrays
+
+
+def _pairs(elements, count):
+    """Slots of a vertex as first and as second of a pair, and of each slot and vertex the other vertex and the element.
+
+    -1 and 0 of an empty slot. None where elements are no pairs, or their rest state is set in each step, or there would be too
+    many slots.
+    """
+    stencil = elements.stencil.numpy()
+    if stencil.shape[1] != 2 or elements.origin is not None:
+        return None
+    columns = [_rows(stencil[:, corner], count) for corner in range(2)]
+    slots = tuple(int(np.diff(offsets).max(initial=0)) for _order, _vertices, offsets in columns)
+    if sum(slots) > SLOTS or sum(slots) * count > 2 * stencil.size:
+        return None
+    codes, source = np.full((sum(slots), count), -1), np.zeros((sum(slots), count), dtype=np.int64)
+    for corner, (order, vertices, offsets) in enumerate(columns):
+        place = corner * slots[0] + np.arange(len(order)) - offsets[vertices], vertices
+        codes[place], source[place] = stencil[order, 1 - corner], order
+    return slots, codes, source
 
 
 def _rows(vertices, count):
@@ -90,17 +145,6 @@ def _of_matrix(model, elements):
     return slots, {"codes": indices(elements, codes.ravel()), "stiffness": model.array(numbers.ravel(), model.dtype)}
 
 
-def _of_pairs(elements, columns, slots, count, arrays):
-    """The arrays of incidences that name the other vertex, those as first of a pair before those as second."""
-    stencil = elements.stencil.numpy()
-    codes, source = -1 - np.tile(np.arange(count), sum(slots)), np.zeros(sum(slots) * count, dtype=np.int64)
-    for corner, (order, vertices, offsets) in enumerate(columns):
-        place = (corner * slots[0] + np.arange(len(order)) - offsets[vertices]) * count + vertices
-        codes[place], source[place] = stencil[order, 1 - corner], order
-    found = {name: _of_incidences(array, source) for name, array in arrays.items() if name != "stencil"}
-    return found | {"codes": indices(elements, codes)}
-
-
 def _of_incidences(array, source):
     """The values of elements ``source``, if elements do not share one."""
     if 0 in array.strides:
@@ -118,12 +162,18 @@ def lanes(model):
     return LANES if model.device.is_cuda and model.count <= LANED else 1
 
 
-def chain(parts, arrays, dtype):
+def chain(parts, arrays, dtype, struct_of=elements_of):
     """The struct of all terms: that of the first, and the chain of the others."""
-    made = chain_of(tuple(parts), dtype)()
+    made = chain_of(tuple(parts), dtype, struct_of)()
     if parts:
-        elements = elements_of(parts[0], dtype)()
-        for name, value in arrays[0].items():
-            setattr(elements, name, value)
-        made.first, made.others = elements, chain(parts[1:], arrays[1:], dtype)
+        made.first = filled(struct_of(parts[0], dtype), arrays[0])
+        made.others = chain(parts[1:], arrays[1:], dtype, struct_of)
+    return made
+
+
+def filled(struct, values):
+    """A struct of these values, by name."""
+    made = struct()
+    for name, value in values.items():
+        setattr(made, name, value)
     return made

@@ -8,9 +8,9 @@ import numpy as np
 import warp as wp
 
 from .damping import refuse_apart
+from .jacobi import Gather, Scatter
 from .kernels import project as kernels
 from .kernels.clusters import correct_clusters
-from .operators import fit_cells
 
 # By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
 # the largest n of its vertices. Jacobi: the plain sum.
@@ -98,22 +98,17 @@ class Sweep:
             wp.zeros(elements.count, dtype=kernels.multiplier_type(*key), device=model.device) if multipliers else None
             for elements, key in zip(model.terms, keys, strict=True)
         ]
-        more, cuda = (multipliers, spread is not None), model.device.is_cuda
-        if self.in_place:
-            self._kernels = [
-                model.kernel(correct_clusters, model.dtype, *more)
-                if elements.cells
-                else model.kernel(kernels.correct_in_place, *key, *more)
-                for elements, key in zip(model.terms, keys, strict=True)
-            ]
+        if not self.in_place:
+            way = Gather if model.device.is_cuda else Scatter
+            self._jacobi = way(model, x, h, self.correction, self.multipliers, keys, *self._weights(kind, alpha), spread)
             return
-        factory = kernels.gather_correction if cuda else kernels.scatter_correction
-        self._kernels = [model.kernel(factory, *key, *more) for key in keys]
-        self._advance = [model.kernel(kernels.advance_multipliers, *key) for key in keys if multipliers and cuda]
-        self._incidences = [elements.incidences if cuda else () for elements in model.terms]
-        self._apply = model.kernel(kernels.apply_correction, model.dtype)
-        self._total = model.vectors()
-        self._weigh(kind, alpha)
+        more = multipliers, spread is not None
+        self._kernels = [
+            model.kernel(correct_clusters, model.dtype, *more)
+            if elements.cells
+            else model.kernel(kernels.correct_in_place, *key, *more)
+            for elements, key in zip(model.terms, keys, strict=True)
+        ]
 
     def _by_colour(self, elements):
         """The elements of all copies by colour, and the range of each colour."""
@@ -125,51 +120,44 @@ class Sweep:
         firsts = np.cumsum(counts) - counts
         return elements.reordered(np.argsort(colour, kind="stable")), list(zip(firsts.tolist(), counts.tolist(), strict=True))
 
-    def _weigh(self, kind, alpha):
+    def _weights(self, kind, alpha):
         """Factors of elements and of vertices."""
         model, terms = self.model, self.model.terms
+        even = [model.constant(self.relaxation, elements.count) for elements in terms]
         if kind == "jacobi":
-            self._factors = [model.constant(self.relaxation, elements.count) for elements in terms]
-            self._scale = model.constant(1.0, model.count)
-            return
+            return even, model.constant(1.0, model.count)
         constraints = np.zeros(model.count)
         for elements in terms:
             constraints += np.bincount(elements.stencil.numpy().ravel(), minlength=model.count)
         if kind == "vertex-averaged":
-            self._factors = [model.constant(self.relaxation, elements.count) for elements in terms]
-            self._scale = model.array(1.0 / np.maximum(constraints + alpha, np.finfo(np.float32).tiny), model.dtype)
-            return
+            return even, model.array(1.0 / np.maximum(constraints + alpha, np.finfo(np.float32).tiny), model.dtype)
         constraints[model.inverse_mass.numpy() == 0.0] = 1.0  # what does not move cannot overshoot
         largest = [constraints[elements.stencil.numpy()].max(axis=1) for elements in terms]
         for i, elements in enumerate(terms):
             if elements.cells:  # one factor for all of a cell
                 firsts = elements.cells.offsets.numpy()[:-1]
                 largest[i] = np.repeat(np.maximum.reduceat(largest[i], firsts), elements.cells.sizes)
-        self._factors = [model.array(self.relaxation / each, model.dtype) for each in largest]
-        self._scale = model.constant(1.0, model.count)
+        return [model.array(self.relaxation / each, model.dtype) for each in largest], model.constant(1.0, model.count)
 
     def launch_start(self):
-        """d = 0, λ = 0."""
+        """d = 0, λ = 0, after x̃ is there."""
+        if not self.in_place:
+            self._jacobi.launch_start()
+            return
         for array in (self.correction, *self.multipliers):
             if array is not None:
                 array.zero_()
-        if not self.in_place:
-            self._total.zero_()
 
     def launch(self, backward=False):
         """One sweep; of Gauss–Seidel also backward, from the last term, colour and element to the first."""
         if self.in_place:
             self._launch_in_place(backward)
-            return
-        model = self.model
-        fit_cells(model, self.elements, self.x, self.correction)
-        for i, elements in enumerate(self.elements):
-            given = [*elements.arguments, model.inverse_mass, self.x, self.correction, self.h, self.spread, self._factors[i]]
-            dim = len(self._incidences[i][0]) - 1 if self._incidences[i] else elements.count
-            model.launch(self._kernels[i], dim, [*self._incidences[i], *given], [self.multipliers[i], self._total])
-            if self._advance:
-                model.launch(self._advance[i], elements.count, given, [self.multipliers[i]])
-        model.launch(self._apply, model.count, [self._scale], [self._total, self.correction])
+        else:
+            self._jacobi.launch()
+
+    def parts(self, sweeps):
+        """Pairs of a function that launches and of how many times it runs, for so many sweeps."""
+        return [(self.launch, sweeps)] if self.in_place else self._jacobi.parts(sweeps)
 
     def _launch_in_place(self, backward):
         model, team = self.model, self.model.team

@@ -76,11 +76,7 @@ def hessian(y: Any, rest: Any, policy: int):
 @wp.func
 def project(y: Any, rest: Any):
     length = wp.length(y[0])
-    p = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    p[0] = y[0]
-    if not collapsed(length, rest[0]):
-        p[0] = y[0] * (rest[0] / length)
-    return p
+    return wp.where(collapsed(length, rest[0]), y.dtype(1.0), rest[0] / length) * y
 
 
 @wp.func

@@ -70,9 +70,20 @@ _SETUPS = (
 )
 
 
+# Local sweeps alone: so many that what a frame takes besides, its points on the host above all, does not count.
+_LOCAL = Setup("pbd", {"substeps": 1, "iterations": 1000, "sweep": "vertex-averaged"})
+_LOCAL_SIZES = {"cpu": (16, 32, 64, 128), "cuda": (256, 512, 1024, 2048)}
+
+
 def standard(**given):
-    """Every solver on ``hanging`` of growing size; ``given`` are further fields of each :class:`Benchmark`."""
-    return [Benchmark(SceneRef("hanging"), setup, sizes, **given) for setup, sizes in _SETUPS]
+    """Every solver on ``hanging`` of growing size, and Jacobi sweeps over the springs of ``net``.
+
+    Args:
+        given: Further fields of each :class:`Benchmark`.
+    """
+    kind = "cuda" if given.get("device", "cpu").startswith("cuda") else "cpu"
+    local = Benchmark(SceneRef("net"), _LOCAL, _LOCAL_SIZES[kind], **given)
+    return [*(Benchmark(SceneRef("hanging"), setup, sizes, **given) for setup, sizes in _SETUPS), local]
 
 
 class Run:

@@ -86,7 +86,7 @@ class PBDStepper(LaunchedStepper):
         spread = options.iterations if options.stiffness == "per-step" else None
         self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)
         self.past = Past(model, self.sweep.elements)
-        self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
+        self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
 
     def _launch_start(self):
         self.model.team.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)

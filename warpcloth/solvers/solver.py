@@ -230,8 +230,9 @@ class LaunchedStepper(Stepper):
                 times it runs.
         """
         launches = self.model.launches
-        self._parts, self._step, self._frame, self._size = parts, [], None, 0
-        for launch, times in parts:
+        self._parts = [(launch, times) for launch, times in parts if times]
+        self._step, self._frame, self._size = [], None, 0
+        for launch, times in self._parts:
             before = launches[0]
             self._step.append((self._segments(launch), times))
             self._size += (launches[0] - before) // self.model.team.threads * times

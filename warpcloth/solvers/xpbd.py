@@ -123,28 +123,26 @@ class XPBDStepper(LaunchedStepper):
         self._keep_largest = model.kernel(keep_largest)
         gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         self._scale = np.where(gravity > 0.0, gravity, 1.0)
-        self._to_and_fro = options.integrator == "midpoint" and self.sweep.in_place
-        sweeps = options.iterations // (2 if self._to_and_fro else 1) - 1
-        self.record((self._launch_start, 1), (self._launch_sweep, sweeps), (self._launch_last, 1))
+        sweeps = self.sweep.parts(options.iterations - (not soft))
+        if options.integrator == "midpoint" and self.sweep.in_place:
+            sweeps = [(self._launch_to_and_fro, options.iterations // 2)]
+        self.record((self._launch_start, 1), *sweeps, (self._launch_last, 1))
         self.integrator.start()
 
     def _launch_start(self):
         self.model.team.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
 
-    def _launch_sweep(self):
-        """One sweep, or one forward and one backward."""
+    def _launch_to_and_fro(self):
+        """One sweep forward and one backward."""
         self.sweep.launch()
-        if self._to_and_fro:
-            self.sweep.launch(backward=True)
+        self.sweep.launch(backward=True)
 
     def _launch_last(self):
-        """The last sweep, the force that it leaves unbalanced, and the end of the step."""
+        """The force that the sweeps leave unbalanced, or of hard constraints the last sweep and its move; the end of a step."""
         team = self.model.team
         if self._gradient is None:
             team.launch_alone(self.model, self._force.zero_, lambda: self._launch_momentum(-1.0))
             self.sweep.launch()
-        else:
-            self._launch_sweep()
         if team.leads:
             self._launch_end()
 
