@@ -54,18 +54,18 @@ class Gather:
     def __init__(self, model, x, h, correction, multipliers, keys, factors, scale, spread):
         self.model, self.x, self.correction, self.multipliers = model, x, correction, multipliers
         more, count = any(array is not None for array in multipliers), model.count
-        found = [
+        self._found = [  # whose memory the structs do not keep
             gathered_in_rows(elements, count, pairs=not more, factor=factor)
             for elements, factor in zip(model.terms, factors, strict=True)
         ]
         parts = tuple(
             jacobi.Projected(part, scalar, 0 in factor.strides, more, spread is not None)
-            for (part, _arrays), (_term, _dtype, scalar), factor in zip(found, keys, factors, strict=True)
+            for (part, _arrays), (_term, _dtype, scalar), factor in zip(self._found, keys, factors, strict=True)
         )
         others = [None if array is None else wp.zeros_like(array) for array in multipliers]
         self._places = [(correction, *multipliers), (model.vectors(), *others)]
         self._chains = [
-            _chain(parts, found, *lambdas, model.dtype) for lambdas in ((multipliers, others), (others, multipliers))
+            _chain(parts, self._found, *lambdas, model.dtype) for lambdas in ((multipliers, others), (others, multipliers))
         ]
         self._rows = wp.zeros(count, dtype=wp.types.vector(4, model.dtype), device=model.device)
         self._pack = model.kernel(jacobi.pack, model.dtype)
