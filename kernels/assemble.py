@@ -8,6 +8,7 @@ from functools import cache
 
 import warp as wp
 
+from .memory import load
 from .term import Term
 
 
@@ -26,20 +27,24 @@ def local_coordinate(term: Term, dtype, corrected: bool):
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    weight = term.weight
+    weight, vector, vertex = term.weight, load(vec3), load(wp.int32, 2)
+
+    @wp.func
+    def part_of(rest: rest_type, corner: int, place: vec3):
+        w = weight(rest, corner)
+        y = y_type()
+        for m in range(M):
+            y[m] = w[m] * place
+        return y
 
     @wp.func
     def y_of(stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        y = y_type()
-        for i in range(K):
-            w = weight(rest, i)
-            for m in range(M):
-                y[m] = y[m] + w[m] * x[stencil[e, i]]
+        y = part_of(rest, 0, vector(x, vertex(stencil, K * e)))
+        for i in range(1, K):
+            y += part_of(rest, i, vector(x, vertex(stencil, K * e + i)))
         if wp.static(corrected):
             for i in range(K):
-                w = weight(rest, i)
-                for m in range(M):
-                    y[m] = y[m] + w[m] * d[stencil[e, i]]
+                y += part_of(rest, i, vector(d, vertex(stencil, K * e + i)))
         return y
 
     return y_of

@@ -11,8 +11,9 @@ import warp as wp
 
 from .assemble import types
 from .blocks import add_blocks
-from .elements import Part, chain_of, load, store
+from .elements import Part, chain_of
 from .gather import sum_at_vertices
+from .memory import load, store
 
 
 @cache

@@ -5,7 +5,8 @@ from functools import cache
 import warp as wp
 
 from .assemble import types
-from .elements import Part, chain_of, elements_of, load, load_shared, local_gradient, of_corner, store
+from .elements import Part, chain_of, elements_of, local_gradient, of_corner
+from .memory import load, load_shared, store
 
 
 @cache

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import warp as wp
 
 from .assemble import types
-from .elements import Part, chain_of, elements_of, load, load_shared, of_corner, store
+from .elements import Part, chain_of, elements_of, of_corner
+from .memory import load, load_shared, store
 from .project import multiplier, multiplier_type
 
 

@@ -23,6 +23,7 @@ from typing import Any
 import warp as wp
 
 from .assemble import local_coordinate, types
+from .memory import load, load_shared, store
 from .rotation import epsilon
 from .term import Term
 
@@ -66,10 +67,9 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
 
     Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]. Where G W Gᵀ is no multiple of I its mean diagonal stands for w when spreading.
     """
-    vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    square, corners = wp.types.matrix((term.rows, term.rows), dtype), wp.types.vector(term.vertices, dtype)
+    corners = wp.types.vector(term.vertices, dtype)
     weight, project = term.weight, term.project
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
     spread = spread_compliance(dtype)
@@ -78,14 +78,14 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
 
     @wp.func
     def of_projection(y: y_type, r: rest_type, w: corners, compliance: dtype, before: y_type, sweeps: int):
-        system = square()
-        for i in range(K):
+        system = w[0] * wp.outer(weight(r, 0), weight(r, 0))
+        for i in range(1, K):
             system += w[i] * wp.outer(weight(r, i), weight(r, i))
         mean = wp.trace(system) * dtype(wp.static(1.0 / term.rows))
         rows = y_type()
         if wp.static(per_step):
             compliance = spread(mean, compliance, sweeps)
-        moves = wp.isfinite(compliance) and mean != dtype(0.0)
+        moves = wp.where(compliance < dtype(wp.inf), mean, dtype(0.0)) != dtype(0.0)
         gap = project(y, r) - y
         if wp.static(multipliers):
             gap -= compliance * before
@@ -99,20 +99,23 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
         return rows, rows
 
     @wp.func
+    def square_of(r: rest_type, corner: int, g: y_type):
+        direction = weight(r, corner)[0] * g[0]
+        for m in range(1, M):
+            direction += weight(r, corner)[m] * g[m]
+        return wp.dot(direction, direction)
+
+    @wp.func
     def of_constraint(y: y_type, r: rest_type, w: corners, compliance: dtype, before: dtype, sweeps: int):
         g = constraint_gradient(y, r)
-        total = dtype(0.0)
-        for i in range(K):
-            direction = vec3()
-            for m in range(M):
-                direction += weight(r, i)[m] * g[m]
-            total += w[i] * wp.dot(direction, direction)
-        change = dtype(0.0)
+        total = w[0] * square_of(r, 0, g)
+        for i in range(1, K):
+            total += w[i] * square_of(r, i, g)
         if wp.static(per_step):
             compliance = spread(total, compliance, sweeps)
-        if wp.isfinite(compliance) and total != dtype(0.0):
-            change = -(constraint(y, r) + compliance * before) / (total + compliance)
-        return change, g * change
+        moves = wp.where(compliance < dtype(wp.inf), total, dtype(0.0)) != dtype(0.0)
+        change = wp.where(moves, -(constraint(y, r) + compliance * before) / (total + compliance), dtype(0.0))
+        return change, change * g
 
     return of_constraint if scalar else of_projection
 
@@ -124,7 +127,7 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool):
     K = wp.constant(term.vertices)
     rest_type, corners = wp.types.vector(term.parameters, dtype), wp.types.vector(term.vertices, dtype)
     y_of, measure, change_of = local_coordinate(term, dtype, True), term.measure, multiplier(term, dtype, scalar, per_step)
-    lambda_type = multiplier_type(term, dtype, scalar)
+    lambda_type, number, vertex = multiplier_type(term, dtype, scalar), load(dtype), load(wp.int32, 2)
 
     @wp.func
     def change(
@@ -141,7 +144,7 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool):
     ):
         w = corners()
         for i in range(K):
-            w[i] = inverse_mass[stencil[e, i]]
+            w[i] = number(inverse_mass, vertex(stencil, K * e + i))
         compliance = dtype(1.0) / (stiffness * measure(r) * h * h)
         return change_of(y_of(stencil, e, r, x, d), r, w, compliance, multipliers, sweeps)
 
@@ -205,14 +208,16 @@ def place(first: int, each: int, thread: int, k: int):
 def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
     """Kernel of a Gauss–Seidel sweep: each element sees what those before it did; d += ω Δx, λ += ω Δλ.
 
-    A thread takes ``each`` elements one after the other, from first + thread·each on: 1 of a colour, in which no two share a
-    vertex that moves, or all of a copy; of a negative ``each`` as many, from the last to the first. Pins are never written, so
-    elements may share them.
+    A thread takes ``each`` elements one after the other, from first + thread·each on: on a GPU 1 of a colour, in which no two
+    share a vertex that moves, or all of a copy, on the CPU all; of a negative ``each`` as many, from the last to the first.
+    Pins are never written, so elements may share them.
     """
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
     change, weight = element_change(term, dtype, scalar, per_step), term.weight
+    number, shared, vector, vertex = load(dtype), load_shared(dtype), load(vec3), load(wp.int32, 2)
+    rest_of, put = load(rest_type), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
     def correct(
@@ -232,21 +237,22 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
     ):
         for k in range(wp.abs(each)):
             e = place(first, each, wp.tid(), k)
-            r = rest[e]
+            r = rest_of(rest, e)
             before = lambda_type(dtype(0.0))
             if wp.static(multipliers):
                 before = lambdas[e]
-            more, rows = change(stencil, e, stiffness[e], r, inverse_mass, x, d, h, before, sweeps)
+            more, rows = change(stencil, e, shared(stiffness, e), r, inverse_mass, x, d, h, before, sweeps)
             if wp.static(multipliers):
                 lambdas[e] = before + relaxation * more
             for i in range(K):
-                v = stencil[e, i]
-                if inverse_mass[v] > dtype(0.0):
+                v = vertex(stencil, K * e + i)
+                mobility = number(inverse_mass, v)
+                if mobility > dtype(0.0):
                     w = weight(r, i)
-                    move = vec3()
-                    for m in range(M):
+                    move = w[0] * rows[0]
+                    for m in range(1, M):
                         move += w[m] * rows[m]
-                    d[v] = d[v] + (inverse_mass[v] * relaxation) * move
+                    put(d, v, vector(d, v) + (mobility * relaxation) * move)
 
     return correct
 

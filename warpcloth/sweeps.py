@@ -169,17 +169,19 @@ class Sweep:
             each = (cells or elements).per_copy if self.ordered else 1
             for first, count in self.ranges[i][::way]:
                 before, part = team.part(count // each)
+                # A thread of the CPU goes through what it has in a loop, in half of the time that as many threads take.
+                threads, each_thread = (1, part * each) if model.device.is_cpu else (part, each)
                 given = [
                     *of_cells,
                     *elements.arguments,
                     model.inverse_mass,
                     self.x,
                     first + before * each,
-                    way * each,
+                    way * each_thread,
                     self.h,
                     self.spread,
                     self.relaxation,
                 ]
                 if part:
-                    model.launch(self._kernels[i], part, given, [self.multipliers[i], self.correction])
+                    model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
                 team.launch_meeting(model)

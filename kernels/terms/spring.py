@@ -87,10 +87,7 @@ def constraint(y: Any, rest: Any):
 @wp.func
 def constraint_gradient(y: Any, rest: Any):
     length = wp.length(y[0])
-    g = y * y.dtype(0.0)
-    if not collapsed(length, rest[0]):
-        g[0] = y[0] / length
-    return g
+    return wp.where(collapsed(length, rest[0]), y.dtype(0.0), y.dtype(1.0) / length) * y
 
 
 @wp.func
