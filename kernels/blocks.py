@@ -15,15 +15,16 @@ from .memory import load, load_shared, store
 
 
 @cache
-def gather_piece(part: Part, dtype):
-    """The device function (elements, first, count, base, x, v, h, y, dy): y and, of damped terms, dy = h Σ wᵢ ⊗ vᵢ of a piece.
+def gather_piece(part: Part, dtype, corrected: bool = False):
+    """The device function (elements, first, count, base, x, v, h, y, dy): y of a piece; dy = h Σ wᵢ ⊗ vᵢ too
+    if it is damped or ``corrected``.
 
     The piece is a run from element ``first`` on if its ``count`` is positive, and of -count elements if not; ``base`` is the
     element that the scratch begins with.
     """
     vec3, _ = types(dtype)
     term = part.term
-    K, damped = wp.constant(term.vertices), part.damped
+    K, moved = wp.constant(term.vertices), part.damped or corrected
     y_type = wp.types.matrix((term.rows, 3), dtype)
     part_of, _force_of = of_corner(term, dtype)
     vector, vertex, rest_of = load(vec3), load(wp.int32, 2), load(wp.types.vector(term.parameters, dtype))
@@ -52,7 +53,7 @@ def gather_piece(part: Part, dtype):
                 for corner in range(1, K):
                     total += part_of(r, corner, vector(x, e + ahead[corner]))
                 put(y, e - base, total)
-                if wp.static(damped):
+                if wp.static(moved):
                     total = part_of(r, 0, h * vector(v, e + ahead[0]))
                     for corner in range(1, K):
                         total += part_of(r, corner, h * vector(v, e + ahead[corner]))
@@ -64,7 +65,7 @@ def gather_piece(part: Part, dtype):
             for corner in range(1, K):
                 total += part_of(r, corner, vector(x, vertex(elements.stencil, K * e + corner)))
             put(y, e - base, total)
-            if wp.static(damped):
+            if wp.static(moved):
                 total = part_of(r, 0, h * vector(v, vertex(elements.stencil, K * e)))
                 for corner in range(1, K):
                     total += part_of(r, corner, h * vector(v, vertex(elements.stencil, K * e + corner)))
@@ -75,15 +76,15 @@ def gather_piece(part: Part, dtype):
 
 
 @cache
-def compute_forces(part: Part, dtype):
+def compute_forces(part: Part, dtype, corrected: bool = False):
     """The device function (elements, first, last, h, y, dy): kA ∂u/∂y, and what damping adds to it, in place of y.
 
-    Of the elements of a block, from ``first`` up to ``last``.
+    Of the elements of a block, from ``first`` up to ``last``; with ``corrected`` at y + dy.
     """
     term = part.term
     damped, shared = part.damped, part.shared
     y_type, rest_type = wp.types.matrix((term.rows, 3), dtype), wp.types.vector(term.parameters, dtype)
-    local, rest_of, number = local_gradient(part, dtype), load(rest_type), load(dtype)
+    local, rest_of, number = local_gradient(part, dtype, corrected), load(rest_type), load(dtype)
     shared_number, take, put = load_shared(dtype), load(y_type, stored=dtype), store(y_type, dtype)
 
     @wp.func
@@ -106,6 +107,7 @@ def compute_forces(part: Part, dtype):
                 k = number(elements.stiffness, e)
             if wp.static(damped):
                 beta = shared_number(elements.damping, e)
+            if wp.static(damped or corrected):
                 move = take(dy, e - first)
             put(y, e - first, local(k, beta, rest_of(elements.rest, e), take(y, e - first), move, h))
             e += 1
@@ -154,10 +156,14 @@ def scatter_piece(part: Part, dtype):
 
 
 @cache
-def add_block(part: Part, dtype):
-    """The device function (elements, block, x, v, h, y, dy, out): out += ∂U/∂x + ∂D/∂x [N] of the elements of a block."""
+def add_block(part: Part, dtype, corrected: bool = False):
+    """The device function (elements, block, x, v, h, y, dy, out): out += ∂U/∂x + ∂D/∂x [N] of the elements of a block.
+
+    With ``corrected`` the first at x + h v.
+    """
     vec3, _ = types(dtype)
-    gather, compute, scatter = gather_piece(part, dtype), compute_forces(part, dtype), scatter_piece(part, dtype)
+    gather, compute = gather_piece(part, dtype, corrected), compute_forces(part, dtype, corrected)
+    scatter = scatter_piece(part, dtype)
     whole = load(wp.int32)
 
     @wp.func
@@ -193,7 +199,7 @@ def add_block(part: Part, dtype):
 
 
 @cache
-def add_blocks(parts: tuple[Part, ...], dtype):
+def add_blocks(parts: tuple[Part, ...], dtype, corrected: bool = False):
     """The same of all terms."""
     vec3, _ = types(dtype)
     chain_type = chain_of(parts, dtype)
@@ -214,7 +220,7 @@ def add_blocks(parts: tuple[Part, ...], dtype):
             return
 
         return add_nothing
-    first, others = add_block(parts[0], dtype), add_blocks(parts[1:], dtype)
+    first, others = add_block(parts[0], dtype, corrected), add_blocks(parts[1:], dtype, corrected)
 
     @wp.func
     def add(

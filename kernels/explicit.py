@@ -17,30 +17,40 @@ from .memory import load, store
 
 
 @cache
-def advance(dtype, symplectic: bool):
-    """The device function (x, v, a, h) → x, v after a step: kick and drift, or drift and kick at the same state."""
+def advance(dtype, symplectic: bool, fine: bool = False):
+    """The device function (x, low, v, a, h) → x, low, v after a step: kick and drift, or drift and kick at the same state.
+
+    ``fine`` keeps in ``low`` what x is rounded by (Dekker 1971, *A floating-point technique for extending the available
+    precision*): the place is x + low.
+    """
     vec3, _ = types(dtype)
 
     @wp.func
-    def kick_and_drift(x: vec3, v: vec3, a: vec3, h: dtype):
+    def advance_vertex(x: vec3, low: vec3, v: vec3, a: vec3, h: dtype):
         after = v + h * a
-        return x + h * after, after
+        if wp.static(symplectic):
+            move = h * after
+        else:
+            move = h * v
+        if wp.static(fine):
+            move += low
+        place = x + move
+        if wp.static(fine):
+            low = move - (place - x)
+        return place, low, after
 
-    @wp.func
-    def drift_and_kick(x: vec3, v: vec3, a: vec3, h: dtype):
-        return x + h * v, v + h * a
-
-    return kick_and_drift if symplectic else drift_and_kick
+    return advance_vertex
 
 
 @cache
-def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str):
+def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str, fine: bool = False):
     """Kernel over copies, each block by block: v, x after a step, a = g − ∇U/m.
 
-    ``gradient`` is what other terms have left, and 0 afterwards. ``flags`` are those of the compiler, on the CPU.
+    ``gradient`` is what other terms have left, and 0 afterwards. ``flags`` are those of the compiler, on the CPU; ``fine`` as
+    in :func:`advance`, of what is not damped.
     """
     vec3, _ = types(dtype)
-    add, step = add_blocks(parts, dtype), advance(dtype, symplectic)
+    add, step = add_blocks(parts, dtype, fine), advance(dtype, symplectic, fine)
     vector, number, whole, put = load(vec3), load(dtype), load(wp.int32), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
@@ -57,6 +67,7 @@ def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str):
         gradient: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
+        low: wp.array(dtype=vec3),
     ):
         copy = wp.tid()
         g = gravity[copy]
@@ -64,16 +75,24 @@ def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str):
         b = copy * blocks
         last = b + blocks
         while b < last:
-            add(chain, b, x, v, h, y, dy, gradient)
+            if wp.static(fine):
+                add(chain, b, x, low, dtype(1.0), y, dy, gradient)
+            else:
+                add(chain, b, x, v, h, y, dy, gradient)
             i = whole(vertices, b)
             end = whole(vertices, b + 1)
             while i < end:
                 w = number(inverse_mass, i)
                 before = vector(x, i)
                 speed = vector(v, i)
-                place, velocity = step(before, speed, g - w * vector(gradient, i), h)
+                rest = vec3()
+                if wp.static(fine):
+                    rest = vector(low, i)
+                place, more, velocity = step(before, rest, speed, g - w * vector(gradient, i), h)
                 put(x, i, wp.where(w > dtype(0.0), place, before))
                 put(v, i, wp.where(w > dtype(0.0), velocity, speed))
+                if wp.static(fine):
+                    put(low, i, wp.where(w > dtype(0.0), more, rest))
                 put(gradient, i, vec3())
                 i += 1
             b += 1
@@ -82,10 +101,10 @@ def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str):
 
 
 @cache
-def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int = 1):
+def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int = 1, fine: bool = False):
     """The device function by which ``lanes`` threads set x, v of a vertex after a step, a = g − ∇U/m, in other arrays."""
     vec3, _ = types(dtype)
-    total_of, step = sum_at_vertices(parts, dtype, lanes=lanes), advance(dtype, symplectic)
+    total_of, step = sum_at_vertices(parts, dtype, fine, lanes), advance(dtype, symplectic, fine)
     vector, number, put = load(vec3), load(dtype), store(vec3)
 
     @wp.func
@@ -98,34 +117,46 @@ def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int =
         h: dtype,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
+        low: wp.array(dtype=vec3),
         x_after: wp.array(dtype=vec3),
         v_after: wp.array(dtype=vec3),
+        low_after: wp.array(dtype=vec3),
     ):
-        total = total_of(thread, chain, inverse_mass.shape[0], x, v, h)  # of pins too: what follows need not wait for w
+        # Of pins too: what follows need not wait for w.
+        total = vec3()
+        if wp.static(fine):
+            total = total_of(thread, chain, inverse_mass.shape[0], x, low, dtype(1.0))
+        else:
+            total = total_of(thread, chain, inverse_mass.shape[0], x, v, h)
         i = thread // lanes
         w = number(inverse_mass, i)
         place = vector(x, i)
         velocity = vector(v, i)
+        rest = vec3()
+        if wp.static(fine):
+            rest = vector(low, i)
         if w > dtype(0.0):
-            place, velocity = step(place, velocity, gravity[i // per_copy] - w * total, h)
+            place, rest, velocity = step(place, rest, velocity, gravity[i // per_copy] - w * total, h)
         if thread == i * lanes:
             put(x_after, i, place)
             put(v_after, i, velocity)
+            if wp.static(fine):
+                put(low_after, i, rest)
 
     return gather_one
 
 
 @cache
-def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, lanes: int = 1):
+def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, lanes: int = 1, fine: bool = False):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
     Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN
-    stays.
+    stays. ``fine`` as in :func:`advance`, of what is not damped.
     """
     vec3, _ = types(dtype)
-    gather_one = gather_vertex(parts, dtype, symplectic, lanes)
+    gather_one = gather_vertex(parts, dtype, symplectic, lanes, fine)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"fast_math": fast})
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": fast})
     def gather_vertices(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
@@ -134,11 +165,13 @@ def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, lanes: 
         h: dtype,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
+        low: wp.array(dtype=vec3),
         # out
         x_after: wp.array(dtype=vec3),
         v_after: wp.array(dtype=vec3),
+        low_after: wp.array(dtype=vec3),
     ):
-        gather_one(wp.tid(), chain, inverse_mass, gravity, per_copy, h, x, v, x_after, v_after)
+        gather_one(wp.tid(), chain, inverse_mass, gravity, per_copy, h, x, v, low, x_after, v_after, low_after)
 
     return gather_vertices
 
@@ -183,13 +216,13 @@ def gather_copies(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, 
         while left > 0:
             i = first
             while i < end:
-                gather_one(i, chain, inverse_mass, gravity, per_copy, h, x, v, x_other, v_other)
+                gather_one(i, chain, inverse_mass, gravity, per_copy, h, x, v, x, x_other, v_other, x)
                 i += threads
             wait_for_block()
             i = first
             while i < end:
                 if left > 1:
-                    gather_one(i, chain, inverse_mass, gravity, per_copy, h, x_other, v_other, x, v)
+                    gather_one(i, chain, inverse_mass, gravity, per_copy, h, x_other, v_other, x, x, v, x)
                 else:  # the last of an odd number
                     put(x, i, vector(x_other, i))
                     put(v, i, vector(v_other, i))

@@ -244,6 +244,7 @@ def reset(dtype, led: bool):
         v: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
         v_before: wp.array(dtype=vec3),
+        low: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int32),
         worst: wp.array(dtype=wp.float64),
     ):
@@ -259,6 +260,8 @@ def reset(dtype, led: bool):
             if move:
                 move[i] = move_start[i]
                 v_before[i] = v_before_start[i]
+            if low:
+                low[i] = vec3()
             if i == copy * per_copy:
                 if step:
                     step[copy] = 0

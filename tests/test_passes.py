@@ -304,3 +304,34 @@ def test_the_residual_is_that_of_the_worst_step(device):
     stepper.state.v.zero_()
     stepper.frame()
     assert np.isnan(stepper.residual[0]) and stepper.results == [Result.DIVERGED]
+
+
+@pytest.mark.parametrize("way", ["own", "gathered"])
+@pytest.mark.parametrize("away", [0.0, 128.0])
+def test_motion_does_not_depend_on_where_the_origin_is(away, way, device, monkeypatch):
+    """Far from it places are kept to more digits than x has; frames are steps, and a run repeats itself, to the bit."""
+    if way == "gathered":
+        monkeypatch.setattr(explicit, "Sweep", Gather)
+    sheet = wc.Mesh.grid(17, 17)  # of places that float32 has in both
+
+    def stepper_of(away, dtype):
+        mesh = wc.Mesh(sheet.points + away, sheet.triangles)
+        terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)]
+        scene = wc.Scene(mesh, density=0.1, terms=terms, pins=[0, 16], duration=1.0)
+        return wc.Explicit(substeps=64).bind(scene.build(device=device, dtype=dtype))
+
+    exact, stepper, other = (stepper_of(*key) for key in ((0.0, "float64"), (away, "float32"), (away, "float32")))
+    assert (stepper.low is not None) == (away > 0.0)
+    for _ in range(20):
+        exact.frame()
+        stepper.frame()
+        for _ in range(64):
+            other.step()
+    x = stepper.state.x.numpy()
+    # x is rounded by half of this; without the rest it is 50 times as far off.
+    assert np.abs(x - away - exact.state.x.numpy()).max() < max(2.0 * np.spacing(np.float32(away)), 2e-5)
+    assert np.array_equal(x, other.state.x.numpy())
+    stepper.reset()
+    for _ in range(20):
+        stepper.frame()
+    assert np.array_equal(x, stepper.state.x.numpy())

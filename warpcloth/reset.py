@@ -33,7 +33,7 @@ class Reset:
         x, v = model.positions if x is None else x, model.velocities if v is None else v
         given = [mask, model.inverse_mass, model.per_copy, model.positions, x, v, *integrator.started]
         worst = stepper.worst and stepper.worst.array
-        model.launch(self._kernel, model.count, given, [*stepper.state, *integrator.past, stepper.count, worst])
+        model.launch(self._kernel, model.count, given, [*stepper.state, *integrator.past, stepper.low, stepper.count, worst])
         if stepper.residual.any() or any(result is not Result.COMPLETED for result in stepper.results):
             chosen = mask.numpy()
             stepper.residual = np.where(chosen, 0.0, stepper.residual)
