@@ -117,7 +117,7 @@ def test_one_pass_is_forces_and_update(name, way, scheme, dtype, device, monkeyp
     "name", ["nothing", "springs", "springs, the higher vertex first, each of its own stiffness", "damped springs"]
 )
 def test_steps_of_one_launch_are_steps(name, dtype, device, monkeypatch):
-    """Of CUDA, but right on the CPU too: an even number and an odd one, to the bit those of a launch each."""
+    """Of CUDA, but right on the CPU too: an even number and an odd one, of the CPU to the bit those of a launch each."""
     monkeypatch.setattr(explicit, "Sweep", Gather)
     monkeypatch.setattr(incidences, "LANED", 0)  # as of many copies
     vary = {"gravity": [[0.0, -9.81, 0.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]}
@@ -132,7 +132,9 @@ def test_steps_of_one_launch_are_steps(name, dtype, device, monkeypatch):
         states.append([array.numpy() for array in stepper.state])
         monkeypatch.setattr(passes, "block_of", lambda model, parts: 0)
     assert launches == [2, 9]
-    assert np.array_equal(*states)
+    # Compilers of GPUs contract the products of the two kernels as each allows: a few roundings a step, as above.
+    tolerance = 9 * 64 * np.finfo(dtype).eps / stepper.h if model.device.is_cuda else 0.0
+    assert np.abs(np.array(states[0]) - states[1]).max() <= tolerance
 
 
 @pytest.mark.parametrize(
