@@ -199,8 +199,8 @@ def _largest(matrix):
     start = np.random.default_rng(0).normal(size=matrix.shape[0])
     if not matrix.count_nonzero():
         return 0.0, start
-    # The upper eigenvalues of a large net lie close together: 1e-4 takes 35 s at 512² vertices, 1e-2 a second, with a value that
-    # is 0.4 % too small. With the residual, which bounds how far off it is, no step is taken for stable that is not.
+    # The upper eigenvalues of a large net lie close together: 1e-4 takes 35 s at 512² vertices, 1e-2 a second, with a value
+    # that is 0.4 % too small. With the residual, about what it is off by, no step passes for stable that is not.
     tolerance = 1e-4 if matrix.shape[0] < 50_000 else 1e-2
     values, vectors = eigsh(matrix, k=1, which="LA", v0=start, tol=tolerance)
     u = vectors[:, 0]
