@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from .memory import load
+from .memory import load, load_shared, store
 from .term import Term
 
 
@@ -56,6 +56,7 @@ def energy(term: Term, dtype, corrected: bool = False):
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, u, measure = local_coordinate(term, dtype, corrected), term.energy, term.measure
+    rest_of, number = load(rest_type), load_shared(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def energy_of_elements(
@@ -67,8 +68,8 @@ def energy(term: Term, dtype, corrected: bool = False):
         out: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
-        r = rest[e]
-        out[e] = wp.float64(stiffness[e] * measure(r) * u(y_of(stencil, e, r, x, d), r))
+        r = rest_of(rest, e)
+        out[e] = wp.float64(number(stiffness, e) * measure(r) * u(y_of(stencil, e, r, x, d), r))
 
     return energy_of_elements
 
@@ -80,6 +81,7 @@ def scatter_gradient(term: Term, dtype, corrected: bool = False):
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, weight, gradient, measure = local_coordinate(term, dtype, corrected), term.weight, term.gradient, term.measure
+    vector, vertex, rest_of, number, put = load(vec3), load(wp.int32, 2), load(rest_type), load_shared(dtype), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter(
@@ -91,14 +93,15 @@ def scatter_gradient(term: Term, dtype, corrected: bool = False):
         out: wp.array(dtype=vec3),
     ):
         e = wp.tid()
-        r = rest[e]
-        g = (stiffness[e] * measure(r)) * gradient(y_of(stencil, e, r, x, d), r)
+        r = rest_of(rest, e)
+        g = (number(stiffness, e) * measure(r)) * gradient(y_of(stencil, e, r, x, d), r)
         for i in range(K):
             w = weight(r, i)
-            force = vec3()
-            for m in range(M):
+            force = w[0] * g[0]
+            for m in range(1, M):
                 force += w[m] * g[m]
-            wp.atomic_add(out, stencil[e, i], force)
+            v = vertex(stencil, K * e + i)
+            put(out, v, vector(out, v) + force)
 
     return scatter
 

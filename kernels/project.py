@@ -161,6 +161,8 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
     change, weight = element_change(term, dtype, scalar, per_step), term.weight
+    number, shared, vector, vertex = load(dtype), load_shared(dtype), load(vec3), load(wp.int32, 2)
+    rest_of, put = load(rest_type), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter(
@@ -178,19 +180,20 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
         out: wp.array(dtype=vec3),
     ):
         e = wp.tid()
-        r = rest[e]
+        r = rest_of(rest, e)
         before = lambda_type(dtype(0.0))
         if wp.static(multipliers):
             before = lambdas[e]
-        more, rows = change(stencil, e, stiffness[e], r, inverse_mass, x, d, h, before, sweeps)
+        more, rows = change(stencil, e, shared(stiffness, e), r, inverse_mass, x, d, h, before, sweeps)
         if wp.static(multipliers):
             lambdas[e] = before + factor[e] * more
         for i in range(K):
             w = weight(r, i)
-            move = vec3()
-            for m in range(M):
+            move = w[0] * rows[0]
+            for m in range(1, M):
                 move += w[m] * rows[m]
-            wp.atomic_add(out, stencil[e, i], (inverse_mass[stencil[e, i]] * factor[e]) * move)
+            v = vertex(stencil, K * e + i)
+            put(out, v, vector(out, v) + (number(inverse_mass, v) * shared(factor, e)) * move)
 
     return scatter
 

@@ -83,7 +83,8 @@ class PBDStepper(LaunchedStepper):
         super().__init__(options, model)
         self.iterations = options.iterations
         model = self.model
-        spread = options.iterations if options.stiffness == "per-step" else None
+        # Spread over one sweep it is what it is.
+        spread = options.iterations if options.stiffness == "per-step" and options.iterations > 1 else None
         self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)
         self.past = Past(model, self.sweep.elements)
         self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
