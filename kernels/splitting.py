@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from .assemble import local_coordinate, types
+from .memory import load, load_shared, store
 from .rotation import epsilon
 from .term import HessianPolicy, Term
 
@@ -164,6 +165,7 @@ def split(term: Term, dtype):
     vec3, _ = types(dtype)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     y_of, measure, minimise = local_coordinate(term, dtype, True), term.measure, local_minimiser(term, dtype)
+    rest_of, shared, take, put = load(rest_type), load_shared(dtype), load(y_type), store(y_type)
 
     @wp.kernel(module="unique", enable_backward=False)
     def split_elements(
@@ -183,15 +185,17 @@ def split(term: Term, dtype):
         change: wp.array(dtype=y_type),
     ):
         e = wp.tid()
-        r = rest[e]
-        w2 = ratio * scale[e] * stiffness[e] * measure(r)
+        r = rest_of(rest, e)
+        part = ratio * shared(scale, e)
+        w2 = part * shared(stiffness, e) * measure(r)
         y = y_of(stencil, e, r, x, d)
-        v = y + u[e]
-        after = minimise(v, z[e], r, ratio * scale[e], steps)
-        gap[e] = w2 * (y - after)
-        change[e] = w2 * (after - z[e])
-        z[e] = after
-        u[e] = v - after
+        v = y + take(u, e)
+        before = take(z, e)
+        after = minimise(v, before, r, part, steps)
+        put(gap, e, w2 * (y - after))
+        put(change, e, w2 * (after - before))
+        put(z, e, after)
+        put(u, e, v - after)
 
     return split_elements
 
@@ -203,6 +207,8 @@ def scatter_splitting(term: Term, dtype):
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     weight, measure = term.weight, term.measure
+    rest_of, shared, take = load(rest_type), load_shared(dtype), load(y_type)
+    vector, vertex, put = load(vec3), load(wp.int32, 2), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter(
@@ -220,20 +226,23 @@ def scatter_splitting(term: Term, dtype):
         force: wp.array(dtype=vec3),
     ):
         e = wp.tid()
-        r = rest[e]
-        pull = gap[e] + (ratio * scale[e] * stiffness[e] * measure(r)) * u[e]
+        r = rest_of(rest, e)
+        apart = take(gap, e)
+        moved = take(change, e)
+        pull = apart + (ratio * shared(scale, e) * shared(stiffness, e) * measure(r)) * take(u, e)
         for i in range(K):
             w = weight(r, i)
-            a = vec3()
-            b = vec3()
-            c = vec3()
-            for m in range(M):
-                a += w[m] * gap[e][m]
-                b += w[m] * change[e][m]
+            a = w[0] * apart[0]
+            b = w[0] * moved[0]
+            c = w[0] * pull[0]
+            for m in range(1, M):
+                a += w[m] * apart[m]
+                b += w[m] * moved[m]
                 c += w[m] * pull[m]
-            wp.atomic_add(primal, stencil[e, i], a)
-            wp.atomic_add(dual, stencil[e, i], b)
-            wp.atomic_add(force, stencil[e, i], c)
+            v = vertex(stencil, K * e + i)
+            put(primal, v, vector(primal, v) + a)
+            put(dual, v, vector(dual, v) + b)
+            put(force, v, vector(force, v) + c)
 
     return scatter
 
