@@ -27,19 +27,17 @@ def rows_of(slots):
 
 
 @cache
-def load_row(dtype, scalar, width, shared=False):
+def load_row(dtype, scalar, width):
     """The device function (a, i) → the i-th ``width`` scalars of contiguous memory, of whatever type; on CUDA 16 bytes at once.
 
-    With ``shared`` of an array of stride 0 the one number that all share. The compiler does not put loads together by itself
-    where it is short of registers.
+    The compiler does not put loads together by itself where it is short of registers.
     """
     row, number = f"wp::vec_t<{width}, wp::{scalar.__name__}>", {wp.float64: "double", wp.float32: "float"}.get(scalar, "int")
     each = min(width, 16 // wp.types.type_size_in_bytes(scalar))
     parts = range(width // each)
     loads = [f"const {number}{each} q{m} = ((const {number}{each}*)a.data)[{len(parts)} * i + {m}];" for m in parts]
     values = ", ".join(f"q{m}.{axis}" for m in parts for axis in "xyzw"[:each])
-    lines = [f"if (a.strides[0] == 0) return {row}(*(const {number}*)a.data);"] if shared else []
-    lines += ["#if defined(__CUDA_ARCH__)", *loads, f"return {row}({values});"]
+    lines = ["#if defined(__CUDA_ARCH__)", *loads, f"return {row}({values});"]
     lines += ["#else", f"return ((const {row}*)a.data)[i];", "#endif", ""]
 
     @wp.func_native("\n".join(lines))
@@ -50,8 +48,8 @@ def load_row(dtype, scalar, width, shared=False):
 
 @cache
 def row_functions(part: Part, dtype):
-    """The device functions of pairs: (codes, q) → codes of row q; (a, q) → numbers of a row, shared or not; (rest, row, i, N)
-    → rest states (P, width) of a row of vertex i; (those, k) → that of the k-th slot."""
+    """The device functions of pairs: (codes, q) → codes of row q; (a, q) → numbers of row q; (rest, row, i, N) → rest states
+    (P, width) of a row of vertex i; (those, k) → that of the k-th slot."""
     P, (_rows, width) = wp.constant(part.term.parameters), rows_of(sum(part.pairs))
     rest_type = wp.types.vector(part.term.parameters, dtype)
     rests_type = wp.types.matrix((part.term.parameters, width), dtype)
@@ -71,7 +69,7 @@ def row_functions(part: Part, dtype):
             r[p] = rests[p, k]
         return r
 
-    return load_row(wp.int32, wp.int32, width), load_row(dtype, dtype, width, True), rests_of, rest_of
+    return load_row(wp.int32, wp.int32, width), load_row(dtype, dtype, width), rests_of, rest_of
 
 
 class Projected(NamedTuple):

@@ -135,10 +135,11 @@ def _of_matrix(model, elements):
     codes = np.tile(np.arange(count), (slots, 1))
     for copy in range(0, count, n):
         codes[slot, copy + vertices] = copy + neighbours
-    numbers, blocks = np.zeros((slots, count)), wp.zeros((CHUNK, K * K), dtype=wp.float64, device=model.device)
+    size = min(CHUNK, elements.count)
+    numbers, blocks = np.zeros((slots, count)), wp.zeros((size, K * K), dtype=wp.float64, device=model.device)
     kernel = model.kernel(constant_blocks, elements.term, model.dtype)
-    for first in range(0, elements.count, CHUNK):
-        some = slice(first, min(first + CHUNK, elements.count))
+    for first in range(0, elements.count, size):
+        some = slice(first, min(first + size, elements.count))
         model.launch(kernel, some.stop - first, [array[some] for array in elements.arguments], [blocks])
         rows, of_one, apart = entries_of(stencil[some])
         np.add.at(numbers, (slot[np.searchsorted(entries, of_one)], rows), blocks.numpy()[: len(apart)][apart])

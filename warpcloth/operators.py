@@ -34,7 +34,7 @@ class Sums:
         self._finish_largest = model.kernel(reduce.finish_largest)
 
     def dot(self, a, b, out, active=None):
-        """out (B,) = Σ a·b over the vertices of each copy; not set for those that are not ``active`` (B,), if that is given."""
+        """out (B,) = Σ a·b over the vertices of each copy; anything for those not ``active`` (B,), if that is given."""
         self.model.launch(self._dot, self.partial.shape, [a, b, active, self.model.per_copy], [self.partial])
         self._add_chunks(0, out)
 
