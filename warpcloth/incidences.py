@@ -116,21 +116,25 @@ def _of_matrix(model, elements):
 
     None if that makes them more than twice as many.
     """
+    from scipy.sparse import coo_matrix
+
     K, n, count = elements.term.vertices, model.per_copy, model.count
-    stencil = elements.stencil.numpy().astype(np.int64)
+    stencil = elements.stencil.numpy()
 
     def entries_of(some):
-        """Rows of all copies, and row·n + column of one, of the entries off the diagonal, and where they are in the blocks."""
+        """Rows and columns of the entries off the diagonal, and where they are in the blocks."""
         rows, columns = np.repeat(some, K, axis=1), np.tile(some, K)
         apart = rows != columns
-        return rows[apart], (rows % n * n + columns % n)[apart], apart
+        return rows[apart], columns[apart], apart
 
-    entries = np.unique(entries_of(stencil[stencil[:, 0] < n])[1])
-    vertices, neighbours = np.divmod(entries, n)
-    firsts = np.searchsorted(vertices, np.arange(n + 1))
-    slots = int(np.diff(firsts).max(initial=0))
-    if slots * n > 2 * len(entries):
+    rows, columns, _apart = entries_of(stencil[stencil[:, 0] < n])
+    pattern = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n)).tocsr()
+    firsts, neighbours = pattern.indptr, pattern.indices
+    slots = int(np.diff(firsts).max())
+    if slots * n > 2 * len(neighbours):
         return None
+    vertices = np.repeat(np.arange(n, dtype=np.int64), np.diff(firsts))
+    entries = vertices * n + neighbours
     slot = np.arange(len(entries)) - firsts[vertices]
     codes = np.tile(np.arange(count), (slots, 1))
     for copy in range(0, count, n):
@@ -141,8 +145,9 @@ def _of_matrix(model, elements):
     for first in range(0, elements.count, size):
         some = slice(first, min(first + size, elements.count))
         model.launch(kernel, some.stop - first, [array[some] for array in elements.arguments], [blocks])
-        rows, of_one, apart = entries_of(stencil[some])
-        np.add.at(numbers, (slot[np.searchsorted(entries, of_one)], rows), blocks.numpy()[: len(apart)][apart])
+        rows, columns, apart = entries_of(stencil[some])
+        place = np.searchsorted(entries, rows.astype(np.int64) % n * n + columns % n)
+        np.add.at(numbers, (slot[place], rows), blocks.numpy()[: len(apart)][apart])
     return slots, {"codes": indices(elements, codes.ravel()), "stiffness": model.array(numbers.ravel(), model.dtype)}
 
 
