@@ -163,6 +163,40 @@ def test_an_interrupt_waits_for_the_threads(device):
     team.run([wait, wait])
 
 
+def test_a_second_interrupt_leaves_the_threads_to_the_next_call(device):
+    """It comes at once; what runs then ends before anything else begins."""
+    team, ended, interrupt = Team(3, wp.get_device(device)), [], threading.main_thread().ident
+
+    def late():
+        for _ in range(2):
+            threading.Event().wait(0.2)  # while the main thread waits, or has the first
+            signal.pthread_kill(interrupt, signal.SIGINT)
+        threading.Event().wait(0.2)
+        ended.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        team.run([late])
+    left, found = list(ended), []
+    team.run([lambda: found.append(list(ended))])
+    assert not left and found == [[True]]
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_steppers_of_one_model_have_its_threads_in_turn(copies, device):
+    """Whoever calls them."""
+    model = declared([SPRINGS], fps=60.0).build(device=device, copies=copies, threads=2)
+    steppers = [wc.PBD(substeps=4, iterations=2).bind(model) for _ in range(2)]
+    callers = [threading.Thread(target=lambda s=s: [s.frame() for _ in range(50)], daemon=True) for s in steppers]
+    for stepper in steppers:
+        stepper.frame()
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(20.0)
+        assert not caller.is_alive()
+    assert same(steppers)
+
+
 def test_threads_that_nobody_needs_end(device):
     before = threading.enumerate()
     model = square().build(device=device, threads=2, copies=2)

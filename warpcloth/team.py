@@ -47,7 +47,7 @@ class Team:
             raise ValueError(f"threads is {threads} on {device}, which has its own; more than 1 is for device='cpu'")
         if self.threads > _cores():
             warnings.warn(f"threads is {threads} on {_cores()} cores; more threads than cores are slower", stacklevel=4)
-        self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth")
+        self._pool, self._busy, self._running = ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth"), threading.Lock(), None
         self._meeting = wp.zeros(kernels.NUMBERS, dtype=wp.int32, device=device)
         self._leave = _leave()
 
@@ -93,6 +93,8 @@ class Team:
     def run(self, functions):
         """Calls one function in each thread, as many as there are or fewer, and returns when all have ended.
 
+        Calls from several threads, as of several steppers of one model, run one after another.
+
         Raises:
             Exception: What a function raises, of several the first one. What waits for it is let go.
         """
@@ -100,13 +102,16 @@ class Team:
             for function in functions:
                 function()
             return
-        # By a thread of the pool: an interrupt, which comes in the main thread alone, finds all of them started or none.
-        running = self._pool.submit(self._run, functions)
-        try:
-            running.result()
-        except KeyboardInterrupt:
-            running.exception()  # the state is whole again when all have ended
-            raise
+        with self._busy:
+            if self._running is not None:
+                self._running.exception()  # has ended, but where a second interrupt left it behind
+            # By a thread of the pool: an interrupt, which comes in the main thread alone, finds all of them started or none.
+            self._running = self._pool.submit(self._run, functions)
+            try:
+                self._running.result()
+            except KeyboardInterrupt:
+                self._running.exception()  # the state is whole again when all have ended
+                raise
 
     def _run(self, functions):
         self._meeting.numpy()[:] = 0
