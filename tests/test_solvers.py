@@ -462,7 +462,7 @@ def test_a_residual_starts_again_where_it_is_kept(device):
     assert (stepper.residual[[0, 2]] >= kept[[0, 2]]).all()
 
 
-@pytest.mark.parametrize("kind", ["numpy", "warp", "vectors"])
+@pytest.mark.parametrize("kind", ["numpy", "warp", "vectors", "Warp's own vectors"])
 @pytest.mark.parametrize("name", ["explicit", "newton midpoint", "xpbd"])
 def test_copies_start_where_one_says(name, kind, device):
     """As a model does whose copies vary so; pins stay with their keyframes and have no velocity."""
@@ -480,6 +480,8 @@ def test_copies_start_where_one_says(name, kind, device):
         given = [wp.array(each, dtype=wp.float64, device=device) for each in given]
     elif kind == "vectors":
         given = [model.array(each.reshape(-1, 3), model.vec3) for each in given]
+    elif kind != "numpy":
+        given = [wp.array(each, dtype=wp.vec3d, device=device) for each in given]
     stepper.reset(mask if kind == "numpy" else wp.array(mask, dtype=wp.bool, device=device), *given)
     assert np.array_equal(stepped(stepper, 4), expected)
     stepper.reset()
@@ -503,6 +505,8 @@ def test_putting_copies_back_allocates_nothing(device):
     [
         ("pbd", {"mask": [True, False]}, r"mask is .*; it must be an array \(3,\) of truth values"),
         ("pbd", {"mask": [0, 1, 0]}, "mask is .* of truth values, one for each copy"),
+        ("pbd", {"mask": [[True], [True, False], True]}, "mask is .* of truth values, one for each copy"),
+        ("pbd", {"positions": [[1.0], [1.0, 2.0]]}, r"positions is .* not numeric; it must have shape \(3, 36, 3\)"),
         ("pbd", {"mask": wp.int32}, r"mask is an array \(3,\) of int32; on the device"),
         ("pbd", {"positions": np.zeros((36, 3))}, r"positions has shape \(36, 3\); it must be \(3, 36, 3\)"),
         ("pbd", {"velocities": np.full((3, 36, 3), np.nan)}, "velocities.* must be finite"),

@@ -59,7 +59,10 @@ class Reset:
             if mask.dtype is not wp.bool or mask.shape != (B,) or not mask.is_contiguous:
                 raise ValueError(f"mask is {_kind(mask)}; on the device it must be a contiguous array ({B},) of wp.bool")
             return mask
-        values = np.ones(B, dtype=bool) if mask is None else _host(mask)
+        try:
+            values = np.ones(B, dtype=bool) if mask is None else np.asarray(_host(mask))
+        except ValueError:  # rows of different lengths
+            values = np.empty(())
         if values.dtype != bool or values.shape != (B,):
             raise ValueError(f"mask is {shown(mask)}; it must be an array ({B},) of truth values, one for each copy")
         return self._buffered("mask", wp.bool, B, values)
@@ -69,7 +72,8 @@ class Reset:
         model = self.model
         shape = (model.copies, model.per_copy, 3)
         if self._on_device(values):
-            whole = (*values.shape, 3) if values.dtype is model.vec3 else values.shape if values.dtype is model.dtype else ()
+            vectors = wp.types.types_equal(values.dtype, model.vec3)  # as wp.vec3 is, which is another class
+            whole = (*values.shape, 3) if vectors else values.shape if values.dtype is model.dtype else ()
             if whole not in (shape, (model.count, 3)) or not values.is_contiguous:
                 raise ValueError(
                     f"{name} is {_kind(values)}; on the device it must be a contiguous array {shape} of {model.dtype.__name__}"
@@ -91,7 +95,7 @@ class Reset:
 
 
 def _host(values):
-    return values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+    return values.numpy() if isinstance(values, wp.array) else values
 
 
 def _kind(values):
