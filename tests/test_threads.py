@@ -230,11 +230,22 @@ def test_more_threads_than_cores_warn(device):
             "whose RigidCluster Explicit cannot divide",
         ),
         (lambda: wc.Explicit(substeps=500).bind(square(2).build(threads=5)), "threads is 5 for 4 vertices"),
+        (lambda: wc.PBD(substeps=1).bind(square(2).build(threads=5)), "threads is 5 for 4 vertices"),
     ],
 )
 def test_what_threads_cannot_do_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_debug_mode_has_one_thread(device, monkeypatch):
+    """Two would end the process: on x86 Warp keeps one pointer to the tiles of a kernel on the CPU."""
+    monkeypatch.setattr(wp.config, "mode", "debug")
+    with pytest.raises(ValueError, match="threads is 2 in Warp's debug mode"):
+        square().build(device=device, threads=2)
+    square().build(device=device, threads=1)
+    monkeypatch.setattr(wp.config, "enable_tiles_in_stack_memory", False)
+    square().build(device=device, threads=2)
 
 
 def test_simulate_and_the_commands_take_threads(device, tmp_path, capsys):

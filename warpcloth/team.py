@@ -35,7 +35,7 @@ class Team:
         UserWarning: If there are fewer cores.
 
     Raises:
-        ValueError: If ``threads`` is below 1, or above on another device than the CPU.
+        ValueError: If ``threads`` is below 1, or above on another device than the CPU or in Warp's debug mode.
     """
 
     def __init__(self, threads, device):
@@ -45,9 +45,18 @@ class Team:
             return
         if not device.is_cpu:
             raise ValueError(f"threads is {threads} on {device}, which has its own; more than 1 is for device='cpu'")
+        if wp.config.mode == "debug" and wp.config.enable_tiles_in_stack_memory:
+            raise ValueError(
+                f"threads is {threads} in Warp's debug mode, where threads of one kernel share the pointer to its tiles; "
+                "wp.config.mode='release' or wp.config.enable_tiles_in_stack_memory=False take more than 1"
+            )
         if self.threads > _cores():
             warnings.warn(f"threads is {threads} on {_cores()} cores; more threads than cores are slower", stacklevel=4)
-        self._pool, self._busy, self._running = ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth"), threading.Lock(), None
+        self._pool, self._busy, self._running = (
+            ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth"),
+            threading.Lock(),
+            None,
+        )
         self._meeting = wp.zeros(kernels.NUMBERS, dtype=wp.int32, device=device)
         self._leave = _leave()
 

@@ -235,10 +235,10 @@ class ExplicitStepper(LaunchedStepper):
 
 
 def _refuse_undivided(model):
-    """Refuses one cloth that has no range for each thread.
+    """Refuses one cloth with terms that ranges do not have.
 
     Raises:
-        ValueError: Naming the term, or both numbers.
+        ValueError: Naming the term.
     """
     threads = model.team.threads
     for elements in model.terms:
@@ -247,5 +247,3 @@ def _refuse_undivided(model):
                 f"threads is {threads} with one copy, whose {elements.label} Explicit cannot divide; threads=1 can, or PBD "
                 "and XPBD, and copies are shared out with every solver"
             )
-    if threads > model.count:
-        raise ValueError(f"threads is {threads} for {model.count} vertices; there must be one for each at least")

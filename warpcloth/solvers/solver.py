@@ -52,7 +52,7 @@ class Step:
         """The :class:`Stepper` of type ``stepper`` on a model, or of copies for several threads one for each of these.
 
         Raises:
-            ValueError: If several threads are to share one cloth, and cannot.
+            ValueError: If several threads are to share one cloth, and cannot, or are more than its vertices.
         """
         threads = model.team.threads
         if threads > 1 and model.copies > 1:
@@ -64,6 +64,8 @@ class Step:
                 f"threads is {threads} with one copy, whose steps {type(self).__name__} cannot divide as it is set; "
                 "Explicit and HierarchicalPBD can, PBD and XPBD with sweep='coloured', and with several copies every solver"
             )
+        if threads > model.count:
+            raise ValueError(f"threads is {threads} for {model.count} vertices; there must be one for each at least")
         return stepper(self, model)
 
     def __post_init__(self):
