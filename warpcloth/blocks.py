@@ -53,8 +53,8 @@ def _with_pieces(elements, blocks, copies):
     stencil = _one(elements)
     lowest = stencil.min(axis=1)
     block = np.searchsorted(blocks, lowest, side="right") - 1
-    _shapes, shape = np.unique(stencil - stencil[:, :1], axis=0, return_inverse=True)
-    order = np.lexsort((stencil[:, 0], shape.ravel(), block))
+    first, *others = stencil.T
+    order = np.lexsort((first, *(other - first for other in others[::-1]), block))
     new = _changes(block[order]) | _changes(stencil[order] - np.arange(len(order))[:, None])
     run = np.cumsum(new) - 1
     loose = np.bincount(run)[run] < RUN
