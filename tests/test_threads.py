@@ -107,6 +107,25 @@ def test_ranges_move_as_the_whole(name, dtype, launches, device, monkeypatch):
         assert np.abs(stepper.state.x.numpy() - steppers[0].state.x.numpy()).max() < 43 * stepper.h * tolerance
 
 
+def test_ranges_far_from_the_origin_move_as_the_whole(device):
+    """They too keep places to more digits than x has, those of ghosts as well, and start again."""
+    sheet = wc.Mesh.grid(17, 17)
+    terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)]
+    scene = wc.Scene(wc.Mesh(sheet.points + 128.0, sheet.triangles), density=0.1, terms=terms, pins=[0, 16], duration=1.0)
+    steppers = [wc.Explicit(substeps=64).bind(scene.build(device=device, threads=threads)) for threads in (1, 2, 3, 3)]
+    for stepper in steppers:
+        for _ in range(20):
+            stepper.frame()
+    one, two, three, other = (stepper.state.x.numpy().copy() for stepper in steppers)
+    # As in test_passes, each within two roundings of x.
+    assert all(np.abs(x - one).max() < 4.0 * np.spacing(np.float32(128.0)) for x in (two, three))
+    assert np.array_equal(three, other)
+    steppers[2].reset()
+    for _ in range(20 * 64):
+        steppers[2].step()
+    assert np.array_equal(three, steppers[2].state.x.numpy())
+
+
 @pytest.mark.parametrize("name", DIVIDED)
 def test_threads_allocate_nothing(name, device):
     record, terms = DIVIDED[name]

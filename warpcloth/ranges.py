@@ -24,19 +24,26 @@ class Ranges:
         h: Step [s].
         symplectic: Whether x moves on by the v after the step.
         count: Of the steps of keyframes (1,), or None.
+        fine: As of :class:`warpcloth.passes.Sweep`.
 
     Attributes:
         model: The model.
+        low: What places are rounded by (N,) [m], or None.
     """
 
-    def __init__(self, model, state, h, symplectic, count):
+    def __init__(self, model, state, h, symplectic, count, fine=False):
         self.model, threads = model, model.team.threads
+        self.low = model.vectors() if fine else None
+        state = (*state, self.low) if fine else state
         ends = [model.count * thread // threads for thread in range(threads + 1)]
         self._ranges = [_Range(model, state, h, symplectic, count, *own) for own in pairwise(ends)]
         shared = np.unique(np.concatenate([each.ghosts for each in self._ranges]))
         damped = any(elements.damping is not None for elements in model.terms)
         # By threads that have met and threads that have not: in even steps one array, in odd ones the other.
-        self._places = [[wp.zeros(len(shared), dtype=model.vec3, device=model.device) for _ in state] for _ in range(2)]
+        carried = 2 if damped or fine else 1
+        self._places = [
+            [wp.zeros(len(shared), dtype=model.vec3, device=model.device) for _ in range(carried)] for _ in range(2)
+        ]
         for each in self._ranges:
             each.share(shared, damped)
         self._counting = next((each for each in self._ranges if each.model.pins is not None), None)
@@ -81,17 +88,18 @@ class _Range:
         self._whole, self._whole_count = state, count
         window = slice(self.low, int(touched[-1]) + 1)
         self._window = [array[window] for array in state]
-        self._state = [wp.clone(array) for array in self._window]
+        x, v = (wp.clone(array) for array in self._window[:2])
         self.count = None if count is None else wp.clone(count)
-        self.model = self._on_window(model, terms, window)
-        self.sweep = Sweep(self.model, self._state, h, symplectic)
+        self.model = self._on_window(model, terms, window, len(x))
+        self.sweep = Sweep(self.model, (x, v), h, symplectic, fine=len(state) > 2)
+        self._state = [x, v] if self.sweep.low is None else [x, v, self.sweep.low]
 
-    def _on_window(self, model, terms, window):
+    def _on_window(self, model, terms, window, count):
         other = shallow_copy(model)
         other.terms = tuple(
             replace(elements, stencil=_indices(model, stencil - self.low), per_copy=len(stencil)) for elements, stencil in terms
         )
-        other.count = other.per_copy = len(self._state[0])
+        other.count = other.per_copy = count
         own = np.zeros(other.count, dtype=bool)
         own[self.first - self.low : self.end - self.low] = True
         other.inverse_mass = model.array(np.where(own, model.inverse_mass[window].numpy(), 0.0), model.dtype)
@@ -108,7 +116,8 @@ class _Range:
         taken = np.searchsorted(shared, self.ghosts)
         self._given = [_indices(self.model, each) for each in (shared[given] - self.low, given)]
         self._taken = [_indices(self.model, each) for each in (taken, self.ghosts - self.low)]
-        self._carry, self._arrays = self.model.kernel(carry, self.model.vec3), 2 if damped else 1
+        x, v, *low = self._state
+        self._carry, self._arrays = self.model.kernel(carry, self.model.vec3), [x, *([v] if damped else low)]
 
     def load(self):
         """Takes over the state, which others than steps may have changed."""
@@ -127,12 +136,12 @@ class _Range:
 
     def give(self, places):
         """Writes what are ghosts of others."""
-        for array, out in zip(self._state[: self._arrays], places, strict=False):
+        for array, out in zip(self._arrays, places, strict=True):
             self.model.launch(self._carry, len(self._given[0]), [*self._given, array], [out])
 
     def take(self, places):
         """Reads the ghosts."""
-        for source, array in zip(places, self._state[: self._arrays], strict=False):
+        for source, array in zip(places, self._arrays, strict=True):
             self.model.launch(self._carry, len(self._taken[0]), [*self._taken, source], [array])
 
 

@@ -212,7 +212,7 @@ class ExplicitStepper(LaunchedStepper):
 
     Attributes:
         passes: The :class:`warpcloth.passes.Sweep` or :class:`warpcloth.passes.Gather` that a step is, or for several threads
-            the :class:`warpcloth.ranges.Ranges`, which keeps no ``low``.
+            the :class:`warpcloth.ranges.Ranges`.
     """
 
     def __init__(self, options, model):
@@ -220,10 +220,10 @@ class ExplicitStepper(LaunchedStepper):
         symplectic = options.scheme == "symplectic"
         if model.team.threads > 1:
             _refuse_undivided(model)
-            self.passes = Ranges(model, self.state, self.h, symplectic, self.count)
+            self.passes = Ranges(model, self.state, self.h, symplectic, self.count, is_fine(model))
         else:
             self.passes = (Gather if model.device.is_cuda else Sweep)(model, self.state, self.h, symplectic, is_fine(model))
-        self.model, self.low = self.passes.model, getattr(self.passes, "low", None)
+        self.model, self.low = self.passes.model, self.passes.low
         self.past = Past(self.model, self.model.terms)  # none: what is damped is so within the pass
         self.record((lambda: self.launch_steps(1), 1))
 
