@@ -124,6 +124,16 @@ def test_no_stiffness_is_no_constraint(device):
         assert stepper.state.x.numpy()[1, 1] == pytest.approx(-1.5 - 9.81 / 3600, rel=1e-6)
 
 
+def test_one_sweep_of_a_step_has_no_stiffness_to_spread(device):
+    found = []
+    for stiffness in ("per-sweep", "per-step"):
+        stepper = wc.PBD(substeps=4, iterations=1, stiffness=stiffness).bind(scene("hanging", n=8).build(device=device))
+        for _ in range(5):
+            stepper.frame()
+        found.append((stepper.state.x.numpy(), stepper.model.kernels))
+    assert np.array_equal(found[0][0], found[1][0]) and found[0][1] == found[1][1]
+
+
 # --- what the sweeps of a step converge to
 
 

@@ -276,6 +276,8 @@ def test_simulate_and_the_commands_take_threads(device, tmp_path, capsys):
     assert main(["run", "hanging", *command, "-o", str(tmp_path / "out.usdc")]) == 0
     out = capsys.readouterr().out
     assert json.loads(out[out.index("{") :])["threads"] == 2
+    assert main(["run", "hanging", *[word for word in command if word != "--json"], "-o", str(tmp_path / "out.usdc")]) == 0
+    assert "cpu, float32, 2 threads" in capsys.readouterr().out
     assert main(["bench", "hanging", *command]) == 0
     (row,) = json.loads(capsys.readouterr().out)["rows"]
     assert row["threads"] == 2 and row["launches"] > 1.0

@@ -76,6 +76,7 @@ def run(arguments):
 
 
 def _summary(facts):
+    threads = facts["threads"]
     return "\n".join(
         [
             f"{facts['scene']}: {facts['message']}",
@@ -84,7 +85,7 @@ def _summary(facts):
             f"  worst strain  {100.0 * facts['worst_strain']:.3g} %",
             f"  residual      {facts['residual']:.2g}",
             f"  solver        {_solver_line(facts)}",
-            f"  device        {facts['device']}, {facts['dtype']}",
+            f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),
             f"  file          {place(facts)}",
         ]
     )
