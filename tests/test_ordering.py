@@ -1,13 +1,16 @@
 """Vertices renumbered for memory: what a run gives is in the scene's own order, the same but for rounding."""
 
 import json
-from dataclasses import replace
+import time
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 import warpcloth as wc
 from warpcloth import ordering, scene_files
+from warpcloth.bench.measure import measure
+from warpcloth.chart.tasks import SceneRef, Setup
 from warpcloth.cli import main
 from warpcloth.ordering import near_order, order_of_run, spread
 from warpcloth.scenes import flag, hanging
@@ -268,6 +271,18 @@ def test_the_command_renumbers_a_model_that_it_has_built_already(tmp_path, alway
     expected = wc.simulate(scene, wc.Explicit(substeps=substeps)).points
     # Of float32 every step rounds; a tenth of a second of a swing multiplies that by little.
     np.testing.assert_allclose(np.asarray(FrameSequence(output)), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", ["explicit", "pbd"])
+def test_a_benchmark_measures_what_a_run_does(solver, tmp_path, always, device, monkeypatch):
+    built = []
+    build = wc.Scene.build
+    monkeypatch.setattr(wc.Scene, "build", lambda scene, **options: built.append(build(scene, **options)) or built[-1])
+    (tmp_path / "sheet.py").write_text(SCENE)
+    scene, setup = asdict(SceneRef(str(tmp_path / "sheet.py"))), asdict(Setup(solver, {"substeps": 64}))
+    row = measure(scene, setup, frames=0, device=device, dtype="float32", started=time.time())
+    assert row["status"] == "ok"
+    assert (built[0].order is not None) == (solver == "explicit")
 
 
 @pytest.mark.parametrize(

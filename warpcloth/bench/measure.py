@@ -9,6 +9,7 @@ import warp as wp
 
 from ..capture import Mirror
 from ..chart.tasks import SceneRef, Setup
+from ..ordering import order_of_run
 from ..status import Result
 from .counts import compulsory_bytes, elements_of, launches_of
 
@@ -64,8 +65,10 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:
-            model = declared.build(device=device, dtype=dtype, copies=copies, threads=threads)
-            stepper = Setup(**setup).record().bind(model)
+            solver = Setup(**setup).record()
+            order = order_of_run(declared, solver)  # as a run has it
+            model = declared.build(device=device, dtype=dtype, copies=copies, order=order, threads=threads)
+            stepper = solver.bind(model)
         except ValueError as error:
             return found | {"status": "refused", "reason": str(error)}
     wp.synchronize_device(device)
