@@ -2,8 +2,10 @@
 
 import gc
 import json
+import os
 import signal
 import threading
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -283,3 +285,25 @@ def test_simulate_and_the_commands_take_threads(device, tmp_path, capsys):
     assert row["threads"] == 2 and row["launches"] > 1.0
     assert main(["run", "hanging", "-p", "n=5", "--threads", "2", "-o", str(tmp_path / "no.usdc")]) == 2
     assert "Newton cannot divide" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*fork")
+def test_a_forked_process_has_threads_of_its_own(device):
+    """Those of its parent are not there."""
+    stepper = wc.Explicit(substeps=8, above_limit="allow").bind(declared([SPRINGS]).build(device=device, threads=2))
+    stepper.frame()
+    child = os.fork()
+    if child == 0:
+        stepper.frame()
+        os._exit(0 if np.isfinite(stepper.state.x.numpy()).all() else 1)
+    for _ in range(200):
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            break
+        time.sleep(0.05)
+    else:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        pytest.fail("the forked process hangs")
+    assert os.waitstatus_to_exitcode(status) == 0

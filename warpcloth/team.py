@@ -40,7 +40,7 @@ class Team:
 
     def __init__(self, threads, device):
         whole("threads", threads, 1)
-        self.threads, self._here, self._pool = int(threads), threading.local(), None
+        self.threads, self._here = int(threads), threading.local()
         if self.threads == 1:
             return
         if not device.is_cpu:
@@ -52,13 +52,14 @@ class Team:
             )
         if self.threads > _cores():
             warnings.warn(f"threads is {threads} on {_cores()} cores; more threads than cores are slower", stacklevel=4)
-        self._pool, self._busy, self._running = (
-            ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth"),
-            threading.Lock(),
-            None,
-        )
+        self._start()
         self._meeting = wp.zeros(kernels.NUMBERS, dtype=wp.int32, device=device)
         self._leave = _leave()
+
+    def _start(self):
+        """The threads themselves, which a forked process does not take over."""
+        self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth")
+        self._busy, self._running, self._process = threading.Lock(), None, os.getpid()
 
     @property
     def thread(self):
@@ -111,6 +112,8 @@ class Team:
             for function in functions:
                 function()
             return
+        if self._process != os.getpid():
+            self._start()
         with self._busy:
             if self._running is not None:
                 self._running.exception()  # has ended, but where a second interrupt left it behind
