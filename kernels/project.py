@@ -90,7 +90,10 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
         if wp.static(multipliers):
             gap -= compliance * before
         if wp.static(term.rows == 1):  # without a branch, so that a GPU may take several constraints at once
-            rows = wp.where(moves, (dtype(1.0) / (system[0, 0] + compliance)) * gap, rows)
+            if wp.static(multipliers):  # whose roundings add up over sweeps
+                rows = wp.where(moves, gap / (system[0, 0] + compliance), rows)
+            else:
+                rows = wp.where(moves, (dtype(1.0) / (system[0, 0] + compliance)) * gap, rows)
         else:
             if moves:
                 for m in range(M):
