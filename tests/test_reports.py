@@ -242,12 +242,14 @@ def test_another_programs_cache(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["coloured"] == "length_ratio_2"
 
 
-def test_stills_and_plots_are_pictures(cloth, tmp_path):
+def test_stills_and_plots_are_pictures(cloth, tmp_path, capsys):
     command = ["analyze", str(cloth), "--measure", "stretch", "directions", "--curves", "--range", "0.9", "1.1"]
     outputs = ["--still", str(tmp_path / "still.png"), "--still-frames", "2", "6", "--plot", str(tmp_path / "plot.svg")]
     assert main([*command, *outputs]) == 0
+    said = capsys.readouterr().out
     for name in ("still_2.png", "still_6.png", "plot.svg"):
         assert (tmp_path / name).stat().st_size > 10_000
+        assert str(tmp_path / name) in said
 
 
 def test_one_file(cloth, tmp_path, capsys):

@@ -81,7 +81,7 @@ def analyze(arguments):
         frames_folder_of(arguments)  # refuses an ending that is none
     started = time.perf_counter()
     analyzer = _analyzer(arguments)
-    progress = Progress(len(analyzer), first="measuring")
+    stills, progress = _stills(arguments, analyzer), Progress(len(analyzer), first="measuring")
     try:
         found = write_report(
             analyzer,
@@ -90,7 +90,7 @@ def analyze(arguments):
             json=arguments.report,
             npz=arguments.npz,
             plot=arguments.plot,
-            stills=_stills(arguments, analyzer),
+            stills=stills,
             colour=arguments.colour,
             colour_range=arguments.range,
             curves=arguments.curves,
@@ -125,6 +125,7 @@ def analyze(arguments):
         "file": arguments.output,
         "frames_folder": frames_folder_of(arguments) if arguments.output else None,
         **{name: path for name, path in files.items() if name != "output"},
+        "still": ", ".join(map(str, stills.values())) if stills else None,
     }
     print(as_json(facts) if arguments.json else _summary(facts))
     return 0
