@@ -102,7 +102,7 @@ def elements_of(part: Part, dtype):
 
     Swept: block b has the pieces from offsets[b] to offsets[b+1], and ``codes`` are the first element of each and how many,
     see :mod:`.blocks`. Gathered: so many incidences has vertex i, and ``codes`` are K·element + corner, from offsets[i] on or,
-    padded, of the first slot of all vertices, then of the second …; of pairs the other vertex, -1 where there are no more.
+    padded, of the first slot of all vertices, then of the second …; of pairs the other vertex, or itself where there is none.
     """
 
     @wp.struct

@@ -14,6 +14,7 @@ from .blocks import add_blocks
 from .elements import Part, chain_of
 from .gather import sum_at_vertices
 from .memory import load, store
+from .places import pack, unpack
 
 
 @cache
@@ -102,30 +103,34 @@ def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str, fine: bo
 
 @cache
 def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int = 1, fine: bool = False):
-    """The device function by which ``lanes`` threads set x, v of a vertex after a step, a = g − ∇U/m, in other arrays."""
+    """The device function by which ``lanes`` threads set x, v of a vertex after a step, a = g − ∇U/m, in other arrays.
+
+    ``fine`` keeps what x is rounded by as :mod:`.places` packs it.
+    """
     vec3, _ = types(dtype)
-    total_of, step = sum_at_vertices(parts, dtype, fine, lanes), advance(dtype, symplectic, fine)
-    vector, number, put = load(vec3), load(dtype), store(vec3)
+    low_type = wp.int32 if fine else vec3
+    total_of, step = sum_at_vertices(parts, dtype, wp.int32 if fine else None, lanes), advance(dtype, symplectic, fine)
+    vector, number, put, whole, put_whole = load(vec3), load(dtype), store(vec3), load(wp.int32), store(wp.int32)
 
     @wp.func
     def gather_one(
         thread: int,
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
-        gravity: wp.array(dtype=vec3),
-        per_copy: int,
+        g: vec3,
         h: dtype,
+        unit: dtype,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
-        low: wp.array(dtype=vec3),
+        low: wp.array(dtype=low_type),
         x_after: wp.array(dtype=vec3),
         v_after: wp.array(dtype=vec3),
-        low_after: wp.array(dtype=vec3),
+        low_after: wp.array(dtype=low_type),
     ):
         # Of pins too: what follows need not wait for w.
         total = vec3()
         if wp.static(fine):
-            total = total_of(thread, chain, inverse_mass.shape[0], x, low, dtype(1.0))
+            total = total_of(thread, chain, inverse_mass.shape[0], x, low, unit)
         else:
             total = total_of(thread, chain, inverse_mass.shape[0], x, v, h)
         i = thread // lanes
@@ -134,26 +139,29 @@ def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int =
         velocity = vector(v, i)
         rest = vec3()
         if wp.static(fine):
-            rest = vector(low, i)
+            rest = unpack(whole(low, i), unit)
         if w > dtype(0.0):
-            place, rest, velocity = step(place, rest, velocity, gravity[i // per_copy] - w * total, h)
+            place, rest, velocity = step(place, rest, velocity, g - w * total, h)
         if thread == i * lanes:
             put(x_after, i, place)
             put(v_after, i, velocity)
             if wp.static(fine):
-                put(low_after, i, rest)
+                put_whole(low_after, i, pack(rest, unit))
 
     return gather_one
 
 
 @cache
-def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, lanes: int = 1, fine: bool = False):
+def gather(
+    parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, alone: bool = True, lanes: int = 1, fine: bool = False
+):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
     Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN
-    stays. ``fine`` as in :func:`advance`, of what is not damped.
+    stays. ``alone`` is for one copy. ``fine`` as in :func:`advance`, of what is not damped, see :func:`gather_vertex`.
     """
     vec3, _ = types(dtype)
+    low_type = wp.int32 if fine else vec3
     gather_one = gather_vertex(parts, dtype, symplectic, lanes, fine)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": fast})
@@ -163,15 +171,20 @@ def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, lanes: 
         gravity: wp.array(dtype=vec3),
         per_copy: int,
         h: dtype,
+        unit: dtype,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
-        low: wp.array(dtype=vec3),
+        low: wp.array(dtype=low_type),
         # out
         x_after: wp.array(dtype=vec3),
         v_after: wp.array(dtype=vec3),
-        low_after: wp.array(dtype=vec3),
+        low_after: wp.array(dtype=low_type),
     ):
-        gather_one(wp.tid(), chain, inverse_mass, gravity, per_copy, h, x, v, low, x_after, v_after, low_after)
+        thread = wp.tid()
+        copy = 0
+        if wp.static(not alone):
+            copy = thread // (lanes * per_copy)  # a tenth of the instructions of a step of springs
+        gather_one(thread, chain, inverse_mass, gravity[copy], h, unit, x, v, low, x_after, v_after, low_after)
 
     return gather_vertices
 
@@ -210,19 +223,20 @@ def gather_copies(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, 
         v_other: wp.array(dtype=vec3),
     ):
         copy, thread = wp.tid()
+        g = gravity[copy]
         first = copy * per_copy + thread
         end = (copy + 1) * per_copy
         left = steps
         while left > 0:
             i = first
             while i < end:
-                gather_one(i, chain, inverse_mass, gravity, per_copy, h, x, v, x, x_other, v_other, x)
+                gather_one(i, chain, inverse_mass, g, h, h, x, v, x, x_other, v_other, x)
                 i += threads
             wait_for_block()
             i = first
             while i < end:
                 if left > 1:
-                    gather_one(i, chain, inverse_mass, gravity, per_copy, h, x_other, v_other, x, x, v, x)
+                    gather_one(i, chain, inverse_mass, g, h, h, x_other, v_other, x, x, v, x)
                 else:  # the last of an odd number
                     put(x, i, vector(x_other, i))
                     put(v, i, vector(v_other, i))

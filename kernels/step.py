@@ -221,13 +221,14 @@ def note_move(dtype):
 
 
 @cache
-def reset(dtype, led: bool):
+def reset(dtype, led: bool, packed: bool = False):
     """Kernel over vertices: those of the copies that the mask (B,) has true start again, and what is kept of these copies too.
 
     Arrays that a stepper lacks are None. A pinned vertex stands still; where keyframes lead it (``led``) it starts where the
-    model has it, whatever ``x_start`` says.
+    model has it, whatever ``x_start`` says. What places are rounded by may be ``packed``, see :mod:`.places`.
     """
     vec3, _ = types(dtype)
+    low_type = wp.int32 if packed else vec3
 
     @wp.kernel(module="unique", enable_backward=False)
     def reset_vertices(
@@ -244,7 +245,7 @@ def reset(dtype, led: bool):
         v: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
         v_before: wp.array(dtype=vec3),
-        low: wp.array(dtype=vec3),
+        low: wp.array(dtype=low_type),
         step: wp.array(dtype=wp.int32),
         worst: wp.array(dtype=wp.float64),
     ):
@@ -261,7 +262,10 @@ def reset(dtype, led: bool):
                 move[i] = move_start[i]
                 v_before[i] = v_before_start[i]
             if low:
-                low[i] = vec3()
+                if wp.static(packed):
+                    low[i] = 0
+                else:
+                    low[i] = vec3()
             if i == copy * per_copy:
                 if step:
                     step[copy] = 0

@@ -28,7 +28,7 @@ def gathered(model, elements, damped=False):
         arrays["damping"] = elements.damping
     if found := _pairs(elements, model.count):
         slots, codes, source = found
-        codes = np.where(codes < 0, -1 - np.arange(model.count), codes)
+        codes = np.where(codes < 0, np.arange(model.count), codes)
         others = {name: _of_incidences(array, source.ravel()) for name, array in arrays.items() if name != "stencil"}
         return part._replace(pairs=slots), {**others, "codes": indices(elements, codes.ravel())}
     if elements.term.quadratic and not damped and (found := _of_matrix(model, elements)):

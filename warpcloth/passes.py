@@ -13,6 +13,9 @@ from .operators import Gradient, fit_cells
 THREADS = 512
 # Vertices of such a copy at most: 132 copies of 64² take 1.5 times as long by 512 threads as by launches.
 VERTICES = 1024
+# What places are rounded by is packed in units of this times what x is rounded by, which leaves it whole for places 16 times as
+# far from the origin as those of the start.
+FINER = 2.0**-6
 
 
 class Sweep:
@@ -60,7 +63,8 @@ class Gather:
     """The same by gathering over the incidences of each vertex, see :func:`warpcloth.kernels.explicit.gather`.
 
     x, of what is damped v, and ``low`` go to and fro between two arrays; the last of an odd number of steps is copied back.
-    Where :func:`block_of` says so a copy is a block of threads and takes all steps in one launch.
+    ``low`` is packed, see :mod:`warpcloth.kernels.places`. Where :func:`block_of` says so a copy is a block of threads and
+    takes all steps in one launch.
     """
 
     def __init__(self, model, state, h, symplectic, fine=False):
@@ -73,12 +77,13 @@ class Gather:
         if self._threads:
             self._kernel = model.kernel(kernels.gather_copies, *key, self._threads)
         else:
-            self._kernel = model.kernel(kernels.gather, *key, self._lanes, fine)
+            self._kernel = model.kernel(kernels.gather, *key, model.copies == 1, self._lanes, fine)
         self._chain = chain(parts, [arrays for _part, arrays in self._found], model.dtype)
         x, v = state
-        self.low, low = (model.vectors(), model.vectors()) if fine else (None, None)
+        self.low, low = (wp.zeros(model.count, dtype=wp.int32, device=model.device) if fine else None for _ in range(2))
         self._states = [(x, v, self.low), (model.vectors(), model.vectors() if any(part.damped for part in parts) else v, low)]
         self._given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, h]
+        self._unit = _rounding(model) * FINER
 
     def launch(self, steps, after_step):
         """So many steps, with a call of ``after_step`` (x, v) after each."""
@@ -90,7 +95,7 @@ class Gather:
         for step in range(steps):
             before, after = self._states[step % 2], self._states[1 - step % 2]
             fit_cells(model, model.terms, before[0], None)
-            model.launch(self._kernel, model.count * self._lanes, [*self._given, *before], [*after])
+            model.launch(self._kernel, model.count * self._lanes, [*self._given, self._unit, *before], [*after])
             after_step(*after[:2])
         if steps % 2:
             for array, last in zip(*self._states, strict=True):
@@ -111,7 +116,12 @@ def is_fine(model):
     lengths = model.scene.mesh.edge_lengths
     if not lengths.size or not lengths.any():
         return False
-    return bool(np.spacing(np.float32(np.abs(model.scene.positions).max())) > 4e-5 * lengths.mean())
+    return bool(_rounding(model) > 4e-5 * lengths.mean())
+
+
+def _rounding(model):
+    """The distance of neighbouring numbers of float32 at the farthest place of the start [m]."""
+    return float(np.spacing(np.float32(np.abs(model.scene.positions).max(initial=0.0))))
 
 
 def block_of(model, parts):

@@ -19,7 +19,8 @@ class Reset:
 
     def __init__(self, stepper):
         self.stepper, self.model = stepper, stepper.model
-        self._kernel = self.model.kernel(kernels.reset, self.model.dtype, self.model.pins is not None)
+        packed = stepper.low is not None and stepper.low.dtype is wp.int32
+        self._kernel = self.model.kernel(kernels.reset, self.model.dtype, self.model.pins is not None, packed)
         self._buffers = {}  # of what comes from the host, made when first needed
 
     def __call__(self, mask, positions, velocities):
