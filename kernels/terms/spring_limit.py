@@ -38,7 +38,8 @@ def energy(y: Any, rest: Any):
 
 @wp.func
 def gradient(y: Any, rest: Any):
-    return spring_gradient(y, nearest_length(y, rest))
+    nearest = nearest_length(y, rest)
+    return wp.where(nearest[0] == wp.length(y[0]), y.dtype(0.0), y.dtype(1.0)) * spring_gradient(y, nearest)
 
 
 @wp.func
