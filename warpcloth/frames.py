@@ -42,8 +42,7 @@ def frames_of(stepper, count, ahead):
         count: How many.
         ahead: The most that are computed beyond the one in use; 0 computes each when it is asked for, without a thread.
     """
-    kind = _DeviceCopy if stepper.model.device.is_cuda else _HostCopy
-    copies = itertools.cycle([kind(stepper) for _ in range(max(ahead, 1))])
+    copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
 
     def compute():
         copy = next(copies)
@@ -80,6 +79,20 @@ def state_of(stepper):
     return tuple(np.array(model.in_scene_order(array.numpy())) for array in stepper.state)  # on the CPU numpy() is a view
 
 
+def _copies(stepper, number):
+    """What takes so many frames from a stepper."""
+    model = stepper.model
+    if not model.device.is_cuda:
+        return [_HostCopy(stepper) for _ in range(number)]
+    on_host(model.device, "reading a frame")
+    shape = (number, len(stepper.state), model.count)
+    found = wp.empty(shape, dtype=model.vec3, device=model.device)
+    host = wp.empty(shape, dtype=model.vec3, device="cpu", pinned=True)
+    places = None if model.places is None else wp.array(model.places, dtype=wp.int32, device=model.device)
+    stream = wp.Stream(model.device)
+    return [_DeviceCopy(stepper, stream, places, found[k], host[k]) for k in range(number)]
+
+
 class _HostCopy:
     """A frame that is computed on the host."""
 
@@ -102,36 +115,29 @@ class _DeviceCopy:
     So the next frame begins while this one is copied, and who takes it waits for its event alone.
     """
 
-    def __init__(self, stepper):
-        self.stepper = stepper
-        model, device = stepper.model, stepper.model.device
-        on_host(device, "reading a frame")
-        self._stream = wp.Stream(device)
-        self._began, self._ended = (wp.Event(device, enable_timing=True) for _ in range(2))
-        self._copied = wp.Event(device)
-        self._found = [model.vectors() for _ in stepper.state]
-        self._host = [wp.empty_like(array, device="cpu", pinned=True) for array in self._found]
-        self._places = None
-        if model.places is not None:
-            self._places = wp.array(model.places, dtype=wp.int32, device=device)
-            self._take = model.kernel(take_vertices, model.dtype)
+    def __init__(self, stepper, stream, places, found, host):
+        self.stepper, self._stream, self._places, self._found, self._host = stepper, stream, places, found, host
+        self._began, self._ended = (wp.Event(stream.device, enable_timing=True) for _ in range(2))
+        self._copied = wp.Event(stream.device)
+        if places is not None:
+            self._take = stepper.model.kernel(take_vertices, stepper.model.dtype)
 
     def frame(self):
         model, stream = self.stepper.model, self.stepper.model.device.stream
         stream.record_event(self._began)
         self.stepper.frame()
-        for array, found in zip(self.stepper.state, self._found, strict=True):
+        for k, array in enumerate(self.stepper.state):
+            found = self._found[k]
             if self._places is None:
                 wp.copy(found, array)
             else:
                 model.launch(self._take, model.count, [array, self._places], [found])
         stream.record_event(self._ended)
         self._stream.wait_event(self._ended)
-        for found, host in zip(self._found, self._host, strict=True):
-            wp.copy(host, found, stream=self._stream)
+        wp.copy(self._host, self._found, stream=self._stream)
         self._stream.record_event(self._copied)
 
     def take(self):
         wp.synchronize_event(self._copied)
         seconds = 1e-3 * wp.get_event_elapsed_time(self._began, self._ended, synchronize=False)
-        return *(np.array(host.numpy()) for host in self._host), seconds
+        return *np.array(self._host.numpy()), seconds

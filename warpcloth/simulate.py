@@ -12,6 +12,9 @@ from .frames import frames_of, state_of
 from .ordering import order_of_run
 from .status import Result, Status
 
+# Of frames that a CUDA device has computed and nobody has taken yet: bytes on either side, and how many.
+AHEAD, FRAMES = 2**28, 1000
+
 
 @dataclass(frozen=True, eq=False)
 class Animation:
@@ -97,7 +100,7 @@ def simulate(
         recorder.append(*state_of(stepper))
         if progress is not None:
             progress(0, frames)
-        with closing(frames_of(stepper, frames, _ahead(model.device, output))) as found:
+        with closing(frames_of(stepper, frames, _ahead(model, output))) as found:
             for number, frame in enumerate(found, start=1):
                 timings["frames"].append(frame.seconds)
                 if not watch.passes(number, frame.points, frame.velocities, frame.results):
@@ -113,14 +116,14 @@ def simulate(
     return Animation(points, velocities, times, status, timings, watch.worst_strain, output)
 
 
-def _ahead(device, output):
+def _ahead(model, output):
     """How many frames are computed beyond the one that is watched and written.
 
-    On CUDA two: one to go on with, and one for when writing a chunk takes longer than a frame. On the CPU one, where there is a
-    file to write and a core to spare; frames in memory are only watched.
+    On CUDA so many that the device waits for nobody until they fill ``AHEAD`` bytes. On the CPU one, where there is a file to
+    write and a core to spare; frames in memory are only watched.
     """
-    if device.is_cuda:
-        return 2
+    if model.device.is_cuda:
+        return min(max(AHEAD // (2 * model.count * wp.types.type_size_in_bytes(model.vec3)), 2), FRAMES)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return int(output is not None and cores > 1)
 
