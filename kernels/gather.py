@@ -183,7 +183,24 @@ def gather_rows(part: Part, dtype, ahead, lanes: int):
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     vector, whole, number, moves = load(vec3), load(wp.int32), load(dtype), move_of(dtype, ahead)
-    moved, slots = ahead is not None, wp.constant(part.rows)
+    moved, ragged = ahead is not None, part.rows % lanes > 0
+    each, slots = wp.constant(-(-part.rows // lanes)), wp.constant(part.rows)
+
+    @wp.func
+    def pull_of(
+        elements: elements_of(part, dtype),
+        slot: int,
+        place: vec3,
+        move: vec3,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=v_type),
+        h: dtype,
+    ):
+        j = whole(elements.codes, slot)
+        apart = vector(x, j) - place
+        if wp.static(moved):
+            apart += moves(v, j, h) - move
+        return number(elements.stiffness, slot) * apart
 
     @wp.func
     def total_of(
@@ -200,15 +217,13 @@ def gather_rows(part: Part, dtype, ahead, lanes: int):
         move = vec3()
         if wp.static(moved):
             move = moves(v, i, h)
-        s = lane
-        while s < slots:
-            slot = s * count + i
-            j = whole(elements.codes, slot)
-            apart = vector(x, j) - place
-            if wp.static(moved):
-                apart += moves(v, j, h) - move
-            total += number(elements.stiffness, slot) * apart
-            s += lanes
+        for n in range(each):
+            s = n * lanes + lane
+            if wp.static(ragged):
+                if s < slots:
+                    total += pull_of(elements, s * count + i, place, move, x, v, h)
+            else:
+                total += pull_of(elements, s * count + i, place, move, x, v, h)
         return total
 
     return total_of

@@ -13,7 +13,7 @@ from .ordering import order_of_run
 from .status import Result, Status
 
 # Of frames that a CUDA device has computed and nobody has taken yet: bytes on either side, and how many.
-AHEAD, FRAMES = 2**28, 1000
+AHEAD, FRAMES = 2**30, 1000
 
 
 @dataclass(frozen=True, eq=False)
