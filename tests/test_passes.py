@@ -212,12 +212,14 @@ PROJECTED["corotated"] = [wc.CorotatedMembrane(stiffness=100.0)]
 @pytest.mark.parametrize("name", PROJECTED)
 def test_jacobi_sweeps_gather_what_they_scatter(name, options, dtype, device, monkeypatch):
     """d and λ, whether sweeps run one by one, which copies what they leave in the other arrays back, or in pairs."""
-    scene, steps, h = declared(PROJECTED[name]), 3, 0.02
-    model = scene.build(device=device, dtype=dtype, copies=2)
-    model = model.with_terms(damped_terms(model, h))
-    Past(model, model.terms).launch(model.positions)  # sets the rest state of what is damped, by element
-    d, found = model.array(RANDOM.normal(scale=0.01, size=(model.count, 3)), model.vec3), []
+    scene, steps, h, found = declared(PROJECTED[name]), 3, 0.02, []
+    moves = RANDOM.normal(scale=0.01, size=(2 * N, 3))
     for way, pairs in ((Scatter, False), (jacobi.Gather, False), (jacobi.Gather, True)):
+        # Scattering is for one thread, of the CPU.
+        model = scene.build(device="cpu" if way is Scatter else device, dtype=dtype, copies=2)
+        model = model.with_terms(damped_terms(model, h))
+        Past(model, model.terms).launch(model.positions)  # sets the rest state of what is damped, by element
+        d = model.array(moves, model.vec3)
         monkeypatch.setattr(sweeps, "Scatter", way)
         monkeypatch.setattr(sweeps, "Gather", way)
         made = sweeps.Sweep(model, model.positions, h, relaxation=0.1, **options)

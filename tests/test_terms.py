@@ -1098,20 +1098,19 @@ def test_gathering_is_scattering(term, dtype, device, monkeypatch):
     monkeypatch.setattr(incidences, "CHUNK", 7)  # of matrices, which are then added up in several
     random = np.random.default_rng(8)
     mesh = rest_mesh()
-    model = model_of(
-        mesh, mesh.points + random.normal(scale=0.03, size=mesh.points.shape), [term.name], dtype, device, pins=[0, 7], copies=2
-    )
-    (elements,) = model.terms
-    zero, x, scalar = model.vectors(), model.positions, model.dtype
-
-    part, arrays = gathered(model, elements)
+    places = mesh.points + random.normal(scale=0.03, size=mesh.points.shape)
+    # Scattering is for one thread, of the CPU.
+    model, other = (model_of(mesh, places, [term.name], dtype, each, pins=[0, 7], copies=2) for each in (device, "cpu"))
+    part, arrays = gathered(model, model.terms[0])
+    scalar = model.dtype
 
     def forces(factory, *key):
-        out = model.vectors()
-        out.fill_(model.vec3(1.0, 2.0, 3.0))  # both add to what is there
         scatters = factory is assemble.scatter_gradient
-        given = elements.arguments if scatters else [chain([part], [arrays], scalar)]
-        model.launch(factory(*key), elements.count if scatters else model.count, [*given, x, zero], [out])
+        on = other if scatters else model
+        out = on.vectors()
+        out.fill_(on.vec3(1.0, 2.0, 3.0))  # both add to what is there
+        given = on.terms[0].arguments if scatters else [chain([part], [arrays], scalar)]
+        on.launch(factory(*key), on.terms[0].count if scatters else on.count, [*given, on.positions, on.vectors()], [out])
         return out.numpy()
 
     scattered = forces(assemble.scatter_gradient, term, scalar)
