@@ -12,9 +12,9 @@ import warp as wp
 from .assemble import types
 from .blocks import add_blocks
 from .elements import Part, chain_of
-from .gather import sum_at_vertices
+from .gather import move_of, sum_at_vertices
 from .memory import load, store
-from .places import pack, unpack
+from .places import pack
 
 UNROLLED = 32
 
@@ -104,15 +104,16 @@ def sweep(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str, fine: bo
 
 
 @cache
-def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int = 1, fine: bool = False):
+def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int = 1, kept=None):
     """The device function by which ``lanes`` threads set x, v of a vertex after a step, a = g − ∇U/m, in other arrays.
 
-    ``fine`` keeps what x is rounded by as :mod:`.places` packs it.
+    ``kept`` is the type of what x is rounded by, see :func:`gather`.
     """
     vec3, _ = types(dtype)
-    low_type = wp.int32 if fine else vec3
-    total_of, step = sum_at_vertices(parts, dtype, wp.int32 if fine else None, lanes), advance(dtype, symplectic, fine)
-    vector, number, put, whole, put_whole = load(vec3), load(dtype), store(vec3), load(wp.int32), store(wp.int32)
+    fine, packed, low_type = kept is not None, kept is wp.int32, kept or vec3
+    total_of, step = sum_at_vertices(parts, dtype, kept, lanes), advance(dtype, symplectic, fine)
+    vector, number, put = load(vec3), load(dtype), store(vec3)
+    rest_of, put_rest = move_of(dtype, low_type), store(low_type)
 
     @wp.func
     def gather_one(
@@ -141,32 +142,33 @@ def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int =
         velocity = vector(v, i)
         rest = vec3()
         if wp.static(fine):
-            rest = unpack(whole(low, i), unit)
+            rest = rest_of(low, i, unit)
         if w > dtype(0.0):
             place, rest, velocity = step(place, rest, velocity, g - w * total, h)
         if thread == i * lanes:
             put(x_after, i, place)
             put(v_after, i, velocity)
-            if wp.static(fine):
-                put_whole(low_after, i, pack(rest, unit))
+            if wp.static(packed):
+                put_rest(low_after, i, pack(rest, unit))
+            elif wp.static(fine):
+                put_rest(low_after, i, rest)
 
     return gather_one
 
 
 @cache
-def gather(
-    parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, alone: bool = True, lanes: int = 1, fine: bool = False
-):
+def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, alone: bool = True, lanes: int = 1, kept=None):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
     Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN
-    stays. ``alone`` is for one copy. ``fine`` as in :func:`advance`, of what is not damped, see :func:`gather_vertex`.
+    stays. ``alone`` is for one copy. ``kept`` is None, or of what is not damped, in float32, the type of what x is rounded by,
+    as in :func:`advance`: vectors, with a ``unit`` of 1, or int32 as :mod:`.places` packs them in units of ``unit``.
     """
     vec3, _ = types(dtype)
-    low_type = wp.int32 if fine else vec3
-    gather_one = gather_vertex(parts, dtype, symplectic, lanes, fine)
+    low_type = kept or vec3
+    gather_one = gather_vertex(parts, dtype, symplectic, lanes, kept)
     # Rows of bending one after another in a loop take 1.3 times as long where places are fine, else as long (H200, 512²).
-    options = {"fast_math": fast, "max_unroll": UNROLLED if fine else 16}
+    options = {"fast_math": fast, "max_unroll": UNROLLED if kept else 16}
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=options)
     def gather_vertices(

@@ -311,9 +311,12 @@ def test_the_residual_is_that_of_the_worst_step(device):
 
 
 @pytest.mark.parametrize("way", ["own", "gathered"])
-@pytest.mark.parametrize("away", [0.0, 128.0])
-def test_motion_does_not_depend_on_where_the_origin_is(away, way, device, monkeypatch):
-    """Far from it places are kept to more digits than x has; frames are steps, and a run repeats itself, to the bit."""
+@pytest.mark.parametrize(("away", "substeps"), [(0.0, 64), (128.0, 64), (4096.0, 512)])
+def test_motion_does_not_depend_on_where_the_origin_is(away, substeps, way, device, monkeypatch):
+    """Far from it places are kept to more digits than x has; frames are steps, and a run repeats itself, to the bit.
+
+    Farther, steps of less than the unit of what is packed too.
+    """
     if way == "gathered":
         monkeypatch.setattr(explicit, "Sweep", Gather)
     sheet = wc.Mesh.grid(17, 17)  # of places that float32 has in both
@@ -322,14 +325,14 @@ def test_motion_does_not_depend_on_where_the_origin_is(away, way, device, monkey
         mesh = wc.Mesh(sheet.points + away, sheet.triangles)
         terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)]
         scene = wc.Scene(mesh, density=0.1, terms=terms, pins=[0, 16], duration=1.0)
-        return wc.Explicit(substeps=64).bind(scene.build(device=device, dtype=dtype))
+        return wc.Explicit(substeps=substeps).bind(scene.build(device=device, dtype=dtype))
 
     exact, stepper, other = (stepper_of(*key) for key in ((0.0, "float64"), (away, "float32"), (away, "float32")))
     assert (stepper.low is not None) == (away > 0.0)
     for _ in range(20):
         exact.frame()
         stepper.frame()
-        for _ in range(64):
+        for _ in range(substeps):
             other.step()
     x = stepper.state.x.numpy()
     # x is rounded by half of this; without the rest it is 50 times as far off.
@@ -339,3 +342,32 @@ def test_motion_does_not_depend_on_where_the_origin_is(away, way, device, monkey
     for _ in range(20):
         stepper.frame()
     assert np.array_equal(x, stepper.state.x.numpy())
+
+
+@pytest.mark.parametrize(
+    ("scene", "varied", "packed"),
+    [
+        ({"pins": [0]}, {}, True),
+        ({"pins": [0], "duration": 1e4}, {}, True),  # held
+        ({"duration": 1.0}, {}, True),
+        ({"duration": 1e3}, {}, False),  # falls 5000 km
+        ({"velocities": [1e5, 0.0, 0.0]}, {}, False),
+        ({}, {"velocities": [0.0, 1e5, 0.0]}, False),
+        ({}, {"gravity": [0.0, 0.0, 1e5]}, False),
+        ({"pins": [0]}, {"positions": [4096.0, 0.0, 0.0]}, False),
+        ({"pins": [0]}, {"velocities": [0.0, 1e5, 0.0]}, True),
+        ({"pins": wc.Pins([0], [[[128.0] * 3], [[4096.0] * 3]])}, {}, False),
+    ],
+)
+def test_what_places_are_rounded_by_is_packed_where_that_holds_it(scene, varied, packed, device):
+    """Also at the ends that are known before a run: by units of less than what places may be rounded by there."""
+    sheet = wc.Mesh.grid(17, 17)
+    mesh = wc.Mesh(sheet.points + 128.0, sheet.triangles)
+    if "velocities" in scene:
+        scene = scene | {"velocities": np.zeros_like(mesh.points) + scene["velocities"]}
+    scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=100.0)], **scene)
+    first = {"positions": mesh.points, "velocities": 0.0 * mesh.points, "gravity": np.array(scene.gravity)}
+    vary = {name: np.stack([first[name], first[name] + more]) for name, more in varied.items()}
+    model = scene.build(device=device, copies=2, vary=vary)
+    low = Gather(model, (model.vectors(), model.vectors()), 1e-3, True, passes.is_fine(model)).low
+    assert (low.dtype is wp.int32) == packed

@@ -13,9 +13,11 @@ from .operators import Gradient, fit_cells
 THREADS = 512
 # Vertices of such a copy at most: 132 copies of 64² take 1.5 times as long by 512 threads as by launches.
 VERTICES = 1024
-# What places are rounded by is packed in units of this times what x is rounded by, which leaves it whole for places 16 times as
-# far from the origin as those of the start.
-FINER = 2.0**-6
+# Of the mean edge, what places may be rounded by, see `is_fine`.
+ROUNDING = 4e-5
+# What places are rounded by is packed in units of this times what x is rounded by, which leaves it whole for places so many
+# times as far from the origin as those that are known beforehand.
+FINER, FARTHER = 2.0**-6, 16.0
 
 
 class Sweep:
@@ -63,8 +65,8 @@ class Gather:
     """The same by gathering over the incidences of each vertex, see :func:`warpcloth.kernels.explicit.gather`.
 
     x, of what is damped v, and ``low`` go to and fro between two arrays; the last of an odd number of steps is copied back.
-    ``low`` is packed, see :mod:`warpcloth.kernels.places`. Where :func:`block_of` says so a copy is a block of threads and
-    takes all steps in one launch.
+    ``low`` is packed where :func:`unit_of` says so, see :mod:`warpcloth.kernels.places`. Where :func:`block_of` says so a copy
+    is a block of threads and takes all steps in one launch.
     """
 
     def __init__(self, model, state, h, symplectic, fine=False):
@@ -73,17 +75,19 @@ class Gather:
         parts = [part for part, _arrays in self._found]
         fast = model.device.is_cuda and model.dtype is wp.float32
         key = (tuple(parts), model.dtype, symplectic, fast)
+        unit = unit_of(model) if fine else None
+        kept = None if not fine else wp.int32 if unit else model.vec3
         self._lanes, self._threads = lanes(model), 0 if fine else block_of(model, parts)
         if self._threads:
             self._kernel = model.kernel(kernels.gather_copies, *key, self._threads)
         else:
-            self._kernel = model.kernel(kernels.gather, *key, model.copies == 1, self._lanes, fine)
+            self._kernel = model.kernel(kernels.gather, *key, model.copies == 1, self._lanes, kept)
         self._chain = chain(parts, [arrays for _part, arrays in self._found], model.dtype)
         x, v = state
-        self.low, low = (wp.zeros(model.count, dtype=wp.int32, device=model.device) if fine else None for _ in range(2))
+        self.low, low = (wp.zeros(model.count, dtype=kept, device=model.device) if fine else None for _ in range(2))
         self._states = [(x, v, self.low), (model.vectors(), model.vectors() if any(part.damped for part in parts) else v, low)]
         self._given = [self._chain, model.inverse_mass, model.gravity, model.per_copy, h]
-        self._unit = _rounding(model) * FINER
+        self._unit = unit or 1.0
 
     def launch(self, steps, after_step):
         """So many steps, with a call of ``after_step`` (x, v) after each."""
@@ -116,12 +120,33 @@ def is_fine(model):
     lengths = model.scene.mesh.edge_lengths
     if not lengths.size or not lengths.any():
         return False
-    return bool(_rounding(model) > 4e-5 * lengths.mean())
+    return bool(_rounding(model.scene.positions) > ROUNDING * lengths.mean())
 
 
-def _rounding(model):
-    """The distance of neighbouring numbers of float32 at the farthest place of the start [m]."""
-    return float(np.spacing(np.float32(np.abs(model.scene.positions).max(initial=0.0))))
+def unit_of(model):
+    """The unit that what places are rounded by is packed in [m]; None if above an eighth of what :func:`is_fine` bears.
+
+    A unit of 1e-4 of the mean edge leaves a sheet of small steps 15 times as far off as vectors do. It is for where copies
+    start, where pins are led, and how far what has no pins gets in the scene.
+    """
+    scene, far = model.scene, _size(model.positions.numpy())
+    if scene.pins.keyframes is not None:
+        far = max(far, _size(scene.pins.keyframes))
+    if not len(scene.pins.vertices):
+        speed, g, seconds = _size(model.velocities.numpy()), _size(model.gravity.numpy()), scene.duration
+        far = max(far, (speed + 0.5 * g * seconds) * seconds / FARTHER)
+    unit = FINER * _rounding(far)
+    return unit if unit <= 0.125 * ROUNDING * scene.mesh.edge_lengths.mean() else None
+
+
+def _size(values):
+    """The largest magnitude of numbers."""
+    return float(np.abs(values).max(initial=0.0))
+
+
+def _rounding(places):
+    """The distance of neighbouring numbers of float32 at the farthest of places [m]."""
+    return float(np.spacing(np.float32(_size(places))))
 
 
 def block_of(model, parts):

@@ -3,7 +3,7 @@
 Stencil (x₀, x₁), y = x₁ − x₀, rest state L [m], measure 1. The Hessian k[ŷŷᵀ + (1 − L/l)(I − ŷŷᵀ)] has the eigenvalue
 k(1 − L/l) < 0 in compression (Choi and Ko 2002, *Stable but responsive cloth*); clamping that is dropping it.
 
-A collapsed spring, l ≤ 1e-12 L, has no direction: its Hessian is I, and projection leaves it. Its gradient is 0 where l is.
+A collapsed spring, l ≤ 1e-12 L, has no direction: its gradient is 0, its Hessian I, and projection leaves it.
 """
 
 from typing import Any
