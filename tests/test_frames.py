@@ -3,9 +3,11 @@
 import sys
 import threading
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warpcloth as wc
 from warpcloth.frames import frames_of, state_of
@@ -196,3 +198,13 @@ def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_
     path = None if output is None else str(tmp_path / output)
     wc.simulate(hanging.scene(n=8), SOLVERS["explicit"], output=path, device=device, frames=2)
     assert asked == [module.FRAMES if device.startswith("cuda") else expected]
+
+
+@pytest.mark.parametrize(
+    ("count", "free", "expected"),
+    [(64, 2**37, 1000), (2**18, 2**37, 170), (2**18, 2**30, 42), (2**22, 2**30, 2), (2**26, 0, 2)],
+)
+def test_frames_ahead_leave_memory_to_others(count, free, expected):
+    """A GiB of frames of 24 bytes a vertex, or a quarter of what the device has free; two where not even these fit."""
+    model = SimpleNamespace(device=SimpleNamespace(is_cuda=True, free_memory=free), count=count, vec3=wp.vec3)
+    assert sys.modules["warpcloth.simulate"]._ahead(model, None) == expected

@@ -12,8 +12,9 @@ from .frames import frames_of, state_of
 from .ordering import order_of_run
 from .status import Result, Status
 
-# Of frames that a CUDA device has computed and nobody has taken yet: bytes on either side, and how many.
-AHEAD, FRAMES = 2**30, 1000
+# Of frames that a CUDA device has computed and nobody has taken yet: bytes on either side, the share of the free memory of the
+# device that these are at most, and how many.
+AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,11 +120,12 @@ def simulate(
 def _ahead(model, output):
     """How many frames are computed beyond the one that is watched and written.
 
-    On CUDA so many that the device waits for nobody until they fill ``AHEAD`` bytes. On the CPU one, where there is a file to
-    write and a core to spare; frames in memory are only watched.
+    On CUDA so many that the device waits for nobody until they fill ``AHEAD`` bytes, or a share of what is free. On the CPU one,
+    where there is a file to write and a core to spare; frames in memory are only watched.
     """
     if model.device.is_cuda:
-        return min(max(AHEAD // (2 * model.count * wp.types.type_size_in_bytes(model.vec3)), 2), FRAMES)
+        room = min(AHEAD, int(SHARE * model.device.free_memory))
+        return min(max(room // (2 * model.count * wp.types.type_size_in_bytes(model.vec3)), 2), FRAMES)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return int(output is not None and cores > 1)
 
