@@ -140,4 +140,4 @@ class _DeviceCopy:
     def take(self):
         wp.synchronize_event(self._copied)
         seconds = 1e-3 * wp.get_event_elapsed_time(self._began, self._ended, synchronize=False)
-        return *np.array(self._host.numpy()), seconds
+        return *(np.array(each) for each in self._host.numpy()), seconds

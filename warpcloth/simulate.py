@@ -120,8 +120,8 @@ def simulate(
 def _ahead(model, output):
     """How many frames are computed beyond the one that is watched and written.
 
-    On CUDA so many that the device waits for nobody until they fill ``AHEAD`` bytes, or a share of what is free. On the CPU one,
-    where there is a file to write and a core to spare; frames in memory are only watched.
+    On CUDA so many that the device waits for nobody until they fill ``AHEAD`` bytes, or a share of what is free. On the CPU
+    one, where there is a file to write and a core to spare; frames in memory are only watched.
     """
     if model.device.is_cuda:
         room = min(AHEAD, int(SHARE * model.device.free_memory))

@@ -135,7 +135,7 @@ class Stepper:
     factorise_seconds = 0.0
     iterations = 1
     uniform = False  # Whether all steps have as many iterations
-    low = None  # What x is rounded by (B·n,) vectors [m], of steps that keep it
+    low = None  # What x is rounded by (B·n,), vectors [m] or packed, of steps that keep it
     worst = None  # Mirror of the residuals of methods that keep the largest on the device, (B,)
 
     def __init__(self, options, model, integrator="euler"):
