@@ -105,7 +105,7 @@ def test_the_standard_has_every_solver_on_growing_scenes():
     local = [each for each in listed if each.scene != SceneRef("hanging")]
     assert [(each.scene, each.setup.options["sweep"]) for each in local] == [(SceneRef("net"), "vertex-averaged")]
     assert standard(device="cuda:0")[-1].sizes == (256, 512, 1024, 2048)
-    for each in listed:
+    for each in (*listed, *standard(device="cuda:0", dtype="float64", frames=3)):
         assert len(each.sizes) >= 3 and list(each.sizes) == sorted(set(each.sizes))
         assert (each.dtype, each.frames) == ("float64", 3)
         assert each.setup.solver == "explicit" or each.setup.record().substeps
@@ -346,6 +346,8 @@ def test_scenes_without_sizes_are_taken_as_they_are(monkeypatch, tmp_path):
         ("bench --compare old.json", "expected 2 arguments"),
         ("bench hanging --compare old.json new.json", "SCENE is given beside --compare"),
         ("bench --compare old.json new.json --csv t.csv", "--csv is given beside --compare"),
+        ("bench --compare old.json new.json --copies 2", "--copies is given beside --compare"),
+        ("bench --compare old.json new.json --device cuda:0", "--device is given beside --compare"),
         ("bench --compare old.json none.json", "none.json: No such file"),
         ("bench --compare old.json text.json", "text.json: is no result of benchmarks"),
         ("bench --compare list.json new.json", "list.json: is no result of benchmarks"),

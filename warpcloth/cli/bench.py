@@ -26,6 +26,9 @@ matrices. MB: most memory, of the process on a CPU, of Warp's pool on CUDA.
 """
 
 
+_OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": "float32"}
+
+
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     from ..solvers import SOLVERS
@@ -36,8 +39,14 @@ def add_arguments(parser):
     add("--solver", choices=SOLVERS, help="newton where not given")
     add("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
     add("--sizes", nargs="+", type=int, default=[], metavar="N", help="resolutions of the scene, as its parameter says them")
-    add("--frames", type=int, default=20, metavar="N", help="to time at most, 20 where not given; 3 are enough after 10 s")
-    add("--copies", type=int, default=1, metavar="N", help="of the scene that run at once, 1 where not given")
+    add(
+        "--frames",
+        type=int,
+        default=_OF_A_RUN["frames"],
+        metavar="N",
+        help="to time at most, 20 where not given; 3 are enough after 10 s",
+    )
+    add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="of the scene that run at once, 1 where not given")
     add("--csv", metavar="FILE", help="write a table")
     add("--compare", nargs=2, metavar=("OLD", "NEW"), help="print ratios of two results that --json printed")
 
@@ -220,6 +229,9 @@ def _compare(arguments):
     if arguments.scene:
         raise ValueError("SCENE is given beside --compare, which measures nothing")
     _refuse(arguments, ("p", "solver", "s", "sizes", "csv"), "beside --compare, which measures nothing")
+    for name, default in _OF_A_RUN.items():
+        if getattr(arguments, name) != default:
+            raise ValueError(f"--{name} is given beside --compare, which measures nothing")
     old, new = (read(path) for path in arguments.compare)
     found = ratios(old, new)
     if not found:
