@@ -16,8 +16,6 @@ from .gather import move_of, sum_at_vertices
 from .memory import load, store
 from .places import pack
 
-UNROLLED = 32
-
 
 @cache
 def advance(dtype, symplectic: bool, fine: bool = False):
@@ -168,7 +166,7 @@ def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, alone: 
     low_type = kept or vec3
     gather_one = gather_vertex(parts, dtype, symplectic, lanes, kept)
     # Rows of bending one after another in a loop take 1.3 times as long where places are fine, else as long (H200, 512²).
-    options = {"fast_math": fast, "max_unroll": UNROLLED if kept else 16}
+    options = {"fast_math": fast, "max_unroll": 32 if kept else 16}
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=options)
     def gather_vertices(
