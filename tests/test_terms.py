@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from warpcloth import incidences
+from warpcloth import quadratic
 from warpcloth.incidences import chain, gathered
 from warpcloth.kernels import assemble, gather, project
 from warpcloth.kernels import terms as energies
@@ -1095,7 +1095,7 @@ def test_gathering_is_scattering(term, dtype, device, monkeypatch):
 
     Also that of several threads a vertex, be their number one that the slots of a vertex are a multiple of or not.
     """
-    monkeypatch.setattr(incidences, "CHUNK", 7)  # of matrices, which are then added up in several
+    monkeypatch.setattr(quadratic, "CHUNK", 7)  # of matrices, which are then added up in several
     random = np.random.default_rng(8)
     mesh = rest_mesh()
     places = mesh.points + random.normal(scale=0.03, size=mesh.points.shape)

@@ -3,15 +3,14 @@
 import numpy as np
 import warp as wp
 
-from .kernels.assemble import constant_blocks
 from .kernels.elements import Part, chain_of, elements_of
 from .kernels.jacobi import rows_of
+from .quadratic import entries
 
 SLOTS = 16  # of pairs, which are compiled one by one
 # On CUDA so many threads take a vertex of meshes of so many vertices or less: a step of the springs of 64² takes 2.0 µs, not
 # 3.0, of 128² 2.2, not 3.1, of 256² as long and of larger ones longer.
 LANES, LANED = 4, 50_000
-CHUNK = 1 << 18  # elements whose blocks are added to a matrix at once
 
 
 def gathered(model, elements, damped=False):
@@ -114,40 +113,18 @@ def _slots(values, vertices, offsets, count):
 def _of_matrix(model, elements):
     """How long the longest row of kAGᵀG is off the diagonal, and its rows, where 0 of the vertex itself makes all as long.
 
-    None if that makes them more than twice as many.
+    None if that makes them more than twice as many, or there are none.
     """
-    from scipy.sparse import coo_matrix
-
-    K, n, count = elements.term.vertices, model.per_copy, model.count
-    stencil = elements.stencil.numpy()
-
-    def entries_of(some):
-        """Rows and columns of the entries off the diagonal, and where they are in the blocks."""
-        rows, columns = np.repeat(some, K, axis=1), np.tile(some, K)
-        apart = rows != columns
-        return rows[apart], columns[apart], apart
-
-    rows, columns, _apart = entries_of(stencil[stencil[:, 0] < n])
-    pattern = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n)).tocsr()
-    firsts, neighbours = pattern.indptr, pattern.indices
+    n, count = model.per_copy, model.count
+    rows, columns, entries_of_copies = entries(model, elements)
+    firsts = np.searchsorted(rows, np.arange(n + 1))
     slots = int(np.diff(firsts).max())
-    if slots * n > 2 * len(neighbours):
+    if slots * n > 2 * len(rows) or not slots:
         return None
-    vertices = np.repeat(np.arange(n, dtype=np.int64), np.diff(firsts))
-    entries = vertices * n + neighbours
-    slot = np.arange(len(entries)) - firsts[vertices]
-    codes = np.tile(np.arange(count), (slots, 1))
-    for copy in range(0, count, n):
-        codes[slot, copy + vertices] = copy + neighbours
-    size = min(CHUNK, elements.count)
-    numbers, blocks = np.zeros((slots, count)), wp.zeros((size, K * K), dtype=wp.float64, device=model.device)
-    kernel = model.kernel(constant_blocks, elements.term, model.dtype)
-    for first in range(0, elements.count, size):
-        some = slice(first, min(first + size, elements.count))
-        model.launch(kernel, some.stop - first, [array[some] for array in elements.arguments], [blocks])
-        rows, columns, apart = entries_of(stencil[some])
-        place = np.searchsorted(entries, rows.astype(np.int64) % n * n + columns % n)
-        np.add.at(numbers, (slot[place], rows), blocks.numpy()[: len(apart)][apart])
+    slot = np.arange(len(rows)) - firsts[rows]
+    codes, numbers = np.tile(np.arange(count), (slots, 1)), np.zeros((slots, count))
+    for copy, own in enumerate(entries_of_copies):
+        codes[slot, copy * n + rows], numbers[slot, copy * n + rows] = copy * n + columns, own
     return slots, {"codes": indices(elements, codes.ravel()), "stiffness": model.array(numbers.ravel(), model.dtype)}
 
 

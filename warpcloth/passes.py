@@ -8,6 +8,7 @@ from .incidences import chain, gathered, lanes
 from .kernels import explicit as kernels
 from .kernels.elements import Part
 from .operators import Gradient, fit_cells
+from .quadratic import as_pairs
 
 # Of a block that is a copy; of 1024 vertices 256 threads take 2.1 times as long, 1024 1.2 times (H200).
 THREADS = 512
@@ -23,6 +24,8 @@ FINER, FARTHER = 2.0**-6, 16.0
 class Sweep:
     """Steps of one launch, of one thread a copy, see :func:`warpcloth.kernels.explicit.sweep`. Cells are scattered before.
 
+    Elements of a quadratic energy that is not damped are swept as the pairs of their matrix, see :mod:`warpcloth.quadratic`.
+
     Args:
         model: The :class:`warpcloth.model.Model`.
         state: x and v (N,), which steps move on.
@@ -31,22 +34,24 @@ class Sweep:
         fine: Whether what places are rounded by is kept, see :func:`is_fine`.
 
     Attributes:
-        model: The model with its elements in the order of the sweep.
+        model: The model with its elements in the order of the sweep, but for those that are swept as pairs.
         low: What places are rounded by (N,) [m], or None.
     """
 
     def __init__(self, model, state, h, symplectic, fine=False):
         cells, others = ([elements for elements in model.terms if (elements.cells is None) == apart] for apart in (False, True))
         self._cells, self._gradient = Gradient(model, terms=cells), model.vectors()
-        vertices, others, numbers = in_blocks(others, model.per_copy, model.copies)
-        self.model, self.state = model.with_terms([*cells, *others]), state
-        damped = [elements.damping is not None for elements in others]
-        parts = [Part(each.term, own, 0 in each.stiffness.strides) for each, own in zip(others, damped, strict=True)]
+        swept = [as_pairs(model, elements) for elements in others]
+        vertices, swept, numbers = in_blocks(swept, model.per_copy, model.copies)
+        kept = [after if after.term is before.term else before for before, after in zip(others, swept, strict=True)]
+        self.model, self.state = model.with_terms([*cells, *kept]), state
+        damped = [elements.damping is not None for elements in swept]
+        parts = [Part(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
         # Contracted as on CUDA, where a product is added without being rounded: springs then take 0.8 of the time.
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
         self._kernel = model.kernel(kernels.sweep, tuple(parts), model.dtype, symplectic, flags, fine)
         self.low = model.vectors() if fine else None
-        self._chain = chain(parts, [_swept(elements) for elements in others], model.dtype)
+        self._chain = chain(parts, [_swept(elements) for elements in swept], model.dtype)
         scratch = [
             wp.zeros(size, dtype=model.dtype, device=model.device) for size in (numbers, numbers * (fine or any(damped)))
         ]
