@@ -71,6 +71,20 @@ def test_copies_shared_out_are_those_of_one_thread(name, device):
         assert (stepper.h, stepper.steps_per_frame) == (steppers[0].h, 2)
 
 
+def test_copies_of_stiffness_by_element_are_those_of_one_thread(device):
+    """To the bit, though what cancels in the matrix of one copy does not in that of another."""
+    scene, random = declared([wc.QuadraticBending(stiffness=1e-3)], fps=60.0), np.random.default_rng(5)
+    values = 1e-3 * np.ones((3, scene.build(device=device).terms[0].per_copy))
+    values[1] *= random.uniform(0.5, 2.0, values[1].shape)
+    values[2, ::2] = 0.0
+    vary = {"QuadraticBending.stiffness": values}
+    record = wc.Explicit(substeps=8, above_limit="allow")
+    steppers = [record.bind(scene.build(device=device, copies=3, vary=vary, threads=threads)) for threads in (1, 2, 3)]
+    for stepper in steppers:
+        stepper.frame()
+    assert same(steppers)
+
+
 @pytest.mark.parametrize("launches", [1, 10_000])
 @pytest.mark.parametrize("name", [name for name in DIVIDED if name != "explicit"])
 def test_colours_shared_out_are_those_of_one_thread(name, launches, device, monkeypatch):
