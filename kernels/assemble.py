@@ -76,7 +76,7 @@ def energy(term: Term, dtype, corrected: bool = False):
 
 @cache
 def scatter_gradient(term: Term, dtype, corrected: bool = False):
-    """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i]. Serial on the CPU, so deterministic there."""
+    """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i]. For the CPU, in order: nothing is atomic."""
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)

@@ -155,7 +155,7 @@ def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int =
 
 
 @cache
-def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, alone: bool = True, lanes: int = 1, kept=None):
+def gather(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, alone: bool, lanes: int = 1, kept=None):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
     Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN

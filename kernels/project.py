@@ -156,9 +156,9 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool):
 
 @cache
 def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
-    """Kernel over elements: adds factorₑ Δxᵢ [m] of every element to out, factorₑ Δλ to λ. For the CPU, where it runs in order.
+    """Kernel over elements: adds factorₑ Δxᵢ [m] of every element to out, factorₑ Δλ to λ.
 
-    One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
+    For the CPU, in order: nothing is atomic. One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
     """
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)

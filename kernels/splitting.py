@@ -202,7 +202,10 @@ def split(term: Term, dtype):
 
 @cache
 def scatter_splitting(term: Term, dtype):
-    """Kernel over elements: adds Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N]. For the CPU."""
+    """Kernel over elements: adds Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N].
+
+    For the CPU, in order: nothing is atomic.
+    """
     vec3, _ = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)

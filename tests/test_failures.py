@@ -565,9 +565,8 @@ def test_07_units_of_the_local_coordinate_do_not_matter(name, device):
     (springs,) = model.terms
     term = replace(SPRING, name="ScaledSpring", weight=scaled_weight)
     rest = wp.array(c * springs.rest.numpy(), dtype=springs.rest.dtype, device=model.device)
-    stiffness = model.constant(
-        springs.stiffness.numpy()[0] / c**2, springs.count
-    )  # shared as it is, for a sum rounds otherwise
+    # Shared as it is: numbers of their own are multiplied before the sum on CUDA, which rounds otherwise.
+    stiffness = model.constant(springs.stiffness.numpy()[0] / c**2, springs.count)
     model.terms = (replace(springs, term=term, rest=rest, stiffness=stiffness),)
     stepper = solver.bind(model)
     stepper.step()

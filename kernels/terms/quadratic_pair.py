@@ -4,14 +4,12 @@ Stencil (x₀, x₁), y = x₁ − x₀, measure 1; the one number of the rest s
 have a matrix Q whose rows do, so that ½xᵀQx is the sum over pairs i < j of k = −Qᵢⱼ. Nothing declares it.
 """
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-import warp as wp
 
-from ..term import Term
-from .quadratic_bending import energy, gradient, hessian, project
-from .spring import weight
+from . import spring
+from .quadratic_bending import QUADRATIC_BENDING
 
 
 def rest_state(points, stencil):
@@ -19,23 +17,13 @@ def rest_state(points, stencil):
     return np.zeros((len(stencil), 1))
 
 
-@wp.func
-def measure(rest: Any):
-    return rest.dtype(1.0)
-
-
-QUADRATIC_PAIR = Term(
+QUADRATIC_PAIR = replace(
+    QUADRATIC_BENDING,
     name="QuadraticPair",
     vertices=2,
-    rows=1,
     parameters=1,
     rest_state=rest_state,
-    weight=weight,
-    measure=measure,
-    energy=energy,
-    gradient=gradient,
-    hessian=hessian,
-    project=project,
-    linear=True,
-    quadratic=True,
+    weight=spring.weight,
+    measure=spring.measure,
+    dissipation=None,
 )
