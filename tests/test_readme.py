@@ -113,6 +113,16 @@ def test_tables_are_whole(head, names):
     assert set(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) == names
 
 
+def test_the_table_of_residuals_is_that_of_the_solvers():
+    methods = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
+    rows = re.findall(
+        r"^\| `(\w+)` \| (.+) \| (.+) \| (.+) \| (.+) \|$", methods.split("## What the residual")[1], re.MULTILINE
+    )
+    found = {name: (measure, weightless, unit, held == "`tolerance`") for name, measure, unit, weightless, held in rows}
+    solvers = {record.__name__: record for record in SOLVERS.values() if record.residual is not None}
+    assert found == {name: (*record.residual, hasattr(record, "tolerance")) for name, record in solvers.items()}
+
+
 def test_links_lead_somewhere():
     links = re.findall(r"\]\((?!https:)([^)]+)\)", README)
     assert len(links) > 2 and all((ROOT / link).is_file() for link in links)

@@ -10,7 +10,9 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.solvers import SOLVERS as RECORDS
 from warpcloth.solvers.explicit import step_limits
+from warpcloth.status import Result, digits, sentence
 
 
 def scene(name, **parameters):
@@ -228,6 +230,47 @@ def test_a_mass_that_its_pin_swings_up_is_not_diverged(device):
     exact = 0.5 * amplitude * (np.sin(omega * times) - omega * times * np.cos(omega * times))
     # Keyframes are joined by straight lines, (ωΔt)²/12 = 0.1 % less drive; symplectic Euler's phase is ωh/2 early.
     assert np.abs(animation.points[:, 1, 0] - 1.0 - exact).max() < 0.005 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("weight", [9.81, 0.0])
+@pytest.mark.parametrize("name", sorted(RECORDS))
+def test_the_residual_has_a_unit(name, weight, device):
+    """A sentence says whether the result can be used, then the figure, its unit and what it was compared with."""
+    velocities = np.zeros((16, 3))
+    velocities[5:7, 2] = 3.0
+    cloth = replace(scene("hanging", n=4), gravity=(0.0, -weight, 0.0), velocities=velocities)
+    solver = RECORDS[name](substeps=64 if name == "explicit" else 2)
+    status = wc.simulate(cloth, solver, device=device, frames=1).status
+    kind, start = solver.residual, status.message.split("; usable")
+    assert start[0].removesuffix(" in a step or more") == status.result.value and len(start) == 2, status
+    if kind is None:
+        assert status.message == "completed; usable" and (status.residual, status.measure, status.unit) == (0.0, None, None)
+        return
+    unit = kind.unit if weight else kind.weightless
+    assert status.residual > 0.0 and (status.measure, status.unit) == (kind.measure, unit)
+    compared = "tolerance 0.001" if hasattr(solver, "tolerance") else "this solver has no tolerance"
+    assert status.message.endswith(f": {kind.measure} {digits(status.residual)} {unit} ({compared})")
+
+
+def test_rounding_is_no_failure():
+    said = sentence(Result.ROUNDED, "float32", 0.037, *wc.Newton.residual[::2], tolerance=0.001)
+    assert said == (
+        "converged as far as rounding allows; usable, as near to the solution as float32 comes: "
+        "largest unbalanced acceleration of a vertex 0.037 times gravity (tolerance 0.001)"
+    )
+
+
+def test_copies_have_strain_and_residual_of_their_own(device):
+    """To the bit those of each copy run by itself, and the sentence names the worst."""
+    cloth, solver, stiffness = scene("hanging", n=4), wc.XPBD(substeps=2, iterations=2), [100.0, 1e4, 1.0]
+    found = wc.simulate(cloth, solver, device=device, frames=2, copies=3, vary={"Spring.stiffness": stiffness}, dtype="float64")
+    ones = [replace(cloth, terms=[replace(cloth.terms[0], stiffness=k), *cloth.terms[1:]]) for k in stiffness]
+    alone = [wc.simulate(one, solver, device=device, frames=2, dtype="float64") for one in ones]
+    assert np.array_equal(found.worst_strain, [one.worst_strain for one in alone])
+    assert np.array_equal(found.status.residual, [one.status.residual for one in alone])
+    assert all(isinstance(number, float) for number in (alone[0].worst_strain, alone[0].status.residual))
+    assert len(set(found.worst_strain)) == len(set(found.status.residual)) == 3
+    assert f"in copy {np.argmax(found.status.residual)} " in found.status.message
 
 
 def test_a_step_without_finite_forces_ends_the_copy(device):

@@ -10,7 +10,7 @@ import warp as wp
 
 from .frames import frames_of, state_of
 from .ordering import order_of_run
-from .status import Result, Status
+from .status import Result, Status, sentence
 
 # Of frames that a CUDA device has computed and nobody has taken yet: bytes on either side, the share of the free memory of the
 # device that these are at most, and how many.
@@ -29,7 +29,8 @@ class Animation:
         status: :class:`warpcloth.status.Status`.
         timings: ``compile`` (building the model and binding the solver, with compiling what was not in the cache),
             ``factorise`` (constant matrices, a part of it) and ``frames`` (a list) [s].
-        worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame.
+        worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame; of B > 1 copies one for each, (B,), over its good
+            frames.
         output: Path of the USD file, or None.
     """
 
@@ -38,7 +39,7 @@ class Animation:
     times: np.ndarray
     status: Status
     timings: dict
-    worst_strain: float
+    worst_strain: float | np.ndarray
     output: str | None = None
 
 
@@ -111,10 +112,10 @@ def simulate(
                     progress(number, frames)
     finally:
         recorder.close()
-    status = watch.status(frame.results, frame.residual)
+    status = watch.status(frame.results, frame.residual, solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
-    return Animation(points, velocities, times, status, timings, watch.worst_strain, output)
+    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), output)
 
 
 def _ahead(model, output):
@@ -128,6 +129,11 @@ def _ahead(model, output):
         return min(max(room // (2 * model.count * wp.types.type_size_in_bytes(model.vec3)), 2), FRAMES)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return int(output is not None and cores > 1)
+
+
+def of_copies(values):
+    """A number for each copy, (B,), and of one copy a float."""
+    return np.array(values) if len(values) > 1 else float(values[0])
 
 
 class Watch:
@@ -150,14 +156,14 @@ class Watch:
         good: The last good frame of each copy (B,).
         alive: Whether a copy is still good (B,).
         fastest: Largest speed in a good frame, over what can have made it (B,).
-        worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame.
+        worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
     """
 
     def __init__(self, model, h, slowest=1.0):
         scene = model.scene
         self.model, self.rest = model, scene.mesh.edge_lengths[scene.mesh.edge_lengths > 0.0]
         self.ends = scene.mesh.edges[scene.mesh.edge_lengths > 0.0].T.astype(np.intp)
-        self.worst_strain, self.messages = 0.0, {}
+        self.worst_strain, self.messages = np.zeros(model.copies), {}
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.fastest = np.zeros(model.copies)
         start = (model.positions, model.velocities, model.mass, model.inverse_mass)
@@ -225,22 +231,25 @@ class Watch:
         for column in np.moveaxis(points.reshape(B, n, 3)[self.alive], -1, 0):  # a fifteenth of the time of rows of three
             column = column.astype(np.float64)
             squares += (column.take(self.ends[1], axis=1) - column.take(self.ends[0], axis=1)) ** 2
-        strain = np.abs(np.sqrt(squares) / self.rest - 1.0)
-        self.worst_strain = max(self.worst_strain, float(strain.max(initial=0.0)))
+        strain = np.abs(np.sqrt(squares) / self.rest - 1.0).max(axis=1, initial=0.0)
+        self.worst_strain[self.alive] = np.maximum(self.worst_strain[self.alive], strain)
         return True
 
-    def status(self, results, residual):
-        """The :class:`Status` of a run whose copies ended with these."""
+    def status(self, results, residual, solver):
+        """The :class:`Status` of a run with a solver, whose copies ended with these."""
         results = [Result.DIVERGED if copy in self.messages else result for copy, result in enumerate(results)]
-        worst, residual = results[0], float(residual.max())
-        for result in results[1:]:
-            worst = worst.worse(result)
-        message = worst.value
+        result = max(results, key=list(Result).index)
+        kind, measure, unit = solver.residual, None, None
+        copy = int(np.argmax(residual))  # the first that is NaN, if any
+        if kind is not None:
+            measure, unit = kind.measure, kind.unit if self.gravity[copy] > 0.0 else kind.weightless
         if self.messages:
             message = "; ".join(self.messages[copy] for copy in sorted(self.messages))
-        elif worst not in (Result.COMPLETED, Result.CONVERGED):
-            message = f"{worst.value}, in a step or more; largest residual {residual:.2g}"
-        return Status(worst, int(self.good.max()), residual, message, self.good)
+        else:
+            dtype, tolerance = self.model.numpy_dtype.__name__, getattr(solver, "tolerance", None)
+            which = copy if len(residual) > 1 else None
+            message = sentence(result, dtype, residual[copy], measure, unit, tolerance, which)
+        return Status(result, int(self.good.max()), of_copies(residual), message, self.good, measure, unit)
 
 
 class _Memory:

@@ -24,24 +24,79 @@ class Result(Enum):
         return max(self, other, key=order.index)
 
 
+UNBALANCED = "largest unbalanced acceleration of a vertex"
+
+# For what a result can be used that is not good without more ado, and not bad.
+_NEAR = "usable if this is near enough to the solution"
+
+
+class Residual(NamedTuple):
+    """The quantity that a solver reports as its residual; each record of options names its own as ``residual``.
+
+    Attributes:
+        measure: What is measured; of a run it is the largest of any step.
+        weightless: Its unit in a scene without gravity.
+        unit: Its unit in one with gravity.
+    """
+
+    measure: str
+    weightless: str
+    unit: str = "times gravity"
+
+
 class Status(NamedTuple):
     """How a run ended.
 
     Attributes:
         result: The worst of any step and copy.
         frame: The last frame in which a copy is good.
-        residual: The largest relative residual of any step and copy; 0 of methods that have none.
-        message: One sentence.
+        residual: The largest residual of any step; of B > 1 copies one for each, (B,). 0 of methods that have none.
+        message: One sentence: how it ended, whether the result can be used, and the residual with its unit and tolerance.
         good: The last good frame of each copy, (B,).
+        measure: What the residual measures, or None of methods that have none.
+        unit: The unit of the residual, of several copies that of the worst; or None.
     """
 
     result: Result
     frame: int = 0
-    residual: float = 0.0
+    residual: float | np.ndarray = 0.0
     message: str = ""
     good: np.ndarray | None = None
+    measure: str | None = None
+    unit: str | None = None
 
     @property
     def ok(self):
         """False if a copy diverged."""
         return self.result is not Result.DIVERGED
+
+
+def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None):
+    """How a run ended, whether its result can be used, and the residual with its unit and what it was compared with.
+
+    Args:
+        result: The worst :class:`Result` of any step.
+        dtype: The precision, ``"float32"`` or ``"float64"``.
+        residual: The largest residual.
+        measure: What it measures, or None of methods that have none.
+        unit: Its unit.
+        tolerance: What it was compared with, or None of methods that iterate without looking.
+        copy: The copy whose residual it is, or None of one copy.
+    """
+    use = {
+        Result.COMPLETED: "usable" if measure is None else _NEAR,
+        Result.CONVERGED: "usable",
+        Result.ROUNDED: f"usable, as near to the solution as {dtype} comes",
+    }.get(result, _NEAR)
+    where = " in a step or more" if use is _NEAR and result is not Result.COMPLETED else ""
+    text = f"{result.value}{where}; {use}"
+    if measure is None:
+        return text
+    compared = "this solver has no tolerance" if tolerance is None else f"tolerance {tolerance:g}"
+    whose = "" if copy is None else f", in copy {copy}"
+    return f"{text}: {measure} {digits(residual)} {unit}{whose} ({compared})"
+
+
+def digits(value):
+    """Two digits of a number, written out where that is short."""
+    return f"{float(f'{value:.2g}'):.0f}" if 100.0 <= value < 1e6 else f"{value:.2g}"

@@ -7,6 +7,7 @@ import time
 from dataclasses import asdict, dataclass, replace
 
 from .. import scene_files
+from ..status import digits
 from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place, say
 
 # A step that all solvers but the explicit ones take well; where no step is given the substeps come nearest to it.
@@ -62,6 +63,8 @@ def run(arguments):
         "compile_seconds": setup.seconds + animation.timings["compile"],
         "worst_strain": animation.worst_strain,
         "residual": status.residual,
+        "residual_measure": status.measure,
+        "residual_unit": status.unit,
         **_solver_facts(arguments, setup, scene.fps),
         "device": str(device),
         "dtype": arguments.dtype,
@@ -76,14 +79,15 @@ def run(arguments):
 
 
 def _summary(facts):
-    threads = facts["threads"]
+    threads, measured = facts["threads"], facts["residual_measure"] is not None
+    residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none: the method has none"
     return "\n".join(
         [
             f"{facts['scene']}: {facts['message']}",
             f"  frames        {facts['frames']} of {facts['frames_asked']}, {facts['seconds_per_frame']:.3g} s each (median)",
             f"  compiling     {facts['compile_seconds']:.3g} s",
             f"  worst strain  {100.0 * facts['worst_strain']:.3g} %",
-            f"  residual      {facts['residual']:.2g}",
+            f"  residual      {residual}",
             f"  solver        {_solver_line(facts)}",
             f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),
             f"  file          {place(facts)}",

@@ -12,7 +12,7 @@ from ..kernels.accelerate import plain_step
 from ..kernels.minimise import add_inertia
 from ..linear import CopyFactors
 from ..operators import Sums, constant_matrices
-from ..status import Result
+from ..status import Residual, Result
 from .solver import ImplicitStep, Stepper, refuse_cells, refuse_hard
 
 
@@ -46,6 +46,8 @@ class ADMM(ImplicitStep):
     Raises:
         ValueError: If an option breaks a rule.
     """
+
+    residual = Residual("largest acceleration of a vertex by the primal or the dual residual", "m/s²")
 
     iterations: int = 20
     tolerance: float = 1e-3

@@ -13,7 +13,7 @@ from ..kernels import constrain as kernels
 from ..linear import ConjugateGradients, FactorisedRows
 from ..operators import RowSums, Sums
 from ..search import Search
-from ..status import Result
+from ..status import Residual, Result
 from .solver import ImplicitStep, Stepper, refuse_hard, require_model
 
 STABILISATIONS = ("none", "geometric-stiffness", "line-search")
@@ -61,6 +61,10 @@ class ConstrainedDynamics(ImplicitStep):
     Raises:
         ValueError: If an option breaks a rule.
     """
+
+    residual = Residual(
+        "largest acceleration that a vertex lacks, or a constraint to be met", "times the largest at the start of its step"
+    )
 
     iterations: int = 20
     tolerance: float = 1e-3

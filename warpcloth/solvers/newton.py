@@ -7,6 +7,7 @@ import numpy as np
 from ..capture import Segment
 from ..checks import choice, number, whole
 from ..minimise import LINEAR, POLICIES, Minimiser
+from ..status import UNBALANCED, Residual
 from .solver import ImplicitStep, Stepper, refuse_hard
 
 
@@ -31,6 +32,8 @@ class Newton(ImplicitStep):
     Raises:
         ValueError: If an option breaks a rule.
     """
+
+    residual = Residual(UNBALANCED, "times the largest at the start of its step")
 
     tolerance: float = 1e-3
     iterations: int = 100

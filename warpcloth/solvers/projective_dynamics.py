@@ -12,7 +12,7 @@ from ..kernels import accelerate as kernels
 from ..kernels.minimise import add_inertia
 from ..linear import CopyFactors, DiagonalScaling
 from ..operators import CHUNKS, Energy, Gradient, Sums, constant_matrices
-from ..status import Result
+from ..status import UNBALANCED, Residual, Result
 from .solver import ImplicitStep, Stepper, refuse_hard, refuse_without_projection
 
 ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")
@@ -47,6 +47,8 @@ class ProjectiveDynamics(ImplicitStep):
     Raises:
         ValueError: If an option breaks a rule.
     """
+
+    residual = Residual(UNBALANCED, "times the largest at the start of its step")
 
     iterations: int = 20
     tolerance: float = 1e-3

@@ -33,12 +33,14 @@ class Step:
         dt: Step [s]; 1/(fps·dt) must be a whole number.
         substeps: Steps a frame.
         ordered: Whether the result depends on the order of elements by more than rounding.
+        residual: The :class:`warpcloth.status.Residual` that its steps report, or None.
 
     Raises:
         ValueError: If both or neither are given, or they are not above 0.
     """
 
     ordered = False
+    residual = None
 
     dt: float | None = None
     substeps: int | None = None

@@ -11,7 +11,7 @@ from ..damping import Past
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..operators import Gradient, Sums
-from ..status import Result
+from ..status import UNBALANCED, Residual, Result
 from ..sweeps import IN_PLACE, Sweep, refuse_unprojectable
 from .solver import ImplicitStep, LaunchedStepper, refuse_hard, require_model
 
@@ -52,6 +52,8 @@ class XPBD(ImplicitStep):
     Raises:
         ValueError: If an option breaks a rule.
     """
+
+    residual = Residual(UNBALANCED, "m/s²")
 
     iterations: int = 20
     sweep: str = "coloured"
