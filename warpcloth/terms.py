@@ -269,6 +269,7 @@ class QuadraticBending(_Damped):
         stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh. A grid with one diagonal a
             cell is 3 times as stiff where it curves along its diagonals, as stiff where it folds about them or curves along
             its rows, and 0.75 times 15° off the rows away from them; one with alternating diagonals is 1 to 1.5 times.
+            Poisson's ratio of the equilateral mesh is −1/3, and the others are no isotropic plates.
         damping: β [N·m·s], of the rate of ‖y‖, which for a small angle θ is |e|·|θ|.
         name: To tell two terms of one kind apart.
     """

@@ -77,13 +77,28 @@ def strip(pattern, angle, spacing, length=1.0, width=1.0):
 def rolled(pattern, angle):
     """Stiffness over D of a net that is rolled to a cylinder, however fine it is.
 
-    With c, s of the angle the curvature has the parts c², s² and cs in the net's own axes. Hinges of "diagonal" measure
-    κ₁₁ + κ₁₂, κ₂₂ + κ₁₂ and 2κ₁₂, those of "alternating" κ₁₁, κ₂₂ and ±2κ₁₂; squares and sum, over a cell, are these.
+    With c, s of the angle the curvature has the parts c², s² and cs in the net's own axes.
     At rest a sheet may find a softer shape: one that also twists, or whose two kinds of vertices of "alternating" part.
     """
+    c, s = np.cos(angle), np.sin(angle)
+    curvature = np.array([c * c, s * s, c * s])
+    return float(curvature @ plate(pattern) @ curvature)
+
+
+def plate(pattern):
+    """C (3, 3) of a net whose vertices lie on a surface of curvature κ = (κ₁₁, κ₂₂, κ₁₂): ½D κᵀCκ an area, however fine.
+
+    C is the sum of the squares of what the hinges measure, of which these are the rows. An equilateral net's hinge along e
+    measures κₙₙ − ⅓κₑₑ, and its three directions make 4/3 tr κ² − 1/3 (tr κ)²: a plate whose Poisson's ratio is −1/3. The
+    other nets are no isotropic plates.
+    """
     choice("pattern", pattern, PATTERNS[:3])
-    twist = np.sin(2.0 * angle)
-    return float({"equilateral": 1.0, "diagonal": 1.0 + twist + twist**2, "alternating": 1.0 + 0.5 * twist**2}[pattern])
+    rows = {
+        "equilateral": [[-1 / 3, 1, 0], [2 / 3, 0, np.sqrt(4 / 3)], [2 / 3, 0, -np.sqrt(4 / 3)]],
+        "diagonal": [[1, 0, 1], [0, 1, 1], [0, 0, 2]],
+        "alternating": [[1, 0, 0], [0, 1, 0], [0, 0, 2]],
+    }[pattern]
+    return np.transpose(rows) @ np.array(rows, dtype=float)
 
 
 def roll(mesh):
