@@ -167,7 +167,7 @@ def test_what_rounding_hides_is_no_rest_shape(device):
 
 def test_a_saddle_that_is_not_left_is_reported(device, monkeypatch):
     """What no nudge moves away from is in balance, and said to be no more."""
-    monkeypatch.setattr("warpcloth.minimise.Minimiser.curves_down", lambda self: True)
+    monkeypatch.setattr("warpcloth.minimise.Minimiser.curves_down", lambda self, tolerance: True)
     rest = wc.equilibrium(scene("chain", links=3), device=device)
     assert rest.status.result.name == "SADDLE"
 

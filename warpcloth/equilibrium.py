@@ -21,7 +21,7 @@ class Equilibrium(NamedTuple):
     Attributes:
         points: (n, 3) [m].
         status: How it ended, see :class:`warpcloth.status.Result`, with the residual: the largest unbalanced acceleration of
-            a vertex over gravity's (without any, over the largest where the last descent began).
+            a vertex over gravity's (without any, over the largest at the start).
         iterations: Newton iterations in all, each round of proximal steps counting as one more.
     """
 
@@ -67,10 +67,10 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     for part in range(1, load_steps + 1):
         result = descent.run(part / load_steps, _frequency_scale(model))
     # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
-    if result in SETTLED and minimiser.curves_down():
+    if result in SETTLED and minimiser.curves_down(tolerance):
         base.assign(base.numpy() + _nudge(model))
         result = descent.run(1.0, _frequency_scale(model))
-        if result in SETTLED and minimiser.curves_down():
+        if result in SETTLED and minimiser.curves_down(tolerance):
             result = Result.SADDLE
     residual = float(minimiser.residual.max())
     message = result.value if result is Result.CONVERGED else f"{result.value}, residual {residual:.2g}"
@@ -85,6 +85,7 @@ class _Descent:
     def __init__(self, minimiser, base, tolerance, iterations):
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
         self.used, self.moved = 0, 0.0
+        self.scale = None  # of the first descent: without gravity a later one begins at its own rounding
         self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
 
     def run(self, load, s):
@@ -102,7 +103,8 @@ class _Descent:
 
     def _settle(self, s, load, most):
         self.minimiser.set_objective(s, load)
-        (result,) = self.minimiser.minimise(self.tolerance, min(most, max(self.iterations - self.used, 0)))
+        (result,) = self.minimiser.minimise(self.tolerance, min(most, max(self.iterations - self.used, 0)), self.scale)
+        self.scale = self.minimiser.scale
         self.used += self.minimiser.iterations
         correction = self.minimiser.correction.numpy()
         self.moved = np.abs(correction).max(initial=0.0) / self.size

@@ -115,11 +115,11 @@ class Factorised:
         left.write(solution.reshape(-1, 3))
         self.negative.write(negative)
 
-    def curves_down(self):
-        """Whether some copy has an eigenvalue below −1000 ε of its largest diagonal entry: beyond rounding, it is negative."""
+    def curves_down(self, unresolved=0.0):
+        """Whether some copy has an eigenvalue below −1000 ε times its largest diagonal entry − ``unresolved`` [N/m]."""
         shift = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
         values = self.values.read()
-        factors = (self._factor(copy, values, shift) for copy in range(self.model.copies))
+        factors = (self._factor(copy, values, shift, unresolved) for copy in range(self.model.copies))
         return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
     def _mirror(self, array):
@@ -128,8 +128,8 @@ class Factorised:
             self._mirrors[array.ptr] = Mirror(array)
         return self._mirrors[array.ptr]
 
-    def _factor(self, copy, values, shift=0.0):
-        """The factors of a copy's matrix, or None; with ``shift`` times its largest diagonal entry added to the diagonal."""
+    def _factor(self, copy, values, shift=0.0, unresolved=0.0):
+        """The factors of a copy's matrix, or None; with ``shift`` times its largest entry + ``unresolved`` on the diagonal."""
         from scipy.sparse import identity
         from scipy.sparse.linalg import splu
 
@@ -139,7 +139,8 @@ class Factorised:
             return None
         columns = matrix.tocsc()
         if shift:
-            columns = columns + shift * np.abs(columns.diagonal()).max() * identity(columns.shape[0], format="csc")
+            added = shift * np.abs(columns.diagonal()).max() + unresolved
+            columns = columns + added * identity(columns.shape[0], format="csc")
         options = {"SymmetricMode": True, "Equil": False}
         try:
             return splu(columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)

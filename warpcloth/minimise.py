@@ -42,7 +42,8 @@ class Minimiser:
 
     Attributes:
         correction: d (N,) [m].
-        residual: The largest unbalanced acceleration of each copy over that of gravity, (B,), after :meth:`minimise`.
+        residual: The largest unbalanced acceleration of each copy over ``scale``, (B,), after :meth:`minimise`.
+        scale: The acceleration of each copy that its residual is relative to [m/s²], (B,), after :meth:`minimise`.
         iterations: Newton iterations of the last :meth:`minimise`.
     """
 
@@ -89,11 +90,11 @@ class Minimiser:
         self.search.s, self.search.load = s, load
         self._record()
 
-    def minimise(self, tolerance, iterations):
+    def minimise(self, tolerance, iterations, scale=None):
         """Iterates until every vertex is in balance, or nothing is left to gain in the model's precision.
 
-        In balance is a copy with max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a, an acceleration; a is that of gravity, or without any the
-        largest at d = 0. Nothing is left to gain when ‖∇φ‖ is no more than rounding may make of it,
+        In balance is a copy with max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a. The acceleration a is ``scale`` (B,) [m/s²], by default
+        gravity's, without any the largest at d = 0. Nothing is left to gain when ‖∇φ‖ is no more than rounding may make of it,
         4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) a vertex, and an iteration has not lowered φ by more than rounding: the
         norm alone would let the noise of stiff directions hide what soft ones still lack.
 
@@ -102,8 +103,10 @@ class Minimiser:
         """
         B = self.model.copies
         self._start()
-        scale = np.where(self.gravity > 0.0, self.gravity, self._acceleration.read())
-        scale[scale == 0.0] = 1.0
+        if scale is None:
+            scale = np.where(self.gravity > 0.0, self.gravity, self._acceleration.read())
+            scale[scale == 0.0] = 1.0
+        self.scale = scale
         energy = self._energy.read().copy()
         rounded = stalled = np.zeros(B, dtype=bool)
         # Linear systems are solved no better than the residual has fallen (Eisenstat and Walker 1996).
@@ -144,14 +147,19 @@ class Minimiser:
             self._assemble()
             self._solve()
 
-    def curves_down(self):
-        """Whether the unchanged Hessian at d = 0 has a negative eigenvalue in some copy, beyond rounding."""
+    def curves_down(self, tolerance):
+        """Whether the unchanged Hessian at d = 0 has a negative eigenvalue in some copy that balance to ``tolerance`` resolves.
+
+        A force of ``tolerance`` times the scale and the mass of the cloth may be left, and with it a compression of that force
+        over an edge [N/m]. A sheet without bending stiffness has no other resistance against a move out of its plane.
+        """
         before = self._policy.read().copy()
         self._start()
         self._policy.write(int(HessianPolicy.RAW))
         self._assemble()
         self._policy.write(before)
-        return Factorised(self.hessian).curves_down()
+        unresolved = tolerance * float((self.scale * self.model.mass.numpy().reshape(self.model.copies, -1).sum(axis=1)).max())
+        return Factorised(self.hessian).curves_down(unresolved / self.edge)
 
     # What the segments record.
 

@@ -32,7 +32,8 @@ def entries(model, elements):
         apart = rows != columns
         return rows[apart], columns[apart], apart
 
-    rows, columns, _apart = places_of(stencil[: elements.per_copy])
+    # Colours put elements of all copies in one order; all vertices of an element are in one copy.
+    rows, columns, _apart = places_of(stencil[stencil[:, 0] < n])
     pattern = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n)).tocsr()
     rows, columns = np.repeat(np.arange(n, dtype=np.int64), np.diff(pattern.indptr)), pattern.indices.astype(np.int64)
     place = rows * n + columns
