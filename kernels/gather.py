@@ -171,7 +171,7 @@ def gather_pairs(part: Part, dtype, ahead, lanes: int):
                 k = number(elements.stiffness, slot)
             total += force_of(r, corner, local(k, beta, r, y, dy, h))
         if wp.static(apart):
-            total *= number(elements.stiffness, 0)
+            total *= number(elements.stiffness, i)
         return total
 
     return total_of

@@ -13,7 +13,7 @@ import warp as wp
 import warpcloth as wc
 from warpcloth import quadratic
 from warpcloth.incidences import chain, gathered
-from warpcloth.kernels import assemble, gather, project
+from warpcloth.kernels import assemble, constrain, gather, project, splitting
 from warpcloth.kernels import terms as energies
 from warpcloth.kernels.elements import chain_of
 from warpcloth.kernels.term import HessianPolicy, Term
@@ -1120,6 +1120,96 @@ def test_gathering_is_scattering(term, dtype, device, monkeypatch):
     for each in (found, *(forces(gradient_by_lanes, part, scalar, lanes) for lanes in (3, 4))):
         assert (np.linalg.norm(scattered - each, axis=1) <= FEW * eps(dtype) * (4.0 + size * row_sums(model))).all()
     assert (found == again).all() and (found != [1.0, 2.0, 3.0]).any()
+
+
+@pytest.mark.parametrize("name", ["Spring", "QuadraticBending"])
+@every_dtype
+def test_a_copy_gathers_the_bits_of_a_model_of_its_own(name, dtype, device):
+    """Be the stiffness one for all or one for each copy, and the elements of copies one after another or mixed."""
+    values, found = [3.0, 7.0, 11.0], []
+    x = rest_mesh().points + np.random.default_rng(12).normal(scale=0.03, size=rest_mesh().points.shape)
+    batch = model_of(rest_mesh(), x, [name], dtype, device, copies=3, vary={f"{name}.stiffness": values})
+    elements = batch.terms[0]
+    mixed = np.arange(elements.count).reshape(3, -1).T.ravel()  # as colours order them, a copy after another in each
+    batches = [(batch, elements), (batch, elements.reordered(mixed))]
+    alone = [model_of(rest_mesh(), x, [name], dtype, device, vary={f"{name}.stiffness": [k]}, copies=1) for k in values]
+    for k in values:
+        scene = wc.Scene(rest_mesh(), density=0.2, positions=x, terms=[getattr(wc, name)(stiffness=k)])
+        alone.append(scene.build(device=device, dtype=dtype))
+    for model, elements in [*batches, *((model, model.terms[0]) for model in alone)]:
+        part, arrays = gathered(model, elements)
+        out = model.vectors()
+        given = [chain([part], [arrays], model.dtype), model.positions, model.vectors()]
+        model.launch(gather.gather_gradient((part,), model.dtype), model.count, given, [out])
+        found.append(out.numpy())
+    for forces in found[:2]:
+        for again in (found[2:5], found[5:]):
+            assert np.array_equal(forces, np.vstack(again)) and forces.any()
+
+
+def agree(found, dtype):
+    """Whether sums over elements in several orders agree but for rounding, and are not 0."""
+    scattered, gathered_ = found
+    return np.abs(scattered).max() > 0.0 and np.abs(gathered_ - scattered).max() <= FEW * eps(dtype) * np.abs(scattered).max()
+
+
+@pytest.mark.parametrize("term", **named(DECLARABLE))
+@every_dtype
+def test_sums_of_splitting_gather_what_they_scatter(term, dtype, device):
+    """Gᵀ of the gaps, the changes and the multipliers of ADMM, added to what is there."""
+    found = []
+    # Scattering is for one thread, of the CPU.
+    for factory, each in ((splitting.scatter_splitting, "cpu"), (splitting.gather_splitting, device)):
+        model = model_of(rest_mesh(), None, [term.name], dtype, each, pins=[0, 7], copies=2)
+        elements = model.terms[0]
+        random, matrix = np.random.default_rng(10), wp.types.matrix((term.rows, 3), model.dtype)
+        scale = model.array(random.uniform(0.5, 2.0, elements.count), model.dtype)
+        values = (model.array(random.normal(size=(elements.count, term.rows, 3)), matrix) for _ in range(3))
+        given = [*elements.arguments, 0.7, scale, *values]
+        out = [model.vectors() for _ in range(3)]
+        for array in out:
+            array.fill_(model.vec3(1.0, 2.0, 3.0))
+        gathers = factory is splitting.gather_splitting
+        dim = model.count if gathers else elements.count
+        model.launch(factory(term, model.dtype), dim, [*(elements.incidences if gathers else ()), *given], out)
+        found.append([array.numpy() - [1.0, 2.0, 3.0] for array in out])
+    assert all(agree(both, dtype) for both in zip(*found, strict=True))
+
+
+ROWS = [
+    (term, *key)
+    for term in DECLARABLE
+    for key in ((False, False), (True, False), (True, True))
+    if (term.constraint if key[0] else term.project)
+]
+
+
+@pytest.mark.parametrize(
+    ("term", "scalar", "curved"), ROWS, ids=[f"{term.name}-{scalar}-{curved}" for term, scalar, curved in ROWS]
+)
+@every_dtype
+def test_rows_of_constraints_gather_what_they_scatter(term, scalar, curved, dtype, device):
+    """out += Jᵀλ of the copies that are active."""
+    found, rows = [], constrain.rows_of(term, scalar, curved)
+    for factory, each in ((constrain.scatter_rows, "cpu"), (constrain.gather_rows, device)):
+        model = model_of(rest_mesh(), None, [term.name], dtype, each, pins=[0, 7], copies=3)
+        elements = model.terms[0]
+        first, per_copy = 5, rows * elements.per_copy + 7  # rows of other terms before and after
+        key = (term, model.dtype, scalar, curved)
+        slopes = wp.zeros(elements.count, dtype=constrain.slope_type(*key), device=each)
+        random = np.random.default_rng(11)
+        slopes.assign(random.normal(size=slopes.numpy().shape))
+        lambdas = model.array(random.normal(size=3 * per_copy), model.dtype)
+        active = wp.array([1, 0, 1], dtype=wp.int32, device=each)
+        given = [elements.stencil, elements.rest, slopes, lambdas, elements.per_copy, first, per_copy, active]
+        out = model.vectors()
+        out.fill_(model.vec3(1.0, 2.0, 3.0))
+        gathers = factory is constrain.gather_rows
+        dim = model.count if gathers else elements.count
+        model.launch(factory(*key), dim, [*(elements.incidences if gathers else ()), *given], [out])
+        found.append(out.numpy() - [1.0, 2.0, 3.0])
+    assert agree(found, dtype)
+    assert all((each[model.per_copy : 2 * model.per_copy] == 0.0).all() for each in found)
 
 
 def test_hessian_matrix_is_differences_of_the_gradient(device):

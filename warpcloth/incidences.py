@@ -18,7 +18,8 @@ def gathered(model, elements, damped=False):
 
     Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
     than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and what the element has
-    beside it at hand, unless the rest state is set, by element, in each step. Of a quadratic energy that is not damped the
+    beside it at hand, unless the rest state is set, by element, in each step. A stiffness that all pairs of a copy share is one
+    number a vertex, so that a copy has the bits of a model of its own. Of a quadratic energy that is not damped the
     incidences are the rows of its matrix.
     """
     part = Part(elements.term, damped, shared=0 in elements.stiffness.strides)
@@ -29,6 +30,10 @@ def gathered(model, elements, damped=False):
         slots, codes, source = found
         codes = np.where(codes < 0, np.arange(model.count), codes)
         others = {name: _of_incidences(array, source.ravel()) for name, array in arrays.items() if name != "stencil"}
+        own = None if damped or part.shared else elements.stiffness_of_copies(model)
+        if own is not None:
+            part = part._replace(shared=True)
+            others["stiffness"] = model.array(np.repeat(own, model.per_copy), model.dtype)
         return part._replace(pairs=slots), {**others, "codes": indices(elements, codes.ravel())}
     if elements.term.quadratic and not damped and (found := _of_matrix(model, elements)):
         slots, rows = found

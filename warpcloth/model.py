@@ -109,6 +109,13 @@ class DeviceElements:
         """Elements of all copies, B·E."""
         return len(self.stencil)
 
+    def stiffness_of_copies(self, model):
+        """The stiffness (B,) that all elements of a copy share, of each copy; None where elements of a copy differ."""
+        # Colours put elements of all copies in one order; all vertices of an element are in one copy.
+        by_copy = np.argsort(self.stencil.numpy()[:, 0] // model.per_copy, kind="stable")
+        values = self.stiffness.numpy()[by_copy].reshape(model.copies, -1)
+        return values[:, 0] if values.size and (values == values[:, :1]).all() else None
+
     def softened(self):
         """The same elements with a stiffness of 1 where it is infinite."""
         stiffness = self.stiffness.numpy()

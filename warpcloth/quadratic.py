@@ -16,7 +16,7 @@ ZERO = 1e-12
 
 
 def entries(model, elements):
-    """The entries of Q off the diagonal, row by row, where all elements share one stiffness without those that cancel.
+    """The entries of Q off the diagonal, row by row, where elements of a copy share one stiffness without those that cancel.
 
     Returns:
         (rows (m,), columns (m,), numbers (B, m) [N/m]) of the vertices of one copy.
@@ -49,7 +49,7 @@ def entries(model, elements):
         own = _without_zeros(blocks.numpy()[: len(apart)], K)[apart]
         np.add.at(numbers, found, own)
         np.add.at(sizes, found, np.abs(own))
-    if 0 not in elements.stiffness.strides:
+    if elements.stiffness_of_copies(model) is None:
         return rows, columns, numbers  # what cancels in a copy need not in others, and copies may not depend on these
     # What cancels, as elements at right angles do, leaves rounding of itself. It may not be held against what else is at its
     # vertices: a few large elements may be all that joins two parts of small ones.
