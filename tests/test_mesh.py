@@ -540,6 +540,12 @@ def test_gltf_is_welded_at_seams(tmp_path):
             np.testing.assert_allclose(loaded.texture_coordinates, loaded.points[:, [0, 2]], atol=1e-7)
 
 
+HEAD = (
+    "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+)
+ROWS = "".join(f"{x} {y} {z}\n" for x, y, z in SQUARE) + "3 0 2 1\n3 1 2 3\n"
+
 BAD_FILES = [
     ("missing.obj", None, FileNotFoundError, "no such file"),
     ("cloth.step", "x", ValueError, "the ending must be one of .obj .ply .stl"),
@@ -555,6 +561,18 @@ BAD_FILES = [
     ("flat.obj", CLOTH + "f 1 1 3\n", ValueError, r"triangles\[0\] = \[0, 0, 2\]: must be 3 different"),
     ("nan.obj", CLOTH.replace("1", "nan") + "f 1 3 4\n", ValueError, r"points\[1\] = .*must be finite"),
     ("range.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", ValueError, "cannot be read as .off"),
+    ("short.off", "# a square\nOFF\n\n4 3 0\n" + ROWS, ValueError, "line 10: the file ends after 2 of the 3 faces"),
+    ("points.off", "OFF 40 2 0\n" + ROWS, ValueError, "line 7: the file ends after 6 of the 40 vertices"),
+    ("row.off", "OFF\n4 2 0\n" + ROWS[:-3], ValueError, "line 8: face 1 has 3 numbers, must have 4"),
+    ("counts.off", "OFF\n4 -2 0\n" + ROWS, ValueError, "line 2: must be the numbers of vertices, faces"),
+    ("open.off", "OFF\n40 1 0\n" + "0 0 0\n" * 40 + "3 0 2 1", ValueError, "line 43: ends in 1 without a line break"),
+    ("nothing.off", "OFF\n", ValueError, "has no line of the numbers of vertices and faces"),
+    ("short.ply", HEAD.replace("face 2", "face 3") + ROWS, ValueError, "line 16: the file ends before face 2 of the 3"),
+    ("row.ply", HEAD + ROWS[:-3], ValueError, "line 15: face 1 has 3 numbers, must have 4"),
+    ("list.ply", HEAD + ROWS.replace("3 0", "-3 0"), ValueError, "line 14: face 0 has a list of -3"),
+    ("counts.ply", HEAD.replace("face 2", "face many") + ROWS, ValueError, "line 7: must be an element"),
+    ("header.ply", HEAD[:-5], ValueError, "its header has no end_header"),
+    ("huge.ply", HEAD.replace("face 2", "face " + 30 * "9") + ROWS, ValueError, "line 16: the file ends before face 2"),
 ]
 
 
@@ -562,8 +580,42 @@ BAD_FILES = [
 def test_bad_files(tmp_path, name, text, kind, message):
     if text is not None:
         (tmp_path / name).write_text(text)
-    with pytest.raises(kind, match=f"^{re.escape(str(tmp_path / name))}: .*{message}"):
+    with pytest.raises(kind, match=f"^{re.escape(str(tmp_path / name))}[:,] .*{message}"):
         Mesh.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("ending", ["ply", "off"])
+def test_a_file_that_is_cut_is_no_other_mesh(tmp_path, ending):
+    """At every byte: what loads at all is the whole mesh, without the line break at its end. A cut 11 would be 1."""
+    mesh = Mesh.grid(4, 4)
+    path = tmp_path / f"cut.{ending}"
+    text = {
+        "ply": HEAD.replace("vertex 4", "vertex 16").replace("face 2", "face 18"),
+        "off": "OFF\n16 18 0\n",
+    }[ending]
+    text += "".join("{:.3f} {:.3f} {:.3f}\n".format(*point) for point in mesh.points)
+    text += "".join("3 {} {} {}\n".format(*corners) for corners in mesh.triangles)
+    loaded = []
+    for length in range(1, len(text) + 1):
+        path.write_text(text[:length])
+        try:
+            found = Mesh.load(path)
+        except ValueError as error:
+            assert str(error).startswith(str(path)), length
+        else:
+            np.testing.assert_array_equal(found.triangles, mesh.triangles)
+            loaded.append(length)
+    assert loaded == [len(text) - 1, len(text)]
+
+
+def test_what_trimesh_stumbles_over_is_no_traceback(tmp_path):
+    """It logs the traceback of a normal that is none, and goes on without normals, which nobody here needs."""
+    path = tmp_path / "cloth.stl"
+    facet = "facet normal 0 None 0\nouter loop\nvertex 0 0 0\nvertex 0 0 1\nvertex 1 0 0\nendloop\nendfacet\n"
+    path.write_text(f"solid \n{facet}endsolid\n")
+    code = f"import warpcloth as wc; print(wc.Mesh.load({str(path)!r}))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (run.stdout, run.stderr) == ("Mesh(3 points, 1 triangles, 3 edges)\n", "")
 
 
 def test_import_is_light():

@@ -1,5 +1,6 @@
 """Meshes from files, by trimesh."""
 
+import logging
 import re
 from pathlib import Path
 
@@ -17,6 +18,8 @@ ENDINGS = {
     ".glb": {},
     ".gltf": {},
 }
+# trimesh logs the tracebacks of what it stumbles over, which Python prints where nobody has asked for a log.
+_QUIET = logging.NullHandler()
 # STL has no shared vertices at all; glTF stores a vertex once for every normal and texture coordinate that it has.
 WELDED = (".stl", ".glb", ".gltf")
 
@@ -45,8 +48,8 @@ def read_file(path, name=None, kind=Mesh):
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The ending is none of those above; the file is empty, cannot be read, has no triangles or (OBJ) has
-            relative indices; it has several geometries and `name` is none of them; or Mesh refuses it. The message
-            begins with the path.
+            relative indices; an ASCII .ply or an .off file has not the rows that its header says; it has several geometries
+            and `name` is none of them; or Mesh refuses it. The message begins with the path.
     """
     points, triangles, st = read_arrays(path, name)
     try:
@@ -80,8 +83,11 @@ def read_arrays(path, name=None):
     # trimesh counts relative indices from the end of the file instead of from their line: other triangles, silently.
     if ending == ".obj" and re.search(rb"^f\s[^\n#]*-\d", path.read_bytes(), re.MULTILINE):
         raise ValueError(f"{path}: its faces have relative (negative) indices, which are not supported")
+    if ending in _COUNTED:
+        _COUNTED[ending](path, path.read_bytes())
     import trimesh
 
+    logging.getLogger("trimesh").addHandler(_QUIET)
     try:
         scene = trimesh.load_scene(path, process=False, maintain_order=True, **ENDINGS[ending])
     except Exception as error:  # the readers raise whatever a broken file makes them stumble over
@@ -97,6 +103,85 @@ def read_arrays(path, name=None):
         raise ValueError(f"{path}: has no geometry {name!r}, it has {names}")
     transform, geometry = found[next(iter(found)) if name is None else name]
     return _arrays(path, scene.geometry[geometry], transform, len(found) > 1)
+
+
+def _check_ply(path, data):
+    """Refuses an ASCII .ply file whose lines are not those that its header says: trimesh would read another mesh."""
+    head, end, body = data.partition(b"end_header")
+    words = [line.split() for line in head.decode("latin-1").splitlines()]
+    if ["format", "ascii"] not in [line[:2] for line in words]:
+        return  # of a binary file trimesh counts the bytes
+    if not end:
+        raise ValueError(f"{path}: its header has no end_header, the file may be cut")
+    elements = []
+    for number, line in enumerate(words, start=1):
+        if line[:1] == ["element"]:
+            if len(line) != 3 or not line[2].isdecimal():
+                raise ValueError(f"{path}, line {number}: must be an element, its name and its count")
+            elements.append((line[1], int(line[2]), []))
+        elif line[:1] == ["property"] and elements:
+            elements[-1][2].append(line[1] == "list" if len(line) > 1 else False)
+    vertices = next((count for name, count, _ in elements if name == "vertex"), 0)
+    lines = body.decode("latin-1").splitlines()[1:]  # what is left of the last line of the header
+    first, row = len(words) + 2, 0
+    for name, count, lists in elements:
+        for index in range(count):
+            where = f"{path}, line {first + row}"
+            if row >= len(lines):
+                raise ValueError(f"{where}: the file ends before {name} {index} of the {count} that its header says")
+            numbers, needed = lines[row].split(), 0
+            for several in lists:
+                length = numbers[needed] if several and needed < len(numbers) else "0"
+                if not length.isdecimal():
+                    raise ValueError(f"{where}: {name} {index} has a list of {length}, must be a whole number of 0 or more")
+                needed += 1 + int(length)
+            if len(numbers) != needed:
+                raise ValueError(f"{where}: {name} {index} has {len(numbers)} numbers, must have {needed}")
+            row += 1
+        if row == len(lines) and count:
+            _refuse_open_end(f"{path}, line {first + row - 1}", data, lines[-1], vertices if any(lists) else np.inf)
+
+
+def _check_off(path, data):
+    """Refuses an .off file whose lines are not those that its header says: trimesh would read another mesh."""
+    lines = enumerate(data.decode("latin-1").splitlines(), start=1)
+    lines = [(number, words) for number, line in lines if (words := line.partition("#")[0].split())]
+    if lines and lines[0][1][0].endswith("OFF"):
+        lines[0][1].pop(0)
+        lines = lines if lines[0][1] else lines[1:]
+    if not lines:
+        raise ValueError(f"{path}: has no line of the numbers of vertices and faces")
+    (number, counts), *rows = lines
+    if len(counts) < 2 or not all(count.isdecimal() for count in counts[:2]):
+        raise ValueError(f"{path}, line {number}: must be the numbers of vertices, faces and edges, each 0 or more")
+    vertices, faces = map(int, counts[:2])
+    for name, count, rows_of in (("vertex", vertices, rows[:vertices]), ("face", faces, rows[vertices : vertices + faces])):
+        for index, (number, words) in enumerate(rows_of):
+            needed = 3
+            if name == "face":
+                if not words[0].isdecimal():
+                    raise ValueError(f"{path}, line {number}: face {index} has {words[0]} corners, must be a whole number")
+                needed = 1 + int(words[0])
+            if len(words) < needed:  # more may be a colour
+                raise ValueError(f"{path}, line {number}: {name} {index} has {len(words)} numbers, must have {needed}")
+        if len(rows_of) < count:
+            last = rows_of[-1][0] if rows_of else number
+            raise ValueError(
+                f"{path}, line {last}: the file ends after {len(rows_of)} of the {count} {_PLURAL[name]} that its header says"
+            )
+    if len(rows) == vertices + faces and rows and len(rows[-1][1]) <= needed:
+        _refuse_open_end(f"{path}, line {rows[-1][0]}", data, rows[-1][1][-1], vertices if faces else np.inf)
+
+
+_COUNTED = {".ply": _check_ply, ".off": _check_off}
+_PLURAL = {"vertex": "vertices", "face": "faces"}
+
+
+def _refuse_open_end(where, data, line, most):
+    """Refuses a file without a line break at its end whose last number could have gone on, as an index below ``most``."""
+    last = line.split()[-1:] or [""]
+    if data[-1:] not in b"\r\n" and not (last[0].isdecimal() and (int(last[0]) == 0 or 10 * int(last[0]) >= most)):
+        raise ValueError(f"{where}: ends in {last[0]} without a line break, so that the file may be cut; end the line with one")
 
 
 def _arrays(path, geometry, transform, drop_unused):
