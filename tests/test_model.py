@@ -435,6 +435,31 @@ def test_a_pair_of_several_kinds_is_one_spring(kinds):
     assert len(pairs) < sum(map(len, one_by_one))
 
 
+@pytest.mark.parametrize("pairs", ["edges", "structural", ("edges",), None], ids=str)
+@pytest.mark.parametrize("order", [None, [3, 1, 0, 2]])
+def test_arrays_follow_the_edges_as_given(pairs, order, device):
+    """Of springs and limits, and of a model in an order of its own."""
+    edges, k = [[3, 2], [1, 2], [0, 1]], np.array([1.0, 10.0, 100.0])
+    pairs = np.array(edges) if pairs is None else pairs
+    terms = [
+        wc.Spring(pairs=pairs, stiffness=k, rest_lengths=2.0 * k, damping=3.0 * k),
+        wc.SpringLimit(pairs=pairs, stiffness=4.0 * k, least=1e-3 * k, most=5.0 * k),
+    ]
+    made = wc.Scene(wc.Mesh(np.diag([1.0, 2, 3, 4])[:, :3], edges=edges), masses=np.ones(4), terms=terms)
+    model = made.build(device=device, dtype="float64", order=order)
+    named = np.arange(4) if order is None else np.array(order)
+    scale = dict(zip(((2, 3), (1, 2), (0, 1)), k, strict=True))
+    for elements, factors in zip(model.terms, ((1.0, 2.0, 3.0), (4.0, 1e-3, 5.0)), strict=True):
+        own = [scale[tuple(sorted(named[pair].tolist()))] for pair in elements.stencil.numpy()]
+        lengths = np.linalg.norm(np.diff(made.mesh.points[named[elements.stencil.numpy()]], axis=1)[:, 0], axis=1)
+        found = [elements.stiffness.numpy(), *elements.rest.numpy().T]
+        if elements.kind == "Spring":
+            found.append(elements.damping.numpy())
+        else:
+            found[1:] = [found[1] / lengths, found[2] / lengths]
+        assert np.allclose(found, np.outer(factors, own), rtol=1e-14), elements.label
+
+
 def test_lumped_mass():
     sheet, chain = scene(), wc.Scene(wc.Mesh.chain(5, length=2.0), density=0.1)
     assert np.isclose(sheet.vertex_masses.sum(), 0.1, rtol=1e-14)

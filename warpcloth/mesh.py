@@ -219,7 +219,8 @@ class Mesh:
             kind: One of the four.
 
         Returns:
-            np.ndarray: Pairs (E, 2), int32: the smaller index first, in lexicographic order, each pair once.
+            np.ndarray: Pairs (E, 2), int32: the smaller index first, each pair once. Where they are every edge, row e is
+                edge e of the mesh; all others are in lexicographic order.
 
         Raises:
             ValueError: The kind is unknown, or is "shear" where there are no cells, or "bending" where hinges are refused.
@@ -241,7 +242,7 @@ class Mesh:
                 "the edges of any other triangle mesh resist shear already"
             )
         elif kind != "bending":
-            pairs = self.edges
+            return np.sort(self.edges, axis=1)
         elif len(self.triangles):
             pairs = self.hinges[:, 2:]
         else:

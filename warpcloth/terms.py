@@ -139,8 +139,10 @@ class Spring(_Damped):
     Attributes:
         pairs: Which vertices: ``"edges"`` of the mesh; of a grid ``"structural"`` (along rows and columns), ``"shear"``
             (both diagonals of each cell), ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge);
-            several of these in a tuple, where a pair that belongs to more than one kind is one spring, and springs are in
-            lexicographic order; or own pairs (E, 2), as given.
+            several of these in a tuple, where a pair that belongs to more than one kind is one spring; or own pairs (E, 2).
+            Arrays of the other fields have a value for each row: of own pairs as given, of ``"edges"`` (and of
+            ``"structural"`` without a grid) in the order of ``mesh.edges``, which of an edge mesh is that in which its edges
+            were given, of all other kinds and of several in lexicographic order, the smaller index first.
         stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
         rest_lengths: L [m], one or (E,), if not those of the mesh.
         damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.
@@ -362,7 +364,7 @@ class SpringLimit(_Limit):
 
     Attributes:
         least, most: σ_min, σ_max, ratios to the rest length L, one or (E,); at least one of the two.
-        pairs: Which vertices, as in :class:`Spring`.
+        pairs: Which vertices, and in which order, as in :class:`Spring`.
         stiffness: k [N/m], one or (E,): of the springs that pairs beyond their limits are; infinite for PBD, which takes
             hard constraints, finite for solvers that need forces.
         name: To tell two terms of one kind apart.
@@ -523,10 +525,10 @@ def _product(cls, youngs_modulus, thickness):
 
 def pairs_on(mesh, label, pairs):
     """The pairs of :class:`Spring` on a mesh, (E, 2) int32."""
-    if isinstance(pairs, str):
-        return mesh.springs(pairs)
-    if isinstance(pairs, (tuple, list)) and pairs and all(isinstance(kind, str) for kind in pairs):
-        return np.unique(np.concatenate([mesh.springs(kind) for kind in pairs]), axis=0)
+    kinds = (pairs,) if isinstance(pairs, str) else pairs
+    if isinstance(kinds, (tuple, list)) and kinds and all(isinstance(kind, str) for kind in kinds):
+        found = [mesh.springs(kind) for kind in kinds]
+        return found[0] if len(found) == 1 else np.unique(np.concatenate(found), axis=0)
     return own_stencil(label, "pairs", pairs, 2, len(mesh.points))
 
 
