@@ -73,8 +73,14 @@ def scene():
 
 # argv, with {} for a folder of SCENE_FILES, and a part of the line that it gives.
 WRONG_USES = [
-    ("run", "the following arguments are required: SCENE, -o/--output"),
-    ("run hanging", "the following arguments are required: -o/--output; see warpcloth run --help"),
+    ("run", "the following arguments are required: SCENE; see warpcloth run --help"),
+    ("run {}/good.py -p label=a/b", "the scene is called 'a/b', which is no name for a file; give one with -o"),
+    ("run {}/good.py -p label=..", "the scene is called '..', which is no name for a file; give one with -o"),
+    ("run {}/good.py -o {}/o.usdc --prim Cloth", "good.py is no stage; leave it out"),
+    ("run hanging -o {}/o.usdc --pins", "argument --pins: expected one argument"),
+    ("info hanging --pins nowhere", "'nowhere'"),
+    ("info hanging --pins x==7", "--pins 'x==7' names no vertex; the mesh reaches from (0, 0, 0) to (1, 0, 1)"),
+    ("bench -p help", "-p help lists the parameters of a scene; give SCENE before it"),
     ("walk hanging", "invalid choice: 'walk'"),
     ("run hanging -o {}/o.usdc --speed 3", "unrecognized arguments: --speed"),
     ("run hanging -o {}/o.usdc --solver simplex", "invalid choice: 'simplex'"),

@@ -9,14 +9,14 @@ import os
 import sys
 import types
 import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from .checks import number
 from .scene import Scene
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
-_WORDS = {bool: "true or false", int: "a whole number", float: "a number, or two as in 1/240", str: "a text"}
+WORDS = {bool: "true or false", int: "a whole number", float: "a number, or two as in 1/240", str: "a text"}
 _TRUTH = dict.fromkeys(("true", "yes", "on", "1"), True) | dict.fromkeys(("false", "no", "off", "0"), False)
 _number_of_modules = itertools.count()
 
@@ -35,11 +35,13 @@ class SceneSource:
         path: The file.
         function: Called with ``parameters`` by name, returns a :class:`warpcloth.Scene`.
         parameters: Of the function, as `inspect.Parameter` by name.
+        pins: A selection of vertices that stand still where they start, in place of the pins of the scene; or None.
     """
 
     path: Path
     function: typing.Callable
     parameters: dict
+    pins: str | None = None
 
     def values(self, texts):
         """The parameters that ``texts`` (text by name) sets, converted, and the defaults of the others.
@@ -51,7 +53,7 @@ class SceneSource:
         for name, text in texts.items():
             if name not in self.parameters:
                 raise ValueError(f"{self.path} has no parameter {name!r}; {_allowed(self.parameters)}")
-            values[name] = convert(name, text, _kinds_of_parameter(self.parameters[name]))
+            values[name] = convert(name, text, kinds_of_parameter(self.parameters[name]))
         missing = [name for name in self.parameters if name not in values]
         if missing:
             raise ValueError(f"{self.path} needs a value for {missing[0]}; give it with -p {missing[0]}=…")
@@ -61,19 +63,39 @@ class SceneSource:
         """The scene for the values of the parameters.
 
         Raises:
-            ValueError: The function raises, with its file and line, or returns no scene.
+            ValueError: The function raises, with its file and line, or returns no scene; or ``pins`` selects no vertex.
         """
         if self.path.suffix in STAGES:
-            return self.function(**values)
-        with _Located(self.path):
             scene = self.function(**values)
-        if not isinstance(scene, Scene):
-            raise ValueError(f"{self.path}: scene() returned a {type(scene).__name__}; it must return a warpcloth.Scene")
-        return scene
+        else:
+            with _Located(self.path):
+                scene = self.function(**values)
+            if not isinstance(scene, Scene):
+                raise ValueError(f"{self.path}: scene() returned a {type(scene).__name__}; it must return a warpcloth.Scene")
+        if self.pins is None:
+            return scene
+        return replace(scene, pins=some_vertices(f"--pins {self.pins!r}", self.pins, scene.mesh))
 
 
-def find_source(name):
+def some_vertices(option, selection, mesh):
+    """The vertices that an option selects.
+
+    Raises:
+        ValueError: There are none, or the selection does not follow the grammar.
+    """
+    vertices = mesh.select(selection)
+    if not len(vertices):
+        low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in (mesh.points.min(0), mesh.points.max(0)))
+        raise ValueError(f"{option} names no vertex; the mesh reaches from ({low}) to ({high})")
+    return vertices
+
+
+def find_source(name, pins=None):
     """The scene that a Python file, a USD stage or a name in one of :func:`folders` stands for.
+
+    Args:
+        name: One of the three.
+        pins: See :class:`SceneSource`.
 
     Raises:
         FileNotFoundError: There is no such file or name.
@@ -91,17 +113,17 @@ def find_source(name):
     if not path.is_file():
         raise FileNotFoundError(f"{path}: {'is a folder, no scene' if path.is_dir() else 'there is no such file'}")
     if path.suffix == ".py":
-        return _python_source(path)
+        return _python_source(path, pins)
     if path.suffix in STAGES:
         from .usd import read_scene
 
-        parameters = _parameters(read_scene)
+        parameters = parameters_of(read_scene)
         del parameters["path"]
-        return SceneSource(path, lambda **values: read_scene(str(path), **values), parameters)
+        return SceneSource(path, lambda **values: read_scene(str(path), **values), parameters, pins)
     raise ValueError(f"{path}: is no scene; it must be a .py file or a USD stage ({', '.join(STAGES)})")
 
 
-def _python_source(path):
+def _python_source(path, pins):
     # Under a name of its own: scenes may be called like modules, and may be loaded again after a change.
     name = f"warpcloth_scene_{next(_number_of_modules)}_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -111,11 +133,12 @@ def _python_source(path):
         spec.loader.exec_module(module)
         function = getattr(module, "scene", None)
         if callable(function):
-            return SceneSource(path, function, _parameters(function))
+            return SceneSource(path, function, parameters_of(function), pins)
     raise ValueError(f"{path}: has no function scene(); it must have one that returns a warpcloth.Scene")
 
 
-def _parameters(function):
+def parameters_of(function):
+    """The `inspect.Parameter` by name of a function, or of a record of options."""
     by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     found = inspect.signature(function, eval_str=True).parameters
     return {name: parameter for name, parameter in found.items() if parameter.kind in by_name}
@@ -237,7 +260,7 @@ def convert(name, text, kinds):
             return converters[kind](text)
         except (KeyError, ValueError, ZeroDivisionError, OverflowError):
             continue
-    raise ValueError(f"{name} is {text!r}; it must be {' or '.join(_WORDS[kind] for kind in known)}")
+    raise ValueError(f"{name} is {text!r}; it must be {' or '.join(WORDS[kind] for kind in known)}")
 
 
 def share(name, text):
@@ -282,7 +305,8 @@ def _kinds(annotation):
     return (annotation if isinstance(annotation, type) else type(annotation),)
 
 
-def _kinds_of_parameter(parameter):
+def kinds_of_parameter(parameter):
+    """Types of which a parameter takes a value: those of its annotation, else that of its default."""
     if parameter.annotation is not parameter.empty:
         return _kinds(parameter.annotation)
     if parameter.default is None or parameter.default is parameter.empty:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..checks import number, whole
 from ..solvers import Explicit
-from .tasks import SceneRef, Setup
+from .tasks import Setup
 
 STEPS_PER_FRAME = 4
 # Noise of the start, over the median edge: what is unstable grows out of it, a hundredfold in energy while springs are linear.
@@ -106,7 +106,7 @@ def refined(ref, value):
     known = find_source(ref.name).parameters
     for name in _RESOLUTIONS:
         if name in known:
-            return SceneRef(ref.name, {**ref.parameters, name: int(value)})
+            return replace(ref, parameters={**ref.parameters, name: int(value)})
     raise ValueError(f"{ref.name} has no resolution to vary; its scene() must take {' or '.join(_RESOLUTIONS)}")
 
 

@@ -24,10 +24,12 @@ class SceneRef:
     Attributes:
         name: A known name, a .py file or a USD stage.
         parameters: Of its function, by name; texts are converted, so that "inf" is a number too, which JSON has not.
+        pins: A selection in place of its pins, see :class:`warpcloth.scene_files.SceneSource`; or None.
     """
 
     name: str
     parameters: dict = field(default_factory=dict)
+    pins: str | None = None
 
     def load(self):
         """The :class:`warpcloth.Scene`.
@@ -36,7 +38,7 @@ class SceneRef:
             FileNotFoundError: There is no such scene.
             ValueError: It takes no such parameter.
         """
-        source = scene_files.find_source(self.name)
+        source = scene_files.find_source(self.name, self.pins)
         for name in self.parameters:
             if name not in source.parameters:
                 raise ValueError(f"{source.path} has no parameter {name!r}, only {', '.join(source.parameters) or 'none'}")

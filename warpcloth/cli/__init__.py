@@ -13,7 +13,7 @@ import warnings
 
 import numpy as np
 
-from . import analyze, bench, chart, choose, compare, deform, run
+from . import analyze, bench, chart, choose, compare, deform, options, run
 from .terminal import Interrupted, say, show_warning
 
 
@@ -31,6 +31,7 @@ def main(argv=None):
         debug = False
         try:
             parser = _parser()
+            options.complete(parser)
             try:
                 arguments = parser.parse_args(argv)
             except SystemExit as done:  # --help and --version
@@ -39,6 +40,8 @@ def main(argv=None):
                 parser.print_help(sys.stderr)
                 return 2
             debug = arguments.debug
+            if options.asks_for_help(arguments):
+                return options.show_help(arguments)
             return arguments.command(arguments)
         except Interrupted as interrupted:
             return say(interrupted, 130)
@@ -102,8 +105,19 @@ def _parser():
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
-        sub.add_argument("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
-        sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+        sub.add_argument(
+            "-s",
+            nargs="+",
+            action="extend",
+            default=[],
+            metavar="option=value",
+            help="options of the solver; -s help lists them",
+        )
+        sub.add_argument(
+            "-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene; -p help lists them"
+        )
+        sub.add_argument("--prim", help="path or name of the prim of a stage with several")
+        sub.add_argument("--pins", metavar="SELECTION", help="vertices that stand still where they start, for the scene's pins")
     info.add_argument("--advise", action="store_true", help="say which terms, precision and resolution matter, by trying")
     info.add_argument("--tolerance", metavar="SHARE", help="of --advise: a change that does not matter, 1%% where not given")
     info.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try, 30 where not given")
@@ -120,7 +134,9 @@ def _parser():
     for sub in (runs, info, deforms, analyzes, chooses, benches):
         sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
     for sub in (runs, deforms):
-        sub.add_argument("-o", "--output", required=True, metavar="FILE", help="the .usd, .usda, .usdc or .usdz file to write")
+        text = "the .usd, .usda, .usdc or .usdz file to write"
+        text += "" if sub is deforms else "; where not given NAME.usdc, of the scene's name, which must not be there"
+        sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
     for sub in (runs, deforms, analyzes):
         sub.add_argument("--single-file", action="store_true", help="one file in the end, with no folder of frames beside it")
     scenes = add("scenes", run.scenes, "List scenes and their parameters.")

@@ -52,7 +52,7 @@ def chosen(arguments, device):
     try:
         with executing(arguments) as executor:
             choice, found, exact = choose(
-                SceneRef(arguments.scene, scene_files.assignments(arguments.p)),
+                SceneRef(arguments.scene, scene_files.assignments(arguments.p), getattr(arguments, "pins", None)),
                 tolerance,
                 budget,
                 arguments.solvers,

@@ -215,13 +215,11 @@ def _handles(mesh, fixes, moves, frames):
     for move in moves:
         if move.turn is None and move.shift is None:
             raise ValueError(f"--move {move.selection!r} does not say how; --rotate or --translate must follow it")
-    groups = [(f"--fix {text!r}", mesh.select(text), None) for text in fixes]
-    groups += [(f"--move {move.selection!r}", mesh.select(move.selection), move) for move in moves]
+    named = [(f"--fix {text!r}", text, None) for text in fixes]
+    named += [(f"--move {move.selection!r}", move.selection, move) for move in moves]
+    groups = [(option, scene_files.some_vertices(option, text, mesh), move) for option, text, move in named]
     owners = np.full(len(mesh.points), -1)
     for number, (option, vertices, move) in enumerate(groups):
-        if not len(vertices):
-            low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in (mesh.points.min(0), mesh.points.max(0)))
-            raise ValueError(f"{option} names no vertex; the mesh reaches from ({low}) to ({high})")
         taken = vertices[owners[vertices] >= 0]
         if move is not None and len(taken):
             other = groups[owners[taken[0]]][0]

@@ -1,6 +1,7 @@
 """The commands on scenes: ``run``, ``info`` and ``scenes``."""
 
 import math
+import os
 import statistics
 import sys
 import time
@@ -26,6 +27,7 @@ def run(arguments):
 
     source, values, scene = named_scene(arguments)
     frames = scene.frames if arguments.frames is None else arguments.frames
+    arguments.output = arguments.output or _own_output(scene)
     check_writable(arguments.output)
     device = find_device(arguments.device)
     if arguments.tolerance is not None or arguments.budget is not None:
@@ -76,6 +78,20 @@ def run(arguments):
     if status.ok:
         return 0
     return say(f"{status.message}; the last good frame is {status.frame}, in {arguments.output}", 1)
+
+
+def _own_output(scene):
+    """The file that a run writes where none is named: the scene's name in the current folder, if nothing is there.
+
+    Raises:
+        ValueError: There is, or the name is none that a file can have.
+    """
+    if scene.name != os.path.basename(scene.name) or not scene.name.isprintable() or scene.name.strip(". ") == "":
+        raise ValueError(f"the scene is called {scene.name!r}, which is no name for a file; give one with -o")
+    output = f"{scene.name}.usdc"
+    if os.path.lexists(output):
+        raise ValueError(f"{output} is there already, and without -o nothing is replaced; give -o {output} to replace it")
+    return output
 
 
 def _summary(facts):
@@ -166,7 +182,12 @@ def scenes(arguments):
 
 def named_scene(arguments):
     """(source, values of its parameters, scene) that the arguments name."""
-    source = scene_files.find_source(arguments.scene)
+    source = scene_files.find_source(arguments.scene, getattr(arguments, "pins", None))
+    prim = getattr(arguments, "prim", None)
+    if prim is not None:  # of a stage a parameter like others, which measurements in other processes are given too
+        if source.path.suffix not in scene_files.STAGES:
+            raise ValueError(f"--prim is given, and {arguments.scene} is no stage; leave it out")
+        arguments.p, arguments.prim = [*arguments.p, f"prim={prim}"], None
     values = source.values(scene_files.assignments(arguments.p))
     return source, values, source.scene(values)
 

@@ -19,7 +19,7 @@ _EARTH = 9.81  # [m/s²]
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none
 
 
-def read_scene(path, prim=None):
+def read_scene(path, prim: str | None = None):
     """Reads a scene from a stage; `simulate` then writes its animation as a layer over that stage.
 
     Args:

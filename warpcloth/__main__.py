@@ -1,0 +1,7 @@
+"""``python -m warpcloth``, the command ``warpcloth``."""
+
+import sys
+
+from .cli import main
+
+sys.exit(main())

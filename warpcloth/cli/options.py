@@ -1,0 +1,142 @@
+"""Options of solvers and parameters of scenes: listed by ``-s help`` and ``-p help``, and completed by a shell."""
+
+import os
+import warnings
+from functools import partial
+
+from .. import scene_files
+from .terminal import as_json
+
+_HELP = "help"
+
+
+def asks_for_help(arguments):
+    """Whether ``-s`` or ``-p`` is to list what it takes."""
+    return any(_HELP in (getattr(arguments, key, None) or ()) for key in "sp")
+
+
+def show_help(arguments):
+    """Lists what ``-s`` takes of the solver, and ``-p`` of the scene, where either says help."""
+    found = {}
+    if _HELP in getattr(arguments, "s", ()):
+        found["options"] = _of_solver(getattr(arguments, "solver", None))
+    if _HELP in getattr(arguments, "p", ()):
+        found["parameters"] = _of_scene(_scene_name(arguments))
+    print(as_json(found) if getattr(arguments, "json", False) else "\n\n".join(map(_text, found.values())))
+    return 0
+
+
+def _of_solver(name):
+    from ..solvers import SOLVERS
+
+    name = name or "newton"
+    record = SOLVERS[name]
+    found = _listed(f"-s of {name}", record.__doc__, record, scene_files.parameters_of(record))
+    return found | {"note": "dt or substeps is given, not both; where neither is, a step is chosen"}
+
+
+def _of_scene(name):
+    source = scene_files.find_source(name)
+    return _listed(f"-p of {source.path}", source.function.__doc__, source.function, source.parameters)
+
+
+def _scene_name(arguments):
+    name = getattr(arguments, "scene", None) or getattr(arguments, "mesh", None)
+    if name is None:
+        raise ValueError("-p help lists the parameters of a scene; give SCENE before it")
+    return name
+
+
+def _listed(title, doc, call, parameters):
+    rows = [
+        {
+            "name": name,
+            "default": None if parameter.default is parameter.empty else parameter.default,
+            "needed": parameter.default is parameter.empty,
+            "allowed": _allowed(call, name, parameter),
+        }
+        for name, parameter in parameters.items()
+    ]
+    return {"of": title, "meaning": (doc or "").strip().partition("\n")[0], "rows": rows}
+
+
+def _text(found):
+    lines = [found["of"] + (f": {found['meaning']}" if found["meaning"] else "")]
+    rows = [(row["name"], _default(row), row["allowed"]) for row in found["rows"]]
+    if not rows:
+        return "\n".join([*lines, "  takes none"])
+    widths = [max(map(len, columns)) for columns in zip(*rows, strict=True)]
+    lines += [f"  {name:<{widths[0]}}  {default:<{widths[1]}}  {allowed}" for name, default, allowed in rows]
+    return "\n".join([*lines, *([found["note"]] if "note" in found else [])])
+
+
+def _default(row):
+    return "needed" if row["needed"] else "none" if row["default"] is None else str(row["default"])
+
+
+class _Refused:
+    """A value that no option takes."""
+
+
+def _allowed(call, name, parameter):
+    """What a solver's record or the function of a scene says of a value that it refuses; else what its type takes."""
+    kinds = scene_files.kinds_of_parameter(parameter)
+    for more in ({}, {"substeps": 1}):  # a record wants a step before it looks at the rest
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                call(**{**more, name: _Refused()})
+        except Exception as error:
+            said, _, rule = str(error).partition("; it must be ")
+            if rule and said.startswith(f"{name} is "):
+                break
+    else:
+        rule = " or ".join(words for kind, words in scene_files.WORDS.items() if kind in kinds) or "nothing written as text"
+    return rule.replace("'", "") + (", or none" if type(None) in kinds else "")
+
+
+def complete(parser):
+    """Completes a command line for a shell that asks by argcomplete, and ends there; otherwise does nothing."""
+    if "_ARGCOMPLETE" not in os.environ:
+        return
+    import argcomplete
+
+    files = {"scene": argcomplete.FilesCompleter((*scene_files.STAGES, ".py")), "mesh": argcomplete.FilesCompleter()}
+    _add_completers(parser, files)
+    argcomplete.autocomplete(parser)
+
+
+def _add_completers(parser, files):
+    for action in parser._actions:
+        if isinstance(action.choices, dict) and action.dest == "==SUPPRESS==":
+            for command in action.choices.values():
+                _add_completers(command, files)
+        elif action.dest in files:
+            action.completer = partial(_scenes, files[action.dest])
+        elif action.dest == "s":
+            action.completer = _solver_words
+        elif action.dest == "p":
+            action.completer = _scene_words
+
+
+def _scenes(files, prefix, **_):
+    known = {listed.name for folder in scene_files.folders() for listed in scene_files.list_scenes(folder)}
+    return [*sorted(known), *files(prefix)]
+
+
+def _solver_words(prefix, parsed_args, **_):
+    return _words(prefix, _of_solver(getattr(parsed_args, "solver", None)))
+
+
+def _scene_words(prefix, parsed_args, **_):
+    return _words(prefix, _of_scene(_scene_name(parsed_args)))
+
+
+def _words(prefix, found):
+    """``name=`` of each, or where a name stands already ``name=value`` of each word that it takes."""
+    name, sign, _value = prefix.partition("=")
+    if not sign:
+        return [f"{row['name']}=" for row in found["rows"]] + [_HELP]
+    (rule,) = [row["allowed"] for row in found["rows"] if row["name"] == name] or [""]
+    words = rule.removeprefix("one of ").split(", ") if rule.startswith("one of ") else []
+    return [f"{name}={word.removeprefix('or ')}" for word in words]
