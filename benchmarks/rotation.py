@@ -156,7 +156,6 @@ def main():
     parser.add_argument("--dtype", choices=TYPES, default="float32")
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
     if options.what == "accuracy":
         accuracy(options.count or 10_000_000, options.dtype)
     else:

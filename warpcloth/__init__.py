@@ -1,11 +1,13 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
+from . import checks, ordering
 from .analysis import Analyzer, analyze
 from .arap import Arap
 from .compare import Comparison, compare
 from .deform import Deformation, deform
 from .equilibrium import Equilibrium, equilibrium
 from .mesh import Mesh
+from .quiet import leave_out_news
 from .rotation import kabsch, polar, svd
 from .samples import Analysis
 from .scene import Pins, Scene
@@ -57,12 +59,20 @@ __all__ = [
     "StrainLimit",
     "analyze",
     "as_sequence",
+    "checks",
     "compare",
     "deform",
     "equilibrium",
     "kabsch",
     "open_sequence",
+    "ordering",
     "polar",
     "simulate",
     "svd",
 ]
+
+leave_out_news()
+
+
+def __dir__():
+    return __all__

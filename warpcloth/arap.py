@@ -15,6 +15,7 @@ from .linear import constant_factor
 from .model import DTYPES
 from .operators import CHUNKS
 from .ordering import worthwhile_order
+from .quiet import find_device
 from .rotation import kabsch
 from .selection import distinct_vertices
 
@@ -105,7 +106,7 @@ class Arap:
                 f"vertex {mesh.isolated[0]} is in no triangle and on no edge (isolated vertices of the mesh: "
                 f"{len(mesh.isolated)}); remove such vertices, for nothing says where they go"
             )
-        self.device, self.dtype = wp.get_device(device), dtype
+        self.device, self.dtype = find_device(device), dtype
         self._scalar, self._numpy = DTYPES[dtype]
         self.handles = distinct_vertices("handles", handles, mesh)
         if not len(self.handles):

@@ -13,7 +13,7 @@ from .scene import checked_pins
 PRIMVAR = "rotationAngle"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Deformation:
     """What a deformation left: a frame for each keyframe.
 
@@ -39,6 +39,13 @@ class Deformation:
     times: np.ndarray
     timings: dict
     output: str | None = None
+
+    def __repr__(self):
+        frames, vertices, _ = self.points.shape
+        late = np.count_nonzero(~self.converged)
+        result = f"{late} frames did not converge" if late else "converged"
+        where = "" if self.output is None else f", in {self.output}"
+        return f"Deformation({frames} frames of {vertices} vertices, {self.times[-1]:g} s, {result}{where})"
 
 
 def deform(

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from .kernels import nearest
+from .quiet import find_device
 
 # 2·area by the sum of the squared sides: an equilateral triangle has 0.29. Float32 searches ones below by their rounding.
 _FLAT = 1e-3
@@ -39,7 +40,7 @@ def surface_distances(points, x, triangles, device="cpu"):
     sides = x[triangles] - x[np.roll(triangles, 1, axis=1)]
     flat = 2.0 * triangle_areas(x, triangles) <= _FLAT * np.einsum("tki,tki->t", sides, sides)
     triangles = np.ascontiguousarray(triangles, dtype=np.int32)
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice(find_device(device)):
         mesh = wp.Mesh(wp.array(x, dtype=wp.vec3), wp.array(triangles.ravel(), dtype=wp.int32))
         elements = [mesh.id, wp.array(triangles, dtype=wp.vec3i), wp.array(np.flatnonzero(flat), dtype=wp.int32)]
         state = [wp.array(x, dtype=wp.vec3d), wp.array(points, dtype=wp.vec3d)]

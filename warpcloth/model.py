@@ -13,6 +13,7 @@ from .checks import array, choice, numeric, shown, whole
 from .kernels.assemble import types
 from .kernels.term import Term
 from .precision import cast, refuse_coarse
+from .quiet import find_device
 from .scene import refuse_far_pins
 from .selection import distinct_vertices
 from .team import Team
@@ -225,7 +226,7 @@ class Model:
         whole("copies", copies, 1)
         copies = int(copies)
         self.scene, self.copies = scene, copies
-        self.device = wp.get_device(device)
+        self.device = find_device(device)
         self.team, self.state = Team(threads, self.device), None
         self.dtype, self.numpy_dtype = DTYPES[dtype]
         self.vec3, self.mat33 = types(self.dtype)

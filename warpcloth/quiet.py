@@ -1,18 +1,39 @@
-"""Warp without its greeting, and without its native line about a missing CUDA driver."""
+"""Warp without its greeting, its lines on modules and its native line about a missing CUDA driver, unless asked for."""
 
 import os
 import sys
 import tempfile
+from functools import cache
 
 
-def initialise_warp():
-    """Initialises Warp so that only warnings are said; that there is no driver is no news where only a CPU is asked for."""
+def leave_out_news():
+    """Leaves Warp at warnings where its log level is still its own default; a level that is set later, or was before, holds."""
     import warp as wp
 
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as said:
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING
+
+
+def find_device(name):
+    """The Warp device of a name, Warp being initialised by :func:`initialise_warp`."""
+    import warp as wp
+
+    initialise_warp()
+    return wp.get_device(name)
+
+
+@cache
+def initialise_warp():
+    """Initialises Warp; that there is no driver is no news where only a CPU is asked for."""
+    import warp as wp
+
+    try:
+        sys.stderr.flush()
         before = os.dup(2)
+    except (AttributeError, OSError):  # a process without a standard error
+        wp.init()
+        return
+    with tempfile.TemporaryFile() as said:
         try:
             os.dup2(said.fileno(), 2)
             wp.init()

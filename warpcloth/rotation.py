@@ -5,6 +5,7 @@ import warp as wp
 
 from .checks import choice, numeric, refuse, shown
 from .kernels import cells, decompose, rotation
+from .quiet import find_device
 
 _TYPES = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 _SVD = {
@@ -174,7 +175,7 @@ class _Batch:
         if scalar not in _TYPES.values() or self.shape not in shapes:
             allowed = " or ".join(f"(…, {', '.join(map(str, s))})" for s in shapes)
             raise ValueError(f"{name} has shape {shape} and type {shown(A.dtype)}; it must be {allowed} of float32 or float64")
-        self.device = A.device if self.warp else wp.get_device("cpu")
+        self.device = A.device if self.warp else find_device("cpu")
         self.words = f"{'Warp' if self.warp else 'NumPy'} array of {scalar.__name__} on {self.device}"
         vector = len(self.shape) == 1
         self.kind = wp.types.vector(self.shape[0], scalar) if vector else wp.types.matrix(self.shape, scalar)

@@ -17,7 +17,7 @@ from .status import Result, Status, sentence
 AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Animation:
     """What a run left: the start and every good frame after it.
 
@@ -41,6 +41,12 @@ class Animation:
     timings: dict
     worst_strain: float | np.ndarray
     output: str | None = None
+
+    def __repr__(self):
+        frames, *copies, vertices, _ = self.points.shape
+        of = f"{copies[0]} copies of {vertices} vertices" if copies else f"{vertices} vertices"
+        where = "" if self.output is None else f", in {self.output}"
+        return f"Animation({frames} frames of {of}, {self.times[-1]:g} s, {self.status.result.value}{where})"
 
 
 def simulate(

@@ -7,6 +7,7 @@ from .checks import array, numeric, shown
 from .kernels import deformation, fits, rates
 from .model import DTYPES
 from .neighbourhoods import neighbourhoods
+from .quiet import find_device
 from .terms import CorotatedMembrane, NeoHookeanMembrane, StVKMembrane
 
 RATES = {"midpoint": rates.MIDPOINT, "forward": rates.FORWARD, "logarithm": rates.LOGARITHM}
@@ -20,7 +21,7 @@ class _Elements:
     """
 
     def __init__(self, count, measures, device, dtype):
-        self.device, self.count, self.measures = wp.get_device(device), count, measures
+        self.device, self.count, self.measures = find_device(device), count, measures
         self.scalar, self.numpy = DTYPES[dtype]
         self.vec3, self.mat33 = wp.types.vector(3, self.scalar), wp.types.matrix((3, 3), self.scalar)
         self.results = {measure.name: self.empty(self._kind(measure.shape)) for measure in measures}

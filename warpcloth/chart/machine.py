@@ -16,11 +16,10 @@ def machine(device="cpu"):
     import scipy
     import warp as wp
 
-    from ..quiet import initialise_warp
+    from ..quiet import find_device
     from .tasks import source_digest
 
-    initialise_warp()
-    found = wp.get_device(device)
+    found = find_device(device)
     return {
         "processor": processor(),
         "cores": os.cpu_count(),
