@@ -16,7 +16,7 @@ from warpcloth.chart import machine, stability
 from warpcloth.chart.axes import AXES, FIXED, applied, record_at, scene_at, vary
 from warpcloth.chart.failures import FAILURES
 from warpcloth.chart.maps import _PLAIN, plot_maps, write_table
-from warpcloth.chart.rules import DIVERGES, KNOWN, concave_rate, largest_relaxation, rings, rules
+from warpcloth.chart.rules import DIVERGES, KNOWN, concave_rate, largest_ordered, largest_relaxation, rings, rules
 from warpcloth.chart.stability import Survey, boundary, measure
 from warpcloth.chart.sweep import Store, sweep
 from warpcloth.chart.tasks import SceneRef, Setup
@@ -37,9 +37,9 @@ def net(kind, n=10, stiffness=1.0):
     return SceneRef("net", {"n": n, "kind": kind, "stiffness": stiffness})
 
 
-def mapped(scene, setups, x, xs, y, ys, steps=40, fixed=None, **options):
-    """Cells (setup, y, x) of a map."""
-    survey = Survey(scene, tuple(setups), x, y, tuple(xs), tuple(ys), fixed or {}, steps)
+def mapped(scene, setups, x, xs, y, ys, steps=40, fixed=None, duration=None, **options):
+    """Cells (setup, y, x) of a map, compared over as many steps of 1/60 s if not over a duration."""
+    survey = Survey(scene, tuple(setups), x, y, tuple(xs), tuple(ys), fixed or {}, steps, duration or steps / 60)
     return survey.table((task, task.run()) for task in survey.tasks(**options))
 
 
@@ -133,14 +133,41 @@ def test_limits_of_jacobi_with_compliance(solver, options, iterations, device):
     assert found == pytest.approx(limit, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("solver", "iterations", "accuracy"), [("pbd", 1, 0.01), ("pbd", 4, 0.01), ("xpbd", 1, 0.01), ("xpbd", 4, 0.07)]
-)
-def test_limits_of_gauss_seidel_with_compliance(solver, iterations, accuracy, device):
-    fixed, setup, scene = {"dt": 1.0, "iterations": iterations}, Setup(solver), net("structural", 8)
-    limit = 1.0 / rules(scene_at(scene, fixed, 1), record_at(setup, fixed), 1)["ω = 1 + 3^(−1/n)"]
-    found = boundary(scene, setup, "relaxation", limit / 2, limit * 2, 600, fixed, WIDTH, device=device)
-    assert found == pytest.approx(limit, rel=accuracy)
+ORDERED = [
+    ("structural", "pbd", {}, 4),
+    ("structural", "xpbd", {}, 4),
+    ("shear", "pbd", {"sweep": "sequential"}, 1),
+    ("shear", "pbd", {"sweep": "sequential"}, 5),
+    ("shear", "pbd", {}, 1),
+    ("shear", "pbd", {}, 4),
+    ("shear", "xpbd", {"sweep": "sequential"}, 4),
+    ("shear", "xpbd", {"integrator": "bdf2"}, 5),
+    ("shear", "xpbd", {"integrator": "midpoint"}, 2),
+]
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 1e4])
+@pytest.mark.parametrize(("kind", "solver", "options", "iterations"), ORDERED)
+def test_limits_of_gauss_seidel_in_its_order(kind, solver, options, iterations, stiffness, device):
+    """The eigenvalues of sweeps in the order in which they go, soft and stiff (kh² of 1 and 1e4 times the mass)."""
+    fixed, setup, scene = {"dt": 1.0, "iterations": iterations}, Setup(solver, options), net(kind, 8, stiffness)
+    ratios = rules(scene_at(scene, fixed, 1), record_at(setup, fixed), 600)
+    limit = 1.0 / ratios["Gauss–Seidel, |z| = 1"]
+    found = boundary(scene, setup, "relaxation", limit / 2, limit * 1.5, 600, fixed, WIDTH, device=device)
+    assert found == pytest.approx(limit, rel=0.01)
+
+
+def test_an_order_moves_the_limit_of_gauss_seidel():
+    """With shear springs one sweep in one order for all holds for ω < 1.07, by colour up to 1.36; structural ones for 4/3."""
+    limits = {
+        (kind, sweep): largest_ordered(net(kind, 8, "inf").load(), 1.0, wc.PBD(dt=1.0, iterations=1, sweep=sweep), 10**4)
+        for kind in ("structural", "shear")
+        for sweep in ("sequential", "coloured")
+    }
+    assert limits["structural", "sequential"] == pytest.approx(4 / 3, rel=1e-3)
+    assert limits["structural", "coloured"] == pytest.approx(4 / 3, rel=1e-3)
+    assert limits["shear", "sequential"] < 1.1 < 1.3 < limits["shear", "coloured"]
+    assert largest_ordered(net("shear", 20).load(), 1.0, wc.PBD(dt=1.0), 100) is None, "of too many springs none is sought"
 
 
 @pytest.mark.filterwarnings("error")
@@ -186,7 +213,7 @@ def test_forward_euler_diverges_at_any_step(device):
         steps = round(3.0 * needed)
         ((cell,),) = measure(asdict(net("shear")), [asdict(setup)], {}, "dt", [h], steps, device=device, reference=False)
         assert cell["verdict"] == "diverged" and 0.5 * needed < cell["step"] < 2.5 * needed
-        assert cell["rules"]["forward Euler"] == pytest.approx(steps / needed, rel=1e-3)
+        assert cell["rules"]["forward Euler"] == pytest.approx(cell["steps"] / needed, rel=1e-3)
 
 
 def test_rounding_is_not_divergence(device):
@@ -206,7 +233,7 @@ def test_rules_of_one_spring():
     # Noise of the start is 1e-6 of the length.
     assert concave_rate(scene.build(dtype="float64")) == pytest.approx(100.0 * (1 / 0.8 - 1) / 0.01, rel=1e-4)
     assert rules(scene, newton, 4)["h² = m/(k(L/l − 1))"] == pytest.approx(0.02 * np.sqrt(2500.0), rel=1e-4)
-    plain = record_at(Setup("projective-dynamics", {"acceleration": "none"}), {"iterations": 5})
+    plain = record_at(Setup("projective-dynamics", {"acceleration": "none"}), {**values, "iterations": 5})
     # Gershgorin's sum over a row counts the pin too.
     needed = rules(scene, plain, 4)["1 + Σk h²/m iterations"] * 5
     assert 1.0 + 100.0 * 0.02**2 / 0.01 <= needed * (1 + 1e-9) <= 1.0 + 2 * 100.0 * 0.02**2 / 0.01 * (1 + 1e-9)
@@ -231,7 +258,18 @@ OTHERS = [Setup(name) for name in ("explicit", "xpbd", "pbd", "admm", "hierarchi
 
 def test_implicit_euler_never_diverges(device):
     """8 decades of stiffness, 0.1 to 1e7 N/m, and the ends of 4 of the step; the others diverge where a rule says so."""
-    cells = mapped(HANGING, IMPLICIT[::2] + OTHERS, "stiffness", DECADES, "dt", STEPS[::3], 20, device=device, reference=False)
+    cells = mapped(
+        HANGING,
+        IMPLICIT[::2] + OTHERS,
+        "stiffness",
+        DECADES,
+        "dt",
+        STEPS[::3],
+        20,
+        duration=1e-4,
+        device=device,
+        reference=False,
+    )
     assert {cell["verdict"] for cell in flat(cells[:2])} <= {"stable", "stalled"}
     assert not unexplained(cells)
     (explicit,) = verdicts(cells[2:3][0][:1])
@@ -246,7 +284,9 @@ def test_implicit_euler_never_diverges_on_full_maps(name, device):
     scene = SceneRef(name, {"n": 6, **({"stiffness": 1e3} if name == "net" else {})})
     for fixed in ({}, {"compression": 0.3}):
         steps = tuple(np.geomspace(1e-4, 1.0, 5).tolist())
-        cells = mapped(scene, IMPLICIT + OTHERS, "stiffness", DECADES, "dt", steps, 60, fixed, device=device, reference=False)
+        cells = mapped(
+            scene, IMPLICIT + OTHERS, "stiffness", DECADES, "dt", steps, 60, fixed, 1e-4, device=device, reference=False
+        )
         assert {cell["verdict"] for cell in flat(cells[:3])} <= {"stable", "stalled"}
         assert not unexplained(cells)
 
@@ -263,6 +303,33 @@ def test_jacobi_limits_of_the_known_nets(device):
         limit = 2.0 / np.sqrt(frequency)
         found = boundary(net(kind, 40), Setup("explicit"), "dt", 0.5 * limit, 2.0 * limit, 1000, device=device)
         assert found == pytest.approx(limit, rel=0.01)
+
+
+def test_cells_are_compared_over_the_same_time(device):
+    """Halving the step halves the error of Euler and quarters that of BDF2, of one motion; runs are of 40 steps at least.
+
+    Of as many steps each, they would be errors of motions of other lengths.
+    """
+    setups = [asdict(Setup("newton")), asdict(Setup("newton", {"integrator": "bdf2"}))]
+    values = [2e-3, 4e-3, 2e-2]
+    rows = measure(asdict(HANGING), setups, {"stiffness": 0.01}, "dt", values, 40, duration=0.2, device=device)
+    for row, factor in zip(rows, (2.0, 4.0), strict=True):
+        assert row[1]["error"] / row[0]["error"] == pytest.approx(factor, rel=0.25)
+        assert [cell["steps"] for cell in row] == [100, 50, 40]
+
+
+@pytest.mark.parametrize(
+    ("dt", "steps", "run", "reference"), [(1e-3, 10, 504, 2016), (1e-4, 10, 5056, 2048), (0.1, 10, 10, 20)]
+)
+def test_the_cost_of_a_cell_is_bounded(dt, steps, run, reference, device, monkeypatch):
+    """Half a second: a run has the steps that takes, or those asked for; the reference 4 times as many, or about 2000."""
+    asked = []
+    monkeypatch.setattr(
+        stability, "run", lambda scene, record, *_, **__: asked.append(scene.frames * record.per_frame(scene.fps))
+    )
+    monkeypatch.setattr(stability, "_judge", lambda *_: stability._cell("stable", ""))
+    measure(asdict(HANGING), [asdict(Setup("pbd"))], {"dt": dt}, "stiffness", [1.0], steps, duration=0.5, device=device)
+    assert asked == [reference // 2, reference, run]
 
 
 # --- Failures as maps show them; docs/stability.md says which.
@@ -356,7 +423,8 @@ def test_rows_are_copies_and_either_axis_can_be_a_row(device):
     for a, b in zip(first, turned, strict=True):
         assert a == [list(column) for column in zip(*b, strict=True)]
     for i, setup in enumerate(setups):
-        alone = measure(asdict(HANGING), [asdict(setup)], {"stiffness": 1e3}, "dt", [1e-2], 12, device=device)[0][0]
+        given = {"device": device, "duration": 0.2}
+        alone = measure(asdict(HANGING), [asdict(setup)], {"stiffness": 1e3}, "dt", [1e-2], 12, **given)[0][0]
         within = first[i][1][2]
         assert alone["verdict"] == within["verdict"] and alone["step"] == within["step"]
         assert alone["growth"] == pytest.approx(within["growth"], rel=1e-9)
@@ -479,9 +547,7 @@ def test_the_reference_is_known_to_what_halving_its_step_changes(device):
     ((fine, coarse),) = measure(asdict(HANGING), [asdict(Setup("newton", {"integrator": "bdf2"}))], **survey)
     assert fine["error"] > fine["floor"] > 0.0 and coarse["floor"] > 2.0 * fine["floor"]
     scene = scene_at(HANGING, {"stiffness": 1.0, "dt": 4e-3}, 40)
-    runs = [
-        stability.run(scene, wc.Newton(substeps=4 * k, integrator="bdf2", tolerance=1e-6), device=device) for k in (2, 4, 16)
-    ]
+    runs = [stability.run(scene, wc.Newton(substeps=k, integrator="bdf2", tolerance=1e-6), device=device) for k in (2, 4, 16)]
     before, after = (stability._apart(runs[i], runs[i + 1], 0) for i in (0, 1))
     assert coarse["floor"] == pytest.approx(before, rel=1e-6) and after < before
 
@@ -505,13 +571,12 @@ def test_no_verdict_that_the_reference_does_not_bear(floor, error, verdict):
         # RMS over two frames and two vertices: all are off.
         return stability.Trial(x + np.array([0.0, off, 0.0]), np.array([1]), np.ones(1), [""], [None])
 
-    record = Setup("pbd", {"substeps": 4}).record()
-    cell = stability._judge(trial(error), 0, [trial(floor), trial(0.0)], 0.01, record)
+    cell = stability._judge(trial(error), 0, [trial(floor), trial(0.0)], 0.01)
     assert cell["verdict"] == verdict and cell["status"] == "ok"
     assert (cell["error"], cell["floor"]) == pytest.approx((error, floor))
     assert cell["reason"] == "" if verdict == "stable" else f"known to {100.0 * floor:.2g} %" in cell["reason"]
-    assert stability._judge(trial(error), 0, None, 0.01, record)["verdict"] == "stable"
-    lost = stability._judge(trial(error), 0, "no reference: stopped after 1 s", 0.01, record)
+    assert stability._judge(trial(error), 0, None, 0.01)["verdict"] == "stable"
+    lost = stability._judge(trial(error), 0, "no reference: stopped after 1 s", 0.01)
     assert lost["verdict"] == "unsure" and lost["error"] is None and lost["reason"].startswith("no reference")
 
 
@@ -528,10 +593,12 @@ def test_options_of_methods_share_a_reference(device, monkeypatch):
 
 def made_up():
     """A survey of 4 × 2 cells, with a line from 0.1 to 10, and one of each verdict."""
-    survey = Survey(HANGING, (Setup("newton"),), "dt", "stiffness", (1e-3, 1e-2, 1e-1, 1.0), (1.0, 10.0), {"iterations": 3}, 40)
+    survey = Survey(HANGING, (Setup("newton"),), "dt", "stiffness", (1e-3, 1e-2, 1e-1, 1.0), (1.0, 10.0), {"iterations": 3})
 
     def cell(verdict, ratio, step=None):
-        return stability._cell(verdict, "why, indeed", step=step, floor=0.002) | {"rules": {"2/ω_max": ratio, KNOWN: ratio}}
+        return stability._cell(verdict, "why, indeed", step=step, steps=40, floor=0.002) | {
+            "rules": {"2/ω_max": ratio, KNOWN: ratio}
+        }
 
     top = [cell("diverged", 10.0, 1), cell("diverged", 20.0, 40), cell("refused", None), cell("slow", None)]
     return survey, [[[cell("stable", 0.1), cell("inaccurate", 0.2), cell("stalled", 0.4), cell("unsure", 0.4)], top]]
@@ -623,6 +690,7 @@ def test_the_command(tmp_path, capfd, monkeypatch):
         ("--x dt --y stiffness -p m=3", "no parameter 'm'"),
         ("--x dt --y stiffness --steps 0", "steps is 0"),
         ("--x dt --y stiffness --limit 0", "limit is 0"),
+        ("--x dt --y stiffness --duration 0", "duration is 0"),
         ("--x dt --y stiffness -o map.doc", "the ending is '.doc'"),
         ("--x dt --y stiffness --csv nowhere/map.csv", "nowhere does not exist"),
         ("--x dt --y stiffness -o map.png --csv map.png", "is given for two outputs"),

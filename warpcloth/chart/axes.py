@@ -1,5 +1,6 @@
 """Axes of a map: what a value of each makes of a scene and of a solver."""
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -8,7 +9,8 @@ from ..checks import number, whole
 from ..solvers import Explicit
 from .tasks import Setup
 
-STEPS_PER_FRAME = 4
+# Frames of what is compared, about: a frame has as many steps as that takes.
+FRAMES = 64
 # Noise of the start, over the median edge: what is unstable grows out of it, a hundredfold in energy while springs are linear.
 NOISE = 1e-6
 SEED = 0
@@ -65,13 +67,14 @@ OPTIONS = ("iterations", "relaxation", "weight")
 FIXED = {"dt": 1 / 60}
 
 
-def scene_at(ref, values, steps):
-    """The scene of a cell: frames of a few steps each, and a start with noise.
+def scene_at(ref, values, steps, duration=None):
+    """The scene of a cell: frames of a step or more each, and a start with noise.
 
     Args:
         ref: :class:`warpcloth.chart.tasks.SceneRef`.
         values: By name of the axis; ``dt`` among them.
-        steps: Number of steps, rounded up to whole frames.
+        steps: Number of steps at least, rounded up to whole frames.
+        duration: Time of motion at least [s], for which :data:`FRAMES` are meant; that of ``steps`` if not given.
 
     Raises:
         ValueError: The scene cannot have such a value.
@@ -87,12 +90,18 @@ def scene_at(ref, values, steps):
     for name in VARIED:
         if name in values:
             scene = applied(scene, name, values[name])
-    frame = STEPS_PER_FRAME * values["dt"]
+    compared = steps if duration is None else steps_in(duration, values["dt"])
+    each = -(-compared // FRAMES)
+    frame, frames = each * values["dt"], -(-max(steps, compared) // each)
     noise = np.random.default_rng(SEED).normal(size=scene.positions.shape)
     noise *= NOISE * np.median(scene.mesh.edge_lengths)
     noise[scene.pins.vertices] = 0.0
-    frames = -(-steps // STEPS_PER_FRAME)
     return replace(scene, positions=scene.positions + noise, fps=1.0 / frame, duration=frames * frame)
+
+
+def steps_in(duration, dt):
+    """The fewest steps that last a duration, 1 or more; what rounding adds counts for nothing."""
+    return max(math.ceil(duration / dt * (1.0 - 1e-9)), 1)
 
 
 def refined(ref, value):
@@ -150,7 +159,7 @@ def record_at(setup, values):
     Raises:
         ValueError: The solver has no option of that name, or a value breaks its rule.
     """
-    record = Setup(setup.solver, {**setup.options, "substeps": STEPS_PER_FRAME}).record()
+    record = Setup(setup.solver, {**setup.options, "dt": values.get("dt", FIXED["dt"])}).record()
     known = {field.name for field in fields(record)}
     for name in OPTIONS:
         if name in values:

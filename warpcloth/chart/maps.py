@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from ..outputs import TEXT, Output
-from .axes import AXES
+from .axes import AXES, FRAMES
 from .figures import GREY, PICTURES, check_path, save
 from .rules import DIVERGES, KNOWN
 
@@ -27,7 +27,7 @@ _STYLES = {
     "2/√(2 Σk/m)": "--",
     "forward Euler": "-.",
     "ω λ_max = 2": (0, (1, 1)),
-    "ω = 1 + 3^(−1/n)": (0, (4, 1, 1, 1, 1, 1)),
+    "Gauss–Seidel, |z| = 1": (0, (4, 1, 1, 1, 1, 1)),
     "h² = m/(k(L/l − 1))": "-",
     "1 + Σk h²/m iterations": "--",
     "a ring an iteration": "-.",
@@ -62,7 +62,7 @@ def plot_maps(path, survey, cells):
     places = [_places(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
     shown = {}
     for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
-        axes.pcolormesh(*map(_edges, places), _colours(rows, survey.steps), edgecolors="white", linewidth=0.4)
+        axes.pcolormesh(*map(_edges, places), _colours(rows), edgecolors="white", linewidth=0.4)
         _hatch(axes, places, rows)
         for name, dashes in _STYLES.items():
             style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
@@ -80,7 +80,10 @@ def plot_maps(path, survey, cells):
     _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row})
     rest = ", ".join(f"{name} {value:.4g}" for name, value in survey.fixed.items())
     figure.suptitle(
-        f"{survey.scene}, {survey.steps} steps" + (f", {rest}" if rest else ""), fontsize=10, color=GREY, parse_math=False
+        f"{survey.scene}, {survey.duration:g} s of motion" + (f", {rest}" if rest else ""),
+        fontsize=10,
+        color=GREY,
+        parse_math=False,
     )
     save(figure, path)
 
@@ -98,16 +101,16 @@ def _edges(at):
     return np.concatenate([[2.0 * at[0] - middle[0]], middle, [2.0 * at[-1] - middle[-1]]])
 
 
-def _colours(rows, steps):
+def _colours(rows):
     """sRGB of cells (y, x, 3)."""
-    return np.array([[_colour(cell, steps) for cell in row] for row in rows])
+    return np.array([[_colour(cell) for cell in row] for row in rows])
 
 
-def _colour(cell, steps):
+def _colour(cell):
     if cell["verdict"] != "diverged":
         return _PLAIN[cell["verdict"]]
-    part = math.log(cell["step"]) / math.log(max(steps, 2))
-    return _EARLY + min(part, 1.0) * (_LATE - _EARLY)
+    part = 1.0 + math.log(cell["step"] / cell["steps"]) / math.log(FRAMES)
+    return _EARLY + min(max(part, 0.0), 1.0) * (_LATE - _EARLY)
 
 
 def _hatch(axes, places, rows):
@@ -153,13 +156,15 @@ def _legend(figure, shown, verdicts):
 
 
 def write_table(path, survey, cells):
-    """A line for each cell: method, axes, verdict, step of divergence, growth, error, floor, rules, reason, machine if known.
+    """A line for each cell: method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules, reason.
+
+    The last column is the machine, if known.
 
     Raises:
         FileNotFoundError: The folder does not exist.
     """
     names = list(dict.fromkeys(name for rows in cells for row in rows for cell in row for name in cell["rules"]))
-    plain = ("verdict", "step", "growth", "error", "floor")
+    plain = ("verdict", "step", "steps", "growth", "error", "floor")
     with Output(path, "x", **TEXT) as output:
         table = csv.writer(output.file, lineterminator="\n")
         table.writerow(["method", survey.x, survey.y, *plain, *names, "reason", "machine"])

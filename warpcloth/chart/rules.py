@@ -1,5 +1,7 @@
 """Where methods fail by theory: of a scene and a solver, numbers that are above 1 beyond the limit."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from ..integrators import INTEGRATORS
@@ -7,17 +9,26 @@ from ..kernels.term import HessianPolicy
 from ..operators import Hessian
 from ..solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
 from ..solvers.explicit import step_limits
+from ..sweeps import colours
 from ..terms import Spring
 
 # Beyond these a run diverges; beyond the others it is wrong, or need not be.
-DIVERGES = ("2/ω_max", "2/√(2 Σk/m)", "forward Euler", "ω λ_max = 2", "ω = 1 + 3^(−1/n)")
+DIVERGES = ("2/ω_max", "2/√(2 Σk/m)", "forward Euler", "ω λ_max = 2", "Gauss–Seidel, |z| = 1")
 # Not of a method: how far the reference of a map is known, over the accuracy that is asked for.
 KNOWN = "error of the reference = accuracy"
 # What a run must gain in energy to count as diverged.
 GROWTH = 100.0
-# The least q for which steps that multiply x̃ by q hold, |z| ≤ 1: Euler z² − 2qz + q = 0, midpoint z² − 2(2q − 1)z + 1 = 0, BDF2
+# Factors z of a step, complex, where sweeps multiply x̃ by q: Euler z² − 2qz + q = 0, midpoint z² − 2(2q − 1)z + 1 = 0, BDF2
 # z² = r(4z − 1)/3 with r = q ± √(q² − q).
+_STEPS = {
+    "euler": lambda q: _roots(q, q),
+    "midpoint": lambda q: _roots(2.0 * q - 1.0, 1.0),
+    "bdf2": lambda q: np.concatenate([_roots(2.0 * r / 3.0, r / 3.0) for r in _roots(q, q)]),
+}
+# The least real q for which |z| ≤ 1.
 _LEAST = {"euler": -1.0 / 3.0, "midpoint": 0.0, "bdf2": -9.0 / 55.0}
+# Springs whose sweeps are solved for their eigenvalues, densely.
+_MOST = 1000
 
 
 def rules(scene, record, steps):
@@ -29,8 +40,8 @@ def rules(scene, record, steps):
     - ``h² = m/(k(L/l − 1))``: hₑ √−λ with λ the least eigenvalue of M⁻¹∂²U/∂x² at the start and hₑ the effective step of the
       integrator, beyond which what a step minimises is not convex (Choi and Ko 2002).
     - ``ω λ_max = 2``: of Jacobi sweeps over springs, averaged or not, see :func:`largest_relaxation`.
-    - ``ω = 1 + 3^(−1/n)``: of n Gauss–Seidel sweeps a step of Euler, which multiply what is wrong by (1 − ω)ⁿ in a net of
-      structural springs, see :func:`largest_overshoot` for soft ones; with more springs, and in one order for all, less may do.
+    - ``Gauss–Seidel, |z| = 1``: of sweeps in their order, beyond which energy grows by :data:`GROWTH` in the steps of the run,
+      see :func:`largest_ordered`.
     - ``1 + Σk h²/m iterations``: those that projections need across springs, for accelerated ones the root.
     - ``a ring an iteration``: how many edges lie between pins and the furthest vertex, over the sweeps.
 
@@ -46,8 +57,8 @@ def rules(scene, record, steps):
     if isinstance(record, (PBD, XPBD)) and not damped and all(isinstance(term, Spring) for term in scene.terms):
         if record.sweep not in ("coloured", "sequential"):
             found["ω λ_max = 2"] = record.relaxation / largest_relaxation(scene, he, record)
-        elif he == h:
-            found["ω = 1 + 3^(−1/n)"] = record.relaxation / largest_overshoot(scene, h, record)
+        elif (limit := largest_ordered(scene, he, record, steps)) is not None:
+            found["Gauss–Seidel, |z| = 1"] = record.relaxation / limit
     if isinstance(record, (PBD, XPBD)) and len(scene.pins.vertices):
         found["a ring an iteration"] = rings(scene) / record.iterations
     if hard or isinstance(record, (PBD, HierarchicalPBD)):
@@ -105,16 +116,12 @@ def largest_relaxation(scene, he, record):
         he: Effective step hₑ [s].
         record: :class:`warpcloth.PBD` or :class:`warpcloth.XPBD` with a Jacobi sweep.
     """
-    from scipy.sparse import csr_array, diags_array
+    from scipy.sparse import diags_array
 
-    points, (pairs, mobility, compliance), inverse = scene.mesh.points, _springs(scene, he), _inverse_masses(scene)
-    directions = points[pairs[:, 1]] - points[pairs[:, 0]]
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    columns = (3 * pairs[:, :, None] + np.arange(3)).ravel()
-    values = np.stack([-directions, directions], axis=1).ravel()
-    J = csr_array((values, columns, np.arange(len(pairs) + 1) * 6), shape=(len(pairs), points.size))
+    (pairs, mobility, compliance), inverse = _springs(scene, he), _inverse_masses(scene)
+    J = _directions(scene, pairs)
     factor = _share(mobility, compliance, record) / mobility
-    counts = np.bincount(np.concatenate([term.stencil(scene.mesh) for term in scene.terms]).ravel(), minlength=len(points))
+    counts = np.bincount(np.concatenate([term.stencil(scene.mesh) for term in scene.terms]).ravel(), minlength=len(inverse))
     if record.sweep == "constraint-averaged":
         factor /= np.where(inverse == 0.0, 1, counts)[pairs].max(axis=1)
     elif record.sweep == "vertex-averaged":
@@ -129,28 +136,111 @@ def largest_relaxation(scene, he, record):
     return float(1.0 + (((1.0 - least) / part - 1.0) ** (1.0 / n) if n % 2 else 1.0)) / largest
 
 
-def largest_overshoot(scene, h, record):
-    """The largest stable relaxation ω of n Gauss–Seidel sweeps a step of Euler, each spring by itself.
+def largest_ordered(scene, he, record, steps):
+    """The largest relaxation ω with which Gauss–Seidel sweeps over springs about the rest shape hold for so many steps.
 
-    With ρ the largest share that a spring takes of what is wrong by itself, w/(w + α̃), PBD multiplies that by (1 − ωρ)ⁿ, and
-    XPBD by 1 − ρ(1 − (1 − ω)ⁿ), see :func:`largest_relaxation`; of more than one sweep at most 2, and measured up to 7 % below.
+    A sweep solves (D/ω + L)Δλ = −(Jx̃ + Aλ), with A = JWJᵀ + α̃ of XPBD, JWJᵀ of PBD, D the diagonal of JWJᵀ + α̃, α̃ = 1/(khₑ²),
+    and L what of JWJᵀ comes before an element in the order of the sweep; x = x̃ + WJᵀλ. What n of them multiply x̃ by has complex
+    eigenvalues q, for an order has a direction, and steps multiply by z, see :data:`_STEPS`. It holds while no |z| makes energy
+    grow by :data:`GROWTH` in all steps. A net of structural springs has q = (1 − ω)ⁿ as its least, which is −1/3 for
+    ω = 1 + 3^(−1/n); with more springs complex ones grow before that.
+
+    Args:
+        scene: Of springs alone, without damping.
+        he: Effective step hₑ [s].
+        record: :class:`warpcloth.PBD` or :class:`warpcloth.XPBD` with a Gauss–Seidel sweep.
+        steps: Length of the run.
+
+    Returns:
+        float: ω; None where twice 1 + 3^(−1/n) still holds, or of more than :data:`_MOST` springs, which take long.
     """
-    _, mobility, compliance = _springs(scene, h)
-    n, share = record.iterations, float(_share(mobility, compliance, record).max())
-    if isinstance(record, PBD):
-        return (1.0 + 3.0 ** (-1.0 / n)) / share
-    limit = 1.0 + (4.0 / (3.0 * share) - 1.0) ** (1.0 / n)
-    return limit if n == 1 else min(limit, 2.0)
+    pairs, mobility, compliance = _springs(scene, he, _turns(scene, record))
+    if len(pairs) > _MOST:
+        return None
+    J = (_directions(scene, pairs) * np.repeat(np.sqrt(_inverse_masses(scene)), 3)).toarray()
+    share = _share(mobility, compliance, record)
+    kept = compliance if isinstance(record, XPBD) else np.zeros_like(compliance)
+    integrator = getattr(record, "integrator", "euler")
+    to_and_fro = integrator == "midpoint"
+    return _largest_ordered(
+        J.tobytes(), len(pairs), (mobility / share).tobytes(), kept.tobytes(), record.iterations, integrator, to_and_fro, steps
+    )
 
 
-def _springs(scene, he):
-    """Of springs that can move something: vertices (E, 2), GWGᵀ (E,) and α̃ (E,)."""
+@lru_cache(256)  # cells along the relaxation have one limit, and so have those of a hard net at all steps
+def _largest_ordered(J, count, diagonal, compliance, n, integrator, to_and_fro, steps):
+    """:func:`largest_ordered` of JW^½ (E, 3N), D (E,) and α̃ (E,), each as bytes."""
+    from scipy.linalg import solve_triangular
+
+    J, diagonal, compliance = np.frombuffer(J).reshape(count, -1), np.frombuffer(diagonal), np.frombuffer(compliance)
+    A, B = J @ J.T + np.diag(compliance), J @ _range(J)
+    before, after = np.tril(J @ J.T, -1), np.triu(J @ J.T, 1)
+
+    def grows(omega):
+        moves = np.zeros_like(B)
+        for sweep in range(n):
+            back = to_and_fro and sweep % 2
+            factor = np.diag(diagonal / omega) + (after if back else before)
+            moves -= solve_triangular(factor, B + A @ moves, lower=not back, check_finite=False)
+        q = np.linalg.eigvals(np.eye(B.shape[1]) + B.T @ moves).astype(complex)
+        return abs(_STEPS[integrator](q)).max() > GROWTH ** (0.5 / steps)
+
+    # Not all that lies beyond the first ω that grows must grow.
+    trials = np.linspace(0.0, 2.0 * (1.0 + 3.0 ** (-1.0 / n)), 41)[1:] * (diagonal / np.diag(J @ J.T)).min()
+    first = next((k for k, omega in enumerate(trials) if grows(omega)), None)
+    if first is None:
+        return None
+    low, high = trials[first - 1] if first else 0.0, trials[first]
+    while high - low > 1e-3 * high:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if grows(middle) else (middle, high)
+    return float(high)
+
+
+def _springs(scene, he, turns=None):
+    """Of springs that can move something: vertices (E, 2), GWGᵀ (E,) and α̃ (E,), in the order of ``turns`` if given."""
     pairs = [term.stencil(scene.mesh) for term in scene.terms]
     stiffness = np.concatenate([np.broadcast_to(t.stiffness, len(p)) for t, p in zip(scene.terms, pairs, strict=True)])
     pairs = np.concatenate(pairs)
+    if turns is not None:
+        pairs, stiffness = pairs[turns], stiffness[turns]
     mobility = _inverse_masses(scene)[pairs].sum(axis=1)
     keep = (mobility > 0.0) & (stiffness > 0.0)
     return pairs[keep], mobility[keep], 1.0 / (stiffness[keep] * he**2)
+
+
+def _turns(scene, record):
+    """The order in which a Gauss–Seidel sweep takes springs: term by term as declared, by colour in each if so asked."""
+    found, first, free = [], 0, _inverse_masses(scene) > 0.0
+    for pairs in (term.stencil(scene.mesh) for term in scene.terms):
+        order = np.argsort(colours(pairs, free), kind="stable") if record.sweep == "coloured" else np.arange(len(pairs))
+        found.append(first + order)
+        first += len(pairs)
+    return np.concatenate(found)
+
+
+def _directions(scene, pairs):
+    """J at the rest shape (E, 3N), sparse: of each spring its direction at one end, and the opposite at the other."""
+    from scipy.sparse import csr_array
+
+    points = scene.mesh.points
+    along = points[pairs[:, 1]] - points[pairs[:, 0]]
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    columns = (3 * pairs[:, :, None] + np.arange(3)).ravel()
+    values = np.stack([-along, along], axis=1).ravel()
+    return csr_array((values, columns, np.arange(len(pairs) + 1) * 6), shape=(len(pairs), points.size))
+
+
+def _range(J):
+    """An orthonormal basis of the range of Jᵀ (3N, rank): of the moves that springs notice."""
+    _, values, vectors = np.linalg.svd(J, full_matrices=False)
+    return vectors[values > 1e-9 * values[0]].T
+
+
+def _roots(half, product):
+    """Both z of z² − 2·half·z + product = 0, complex."""
+    root = np.sqrt(half * half - product + 0j)
+    return np.stack([half + root, half - root])
 
 
 def _share(mobility, compliance, record):

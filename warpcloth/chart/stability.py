@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from ..checks import choice
+from ..checks import choice, number
 from ..simulate import Watch
 from ..solvers import Newton
 from ..status import Result
-from .axes import AXES, FIXED, OPTIONS, STEPS_PER_FRAME, record_at, refined, scene_at, together, vary
+from .axes import AXES, FIXED, OPTIONS, record_at, refined, scene_at, steps_in, together, vary
 from .digest import scene_digest
 from .rules import KNOWN, rules
 from .tasks import SceneRef, Setup, task
@@ -19,8 +19,9 @@ from .tasks import SceneRef, Setup, task
 VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
 # RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
 ACCURACY = 0.01
-# Steps in one of the map, of the reference and before it of a coarser run, from which it differs by what it is known to.
-_FINER = (2, 4)
+# Steps of the reference in one of the map, but in all no more than so many, or as many as frames; a run of half as many says
+# how well it is known.
+_FINER, _MOST = 4, 2000
 _FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
 
 
@@ -35,6 +36,7 @@ class Trial:
             (B,).
         reasons: A sentence for each copy, "" if nothing is to be said.
         results: :class:`warpcloth.status.Result` of each copy.
+        steps_per_frame: Steps a frame.
     """
 
     points: np.ndarray
@@ -42,6 +44,7 @@ class Trial:
     growth: np.ndarray
     reasons: list
     results: list
+    steps_per_frame: int = 1
 
 
 class Slow(Exception):
@@ -78,7 +81,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
                 raise Slow(f"stopped after {limit:g} s, in frame {frame} of {frames}")
     said = [watch.messages.get(copy, each.value if each in _FAILED else "") for copy, each in enumerate(stepper.results)]
     said = [text.replace(f", copy {copy}:", ":") for copy, text in enumerate(said)]  # which is of the row, not of the map
-    return Trial(points, watch.good, watch.fastest**2, said, list(stepper.results))
+    return Trial(points, watch.good, watch.fastest**2, said, list(stepper.results), stepper.steps_per_frame)
 
 
 def measure(
@@ -94,6 +97,7 @@ def measure(
     limit=60.0,
     reference=True,
     digests=None,
+    duration=None,
 ):
     """Cells that differ in one value, of each setup: a row of copies where one run can have them, else a run each.
 
@@ -103,54 +107,60 @@ def measure(
         fixed: Values by axis that all cells share; ``dt`` is among them or ``axis``.
         axis: The axis along which they differ.
         values: Of that axis.
-        steps: Length of each run in steps.
+        steps: The fewest steps of a run, however long they take: what diverges shows it in so many.
         accuracy: RMS distance to the reference, over vertices and frames and over the size of the cloth, that is inaccurate.
         device: Of the run.
         dtype: Of the run; the reference has float64.
         limit: Seconds for each run.
-        reference: Whether to compare with Newton, BDF2, of a quarter of the step. Where that refuses the scene there is none.
+        reference: Whether to compare with Newton, BDF2, of a quarter of the step, or where that takes more than 2000 steps with
+            as many. Where that refuses the scene there is none.
         digests: Of the scene, see :func:`warpcloth.chart.digest.scene_digest`: a scene that was changed has another key.
+        duration: Time of motion that is compared with the reference, and run at least, the same for all cells [s]; that of
+            ``steps`` if not given.
 
     Returns:
         list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS` ("stalled": a step ended in
         no minimum; "unsure": inaccurate or not, the reference does not tell), ``status`` ("ok", "diverged", "slow" or
-        "refused"), ``reason``, ``step`` (that of divergence, or None), ``growth`` (see :class:`Trial`), ``error`` (or None),
-        ``floor``, the distance of the reference to a run of twice its step, which bounds its own error if each halving at
-        least halves that (or None), and ``rules`` (see :func:`warpcloth.chart.rules.rules`), of which :data:`KNOWN` is
-        ``floor`` over ``accuracy``.
+        "refused"), ``reason``, ``step`` (that of divergence, or None), ``steps`` (those of the run), ``growth`` (see
+        :class:`Trial`), ``error`` (or None), ``floor``, the distance of the reference to a run of twice its step, which bounds
+        its own error if each halving at least halves that (or None), and ``rules`` (see :func:`warpcloth.chart.rules.rules`),
+        of which :data:`KNOWN` is ``floor`` over ``accuracy``.
     """
     ref, setups = SceneRef(**scene), [Setup(**setup) for setup in setups]
     groups = [values]
-    if not together(scene_at(ref, {"dt": FIXED["dt"], **fixed}, steps), axis):
+    if not together(scene_at(ref, {"dt": FIXED["dt"], **fixed}, 1), axis):
         groups = [[value] for value in values]
-    rows, answer = [[] for _ in setups], None
-    for number, group in enumerate(groups):
-        if reference and (number == 0 or axis not in OPTIONS):  # of no option of a method
-            answer = _reference(ref, fixed, axis, group, steps, device, limit)
+    rows, answer, length = [[] for _ in setups], None, (steps, duration)
+    for nth, group in enumerate(groups):
+        if reference and (nth == 0 or axis not in OPTIONS):  # of no option of a method
+            answer = _reference(ref, fixed, axis, group, length, device, limit)
         for row, setup in zip(rows, setups, strict=True):
             try:
                 record = record_at(setup, fixed if len(group) > 1 else {**fixed, axis: group[0]})
             except ValueError as error:
                 row += [_cell("refused", str(error)) for _ in group]
                 continue
-            found = _attempt(ref, record, fixed, axis, group, steps, device, dtype, limit)
+            found = _attempt(ref, record, fixed, axis, group, length, device, dtype, limit)
             for copy, value in enumerate(group):
-                cell = found if isinstance(found, dict) else _judge(found, copy, answer, accuracy, record)
+                cell = found if isinstance(found, dict) else _judge(found, copy, answer, accuracy)
                 if cell["status"] != "refused":
-                    of_cell = scene_at(ref, {**fixed, axis: value}, steps)
-                    cell = cell | {"rules": {name: _finite(ratio) for name, ratio in rules(of_cell, record, steps).items()}}
+                    of_cell = scene_at(ref, {**fixed, axis: value}, *length)
+                    run_for = of_cell.frames * record.per_frame(of_cell.fps)
+                    known = {name: _finite(ratio) for name, ratio in rules(of_cell, record, run_for).items()}
+                    cell = cell | {"steps": run_for, "rules": known}
                     if cell["floor"] is not None and accuracy > 0.0:
                         cell["rules"][KNOWN] = cell["floor"] / accuracy
                 row.append(cell)
     return rows
 
 
-def _attempt(ref, record, fixed, axis, group, steps, device, dtype, limit):
+def _attempt(ref, record, fixed, axis, group, length, device, dtype, limit):
     """The :class:`Trial` of a group, or the cell of all its copies."""
     try:
         if len(group) == 1:
-            return run(scene_at(ref, {**fixed, axis: group[0]}, steps), record, device=device, dtype=dtype, limit=limit)
-        scene = scene_at(ref, fixed, steps)
+            scene = scene_at(ref, {**fixed, axis: group[0]}, *length)
+            return run(scene, record, device=device, dtype=dtype, limit=limit)
+        scene = scene_at(ref, fixed, *length)
         return run(scene, record, len(group), vary(scene, axis, group), device, dtype, limit)
     except Slow as slow:
         return _cell("slow", str(slow))
@@ -158,31 +168,37 @@ def _attempt(ref, record, fixed, axis, group, steps, device, dtype, limit):
         return _cell("refused", str(error))
 
 
-def _reference(ref, fixed, axis, group, steps, device, limit):
+def _reference(ref, fixed, axis, group, length, device, limit):
     """What a group is compared with: :class:`Trial` of the coarser run and of the reference, or why not; None without any."""
+    dt = {**fixed, axis: group[0]}["dt"]
+    steps, duration = length
+    steps = steps if duration is None else steps_in(duration, dt)
+    scene = scene_at(ref, {**fixed, axis: group[0]}, steps)
+    half = min(_FINER // 2 * round(1.0 / (scene.fps * dt)), -(-_MOST // (2 * scene.frames)))
     found = []
-    for finer in _FINER:
-        record = Newton(substeps=finer * STEPS_PER_FRAME, integrator="bdf2", tolerance=1e-6)
-        found.append(_attempt(ref, record, fixed, axis, group, steps, device, "float64", limit))
+    for substeps in (half, 2 * half):
+        record = Newton(substeps=substeps, integrator="bdf2", tolerance=1e-6)
+        found.append(_attempt(ref, record, fixed, axis, group, (steps, None), device, "float64", limit))
         if isinstance(found[-1], dict):
             return None if found[-1]["status"] == "refused" else f"no reference: {found[-1]['reason']}"
     return found
 
 
 def _apart(first, other, copy):
-    """RMS distance of a copy in two runs, over vertices and frames and over the size; None where one did not end."""
-    if min(each.good[copy] for each in (first, other)) < len(first.points) - 1:
+    """RMS distance of a copy in two runs, over vertices, the frames of the second and the size; None where one did not end."""
+    frames = len(other.points)
+    if min(each.good[copy] for each in (first, other)) < frames - 1:
         return None
-    squares = ((first.points[:, copy] - other.points[:, copy]) ** 2).sum(axis=-1)
+    squares = ((first.points[:frames, copy] - other.points[:, copy]) ** 2).sum(axis=-1)
     return _finite(math.sqrt(squares.mean()) / np.ptp(other.points[0, copy], axis=0).max())
 
 
-def _judge(trial, copy, answer, accuracy, record):
+def _judge(trial, copy, answer, accuracy):
     """The cell of one copy; ``answer`` as of :func:`_reference`."""
     growth, reason = _finite(trial.growth[copy]), trial.reasons[copy]
     floor = _apart(*answer, copy) if isinstance(answer, list) else None
     if trial.good[copy] < len(trial.points) - 1:
-        step = int(trial.good[copy] + 1) * record.per_frame(1.0)
+        step = int(trial.good[copy] + 1) * trial.steps_per_frame
         return _cell("diverged", reason, step=step, growth=growth, floor=floor)
     error = None if floor is None else _apart(trial, answer[-1], copy)
     known = {"growth": growth, "error": error, "floor": floor}
@@ -205,6 +221,7 @@ def _cell(verdict, reason, **more):
         "status": status,
         "reason": reason,
         "step": None,
+        "steps": None,
         "growth": None,
         "error": None,
         "floor": None,
@@ -226,7 +243,7 @@ class Survey:
         x, y: Names of the two axes, of :data:`warpcloth.chart.axes.AXES`.
         xs, ys: Their values.
         fixed: Values of other axes.
-        steps: Length of each run.
+        steps, duration: Of :func:`measure`; without a duration half of that of the scene.
 
     Raises:
         ValueError: The axes are not two, or unknown, or a method has a step of its own.
@@ -240,6 +257,7 @@ class Survey:
     ys: tuple
     fixed: dict
     steps: int = 120
+    duration: float | None = None
 
     def __post_init__(self):
         for name in (self.x, self.y, *self.fixed):
@@ -249,6 +267,9 @@ class Survey:
         for setup in self.setups:
             if {"dt", "substeps"} & set(setup.options):
                 raise ValueError(f"{setup}: the map sets the step; leave dt and substeps out")
+        if self.duration is None:
+            object.__setattr__(self, "duration", 0.5 * self.scene.load().duration)
+        number("duration", self.duration, above=0.0)
 
     def tasks(self, **options):
         """One :class:`warpcloth.chart.tasks.Task` a row, along the axis that copies can differ in, if one can.
@@ -256,13 +277,14 @@ class Survey:
         Args:
             options: Of :func:`measure`.
         """
-        scene = scene_at(self.scene, {**FIXED, **self.fixed} | self._first(), self.steps)
+        scene = scene_at(self.scene, {**FIXED, **self.fixed} | self._first(), 1)
         along = self.y if together(scene, self.y) and not together(scene, self.x) else self.x
         other, others = (self.x, self.xs) if along == self.y else (self.y, self.ys)
         values = self.ys if along == self.y else self.xs
         rest = {name: value for name, value in {**FIXED, **self.fixed}.items() if name != along}
         setups = [asdict(setup) for setup in self.setups]
-        given = {"setups": setups, "axis": along, "values": list(values), "steps": self.steps, **options}
+        given = {"setups": setups, "axis": along, "values": list(values), **options}
+        given |= {"steps": self.steps, "duration": self.duration}
         given["digests"] = self._digests()
         return [task(measure, scene=self.scene, fixed={**rest, other: value}, **given) for value in others]
 

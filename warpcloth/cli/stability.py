@@ -18,7 +18,8 @@ _COUNT = 9
 EPILOG = f"""\
 Axes: {", ".join(AXES)}.
 Stiffness and mass-ratio are factors of what the scene has, compression is 1 − l/L of the start, resolution a parameter n, links
-or elements of the scene. A method is NAME or NAME:option=value,option=value. Every run has the same number of steps. Diverged
+or elements of the scene. A method is NAME or NAME:option=value,option=value. All cells are compared over the same time
+of motion; runs of large steps go on for --steps, to show whether they diverge, and those of small ones cost the most. Diverged
 is what gets ten times as fast as start, gravity and time allow; inaccurate is what ends further than --accuracy, over vertices
 and frames and over the size of the cloth, from Newton's method with BDF2 and a quarter of the step, in float64, by more than
 that is known to; unsure is what that cannot tell. Rows that are measured are kept, and not measured again.
@@ -39,7 +40,10 @@ def add_arguments(parser):
         )
     parser.add_argument("--at", nargs="+", action="extend", default=[], metavar="axis=value", help="of other axes; dt=1/60")
     parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), metavar="METHOD", help="the methods, all if not given")
-    parser.add_argument("--steps", type=int, default=120, metavar="N", help="length of each run, 120 if not given")
+    parser.add_argument(
+        "--duration", type=float, metavar="SECONDS", help="time of motion compared, half of the scene's if not given"
+    )
+    parser.add_argument("--steps", type=int, default=120, metavar="N", help="fewest steps of each run, 120 if not given")
     parser.add_argument(
         "--accuracy", type=float, default=ACCURACY, metavar="SHARE", help=f"{ACCURACY:g} if not given, 0 for none"
     )
@@ -70,6 +74,7 @@ def chart(arguments):
         axes = {survey.x: survey.xs, survey.y: survey.ys}
         fixed = {name: value for name, value in {**FIXED, **survey.fixed}.items() if name not in axes}
         facts = {"scene": str(survey.scene), "x": survey.x, "y": survey.y, "axes": axes, "fixed": fixed, "steps": survey.steps}
+        facts["duration"] = survey.duration
         facts |= {**given, "seed": SEED, "machine": machine(device), "maps": dict(zip(methods, cells, strict=True))}
         print(as_json(facts))
         return 0
@@ -99,7 +104,9 @@ def _survey(arguments):
         fixed[name] = convert(name, text, (int,) if AXES[name].whole else (float,))
     values = [_values(of, getattr(arguments, of), getattr(arguments, f"{of}_range")) for of in "xy"]
     scene = SceneRef(arguments.scene, assignments(arguments.p))
-    return Survey(scene, tuple(setups), arguments.x, arguments.y, *map(tuple, values), fixed, arguments.steps)
+    return Survey(
+        scene, tuple(setups), arguments.x, arguments.y, *map(tuple, values), fixed, arguments.steps, arguments.duration
+    )
 
 
 def _values(of, name, texts):
