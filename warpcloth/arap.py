@@ -18,6 +18,7 @@ from .ordering import worthwhile_order
 from .quiet import find_device
 from .rotation import kabsch
 from .selection import distinct_vertices
+from .turns import in_turn
 
 # A weight below this share of the largest is one of rounding.
 _ROUNDING = 1e-12
@@ -87,6 +88,7 @@ class Arap:
         ImportError: "intrinsic" without libigl.
     """
 
+    @in_turn
     def __init__(self, mesh, handles, weights="cotangent", energy="spokes", device="cpu", dtype="float64"):
         from scipy.sparse import coo_matrix, diags
 
@@ -123,7 +125,7 @@ class Arap:
                 f"negative weights: {len(self.negative_edges)}, the most negative {w.min():.3g} of edge "
                 f"{pairs[w.argmin()].tolist()}, so that the energy can be negative and lowest where nothing is rigid; "
                 f'energy = "spokes_and_rims" avoids it, {others}and weights = "clamped" do at the price of linear precision',
-                stacklevel=2,
+                stacklevel=3,
             )
         pairs, w = pairs[w != 0.0], w[w != 0.0]
         adjacency = coo_matrix((w, pairs.T), shape=(n, n)).tocsr()
@@ -157,6 +159,7 @@ class Arap:
         self._energy = Mirror(self._zeros(1, wp.float64))
         self._local = self._record(mesh, pairs, w, rims)
 
+    @in_turn
     def solve(self, positions, iterations=100, tolerance=1e-6, initial=None):
         """Moves the handles and lets the rest follow. Reuses the factors and all arrays of earlier calls.
 
@@ -201,7 +204,7 @@ class Arap:
             warnings.warn(
                 f"the energy ends at {energies[-1]:.3g} m², below 0: negative weights pull the mesh apart; use "
                 'energy = "spokes_and_rims", or weights = "clamped"',
-                stacklevel=2,
+                stacklevel=3,
             )
         points = self._x.read()[self._place] * self._unit + origin
         points[self.handles] = targets
@@ -222,6 +225,7 @@ class Arap:
             )
         return energy
 
+    @in_turn
     def carry(self, points, before, after):
         """Points moved along with the handles: each part of the mesh rigidly, as fits best how its handles went.
 

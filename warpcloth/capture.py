@@ -5,6 +5,8 @@ from contextlib import contextmanager
 
 import warp as wp
 
+from .turns import TURN
+
 
 def on_host(device, what):
     """Raises if ``device`` is recording: a host call inside a captured segment would see data that nothing has computed.
@@ -77,7 +79,7 @@ class Segment:
     def __init__(self, device, record):
         self.device = device
         self.record = record  # the graph has addresses only; what the function refers to must not be freed
-        with _uncollected(), wp.ScopedCapture(device=device) as capture:
+        with TURN, _uncollected(), wp.ScopedCapture(device=device) as capture:
             record()
         self.graph = capture.graph
 

@@ -5,6 +5,7 @@ import warp as wp
 
 from .kernels import nearest
 from .quiet import find_device
+from .turns import in_turn
 
 # 2·area by the sum of the squared sides: an equilateral triangle has 0.29. Float32 searches ones below by their rounding.
 _FLAT = 1e-3
@@ -16,6 +17,7 @@ def triangle_areas(x, triangles):
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
+@in_turn
 def surface_distances(points, x, triangles, device="cpu"):
     """Distance of each point to the surface that triangles span, flat ones included.
 

@@ -9,6 +9,7 @@ from .checks import choice, number, whole
 from .minimise import Minimiser
 from .solvers.solver import refuse_hard
 from .status import Result, Status
+from .turns import in_turn
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 # Part of the size of the cloth; a descent that rounding ended after less than this has nowhere left to go.
@@ -30,6 +31,7 @@ class Equilibrium(NamedTuple):
     iterations: int
 
 
+@in_turn
 def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cpu", dtype="float64", linear="factorised"):
     """The shape that minimises U(x) − Σ m g·x with the pins where they start, from the positions of the scene.
 

@@ -11,6 +11,7 @@ import warp as wp
 
 from .capture import on_host
 from .kernels.copy import take_vertices
+from .turns import in_turn
 
 
 class Frame(NamedTuple):
@@ -72,6 +73,7 @@ def frames_of(stepper, count, ahead):
             pool.shutdown(wait=False, cancel_futures=True)
 
 
+@in_turn
 def state_of(stepper):
     """Points and velocities as they are now, (B·n, 3) each, in the order of the scene, as arrays of their own."""
     model = stepper.model
@@ -79,6 +81,7 @@ def state_of(stepper):
     return tuple(np.array(model.in_scene_order(array.numpy())) for array in stepper.state)  # on the CPU numpy() is a view
 
 
+@in_turn
 def _copies(stepper, number):
     """What takes so many frames from a stepper."""
     model = stepper.model
@@ -99,6 +102,7 @@ class _HostCopy:
     def __init__(self, stepper):
         self.stepper = stepper
 
+    @in_turn
     def frame(self):
         began = time.perf_counter()
         self.stepper.frame()
@@ -122,6 +126,7 @@ class _DeviceCopy:
         if places is not None:
             self._take = stepper.model.kernel(take_vertices, stepper.model.dtype)
 
+    @in_turn
     def frame(self):
         model, stream = self.stepper.model, self.stepper.model.device.stream
         stream.record_event(self._began)

@@ -17,6 +17,7 @@ from .quiet import find_device
 from .scene import refuse_far_pins
 from .selection import distinct_vertices
 from .team import Team
+from .turns import in_turn
 
 _PINNED = 1e3  # what a pinned vertex of a cell counts, in masses of the rest of the cell: it does not move, so the cell must
 
@@ -221,6 +222,7 @@ class Model:
         ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
     """
 
+    @in_turn
     def __init__(self, scene, device="cpu", dtype="float32", copies=1, vary=None, order=None, threads=1):
         choice("dtype", dtype, tuple(DTYPES))
         whole("copies", copies, 1)
@@ -305,6 +307,7 @@ class Model:
         other.terms = tuple(elements.share(first, count) for elements in self.terms)
         return other
 
+    @in_turn
     def array(self, values, dtype):
         """``values`` on the model's device, in its precision."""
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy_dtype), dtype=dtype, device=self.device)
@@ -343,10 +346,12 @@ class Model:
         words = [] if each is None else [f"{each} {i}"]
         return " of ".join(words + ([f"copy {copy}"] if self.copies > 1 else []))
 
+    @in_turn
     def vectors(self):
         """A new array of one zero vector for each vertex of all copies."""
         return wp.zeros(self.count, dtype=self.vec3, device=self.device)
 
+    @in_turn
     def kernel(self, factory, *key):
         """The kernel that ``factory(*key)`` makes, noted for :meth:`report` as factory(variant).Term."""
         kernel = factory(*key)
@@ -357,6 +362,7 @@ class Model:
         self.kernels.add(".".join([f"{factory.__name__}{variant}", *terms]))
         return kernel
 
+    @in_turn
     def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
         self.launches[0] += 1
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)

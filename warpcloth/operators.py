@@ -6,6 +6,7 @@ import warp as wp
 from .incidences import chain, gathered, lanes
 from .kernels import assemble, clusters, linear, reduce
 from .kernels.gather import gather_gradient
+from .turns import in_turn
 
 # Chunks of a sum per copy: one on the CPU, which runs them in turn; on a GPU enough for it to be busy.
 CHUNKS = 256
@@ -23,6 +24,7 @@ def fit_cells(model, terms, x, correction):
 class Sums:
     """Sums and maxima per copy in double precision and a fixed order."""
 
+    @in_turn
     def __init__(self, model):
         self.model = model
         chunks = CHUNKS if model.device.is_cuda else 1
@@ -55,6 +57,7 @@ class Sums:
 class RowSums(Sums):
     """The same of numbers that every copy has ``per_copy`` of, such as the rows of constraints."""
 
+    @in_turn
     def __init__(self, model, per_copy):
         self.model, self.per_copy = model, per_copy
         chunks = CHUNKS if model.device.is_cuda else 1
@@ -78,6 +81,7 @@ class RowSums(Sums):
 class Gradient:
     """∂U/∂x of all terms [N]; or of the ``terms`` given. On CUDA one launch for all terms, on the CPU one for each."""
 
+    @in_turn
     def __init__(self, model, corrected=False, terms=None):
         self.model, self.terms = model, model.terms if terms is None else terms
         if model.device.is_cuda:
@@ -104,6 +108,7 @@ class Gradient:
 class Energy:
     """U of all terms [J], per copy; or of the ``terms`` given."""
 
+    @in_turn
     def __init__(self, model, sums, corrected=False, terms=None):
         self.model, self.sums, self.terms = model, sums, model.terms if terms is None else terms
         self.kernels = [model.kernel(assemble.energy, elements.term, model.dtype, corrected) for elements in self.terms]
@@ -128,6 +133,7 @@ class Hessian:
         count, per_copy, vector, block: Unknowns, those of a copy, the types of one and of a diagonal block.
     """
 
+    @in_turn
     def __init__(self, model, policy=0, corrected=False, terms=None):
         self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
         self.model, self.terms = model, model.terms if terms is None else terms

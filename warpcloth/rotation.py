@@ -6,6 +6,7 @@ import warp as wp
 from .checks import choice, numeric, refuse, shown
 from .kernels import cells, decompose, rotation
 from .quiet import find_device
+from .turns import in_turn
 
 _TYPES = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 _SVD = {
@@ -15,6 +16,7 @@ _SVD = {
 _POLAR = {(3, 3): rotation.polar3, (3, 2): rotation.polar3x2, (2, 2): rotation.polar2}
 
 
+@in_turn
 def svd(A, convention="plain"):
     """Singular value decompositions A = U diag(S) Vᵀ of many small matrices, S descending.
 
@@ -40,6 +42,7 @@ def svd(A, convention="plain"):
     return _decomposed(batch, decompose.into_three, _SVD[convention][batch.shape], batch.shape, (n,), (n, n))
 
 
+@in_turn
 def polar(A):
     """Polar decompositions A = R P of many small matrices.
 
@@ -58,6 +61,7 @@ def polar(A):
     return _decomposed(batch, decompose.into_two, _POLAR[batch.shape], batch.shape, (n, n))
 
 
+@in_turn
 def kabsch(P, Q, weights=None, neighbours=None):
     """The rotations R that turn points P to Q best, about their centroids: min Σ w ‖(q − q̄) − R(p − p̄)‖² (Kabsch 1976).
 

@@ -11,6 +11,7 @@ import warp as wp
 from .frames import frames_of, state_of
 from .ordering import order_of_run
 from .status import Result, Status, sentence
+from .turns import in_turn
 
 # Of frames that a CUDA device has computed and nobody has taken yet: bytes on either side, the share of the free memory of the
 # device that these are at most, and how many.
@@ -66,7 +67,7 @@ def simulate(
 
     Large meshes whose neighbours are far apart in memory are renumbered for the run, see
     :func:`warpcloth.ordering.order_of_run`; what comes out has the order of the scene. While a frame is written the next one
-    is computed.
+    is computed. Calls from several threads of a process take turns frame by frame, see :mod:`warpcloth.turns`.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
@@ -165,6 +166,7 @@ class Watch:
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
     """
 
+    @in_turn
     def __init__(self, model, h, slowest=1.0):
         scene = model.scene
         self.model, self.rest = model, scene.mesh.edge_lengths[scene.mesh.edge_lengths > 0.0]

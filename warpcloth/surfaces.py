@@ -9,6 +9,7 @@ from .model import DTYPES
 from .neighbourhoods import neighbourhoods
 from .quiet import find_device
 from .terms import CorotatedMembrane, NeoHookeanMembrane, StVKMembrane
+from .turns import in_turn
 
 RATES = {"midpoint": rates.MIDPOINT, "forward": rates.FORWARD, "logarithm": rates.LOGARITHM}
 
@@ -29,9 +30,11 @@ class _Elements:
         self.materials = None
         self.sizes = self.empty(self.scalar)
 
+    @in_turn
     def empty(self, kind, count=None):
         return wp.empty(self.count if count is None else count, dtype=kind, device=self.device)
 
+    @in_turn
     def upload(self, values, kind):
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy), dtype=kind, device=self.device)
 
@@ -42,6 +45,7 @@ class _Elements:
             points = points - points[finite.argmax()] if finite.any() else points
         return self.upload(points, self.vec3)
 
+    @in_turn
     def launch(self, kernel, inputs, outputs, count=None):
         """Launches a kernel; outputs are names of measures, which are left out where nobody has chosen them, or arrays."""
         outputs = [self.results.get(out) if isinstance(out, str) else out for out in outputs]
@@ -57,6 +61,7 @@ class _Elements:
         inputs += [self.scalar(dt), int(RATES[method]), self.scalar(rounding)]
         self.launch(rates.measure_rates(self.scalar), inputs, (*names, "length_rate", "angle_rate"))
 
+    @in_turn
     def read(self):
         """Results by name, NumPy arrays (E, *shape)."""
         return {name: found.numpy() for name, found in self.results.items()}

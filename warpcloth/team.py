@@ -11,6 +11,7 @@ import warp as wp
 
 from .checks import whole
 from .kernels import barrier as kernels
+from .turns import TURN
 
 
 def _leave():
@@ -51,7 +52,7 @@ class Team:
                 "wp.config.mode='release' or wp.config.enable_tiles_in_stack_memory=False take more than 1"
             )
         if self.threads > _cores():
-            warnings.warn(f"threads is {threads} on {_cores()} cores; more threads than cores are slower", stacklevel=4)
+            warnings.warn(f"threads is {threads} on {_cores()} cores; more threads than cores are slower", stacklevel=5)
         self._start()
         self._meeting = wp.zeros(kernels.NUMBERS, dtype=wp.int32, device=device)
         self._leave = _leave()
@@ -136,7 +137,8 @@ class Team:
     def _guard(self, function):
         """What the function raises, or None."""
         try:
-            function()
+            with TURN.shared():  # of the thread that called run
+                function()
         except BaseException as error:
             self._meeting.numpy()[kernels.ABANDONED] = 1
             return error

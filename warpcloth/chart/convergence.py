@@ -13,6 +13,7 @@ from ..equilibrium import SETTLED
 from ..operators import Energy, Sums
 from ..simulate import simulate
 from ..solvers import Newton
+from ..turns import in_turn
 from .digest import scene_digest
 from .tasks import SceneRef, Setup
 
@@ -75,6 +76,7 @@ class OneStep:
             raise ValueError(f"the step after frame {frame} of {scene.name} has nothing to minimise; take another frame")
         self.floor = self._rounding() / (self.first - self.lowest)
 
+    @in_turn
     def place(self, stepper):
         """Sets a bound solver to the state."""
         model = stepper.model
@@ -88,6 +90,7 @@ class OneStep:
         change = stepper.state.v.numpy() - self._start[1] - self.h * self.model.gravity.numpy()
         return np.where(self.free[:, None], self.h * change, 0.0)
 
+    @in_turn
     def objective(self, d):
         """φ(d) [J]."""
         model = self.model

@@ -36,6 +36,7 @@ from ..scene import Scene
 from ..scenes import catenary, chain
 from ..status import Result
 from ..terms import CorotatedMembrane, DihedralBending, NeoHookeanMembrane, QuadraticBending
+from ..turns import in_turn
 from . import elastica
 from .strips import PATTERNS, inner_shares, strip
 
@@ -188,6 +189,7 @@ def bending_density(bending, mesh, positions, **options):
     return float(energies(scene, **options)[0].sum() / (0.5 * D * area))
 
 
+@in_turn
 def energies(scene, **options):
     """Energy [J] of each element of each term where the scene starts, a list of arrays."""
     model = scene.build(**options)

@@ -11,6 +11,7 @@ from ..solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, Hierarchic
 from ..solvers.explicit import step_limits
 from ..sweeps import colours
 from ..terms import Spring
+from ..turns import in_turn
 
 # Beyond these a run diverges; beyond the others it is wrong, or need not be.
 DIVERGES = ("2/ω_max", "2/√(2 Σk/m)", "forward Euler", "ω λ_max = 2", "Gauss–Seidel, |z| = 1")
@@ -77,6 +78,7 @@ def rules(scene, record, steps):
     return found
 
 
+@in_turn
 def concave_rate(model):
     """−λ of the least eigenvalue λ of M⁻¹∂²U/∂x² at the start of one copy [1/s²]; 0 where there is none below 0.
 

@@ -12,6 +12,7 @@ from ..operators import Gradient
 from ..scene import Scene
 from ..solvers.explicit import step_limits
 from ..terms import DihedralBending
+from ..turns import in_turn
 from .panels import Panel, point
 from .physics import BENDING, energies
 from .tasks import task
@@ -128,6 +129,7 @@ def _scene(rest, positions, bending):
     return Scene(mesh, masses=np.ones(4), positions=positions, terms=[bending(stiffness=1.0)])
 
 
+@in_turn
 def _force(scene, device, dtype):
     """∂U/∂x of the first apex (3,)."""
     model = scene.build(device=device, dtype=dtype)

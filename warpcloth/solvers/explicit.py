@@ -12,6 +12,7 @@ from ..damping import Past, dissipations
 from ..operators import Hessian
 from ..passes import Gather, Sweep, is_fine
 from ..ranges import Ranges
+from ..turns import in_turn
 from .solver import LaunchedStepper, Step, refuse_hard
 
 
@@ -79,10 +80,11 @@ class Explicit(Step):
             warnings.warn(
                 f"dt is {h:.6g} s; below {rest:.6g} s it is stable about the rest shape, but only below {motion:.6g} s "
                 "in motion, hinges and membranes counted as at rest",
-                stacklevel=3,
+                stacklevel=4,
             )
 
 
+@in_turn
 def step_limits(model):
     """The largest stable steps of symplectic Euler [s]: about the rest shape, and in motion, see below.
 
@@ -104,6 +106,7 @@ def step_limits(model):
     return tuple(min(limits) for limits in zip(*found, strict=True))
 
 
+@in_turn
 def limit_in_motion(model):
     """The second of :func:`step_limits`, which is the smaller and far quicker to find.
 

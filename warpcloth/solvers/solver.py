@@ -16,6 +16,7 @@ from ..model import Model
 from ..reset import Reset
 from ..scene import Scene
 from ..status import Result
+from ..turns import in_turn, methods_in_turn
 
 
 class State(NamedTuple):
@@ -41,6 +42,10 @@ class Step:
 
     ordered = False
     residual = None
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        methods_in_turn(cls, "bind")
 
     dt: float | None = None
     substeps: int | None = None
@@ -140,6 +145,10 @@ class Stepper:
     low = None  # What x is rounded by (B·n,), vectors [m] or packed, of steps that keep it
     worst = None  # Mirror of the residuals of methods that keep the largest on the device, (B,)
 
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        methods_in_turn(cls, "__init__", "step", "frame", "prepare_frame", "reset")
+
     def __init__(self, options, model, integrator="euler"):
         require_model(model)
         fps = model.scene.fps
@@ -186,11 +195,13 @@ class Stepper:
     def prepare_frame(self):
         """What `frame` records when it is first called, which is for the main thread alone."""
 
+    @in_turn
     def frame(self):
         """One frame, to the bit what ``steps_per_frame`` times `step` makes."""
         for _ in range(self.steps_per_frame):
             self.step()
 
+    @in_turn
     def reset(self, mask=None, positions=None, velocities=None):
         """Puts copies back to their start, by one launch; from there on each is to the bit what it was in its first steps.
 
