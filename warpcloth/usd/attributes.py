@@ -28,6 +28,8 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
+from .values import refuse_unknown, value_of
+
 
 @dataclass(frozen=True)
 class Attribute:
@@ -49,6 +51,11 @@ class Attribute:
     types: tuple
     kilograms: int = 0
     metres: int = 0
+
+    @property
+    def infinite(self):
+        """Whether it need not be finite: a term says itself what it takes, and USD says −inf for the gravity of the earth."""
+        return self.field.startswith("terms.") or self.field == "(gravity magnitude)"
 
 
 _T = Sdf.ValueTypeNames
@@ -135,12 +142,17 @@ class Values:
     def get(self, field, key=None):
         """The value of a field as a number, text, tuple of texts or array; None where nothing is said."""
         for row, attribute in self.authored(field, key):
-            value = attribute.Get(Usd.TimeCode.EarliestTime())
+            value = value_of(attribute, Usd.TimeCode.EarliestTime())
+            if value is None:
+                raise ValueError(f"{attribute.GetName()} is blocked at its first time sample, must have a value")
             if isinstance(value, str):
                 return value
             if isinstance(value, (Vt.TokenArray, Vt.StringArray)):
                 return tuple(value)
             value = np.array(value)[()]
+            refuse_unknown(attribute.GetName(), np.asarray(value), infinite=row.infinite)
+            if row.place in ("body", "material") and value < 0:
+                raise ValueError(f"{attribute.GetName()} is {value}, must be 0 or more")
             # UsdPhysics and the proposal say 0 for a mass, density or stiffness that is not given.
             if row.place not in ("body", "material") or value != 0:
                 scale = self.kilograms**row.kilograms * self.metres**row.metres

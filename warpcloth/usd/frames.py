@@ -1,6 +1,7 @@
 """The frames of an animation, read from its file one at a time."""
 
 import os
+from contextlib import contextmanager
 
 import numpy as np
 from pxr import Sdf, UsdGeom
@@ -15,8 +16,10 @@ from .stage import (
     moving_space,
     open_stage,
     placed,
+    refuse_change,
     topology,
 )
+from .values import array_of, check_composed, sentences, time_codes_of
 
 _VECTORS = ("points", "velocities")
 
@@ -60,11 +63,17 @@ class FrameSequence:
         path = followed(path)  # USD looks for the frames beside a link, and not beside the file that it stands for
         self._file = os.path.abspath(path)
         self._identity = _identity(self._file)  # before it is opened, so that no change is missed
+        with sentences(path):
+            self._open(path, prim, attribute, scale)
+
+    def _open(self, path, prim, attribute, scale):
         self._stage = open_stage(path)
         found = find_prim(self._stage, path, prim)
+        check_composed(found, path)
         self._where = where = f"{path}, prim {found.GetPath()}"
         self._attribute = found.GetAttribute(attribute)
-        self.time_codes = np.array(self._attribute.GetTimeSamples() if self._attribute else [])
+        with self._located():
+            self.time_codes = np.array(time_codes_of(self._attribute) if self._attribute else [])
         if not len(self.time_codes):
             raise ValueError(f"{where}: {attribute} have no time samples, the prim is not animated")
         vectors = attribute in _VECTORS
@@ -80,15 +89,18 @@ class FrameSequence:
         self._faces = []  # what is sampled of the faces, and has to stay as it is
         if attribute == "points" and found.IsA(UsdGeom.Mesh):
             mesh = UsdGeom.Mesh(found)
-            faces = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
-            self._faces = [(sampled, topology(sampled)) for sampled in faces if sampled.GetNumTimeSamples()]
-        first = self._attribute.Get(self.time_codes[0])
-        self._count = count = 0 if first is None else len(first)
+            faces = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr())
+            with self._located():
+                self._faces = [(sampled, topology(sampled)) for sampled in faces if sampled.GetNumTimeSamples()]
         # Curves show a vertex several times where they meet; the first is read.
         self._points = None
-        if not found.IsA(UsdGeom.Mesh) and (vectors or UsdGeom.Primvar(self._attribute).GetInterpolation() == "vertex"):
-            self._points = first_points(curve_vertices(found, count))
-            count = len(self._points)
+        self._components = (3,) if vectors else ()
+        with self._located():
+            first = array_of(self._attribute, self._components, time=self.time_codes[0])
+            self._count = count = 0 if first is None else len(first)
+            if not found.IsA(UsdGeom.Mesh) and (vectors or UsdGeom.Primvar(self._attribute).GetInterpolation() == "vertex"):
+                self._points = first_points(curve_vertices(found, count))
+                count = len(self._points)
         self.shape = (len(self.time_codes), count, 3)[: 3 if vectors else 2]
 
     @property
@@ -157,23 +169,24 @@ class FrameSequence:
                 "and give runs that are to be compared an output each"
             )
         code = self.time_codes[frame]
-        values = self._attribute.Get(code)
-        found = 0 if values is None else len(values)
-        if found != self._count:
-            name = self._attribute.GetName()
-            raise ValueError(f"{self._where}: {found} {name} at time code {code:g}, must be {self._count} as at the first")
-        for sampled, fixed in self._faces:
-            now = topology(sampled, code)
-            if len(now) != len(fixed):
-                raise ValueError(f"{self._where}: {len(now)} {sampled.GetName()} at time code {code:g}, must stay {len(fixed)}")
-            if not np.array_equal(now, fixed):
-                place = int(np.argmax(now != fixed))
-                raise ValueError(
-                    f"{self._where}: {sampled.GetName()}[{place}] is {now[place]} at time code {code:g}, "
-                    f"must stay {fixed[place]}"
-                )
-        values = np.array(values, dtype=np.float32)
+        with self._located():
+            values = array_of(self._attribute, self._components, time=code)
+            found = 0 if values is None else len(values)
+            if found != self._count:
+                name = self._attribute.GetName()
+                raise ValueError(f"{found} {name} at time code {code:g}, must be {self._count} as at the first")
+            for sampled, fixed in self._faces:
+                refuse_change(sampled.GetName(), topology(sampled, code), fixed, code)
+        values = values.astype(np.float32, copy=False)
         return values if self._points is None else values[self._points]
+
+    @contextmanager
+    def _located(self):
+        """Says in an error whose attribute is wrong."""
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(f"{self._where}: {error}") from None
 
 
 def _identity(path):

@@ -6,8 +6,9 @@ import warnings
 import numpy as np
 from pxr import Ar, Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
 
-from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh, topology
+from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh, triangles_of_faces
 from .targets import SAMPLED, Target
+from .values import array_of
 
 # Attributes of the artist's prim that would be used instead of ours, or beside ours with values of another motion.
 _BLOCKED = ("accelerations", "primvars:normals", "primvars:normals:indices")
@@ -237,18 +238,29 @@ def artist_target(artist, surroundings, primvars, **options):
     """The `Target` of an artist's prim; more of its fields by name."""
     half_width = 0.0
     if artist.IsA(UsdGeom.Curves):
-        widths = UsdGeom.Curves(artist).GetWidthsAttr().Get()
-        half_width = float(np.max(widths)) / 2 if widths else 0.0
-    face_triangles = topology(UsdGeom.Mesh(artist).GetFaceVertexCountsAttr()) - 2 if artist.IsA(UsdGeom.Mesh) else np.array([])
+        half_width = float(_widths(artist, surroundings).max(initial=0.0)) / 2
+    face_triangles = triangles_of_faces(artist) if artist.IsA(UsdGeom.Mesh) else np.array([])
     return Target(
         surroundings.prim,
         surroundings.mesh.triangles,
         point_vertices=surroundings.point_vertices,
         half_width=half_width,
-        face_triangles=face_triangles if (face_triangles > 1).any() else None,
+        face_triangles=face_triangles if (face_triangles != 1).any() else None,
         primvars=primvars,
         **options,
     )
+
+
+def _widths(curves, surroundings):
+    """Widths (k,) of curves, in the units of the prim."""
+    try:
+        widths = array_of(UsdGeom.Curves(curves).GetWidthsAttr())
+        widths = np.empty(0) if widths is None else widths
+        for row in np.flatnonzero(~((widths >= 0.0) & np.isfinite(widths)))[:1]:
+            raise ValueError(f"widths[{row}] is {widths[row]}, must be finite and 0 or more")
+    except ValueError as error:
+        raise ValueError(f"{surroundings.path}, prim {surroundings.prim}: {error}") from None
+    return widths
 
 
 def declare_primvars(layer, artist, target, path):

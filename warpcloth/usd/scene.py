@@ -14,6 +14,7 @@ from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
 from .chunks import export
 from .layers import scene_layer
 from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
+from .values import array_of, refuse_unknown, sentences, time_codes_of
 
 _EARTH = 9.81  # [m/s²]
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none
@@ -35,13 +36,14 @@ def read_scene(path, prim: str | None = None):
         ValueError: As `read_stage_mesh`; there is no mass or no term; an attribute has another type than the table says, a
             value that a scene or term refuses, or a name in the namespace "warpcloth" that is not in the table.
     """
-    stage = open_stage(path)
-    cloth = _cloth_prim(stage, path, prim)
-    surroundings = read_stage_mesh(path, str(cloth.GetPath()))
-    try:
-        return _scene(stage, cloth, surroundings)
-    except ValueError as error:
-        raise ValueError(f"{path}, prim {cloth.GetPath()}: {error}") from error
+    with sentences(path):
+        stage = open_stage(path)
+        cloth = _cloth_prim(stage, path, prim)
+        surroundings = read_stage_mesh(path, str(cloth.GetPath()))
+        try:
+            return _scene(stage, cloth, surroundings)
+        except ValueError as error:
+            raise ValueError(f"{path}, prim {cloth.GetPath()}: {error}") from error
 
 
 def _scene(stage, cloth, surroundings):
@@ -109,8 +111,8 @@ def _exact_mesh(values, cloth, surroundings):
     mesh, transform = surroundings.mesh, surroundings.transform
     points, edges, grid_shape = (values.get(f"mesh.{name}") for name in ("points", "edges", "grid_shape"))
     if points is not None:
-        stored = UsdGeom.PointBased(cloth).GetPointsAttr().Get()
-        stored = np.array([] if stored is None else stored, dtype=np.float32)
+        stored = array_of(UsdGeom.PointBased(cloth).GetPointsAttr(), (3,))
+        stored = np.empty((0, 3), np.float32) if stored is None else stored.astype(np.float32)
         if surroundings.point_vertices is not None and len(stored):
             stored = stored[first_points(surroundings.point_vertices)]
         same = np.array_equal(points.astype(np.float32), stored)
@@ -182,7 +184,10 @@ def _term(values, key):
     given = {name: float(value) if isinstance(value, np.number) else value for name, value in given.items()}
     # A term without a name of its own is called by its kind.
     given["name"] = given.get("name", "" if key == kind else key) or None
-    return TERMS[kind](**given)
+    try:
+        return TERMS[kind](**given)
+    except ValueError as error:
+        raise ValueError(f"{prefix}: {error}") from error
 
 
 def _pinned(cloth, surroundings):
@@ -203,7 +208,9 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
             keyframes = np.array([points[vertices] for points in _frames(animated, surroundings, frames, fps)])
             keyframes = None if (keyframes == keyframes[0]).all() else keyframes
     if own is not None:
-        keyframes = [np.array(value) for value in _samples(own[1], surroundings, np.inf, fps)]
+        # Those of a scene that was written have a sample for each frame, beyond the last frame too.
+        most = max(frames, len(own[1].GetTimeSamples()) - 1)
+        keyframes = list(_samples(own[1], surroundings, most, fps))
         wrong = [len(places) for places in keyframes if len(places) != len(vertices)]
         if wrong:
             raise ValueError(f"{own[0].name} has {wrong[0]} places, must have one for each of {len(vertices)} pinned vertices")
@@ -212,22 +219,29 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
 
 def _frames(attribute, surroundings, frames, fps):
     """Animated points of a prim, frame by frame, as positions of the mesh (n, 3) [m] in world space."""
-    shown = np.arange(len(surroundings.mesh.points))
+    count = len(surroundings.mesh.points)
+    shown = np.arange(count)
     if surroundings.point_vertices is not None:
-        shown = first_points(surroundings.point_vertices)
+        shown, count = first_points(surroundings.point_vertices), len(surroundings.point_vertices)
     for value in _samples(attribute, surroundings, frames, fps):
-        if len(value) <= shown[-1]:
-            raise ValueError(f"points has {len(value)} points at a time sample, must have the same as at rest")
-        yield np.array(value, np.float64)[shown] @ surroundings.transform[:3, :3] + surroundings.transform[3, :3]
+        if len(value) != count:
+            raise ValueError(f"points has {len(value)} points at a time sample, must have {count} as at rest")
+        yield value.astype(np.float64)[shown] @ surroundings.transform[:3, :3] + surroundings.transform[3, :3]
 
 
 def _samples(attribute, surroundings, frames, fps):
     """Values of an attribute at frames 0, 1, …, up to a number of frames and no further than its last sample."""
     rate = surroundings.time_codes_per_second / fps
     start = surroundings.start or 0.0
-    samples = attribute.GetTimeSamples()
+    samples = time_codes_of(attribute)
     last = np.ceil((samples[-1] - start) / rate * (1 - 1e-9)) if samples else 0
-    return (attribute.Get(start + frame * rate) for frame in range(int(np.clip(last, 0, frames)) + 1))
+    for frame in range(int(np.clip(last, 0, frames)) + 1):
+        code = start + frame * rate
+        value = array_of(attribute, (3,), time=code)
+        if value is None:
+            raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
+        refuse_unknown(attribute.GetName(), value, f" at time code {code:g}")
+        yield value
 
 
 def _gravity(stage, values, up_axis):

@@ -8,6 +8,17 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
 from ..mesh import Mesh
+from .values import (
+    array_of,
+    check_composed,
+    check_stage,
+    reason_of,
+    refuse_outside,
+    rows_of,
+    sentences,
+    time_codes_of,
+    token_of,
+)
 
 # Where an animation keeps, in the root layer's customLayerData, the prim that it animates.
 METADATA_KEY = "warpcloth"
@@ -69,9 +80,9 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
     The points at the default time are the rest shape. A stage with time samples alone is read at its first sample, with a
-    warning: support for that is deprecated, for nothing says that a first frame is at rest. Polygons are cut into fans of
-    triangles from their first corner, and turned where the prim is left-handed or mirrored by its transform, so that triangle
-    normals point out of the front. The up axis is reported, not changed.
+    warning: support for that is deprecated, for nothing says that a first frame is at rest. Holes are left out. Polygons are
+    cut into fans of triangles from their first corner, and turned where the prim is left-handed or mirrored by its transform,
+    so that triangle normals point out of the front. The up axis is reported, not changed.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
@@ -86,16 +97,24 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is no USD stage, has no mesh or several, the prim is missing or no mesh, its transform is
-            animated or cannot be inverted, or its points and topology make no valid `Mesh`.
+        ValueError: The file is no USD stage or has units, rates or times that are none, has no mesh or several, the prim is
+            missing or no mesh or refers to a file that is missing, its transform is animated or cannot be inverted, its
+            topology changes, or its points and topology make no valid `Mesh`.
     """
-    stage = open_stage(path)
+    with sentences(path):
+        return _stage_mesh(open_stage(path), path, prim, kind, time)
+
+
+def _stage_mesh(stage, path, prim, kind, time):
     found = find_prim(stage, path, prim)
+    check_composed(found, path)
     where = f"{path}, prim {found.GetPath()}"
     transform = local_to_metres(found, where, time)
-    points = placed(_rest_points(found, where, time), transform)
     point_vertices = corner_coordinates = None
     try:
+        points = placed(_rest_points(found, where, time), transform)
+        if time is None:
+            _refuse_moving_topology(found)
         if found.IsA(UsdGeom.Mesh):
             corners, triangles = _corners(found, len(points))
             if np.linalg.det(transform[:3, :3]) < 0:
@@ -105,9 +124,10 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
             mesh = kind(points, corners[triangles], texture_coordinates=at_vertices)
         else:
             point_vertices = curve_vertices(found, len(points))
-            edges = point_vertices[_curve_edges(found)]
+            edges = point_vertices[_curve_edges(found, len(points))]
             edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
             mesh = kind(points[first_points(point_vertices)], edges=edges)
+        pins = _pins(found, point_vertices, len(points))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     layer = stage.GetRootLayer()
@@ -122,7 +142,7 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
         fps=rate if layer.HasFramesPerSecond() or layer.HasTimeCodesPerSecond() else None,
         time_codes_per_second=stage.GetTimeCodesPerSecond(),
         start=stage.GetStartTimeCode() if layer.HasStartTimeCode() else None,
-        pins=_pins(found, point_vertices),
+        pins=pins,
         point_vertices=point_vertices,
         corner_coordinates=corner_coordinates,
         rest=UsdGeom.PointBased(found).GetPointsAttr().Get() is not None,
@@ -145,20 +165,26 @@ def open_stage(path):
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no USD stage.
+        ValueError: It is no USD stage, or has units, rates or times that are none, see `values.check_stage`.
     """
     path = os.fspath(path)
+    try:
+        path.encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{path!r}: the path is no valid UTF-8, which USD needs") from None
     if not os.path.isfile(path):
         raise FileNotFoundError(f"{path}: there is no such file")
     # pxr keeps a layer while anyone uses it, and would show an earlier result that has been replaced since.
     known = Sdf.Layer.Find(os.path.abspath(path))
     if known and not known.dirty:
         known.Reload()
-    try:
-        return Usd.Stage.Open(os.path.abspath(path))
-    except Tf.ErrorException as error:
-        reason = error.args[0].commentary if error.args and hasattr(error.args[0], "commentary") else str(error)
-        raise ValueError(f"{path}: is no USD stage ({reason.strip()})") from None
+    with sentences(path):
+        try:
+            stage = Usd.Stage.Open(os.path.abspath(path))
+        except Tf.ErrorException as error:
+            raise ValueError(f"{path}: is no USD stage ({reason_of(error)})") from None
+        check_stage(stage, path)
+    return stage
 
 
 def flattened(path):
@@ -189,7 +215,8 @@ def find_prim(stage, path, prim=None):
     meshes = [p for p in prims if p.IsA(UsdGeom.Mesh)]
     curves = [p for p in prims if p.IsA(UsdGeom.BasisCurves) and UsdGeom.BasisCurves(p).GetTypeAttr().Get() == "linear"]
     if prim is None:
-        prim = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY, {}).get("prim")
+        own = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY)
+        prim = own.get("prim") if isinstance(own, dict) else None
     if prim is None:
         candidates = meshes or curves
     else:
@@ -275,7 +302,7 @@ def curve_vertices(prim, count):
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(VERTEX_PRIMVAR)
     if not (primvar and primvar.HasValue()):
         return np.arange(count, dtype=np.int32)
-    vertices = np.array(primvar.Get(), dtype=np.int32)
+    vertices = rows_of(primvar.GetName(), primvar.Get(), whole=True)
     named = np.unique(vertices)
     if len(vertices) != count or not np.array_equal(named, np.arange(len(named))):
         raise ValueError(f"primvars:{VERTEX_PRIMVAR} must name each vertex from 0 on, once for each of {count} points")
@@ -290,28 +317,59 @@ def first_points(point_vertices):
 def _rest_points(prim, where, time=None):
     """Points (P, 3) float64 in the prim's own space at the default time, or else at the time or with a warning the first."""
     attribute = UsdGeom.PointBased(prim).GetPointsAttr()
-    value = attribute.Get()
-    if value is None and time is not None:
-        value = attribute.Get(time)
-    elif value is None and attribute.GetNumTimeSamples():
-        first = attribute.GetTimeSamples()[0]
+    codes = time_codes_of(attribute)
+    points = array_of(attribute, (3,))
+    if points is None and time is not None:
+        points = array_of(attribute, (3,), time=time)
+    elif points is None and codes:
+        first = codes[0]
         warnings.warn(
             f"{where}: points have no default value; the sample at time code {first:g} is taken as the rest shape. "
             "This is deprecated: author the rest shape as the default",
-            stacklevel=4,
+            stacklevel=6,
         )
-        value = attribute.Get(first)
-    if value is None or len(value) == 0:
-        raise ValueError(f"{where}: has no points")
-    return np.array(value, dtype=np.float64)
+        points = array_of(attribute, (3,), time=first)
+    if points is None or len(points) == 0:
+        raise ValueError("has no points")
+    return points.astype(np.float64)
 
 
 def topology(attribute, time=None):
-    """An integer array attribute at a time code, or at the default time or else its first sample; empty without a value."""
-    value = attribute.Get() if time is None else attribute.Get(time)
-    if value is None and time is None:
-        value = attribute.Get(Usd.TimeCode.EarliestTime())
-    return np.array(value if value is not None else [], dtype=np.int32)
+    """An integer array attribute at a time code, or at the default time or else its first sample; empty without a value.
+
+    Raises:
+        ValueError: It holds no whole numbers, or cannot be read.
+    """
+    found = array_of(attribute, whole=True, time=time)
+    if found is None and time is None:
+        found = array_of(attribute, whole=True, time=Usd.TimeCode.EarliestTime())
+    return np.array([], dtype=np.int32) if found is None else found
+
+
+def refuse_change(name, now, fixed, code):
+    """Refuses an integer array that is not at a time code what it was before.
+
+    Raises:
+        ValueError: It has another length, or where it first differs.
+    """
+    if len(now) != len(fixed):
+        raise ValueError(f"{len(now)} {name} at time code {code:g}, must stay {len(fixed)}")
+    if not np.array_equal(now, fixed):
+        place = int(np.argmax(now != fixed))
+        raise ValueError(f"{name}[{place}] is {now[place]} at time code {code:g}, must stay {fixed[place]}")
+
+
+def _refuse_moving_topology(prim):
+    """Refuses faces or curves that change over time: a cloth has one topology."""
+    if prim.IsA(UsdGeom.Mesh):
+        mesh = UsdGeom.Mesh(prim)
+        sampled = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr())
+    else:
+        sampled = (UsdGeom.BasisCurves(prim).GetCurveVertexCountsAttr(),)
+    for attribute in sampled:
+        fixed = topology(attribute)
+        for code in time_codes_of(attribute):
+            refuse_change(attribute.GetName(), topology(attribute, code), fixed, code)
 
 
 def _corners(prim, count):
@@ -326,24 +384,44 @@ def _corners(prim, count):
         raise ValueError(f"face {face} has {counts[face]} corners, must have at least 3")
     if counts.sum() != len(corners):
         raise ValueError(f"faceVertexCounts add up to {counts.sum()}, must be the number of indices, {len(corners)}")
-    if (corners < 0).any() or (corners >= count).any():
-        corner = int(np.argmax((corners < 0) | (corners >= count)))
-        raise ValueError(f"faceVertexIndices[{corner}] = {corners[corner]}, must be a vertex, 0 to {count - 1}")
-    start = np.repeat(np.cumsum(counts) - counts, counts - 2)
+    refuse_outside("faceVertexIndices", corners, count, "vertex")
+    fan = triangles_of_faces(prim)
+    start = np.repeat(np.cumsum(counts) - counts, fan)
     # Position of each triangle within its polygon's fan.
-    step = np.arange(len(start)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    step = np.arange(len(start)) - np.repeat(np.cumsum(fan) - fan, fan)
     fans = np.stack([start, start + step + 1, start + step + 2], axis=1)
-    return corners, fans[:, ::-1] if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded else fans
+    sides = (UsdGeom.Tokens.rightHanded, UsdGeom.Tokens.leftHanded)
+    return corners, fans[:, ::-1] if token_of(mesh.GetOrientationAttr(), sides) == UsdGeom.Tokens.leftHanded else fans
 
 
-def _curve_edges(prim):
+def triangles_of_faces(prim):
+    """Number of triangles (F,) that each face of a Mesh prim is cut into; of a hole none, for there is no cloth.
+
+    Raises:
+        ValueError: A hole is no face.
+    """
+    mesh = UsdGeom.Mesh(prim)
+    triangles = topology(mesh.GetFaceVertexCountsAttr()) - 2
+    holes = topology(mesh.GetHoleIndicesAttr())
+    refuse_outside("holeIndices", holes, len(triangles), "face")
+    triangles[holes] = 0
+    return triangles
+
+
+def _curve_edges(prim, count):
     """Pairs of points (E, 2) that the segments of linear curves join."""
     curves = UsdGeom.BasisCurves(prim)
     counts = topology(curves.GetCurveVertexCountsAttr())
+    if (counts < 2).any():
+        curve = int(np.argmax(counts < 2))
+        raise ValueError(f"curveVertexCounts[{curve}] is {counts[curve]}, must be at least 2")
+    if counts.sum() != count:
+        raise ValueError(f"curveVertexCounts add up to {counts.sum()}, must be the number of points, {count}")
     end = np.cumsum(counts)
     inner = np.setdiff1d(np.arange(counts.sum()), end - 1)
     edges = np.stack([inner, inner + 1], axis=1)
-    if curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic:
+    wraps = (UsdGeom.Tokens.nonperiodic, UsdGeom.Tokens.periodic, UsdGeom.Tokens.pinned)
+    if token_of(curves.GetWrapAttr(), wraps) == UsdGeom.Tokens.periodic:
         edges = np.concatenate([edges, np.stack([end - 1, end - counts], axis=1)])
     return edges
 
@@ -353,7 +431,8 @@ def _texture_coordinates(prim, count, corners):
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
     if not (primvar and primvar.HasValue()):
         return None, None
-    st = np.array(primvar.ComputeFlattened(), dtype=np.float64)
+    st = np.array(primvar.ComputeFlattened())
+    st = st.astype(np.float64) if st.dtype.kind in "iuf" else st  # of another type it is no (count, 2) below
     interpolation = primvar.GetInterpolation()
     if interpolation in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and st.shape == (count, 2):
         return st, None
@@ -364,12 +443,13 @@ def _texture_coordinates(prim, count, corners):
     return (at_vertices, None) if np.array_equal(at_vertices[corners], st) else (None, st)
 
 
-def _pins(prim, point_vertices):
+def _pins(prim, point_vertices, count):
     """Sorted vertices (p,) int32 of every GeomSubset of points, by name."""
     pins = {}
     for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
         if subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.point:
             points = topology(subset.GetIndicesAttr())
+            refuse_outside(f"GeomSubset {subset.GetPrim().GetName()}: indices", points, count, "point")
             vertices = points if point_vertices is None else point_vertices[points]
             pins[subset.GetPrim().GetName()] = np.unique(vertices)
     return pins

@@ -29,7 +29,7 @@ class Target:
         transform: (4, 4) from the prim's space to metres, as in `StageMesh`; None where they are the same.
         point_vertices: Vertex of each point of the prim, or None where they are the same.
         half_width: How far the shape reaches around its points, in the prim's units; curves have a width.
-        face_triangles: Number of triangles of each face of the prim (F,), or None where each has one.
+        face_triangles: Number of triangles of each face of the prim (F,), a hole 0, or None where each has one.
         vectors: Names of the vectors that are sampled, of `SAMPLED`; curves are drawn as tubes, which need no normals.
         primvars: Interpolation of each sampled primvar, "vertex" or "uniform", by name.
         coloured: Name of the primvar that a sampled displayColor shows, or None: no colours are sampled.
@@ -81,8 +81,10 @@ class Target:
             known = np.isfinite(primvars[self.coloured])
             if self.primvars[self.coloured] == "uniform" and self.face_triangles is not None:
                 # A face without any value has the colour that says so, the mean over all its triangles.
-                known |= np.repeat(~np.logical_or.reduceat(known, _starts(self.face_triangles)), self.face_triangles)
-            own[DISPLAY_COLOUR] = Vt.Vec3fArray.FromNumpy(self._shown(colours, self.coloured, known))
+                counts = self.face_triangles[self.face_triangles > 0]
+                known |= np.repeat(~np.logical_or.reduceat(known, _starts(counts)), counts)
+            shown = self._shown(colours, self.coloured, known)
+            own[DISPLAY_COLOUR] = Vt.Vec3fArray.FromNumpy(np.nan_to_num(shown, copy=False))  # nobody sees the colour of a hole
         return own
 
     def _shown(self, values, primvar, known):
@@ -174,8 +176,11 @@ def _starts(counts):
 
 
 def _face_means(values, known, face_triangles):
-    """Mean of each face over those of its triangles that have a value, NaN where none has: (T, …) to (F, …)."""
+    """Mean of each face over those of its triangles that have a value, NaN where none has, as a hole: (T, …) to (F, …)."""
     known = known.reshape(-1, *[1] * (values.ndim - 1))
-    starts = _starts(face_triangles)
+    cut = face_triangles > 0
+    starts = _starts(face_triangles[cut])
+    means = np.full((len(face_triangles), *values.shape[1:]), np.nan)
     with np.errstate(invalid="ignore"):
-        return np.add.reduceat(np.where(known, values, 0.0), starts) / np.add.reduceat(known, starts, dtype=int)
+        means[cut] = np.add.reduceat(np.where(known, values, 0.0), starts) / np.add.reduceat(known, starts, dtype=int)
+    return means

@@ -1,0 +1,179 @@
+"""Values of a stage, each read with a check: what is wrong is refused by its name before it reaches any arithmetic."""
+
+import math
+import warnings
+from contextlib import contextmanager, redirect_stderr
+from io import StringIO
+
+import numpy as np
+from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
+
+from ..checks import shown
+
+# Beyond it neighbouring time codes, which are float64, are more than 1e-7 apart, and frames cannot be told by them.
+MOST_TIME_CODE = 1e9
+
+_listening = False
+
+
+@contextmanager
+def sentences(path):
+    """Has what pxr says of a file in one sentence each: its errors raised, its warnings as those of Python.
+
+    Raises:
+        ValueError: pxr has met an error.
+    """
+    global _listening
+    if _listening:  # each listener is told everything
+        yield
+        return
+    _listening, heard = True, UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    except Tf.ErrorException as error:
+        raise ValueError(f"{path}: {reason_of(error)}") from None
+    finally:
+        _listening = False
+        said = heard.TakeUncoalescedDiagnostics()
+    for text in dict.fromkeys(_plain(each.commentary) for each in said):  # not where an error says what is wrong
+        warnings.warn(f"{path}: {text}", stacklevel=4)
+
+
+def reason_of(error):
+    """What an error of pxr says first."""
+    first = error.args[0] if error.args else error
+    return _plain(getattr(first, "commentary", str(first)))
+
+
+def _plain(text):
+    """Without the line breaks of pxr, and without the address of the stage in memory."""
+    return " ".join(text.partition(" (instantiating stage on")[0].split())
+
+
+def check_stage(stage, path):
+    """Refuses units, rates and times that no stage can have.
+
+    Raises:
+        ValueError: One is not finite, or not above 0; the up axis is neither Y nor Z; a layer below is missing.
+    """
+    for error in stage.GetCompositionErrors():
+        if type(error).__name__ == "ErrorInvalidSublayerPath":
+            raise ValueError(f"{path}: {_plain(str(error))} It must be there, for it may say something of the cloth")
+    units = {
+        "metersPerUnit": UsdGeom.GetStageMetersPerUnit(stage),
+        "kilogramsPerUnit": UsdPhysics.GetStageKilogramsPerUnit(stage),
+    }
+    for name, value in units.items():
+        _refuse_unless(0.0 < value < math.inf, path, name, value, "a finite number above 0")
+    axis = UsdGeom.GetStageUpAxis(stage)
+    _refuse_unless(axis in ("Y", "Z"), path, "upAxis", str(axis), '"Y" or "Z"')
+    for layer in stage.GetUsedLayers():
+        where = path if layer == stage.GetRootLayer() else f"{path}, layer {layer.identifier}"
+        for name in ("timeCodesPerSecond", "framesPerSecond"):
+            rate = getattr(layer, name)
+            _refuse_unless(0.0 < rate < math.inf, where, name, rate, "a finite number above 0")
+        for name in ("startTimeCode", "endTimeCode"):
+            code = getattr(layer, name)
+            _refuse_unless(
+                abs(code) <= MOST_TIME_CODE, where, name, code, f"a number of -{MOST_TIME_CODE:g} to {MOST_TIME_CODE:g}"
+            )
+
+
+def check_composed(prim, path):
+    """Refuses a prim that is not whole, for what it or a prim above it refers to is missing.
+
+    Raises:
+        ValueError: pxr could not compose it.
+    """
+    for error in prim.GetStage().GetCompositionErrors():
+        if prim.GetPath().HasPrefix(error.rootSite.path) or error.rootSite.path.HasPrefix(prim.GetPath()):
+            raise ValueError(f"{path}, prim {prim.GetPath()}: {_plain(str(error))} It must be there")
+
+
+def _refuse_unless(good, where, name, value, rule):
+    if not good:
+        raise ValueError(f"{where}: {name} is {shown(value)}, must be {rule}")
+
+
+def value_of(attribute, time=None):
+    """The value of an attribute at a time code, or at the default time; None where there is none.
+
+    Raises:
+        ValueError: The file is broken there, or holds a type that Python has not.
+    """
+    try:
+        with redirect_stderr(StringIO()):  # pxr prints by itself what it cannot turn into a value of Python
+            return attribute.Get(Usd.TimeCode.Default() if time is None else time)
+    except (Tf.ErrorException, TypeError) as error:
+        raise ValueError(f"{attribute.GetName()} cannot be read ({reason_of(error)})") from None
+
+
+def token_of(attribute, allowed):
+    """One of the words that an attribute may have.
+
+    Raises:
+        ValueError: It has another.
+    """
+    value = value_of(attribute)
+    if value not in allowed:
+        raise ValueError(f"{attribute.GetName()} is {shown(value)}, must be one of {', '.join(map(str, allowed))}")
+    return value
+
+
+def array_of(attribute, components=(), whole=False, time=None):
+    """The rows of an array attribute (count, *components), int32 if they are to be whole, else as they are; None without any.
+
+    Raises:
+        ValueError: They are of another type or shape, or cannot be read.
+    """
+    value = value_of(attribute, time)
+    return None if value is None else rows_of(attribute.GetName(), value, components, whole)
+
+
+def rows_of(name, value, components=(), whole=False):
+    """The same of a value."""
+    rows = np.array(value)
+    if rows.dtype.kind not in ("iu" if whole else "iuf") or rows.shape[1:] != components or rows.ndim != 1 + len(components):
+        kind = "whole numbers" if whole else f"rows of {components[0]} numbers" if components else "numbers"
+        raise ValueError(f"{name} holds {rows.dtype} of shape {rows.shape}, must be {kind}")
+    return rows.astype(np.int32) if whole else rows
+
+
+def refuse_outside(name, numbers, count, what):
+    """Refuses a number that is no index of ``count`` things.
+
+    Raises:
+        ValueError: The first such.
+    """
+    wrong = (numbers < 0) | (numbers >= count)
+    if wrong.any():
+        place = int(np.argmax(wrong))
+        raise ValueError(f"{name}[{place}] = {numbers[place]}, must be a {what}, 0 to {count - 1}")
+
+
+def refuse_unknown(name, values, where="", infinite=False):
+    """Refuses numbers that are not finite, or only those that are NaN.
+
+    Raises:
+        ValueError: The first such.
+    """
+    wrong = np.isnan(values) if infinite else ~np.isfinite(values)
+    for place in np.argwhere(wrong)[:1].tolist():
+        index = "".join(f"[{i}]" for i in place)
+        raise ValueError(f"{name}{index}{where} is {values[tuple(place)]}, must be {'a number' if infinite else 'finite'}")
+
+
+def time_codes_of(attribute):
+    """Time codes of the samples of an attribute, a list.
+
+    Raises:
+        ValueError: One is too far out to be told from its neighbours.
+    """
+    codes = attribute.GetTimeSamples()
+    for code in codes:
+        if not abs(code) <= MOST_TIME_CODE:
+            raise ValueError(
+                f"{attribute.GetName()} has a sample at time code {code:g}, "
+                f"must be at -{MOST_TIME_CODE:g} to {MOST_TIME_CODE:g}"
+            )
+    return codes
