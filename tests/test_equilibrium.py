@@ -1,13 +1,17 @@
 """Rest shapes against closed forms: the heavy elastica, a hanging chain, the elastic catenary."""
 
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 import warpcloth as wc
 from warpcloth.chart.elastica import aspect
 from warpcloth.equilibrium import SETTLED
+from warpcloth.linear import lowest_eigenvalue
+from warpcloth.status import digits
 
 # H/W of the tip for Γ, to 8 digits.
 ASPECT = {
@@ -159,7 +163,7 @@ def test_float32_comes_near_float64(device):
 
 
 def test_what_rounding_hides_is_no_rest_shape(device):
-    """With kL²/D = 1e6 float32 leaves forces of 40 times the weight, and the strip 0.2 m away."""
+    """With kL²/D = 1e6 float32 leaves forces of 8 times the weight, and the strip 0.2 m away."""
     rest = wc.equilibrium(scene("cantilever", stretching=1e6), dtype="float32", device=device)
     assert rest.status.result not in SETTLED
     assert rest.status.message.startswith("rounding hides the rest shape in float32")
@@ -199,3 +203,84 @@ def test_a_light_vertex_is_in_balance_beside_a_heavy_one(device):
     cloth = wc.Scene(mesh, masses=[1.0, 1e-3, 1.0, 1e6], terms=[spring], pins=[0, 2])
     rest = wc.equilibrium(cloth, device=device)
     assert rest.points[1] == pytest.approx([0.0, -1.0 - 1e-3 * 9.81 / 10.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("light", [1.0, 1e-6, 1e-12])
+def test_what_weighs_nothing_hides_no_rest_shape(light, device):
+    """A chain under its own weight: the forces that rounding leaves at a light mass are held against the whole load."""
+    k, masses = 1e5, np.full(6, 1e-3) * [1, 1, 1, light, 1, 1]
+    chain = wc.Scene(wc.Mesh.chain(6), masses=masses, terms=[wc.Spring(stiffness=k)], pins=[0])
+    rest = wc.equilibrium(chain, device=device)
+    assert rest.status.result.name == "CONVERGED" and rest.status.residual <= 1e-8, rest.status
+    assert "times the weight (tolerance 1e-08)" in rest.status.message
+    below = np.cumsum(masses[:0:-1])[::-1] * 9.81
+    assert -np.diff(rest.points[:, 1]) == pytest.approx(0.2 + below / k, rel=1e-9)
+
+
+STANDING = {"held": (1.5, True), "held too little": (0.5, False)}
+
+
+@pytest.mark.parametrize(("share", "stable"), STANDING.values(), ids=STANDING)
+def test_stability_of_a_mass_on_a_strut(share, stable, device, monkeypatch):
+    """A mass on a strut of length l falls sideways with −mg/l, and an attachment k at its head holds it: k − mg/l [N/m]."""
+    k, m = 1e3, 0.5
+    length = 1.0 - m * 9.81 / k
+    head = share * m * 9.81 / length
+    strut = wc.Scene(
+        wc.Mesh.chain(2, direction=(0, 1, 0)),
+        masses=np.full(2, m),
+        terms=[wc.Spring(stiffness=k), wc.Attachment(vertices=[1], stiffness=head, targets=[[0.0, length, 0.0]])],
+        pins=[0],
+    )
+    monkeypatch.setattr(import_module("warpcloth.equilibrium"), "_nudge", lambda model: 0.0)
+    rest = wc.equilibrium(strut, device=device)
+    assert rest.points[1] == pytest.approx([0.0, length, 0.0], abs=1e-9)
+    assert rest.lowest_eigenvalue == pytest.approx(head - m * 9.81 / length, rel=1e-6)
+    assert rest.stable is stable and (rest.status.result in SETTLED) is stable
+    said = f"not stable, for the lowest eigenvalue of the Hessian is {digits(rest.lowest_eigenvalue)} N/m: "
+    assert (said in rest.status.message) is not stable
+    monkeypatch.undo()
+    assert wc.equilibrium(strut, device=device).stable
+
+
+def test_rigid_motions_are_no_instability(device):
+    """A sheet that nothing holds has six eigenvalues of 0, here stirred by its rounding; a hanging one has none."""
+    mesh = wc.Mesh.grid(9, 9)
+    turned = mesh.points @ wc.polar(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    terms = [wc.Spring(stiffness=1e3), wc.DihedralBending(stiffness=1e-3)]
+    free = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, positions=turned, gravity=(0, 0, 0)), device=device)
+    assert free.stable and abs(free.lowest_eigenvalue) < 1e-9
+    held = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, pins="corners"), device=device)
+    assert held.stable and held.lowest_eigenvalue > 1e-3
+    unfinished = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms), iterations=20, device=device)
+    assert not unfinished.stable and np.isnan(unfinished.lowest_eigenvalue)
+    assert "; not a rest shape: " in unfinished.status.message
+
+
+@pytest.mark.parametrize("lowest", [-3e4, -1e-3, 0.0, 1e-3, 10.0])
+@pytest.mark.parametrize("n", [30, 600])
+def test_the_lowest_eigenvalue(n, lowest):
+    """Of the Laplacian of a path, 2 − 2 cos(πj/(n+1)), where all are moved and one is put far below."""
+    matrix = 1e5 * scipy.sparse.diags([-1.0, 2.0, -1.0], [-1, 0, 1], (n, n))
+    smallest = 1e5 * (2.0 - 2.0 * np.cos(np.pi / (n + 1)))
+    moved = matrix + (lowest - smallest) * scipy.sparse.identity(n)
+    assert lowest_eigenvalue(moved) == pytest.approx(lowest, rel=1e-6, abs=1e-7)
+    assert lowest_eigenvalue(scipy.sparse.block_diag([moved, [[-1e3]]])) == pytest.approx(min(lowest, -1e3), rel=1e-6)
+    assert np.isnan(lowest_eigenvalue(moved * np.nan)) and lowest_eigenvalue(scipy.sparse.csc_array((0, 0))) == np.inf
+
+
+@pytest.mark.parametrize("load_steps", [1, 4])
+def test_pins_end_at_their_last_keyframe(load_steps, device):
+    """A cable whose end is carried to where another starts hangs as that one does."""
+    started = scene("catenary", links=20)
+    ends = started.positions[started.pins.vertices]
+    away = ends + np.linspace(0.0, 1.0, 5)[:, None, None] * [[[0.0, 0.0, 0.0], [0.0, -0.3, 0.2]]]
+    moved = replace(started, pins=wc.Pins(started.pins.vertices, away))
+    fixed = replace(started, pins=started.pins.vertices)
+    positions = started.positions.copy()
+    positions[started.pins.vertices] = away[-1]
+    one = wc.equilibrium(moved, load_steps=load_steps, device=device)
+    other = wc.equilibrium(replace(fixed, positions=positions), device=device)
+    assert one.status.result in SETTLED and other.status.result in SETTLED
+    assert np.array_equal(one.points[started.pins.vertices], away[-1])
+    assert np.abs(one.points - other.points).max() < 1e-6

@@ -8,10 +8,11 @@ import warp as wp
 from .checks import choice, number, whole
 from .minimise import Minimiser
 from .solvers.solver import refuse_hard
-from .status import Result, Status
+from .status import Residual, Result, Status, digits, sentence
 from .turns import in_turn
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
+RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
 # Part of the size of the cloth; a descent that rounding ended after less than this has nowhere left to go.
 NEAR = 1e-5
 
@@ -21,19 +22,28 @@ class Equilibrium(NamedTuple):
 
     Attributes:
         points: (n, 3) [m].
-        status: How it ended, see :class:`warpcloth.status.Result`, with the residual: the largest unbalanced acceleration of
-            a vertex over gravity's (without any, over the largest at the start).
+        status: How it ended, see :class:`warpcloth.status.Result`, with the residual: Σ‖fᵢ‖, the unbalanced forces of all free
+            vertices, over the whole load Σmᵢ‖g‖ (without gravity, over what it was at the start).
         iterations: Newton iterations in all, each round of proximal steps counting as one more.
+        lowest_eigenvalue: Of the Hessian of the energy over the free vertices [N/m]; NaN where the descent did not end in
+            balance.
+        stable: Whether the descent ended in balance and no eigenvalue is negative by more than rounding and the tolerance
+            leave open: no small move lowers the energy to second order. Moves that cost nothing, such as those of a body
+            that nothing holds, have the eigenvalue 0 and count as stable.
     """
 
     points: np.ndarray
     status: Status
     iterations: int
+    lowest_eigenvalue: float = np.nan
+    stable: bool = False
 
 
 @in_turn
 def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cpu", dtype="float64", linear="factorised"):
-    """The shape that minimises U(x) − Σ m g·x with the pins where they start, from the positions of the scene.
+    """The shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins where they end.
+
+    Pins with keyframes end at the last of these, all others stay where they start.
 
     Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
     the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
@@ -42,10 +52,11 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     eigenvalue in the end, the shape is in balance without being a minimum: it is nudged and settles again.
 
     Args:
-        scene: The :class:`warpcloth.Scene`; velocities, moving pins and duration do not matter.
-        tolerance: Of the residual, see :class:`Equilibrium`. Where rounding leaves more, the descent ends when nothing is left
-            to gain and the status says so; with more than the weight unbalanced it does not pass for a rest shape.
-        load_steps: Parts in which gravity comes on.
+        scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
+        tolerance: Of the residual, see :class:`Equilibrium`, and of the unbalanced acceleration of each vertex over gravity's
+            (without any, over the largest at the start). Where rounding leaves more at a vertex, the descent ends when nothing
+            is left to gain, and the residual decides; with more than the weight unbalanced it does not pass for a rest shape.
+        load_steps: Parts in which gravity comes on and pins move along their keyframes. Pins that turn far need several.
         iterations: The most Newton iterations in all.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
@@ -67,6 +78,7 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0)
     descent = _Descent(minimiser, base, tolerance, iterations)
     for part in range(1, load_steps + 1):
+        _move_pins(scene.pins, base, part / load_steps)
         result = descent.run(part / load_steps, _frequency_scale(model))
     # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
     if result in SETTLED and minimiser.curves_down(tolerance):
@@ -74,11 +86,21 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
         result = descent.run(1.0, _frequency_scale(model))
         if result in SETTLED and minimiser.curves_down(tolerance):
             result = Result.SADDLE
-    residual = float(minimiser.residual.max())
-    message = result.value if result is Result.CONVERGED else f"{result.value}, residual {residual:.2g}"
-    if result is Result.ROUNDED and residual > 1.0:  # forces beyond the weight: nothing says that this is near the rest shape
-        result, message = Result.STALLED, f"rounding hides the rest shape in {dtype}, residual {residual:.2g}"
-    return Equilibrium(np.array(base.numpy()), Status(result, residual=residual, message=message), descent.used)
+    residual, began = descent.residual, result.value
+    if result is Result.ROUNDED and residual <= tolerance:
+        result = Result.CONVERGED
+    elif result is Result.ROUNDED and residual > 1.0:  # forces beyond the weight: nothing says that the rest shape is near
+        result, began = Result.STALLED, f"rounding hides the rest shape in {dtype}"
+    lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
+    use = None if result in SETTLED else "not a rest shape"
+    if result is Result.SADDLE:
+        use = f"not stable, for the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
+    unit = RESIDUAL.unit if minimiser.gravity[0] > 0.0 else RESIDUAL.weightless
+    message = sentence(result, dtype, residual, RESIDUAL.measure, unit, tolerance, use=use)
+    if result is Result.STALLED:
+        message = message.replace(result.value, began)
+    status = Status(result, residual=residual, message=message, measure=RESIDUAL.measure, unit=unit)
+    return Equilibrium(np.array(base.numpy()), status, descent.used, lowest, result in SETTLED)
 
 
 class _Descent:
@@ -88,6 +110,8 @@ class _Descent:
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
         self.used, self.moved = 0, 0.0
         self.scale = None  # of the first descent: without gravity a later one begins at its own rounding
+        model = minimiser.model
+        self.load = float(minimiser.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64))
         self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
 
     def run(self, load, s):
@@ -103,15 +127,36 @@ class _Descent:
             s /= 16.0
             self.used += 1  # so that a round which finds no direction at all ends too
 
+    @property
+    def residual(self):
+        """What is left unbalanced of the load, after the last descent."""
+        return self.unbalanced / self.load
+
     def _settle(self, s, load, most):
         self.minimiser.set_objective(s, load)
+        if self.load == 0.0:
+            self.minimiser.start()
+            self.load = float(self.minimiser.unbalanced()[0]) or 1.0
         (result,) = self.minimiser.minimise(self.tolerance, min(most, max(self.iterations - self.used, 0)), self.scale)
         self.scale = self.minimiser.scale
+        self.unbalanced = float(self.minimiser.unbalanced()[0])
         self.used += self.minimiser.iterations
         correction = self.minimiser.correction.numpy()
         self.moved = np.abs(correction).max(initial=0.0) / self.size
         self.base.assign(self.base.numpy() + correction)
         return result
+
+
+def _move_pins(pins, base, part):
+    """Puts pins with keyframes where they are after ``part`` of these, of 1; in place."""
+    if pins.keyframes is None:
+        return
+    at = part * (len(pins.keyframes) - 1)
+    before = min(int(at), len(pins.keyframes) - 1)
+    one, two = pins.keyframes[before], pins.keyframes[min(before + 1, len(pins.keyframes) - 1)]
+    points = base.numpy()
+    points[pins.vertices] = one + (at - before) * (two - one)
+    base.assign(points)
 
 
 def _nudge(model):

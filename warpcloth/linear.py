@@ -9,6 +9,9 @@ import warp as wp
 from .capture import Mirror, on_host
 from .kernels import linear
 
+# Unknowns of which all eigenvalues are found at once.
+SMALL = 100
+
 
 class ConjugateGradients:
     """Solves A x = b for each copy by conjugate gradients with the inverse diagonal blocks as preconditioner.
@@ -122,6 +125,14 @@ class Factorised:
         factors = (self._factor(copy, values, shift, unresolved) for copy in range(self.model.copies))
         return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
+    def lowest_eigenvalue(self, copy=0):
+        """The lowest eigenvalue of a copy's matrix without its pinned vertices [N/m]; see :func:`lowest_eigenvalue`."""
+        matrix = self.matrices[copy]
+        matrix.data[:] = self.values.read()[self.starts[copy] : self.starts[copy + 1]]
+        n = self.model.per_copy
+        free = np.flatnonzero(np.repeat(self.model.inverse_mass.numpy()[copy * n : (copy + 1) * n] > 0.0, 3))
+        return lowest_eigenvalue(matrix.tocsr()[free][:, free])
+
     def _mirror(self, array):
         """The mirror of an array, built when the array is first seen."""
         if array.ptr not in self._mirrors:
@@ -146,6 +157,46 @@ class Factorised:
             return splu(columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         except RuntimeError:  # exactly singular
             return None
+
+
+def lowest_eigenvalue(matrix):
+    """The lowest eigenvalue of a sparse symmetric matrix, by Lanczos iterations with the inverse of A + σ.
+
+    σ is raised from 1000 ε times the largest entry of the diagonal, tenfold each time, until A + σ has no negative pivot: then
+    no eigenvalue lies below −σ, the lowest is the nearest to it, and few iterations find it (Ericsson and Ruhe 1980).
+
+    Args:
+        matrix: A, scipy (n, n).
+
+    Returns:
+        float: As exact as about 1e-10 (λ + σ), σ at most 10 |λ| or 1000 ε times the largest entry. Infinite where n is 0, NaN
+            where an entry is not finite.
+    """
+    from scipy.sparse import identity
+    from scipy.sparse.linalg import LinearOperator, eigsh, splu
+
+    n, columns = matrix.shape[0], matrix.tocsc().astype(np.float64)
+    if n == 0:
+        return np.inf
+    if not np.isfinite(columns.data).all():
+        return np.nan
+    if n <= SMALL:
+        return float(np.linalg.eigvalsh(columns.toarray())[0])
+    shift = 1e3 * np.finfo(np.float64).eps * (np.abs(columns.diagonal()).max() or 1.0)
+    options = {"SymmetricMode": True, "Equil": False}
+    while True:
+        try:
+            shifted = columns + shift * identity(n, format="csc")
+            factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            if (factor.U.diagonal() > 0.0).all():
+                break
+        except RuntimeError:  # exactly singular
+            pass
+        shift *= 10.0
+    inverse = LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=n)
+    (largest,) = eigsh(inverse, k=1, which="LA", v0=start, tol=1e-10, return_eigenvectors=False)
+    return float(1.0 / largest - shift)
 
 
 class FactorisedRows:

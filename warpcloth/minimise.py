@@ -153,13 +153,30 @@ class Minimiser:
         A force of ``tolerance`` times the scale and the mass of the cloth may be left, and with it a compression of that force
         over an edge [N/m]. A sheet without bending stiffness has no other resistance against a move out of its plane.
         """
+        self._assemble_raw()
+        unresolved = tolerance * float((self.scale * self.model.mass.numpy().reshape(self.model.copies, -1).sum(axis=1)).max())
+        return Factorised(self.hessian).curves_down(unresolved / self.edge)
+
+    def lowest_eigenvalue(self):
+        """The lowest eigenvalue of the unchanged Hessian at d = 0 over the free vertices of the first copy [N/m]."""
+        self._assemble_raw()
+        return Factorised(self.hessian).lowest_eigenvalue()
+
+    def unbalanced(self):
+        """Σ‖∇φᵢ‖ at d of each copy, (B,) [N]."""
+        gradient = self.search.gradient.numpy().astype(np.float64).reshape(self.model.copies, -1, 3)
+        return np.linalg.norm(gradient, axis=2).sum(axis=1)
+
+    def _assemble_raw(self):
         before = self._policy.read().copy()
-        self._start()
+        self.start()
         self._policy.write(int(HessianPolicy.RAW))
         self._assemble()
         self._policy.write(before)
-        unresolved = tolerance * float((self.scale * self.model.mass.numpy().reshape(self.model.copies, -1).sum(axis=1)).max())
-        return Factorised(self.hessian).curves_down(unresolved / self.edge)
+
+    def start(self):
+        """d = 0, with what follows from it."""
+        self._start()
 
     # What the segments record.
 

@@ -71,7 +71,7 @@ class Status(NamedTuple):
         return self.result is not Result.DIVERGED
 
 
-def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None):
+def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None, use=None):
     """How a run ended, whether its result can be used, and the residual with its unit and what it was compared with.
 
     Args:
@@ -82,8 +82,9 @@ def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=No
         unit: Its unit.
         tolerance: What it was compared with, or None of methods that iterate without looking.
         copy: The copy whose residual it is, or None of one copy.
+        use: What the result can be used for, if not what it is of a run in time.
     """
-    use = {
+    use = use or {
         Result.COMPLETED: "usable" if measure is None else _NEAR,
         Result.CONVERGED: "usable",
         Result.ROUNDED: f"usable, as near to the solution as {dtype} comes",
