@@ -22,7 +22,6 @@ def scene(density: float = 0.5, stiffness: float = 1e6, bending: float = 1.0, du
             wc.QuadraticBending(stiffness=bending),
         ],
         pins=stage.mesh.corners()[:2],
-        gravity=(0.0, 0.0, -9.81),
         duration=duration,
         fps=stage.time_codes_per_second,
         name="usd_cloth",

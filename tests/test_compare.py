@@ -33,6 +33,50 @@ def still(points, mesh=GRID):
     return as_sequence(mesh, points[None], times=[0.0])
 
 
+def upright(points, axis):
+    """Points of a world that is Y up, as one has them that is Z up, or as they are."""
+    return points if axis == "Y" else points[..., [0, 2, 1]] * [1.0, -1.0, 1.0]
+
+
+@pytest.mark.parametrize(("one", "other"), [("Y", "Z"), ("Z", "Y"), ("Z", "Z"), ("Y", None), (None, "Z")])
+def test_stages_of_two_up_axes_are_compared_upright(tmp_path, capsys, one, other):
+    frames, sequences = waves(GRID.points), []
+    for name, axis in (("a", one), ("b", other)):
+        # What does not say its axis is taken as the other.
+        own = [upright(points, axis or one or other) for points in (GRID.points, frames)]
+        mesh = wc.Mesh(own[0], GRID.triangles, up_axis=axis)
+        sequences.append(as_sequence(mesh, own[1], dt=1 / 24))
+        if axis is not None:
+            writer = AnimationWriter(tmp_path / f"{name}.usda", mesh, fps=24.0)
+            for points in own[1]:
+                writer.append(points, np.zeros_like(points))
+            writer.close()
+    found = wc.compare(*sequences)
+    assert found.up_axes == (one, other) and not any(getattr(found, name).any() for name in DISTANCES)
+    assert found.stretch_largest.max() < 100 * EPS
+    if None in (one, other):
+        return
+    assert main(["compare", str(tmp_path / "a.usda"), str(tmp_path / "b.usda")]) == 0
+    out = capsys.readouterr().out
+    said = f"A is {one} up and B {other} up; B was turned to {one} up"
+    assert (said in out) == (one != other)
+    # Taken as they are they are apart where a turn moves them.
+    as_they_are = wc.compare(*sequences, up_axis="Y")
+    assert (as_they_are.largest.max() > 0.1) == (one != other) and as_they_are.up_axes == ("Y", "Y")
+    command = ["compare", str(tmp_path / "a.usda"), str(tmp_path / "b.usda"), "--json"]
+    assert main([*command, "--up-axis-a", one, "--up-axis-b", other]) == 0
+    assert json.loads(capsys.readouterr().out)["largest"]["value"] == 0.0
+    assert main([*command, "--up-axis", "Z"]) == 0
+    assert (json.loads(capsys.readouterr().out)["largest"]["value"] > 0.1) == (one != other)
+
+
+def test_an_axis_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="up_axis_b is 'X'; it must be one of 'Y', 'Z'"):
+        wc.compare(still(GRID.points), still(GRID.points), up_axis_b="X")
+    with pytest.raises(ValueError, match="up_axis is 'X'; it must be one of 'Y', 'Z'"):
+        wc.Mesh(GRID.points, GRID.triangles, up_axis="X")
+
+
 # --- with the same triangles
 
 
@@ -427,7 +471,7 @@ def test_the_command_compares_surfaces_of_different_meshes(files, tmp_path, capf
     [
         ("compare {}/cloth.usdc", "the following arguments are required: B; see warpcloth compare --help"),
         ("compare {}/cloth.usdc {}/none.usdc", "none.usdc: there is no such file"),
-        ("compare {}/cloth.usdc {}/obj", "b: has no times, by which frames belong together; give fps (--fps)"),
+        ("compare {}/cloth.usdc {}/obj", "obj: has no times, by which frames belong together; give fps (--fps or --fps-b)"),
         ("compare {}/cloth.usdc {}/rest.obj", "rest.obj: is one mesh"),
         ("compare {}/cloth.usdc {}/cloth.usdc --prim-b /None", "None"),
         ("compare {}/cloth.usdc {}/cloth.usdc --fps-a 0", "fps is 0.0; it must be a number above 0"),

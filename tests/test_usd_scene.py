@@ -146,6 +146,8 @@ def assert_same_scene(read, scene):
         np.testing.assert_array_equal(read.pins.keyframes, scene.pins.keyframes[:, order])
     for field in fields(scene.mesh):
         one, other = getattr(scene.mesh, field.name), getattr(read.mesh, field.name)
+        if field.name == "up_axis":  # a stage says its own, which gravity gives where the mesh has none
+            one = one or scene.up_axis
         if field.name == "texture_coordinates" and one is not None:
             one = one.astype(np.float32).astype(np.float64)
         assert_same(one, other, field.name)
@@ -331,6 +333,27 @@ def test_standard_names_are_read_in_units_of_the_stage(tmp_path, options, densit
     terms = terms or [("Spring", 3e3), ("QuadraticBending", 2.0)]
     assert [type(term).__name__ for term in scene.terms] == [kind for kind, _ in terms]
     np.testing.assert_allclose([term.stiffness for term in scene.terms], [stiffness for _, stiffness in terms], rtol=4 * EPS)
+
+
+@pytest.mark.parametrize("given", [None, (0.0, -1.62, 0.0), (0.0, 0.0, -1.62), (0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("up", ["Y", "Z", None])
+def test_gravity_follows_the_up_axis_of_a_loaded_mesh(tmp_path, up, given):
+    """An explicit gravity wins, and files say what gravity says."""
+    mesh = wc.Mesh.grid(3, 3)
+    if up is not None:
+        artist(tmp_path / "artist.usda", up=up).Save()
+        mesh = wc.Mesh.load(tmp_path / "artist.usda")
+    assert mesh.up_axis == up
+    scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=10.0)], duration=1 / 60, gravity=given)
+    own = (0.0, 0.0, -9.81) if up == "Z" else (0.0, -9.81, 0.0)
+    assert scene.gravity.tolist() == list(own if given is None else given)
+    said = {None: up or "Y", (0.0, -1.62, 0.0): "Y", (0.0, 0.0, -1.62): "Z"}.get(given, up or "Y")
+    wc.simulate(scene, wc.Explicit(substeps=8), output=str(tmp_path / "run.usda"))
+    write_scene(scene, tmp_path / "scene.usda")
+    pins = wc.Pins([0, 8], np.array([mesh.points[[0, 8]]] * 2))
+    wc.deform(mesh, pins, output=str(tmp_path / "deformed.usda"))
+    axes = [UsdGeom.GetStageUpAxis(Usd.Stage.Open(str(tmp_path / f"{name}.usda"))) for name in ("run", "scene", "deformed")]
+    assert axes == [said, said, up or "Y"]
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ from os import PathLike
 
 import numpy as np
 
-from .checks import number, shown, whole
+from .checks import choice, number, shown, whole
 from .distances import surface_distances, triangle_areas
 from .measures import MEASURES
-from .mesh import same_topology
+from .mesh import UP_AXES, same_topology
 from .samples import Exclusion
 from .sequences import Sequence, as_sequence, open_sequence
 from .surfaces import Triangles
@@ -26,6 +26,7 @@ class Comparison:
 
     Attributes:
         same_topology: Whether both have the same number of vertices and the same triangles, in the same order.
+        up_axes: "Y" or "Z" of a and of b, None where the input does not say. Where they differ b was turned to the axis of a.
         times: Times of the frames (F,) [s].
         frames: Their indices in a and in b (F, 2).
         labels: Their numbers as the files have them (F, 2).
@@ -50,6 +51,7 @@ class Comparison:
     """
 
     same_topology: bool
+    up_axes: tuple
     times: np.ndarray
     frames: np.ndarray
     labels: np.ndarray
@@ -75,7 +77,21 @@ class Comparison:
         return np.divide(self.rms, self.sizes, out=np.full(len(self.rms), np.nan), where=self.sizes > 0.0)
 
 
-def compare(a, b, prim_a=None, prim_b=None, fps=None, fps_a=None, fps_b=None, frames=None, device="cpu", progress=None):
+def compare(
+    a,
+    b,
+    prim_a=None,
+    prim_b=None,
+    fps=None,
+    fps_a=None,
+    fps_b=None,
+    frames=None,
+    device="cpu",
+    progress=None,
+    up_axis=None,
+    up_axis_a=None,
+    up_axis_b=None,
+):
     """Compares two animations frame by frame, those frames that both have.
 
     One frame of each is in memory at a time. Frames belong together by time: where times differ by no more than 1e-6 of the
@@ -92,6 +108,11 @@ def compare(a, b, prim_a=None, prim_b=None, fps=None, fps_a=None, fps_b=None, fr
         frames: Compare only that many frames after the first that both have.
         device: A Warp device.
         progress: Function called with (frame, frames) once each frame is compared, ``frames`` being those after the first.
+        up_axis: "Y" or "Z" of both, where they say nothing or are to have another than they say. Where one is Y up and the
+            other Z up, b is turned about x by 90° to the axis of a: (x, y, z) of Z up is (x, z, −y) of Y up. One that says
+            nothing is taken as the other.
+        up_axis_a: The same of a alone.
+        up_axis_b: The same of b alone.
 
     Returns:
         :class:`Comparison`.
@@ -106,7 +127,12 @@ def compare(a, b, prim_a=None, prim_b=None, fps=None, fps_a=None, fps_b=None, fr
     b = opened("b", b, prim_b, fps if fps_b is None else fps_b)
     for name, sequence in (("a", a), ("b", b)):
         if sequence.times is None:
-            raise ValueError(f"{name}: has no times, by which frames belong together; give fps (--fps)")
+            where = name if sequence.path is None else sequence.path
+            raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
+    up_axes = tuple(
+        up_axis_of(*given) for given in (("up_axis_a", a, up_axis_a or up_axis), ("up_axis_b", b, up_axis_b or up_axis))
+    )
+    b = _turned(b, *up_axes)
     pairs = _matching(a, b)
     unmatched = tuple(np.setdiff1d(np.arange(len(s)), places) for s, places in zip((a, b), pairs.T, strict=True))
     pairs = pairs if frames is None else pairs[: frames + 1]
@@ -121,7 +147,7 @@ def compare(a, b, prim_a=None, prim_b=None, fps=None, fps_a=None, fps_b=None, fr
         raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
     labels = np.column_stack([s.labels[places] for s, places in zip((a, b), pairs.T, strict=True)])
     excluded = tuple(pair.excluded)
-    return Comparison(pair.same, a.times[pairs[:, 0]], pairs, labels, unmatched, excluded, **_columns(rows))
+    return Comparison(pair.same, up_axes, a.times[pairs[:, 0]], pairs, labels, unmatched, excluded, **_columns(rows))
 
 
 def opened(name, source, prim=None, fps=None):
@@ -140,7 +166,22 @@ def opened(name, source, prim=None, fps=None):
     sequence = open_sequence(frames, prim, fps, mesh)
     if not same_topology(mesh, sequence.mesh):
         raise ValueError(f"{name}: its mesh is {mesh}, and {frames} has other triangles; it must be the rest shape of these")
-    return replace(sequence, mesh=mesh, declared=True)
+    return replace(sequence, mesh=mesh, declared=True, up_axis=sequence.up_axis or mesh.up_axis)
+
+
+def up_axis_of(name, sequence, given):
+    """The up axis that is given for a sequence, or its own."""
+    if given is not None:
+        choice(name, given, UP_AXES)
+    return given or sequence.up_axis
+
+
+def _turned(b, axis_a, axis_b):
+    """b with its frames turned to the up axis of a, exactly; as it is where the axes are one or either is not known."""
+    if axis_a is None or axis_b is None or axis_a == axis_b:
+        return b
+    columns, signs = ([0, 2, 1], [1.0, 1.0, -1.0]) if axis_a == "Y" else ([0, 2, 1], [1.0, -1.0, 1.0])
+    return replace(b, read=lambda frame: b[frame][:, columns] * signs)
 
 
 def _matching(a, b):

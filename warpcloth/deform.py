@@ -62,7 +62,7 @@ def deform(
     single_file=False,
     progress=None,
     stage=None,
-    up_axis="Y",
+    up_axis=None,
 ):
     """Deforms a mesh as rigidly as its moved handles allow (Sorkine & Alexa 2007).
 
@@ -86,7 +86,7 @@ def deform(
         single_file: Whether ``output`` is to be one file in the end, with nothing beside it.
         progress: Function called with (frame, frames) once each frame is kept, ``frames`` being those after the first; or None.
         stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; ``output`` is then a layer over it.
-        up_axis: "Y" or "Z", of an output that is no layer.
+        up_axis: "Y" or "Z", of an output that is no layer; that of the mesh where not given.
 
     Returns:
         :class:`Deformation`.

@@ -5,10 +5,12 @@ from functools import cached_property
 
 import numpy as np
 
+from .checks import choice
 from .kernels.deformation import FLATTEST
 from .selection import select
 
 STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+UP_AXES = ("Y", "Z")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -25,10 +27,12 @@ class Mesh:
             each row has its smaller index first, and rows are in lexicographic order. Of an edge mesh: as given.
         texture_coordinates: One st pair for each vertex (n, 2), float64, or None.
         grid_shape: (nx, ny) if vertex i + nx·j is column i, row j of a grid of four-sided cells, or None.
+        up_axis: "Y" or "Z", which gravity and files follow; None where nobody says, which they take for "Y".
 
     Raises:
         ValueError: An array has the wrong shape or type, is empty, or has an element (named by its index) that is not
-            finite, refers to no vertex, repeats a vertex, has no area or length, or (edges) occurs twice.
+            finite, refers to no vertex, repeats a vertex, has no area or length, or (edges) occurs twice; or the up axis is
+            another.
     """
 
     points: np.ndarray
@@ -36,8 +40,11 @@ class Mesh:
     edges: np.ndarray | None = None
     texture_coordinates: np.ndarray | None = None
     grid_shape: tuple[int, int] | None = None
+    up_axis: str | None = None
 
     def __post_init__(self):
+        if self.up_axis is not None:
+            choice("up_axis", self.up_axis, UP_AXES)
         points = _numbers("points", self.points, 3)
         n = len(points)
         if (self.triangles is None) == (self.edges is None):

@@ -66,7 +66,7 @@ def write_report(
     colour_range=None,
     curves=False,
     single_file=False,
-    up_axis="Y",
+    up_axis=None,
     progress=None,
 ):
     """Measures all rows of an analysis and writes them, in memory that does not grow but for the plot's percentiles.
@@ -84,7 +84,7 @@ def write_report(
             about the value of what is undeformed where there is one.
         curves: Whether stage and pictures show the principal directions, as long as their stretches.
         single_file: Whether the stage is one file, see :class:`warpcloth.usd.AnimationWriter`.
-        up_axis: "Y" or "Z", of what is no stage.
+        up_axis: "Y" or "Z", of what does not say its own.
         progress: Function called with (row, rows) after each, or None.
 
     Returns:
@@ -267,11 +267,11 @@ class _Shown:
         areas = areas[np.isfinite(areas) & (areas > 0.0)]  # others have no segments
         self.length = _SEGMENT * np.sqrt(np.median(areas)) if len(areas) else 0.0
         sequence = analyzer.sequence
+        up_axis = sequence.up_axis or up_axis or analyzer.mesh.up_axis or "Y"
         if self.stills:
             from .chart import View
 
             places = {pair.frame for pair in analyzer.pairs if sequence.labels[pair.frame] in self.stills}
-            up_axis = sequence.stage.up_axis if sequence.stage else up_axis
             self.view = View(up_axis=up_axis).fit(sequence[place] for place in sorted(places))
         self.writer, self.rate = None, _rate(sequence)
         if usd:

@@ -11,6 +11,8 @@ from .mesh import Mesh
 from .selection import distinct_vertices
 from .terms import Declared
 
+EARTH = 9.81  # [m/s²]
+DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
 _MOST_FRAMES = 2**31 - 1  # what counts them on the device is int32
 
 
@@ -30,7 +32,7 @@ class Pins:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A cloth, what acts on it, and for how long. SI units, y up. ``dataclasses.replace`` changes fields of one.
+    """A cloth, what acts on it, and for how long. SI units. ``dataclasses.replace`` changes fields of one.
 
     Attributes:
         mesh: The :class:`Mesh`; its points are the rest shape.
@@ -42,7 +44,7 @@ class Scene:
         velocities: How they start, (n, 3) [m/s]; at rest if not given. What they say of pinned vertices does not matter.
         terms: The energies, see :mod:`warpcloth.terms`.
         pins: :class:`Pins`, or vertices or a selection of fixed ones.
-        gravity: Acceleration (3,) [m/s²].
+        gravity: Acceleration (3,) [m/s²]; if not given 9.81 down the up axis of the mesh, which is y where it has none.
         duration: [s], a whole number of frames.
         fps: Frames per second.
         name: For reports and files.
@@ -60,7 +62,7 @@ class Scene:
     velocities: np.ndarray | None = None
     terms: Sequence = ()
     pins: Pins | str | Sequence[int] | np.ndarray | None = None
-    gravity: Sequence[float] = (0.0, -9.81, 0.0)
+    gravity: Sequence[float] | None = None
     duration: float = 1.0
     fps: float = 60.0
     name: str = "scene"
@@ -82,7 +84,8 @@ class Scene:
                 f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames from 1 to {_MOST_FRAMES}"
             )
         keep("terms", self._checked_terms())
-        keep("gravity", array("gravity", self.gravity, (3,)))
+        gravity = EARTH * np.array(DOWN[self.mesh.up_axis or "Y"]) if self.gravity is None else self.gravity
+        keep("gravity", array("gravity", gravity, (3,)))
         keep("positions", self.mesh.points if self.positions is None else array("positions", self.positions, (n, 3)))
         keep("velocities", np.zeros((n, 3)) if self.velocities is None else array("velocities", self.velocities, (n, 3)))
         keep("pins", checked_pins(self.pins, self.mesh))
@@ -136,7 +139,9 @@ class Scene:
 
     @property
     def up_axis(self):
-        """The axis that gravity is along, "Y" or "Z"; "Y" without gravity."""
+        """The axis that gravity is along, "Y" or "Z"; that of the mesh without gravity."""
+        if not self.gravity[1:].any():
+            return self.mesh.up_axis or "Y"
         return "Z" if abs(self.gravity[2]) > abs(self.gravity[1]) else "Y"
 
     def build(self, device="cpu", dtype="float32", copies=1, vary=None, order=None, threads=1):

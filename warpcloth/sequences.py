@@ -49,6 +49,7 @@ class Sequence:
         precision: Type of the numbers that the input has, which says how coarsely they are rounded.
         declared: Whether the input says the rest shape; else `mesh` has the points of the first frame.
         files: Paths of the files that frames are read from.
+        up_axis: "Y" or "Z"; None where the input does not say.
 
     Raises:
         ValueError: The mesh has no triangles.
@@ -63,6 +64,7 @@ class Sequence:
     declared: bool = True
     precision: type = np.float64
     files: tuple = ()
+    up_axis: str | None = None
 
     def __post_init__(self):
         if not len(self.mesh.triangles):
@@ -169,7 +171,7 @@ def as_sequence(mesh, frames, dt=None, times=None):
         times = dt * np.arange(count)
     elif times is not None:
         times = _increasing(times, count)
-    return Sequence(mesh, np.arange(count), times, read, precision=precision)
+    return Sequence(mesh, np.arange(count), times, read, precision=precision, up_axis=mesh.up_axis)
 
 
 def _open_stage(path, prim, fps):
@@ -185,7 +187,7 @@ def _open_stage(path, prim, fps):
         )
     labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
     times = frames.times if fps is None else (codes - codes[0]) / fps
-    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32, frames.files)
+    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32, frames.files, stage.up_axis)
 
 
 def _open_files(path, found, prim, fps):
@@ -280,7 +282,8 @@ def _open_npy(path, fps, mesh):
     if mesh is None:
         raise ValueError("has no triangles; give a rest mesh that has them (--rest), or an .npz file")
     count, read, precision = _array("points", points, mesh)
-    return Sequence(mesh, np.arange(count), _even(count, fps), read, path, precision=precision, files=(path,))
+    times = _even(count, fps)
+    return Sequence(mesh, np.arange(count), times, read, path, precision=precision, files=(path,), up_axis=mesh.up_axis)
 
 
 def _array(name, frames, mesh):

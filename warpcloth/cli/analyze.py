@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 from .. import scene_files
+from ..mesh import UP_AXES
 from ..outputs import check_apart
 from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place
 
@@ -56,7 +57,7 @@ def add_arguments(parser):
         metavar=("LOW", "HIGH"),
         help="of the colours; else of all frames, without the last 1 %%",
     )
-    add("--up-axis", choices=("Y", "Z"), default="Y", help="of what is no stage; Y where not given")
+    add("--up-axis", choices=UP_AXES, help="of what does not say its own; Y where not given")
     add("--curves", action="store_true", help="show the principal directions as curves")
     add("--csv", metavar="FILE", help="a table: percentiles of every frame, the worst element and its place")
     add("--report", metavar="FILE", help="the same and what is left out, as JSON")

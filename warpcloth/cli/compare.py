@@ -6,6 +6,7 @@ import numpy as np
 
 from ..chart.figures import PICTURES, check_path
 from ..checks import whole
+from ..mesh import UP_AXES
 from ..outputs import TEXT, Output, check_apart
 from .terminal import Progress, as_json, check_writable, find_device
 
@@ -15,7 +16,7 @@ EPILOG = """\
 A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames that
 both have at one time are compared, and the others are said. With the same triangles vertices are compared, and stretches, each
 against its own rest shape, which of a folder or an .npz file is the first frame where no --rest-a or --rest-b says another;
-with other triangles the surfaces alone.
+with other triangles the surfaces alone. Where one is Y up and the other Z up, B is turned to the axis of A.
 
   warpcloth compare hanging.usdc frames --fps-b 24 --rest-b rest.obj --csv apart.csv
 """
@@ -29,7 +30,9 @@ def add_arguments(parser):
         parser.add_argument(f"--prim-{name}", metavar="PRIM", help=f"path or name of the prim of {of}, if it has several")
         parser.add_argument(f"--rest-{name}", metavar="MESH", help=f"mesh file with the rest shape of {of}")
         parser.add_argument(f"--fps-{name}", type=float, metavar="FPS", help=f"frames per second of {of} alone")
+        parser.add_argument(f"--up-axis-{name}", choices=UP_AXES, help=f"up axis of {of} alone")
     parser.add_argument("--fps", type=float, help="frames per second of both, if they do not say")
+    parser.add_argument("--up-axis", choices=UP_AXES, help="up axis of both, if not those that they say")
     parser.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not all")
     parser.add_argument("--csv", metavar="FILE", help="write a line for each frame")
     parser.add_argument("--plot", metavar="FILE", help=f"draw the distances over time, as {', '.join(PICTURES)}")
@@ -46,7 +49,8 @@ def compare(arguments):
     check_apart([arguments.csv, arguments.plot], [*a.files, *b.files, arguments.rest_a, arguments.rest_b])
     progress = Progress()
     try:
-        found = compare(a, b, frames=arguments.frames, device=device, progress=progress)
+        axes = {name: getattr(arguments, name) for name in ("up_axis", "up_axis_a", "up_axis_b")}
+        found = compare(a, b, frames=arguments.frames, device=device, progress=progress, **axes)
     finally:
         progress.close()
     columns = _columns(found)
@@ -109,6 +113,7 @@ def _facts(arguments, found, sequences):
         "vertices": [len(s.mesh.points) for s in sequences],
         "triangles": [len(s.mesh.triangles) for s in sequences],
         "same_topology": found.same_topology,
+        "up_axes": list(found.up_axes),
         "rest_declared": [bool(s.declared) for s in sequences],
         "compared": int(np.isfinite(found.hausdorff).sum()),
         "unmatched": [
@@ -177,6 +182,10 @@ def _summary(facts, found):
         first = [of for of, declared in zip("AB", facts["rest_declared"], strict=True) if not declared]
         if first:
             lines.append(f"                from the first frame of {' and of '.join(first)}, where no rest shape is given")
+    up_a, up_b = facts["up_axes"]
+    if up_a and up_b and up_a != up_b:
+        lines.append(f"  up axis       A is {up_a} up and B {up_b} up; B was turned to {up_a} up")
+        lines.append("                (--up-axis takes both as they are)")
     for of, labels in zip("AB", facts["unmatched"], strict=True):
         if labels:
             few = ", ".join(f"{label:g}" for label in labels[:_SHOWN]) + (", …" if len(labels) > _SHOWN else "")

@@ -50,7 +50,7 @@ class MeasureWriter(ChunkWriter):
         directions=None,
         source=None,
         fps=24.0,
-        up_axis="Y",
+        up_axis=None,
         chunk=10,
         metadata=None,
     ):
@@ -65,7 +65,7 @@ class MeasureWriter(ChunkWriter):
             directions: "vertex" or "uniform" by name of each set of segments, or None.
             source: The `StageMesh` that was measured, or None.
             fps: Frames per second, also time codes per second; a source has its own.
-            up_axis: "Y" or "Z"; a source has its own.
+            up_axis: "Y" or "Z", that of the mesh where not given; a source has its own.
             chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
             metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers, texts or dicts
                 of such.
@@ -78,6 +78,7 @@ class MeasureWriter(ChunkWriter):
         super().__init__(output, mesh, chunk)
         # Its own, or earlier measures and the motion of a result that was measured would not be seen.
         self._clip_set = f"measures_{self._run.name[-8:]}"
+        up_axis = up_axis or mesh.up_axis or "Y"
         check_scene(fps, up_axis)
         primvars, directions = dict(primvars), dict(directions or {})
         check_primvars(primvars, mesh)

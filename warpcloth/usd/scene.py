@@ -8,7 +8,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from ..mesh import Mesh
-from ..scene import Pins, Scene
+from ..scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
 from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
 from .chunks import export
@@ -16,7 +16,6 @@ from .layers import scene_layer
 from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
 from .values import array_of, refuse_unknown, sentences, time_codes_of
 
-_EARTH = 9.81  # [m/s²]
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none
 
 
@@ -127,6 +126,7 @@ def _exact_mesh(values, cloth, surroundings):
         edges=None if len(mesh.triangles) else mesh.edges if edges is None else edges,
         texture_coordinates=mesh.texture_coordinates,
         grid_shape=None if grid_shape is None else tuple(grid_shape.tolist()),
+        up_axis=mesh.up_axis,
     )
 
 
@@ -254,9 +254,9 @@ def _gravity(stage, values, up_axis):
     values.places["physics scene"] = scenes[0] if scenes else None
     direction, magnitude = values.get("(gravity direction)"), values.get("(gravity magnitude)")
     if direction is None or not direction.any():
-        direction = np.array((0.0, 0.0, -1.0) if up_axis == "Z" else (0.0, -1.0, 0.0))
+        direction = np.array(DOWN[up_axis])
     if magnitude is None or magnitude < 0:  # as UsdPhysics has it: a negative value asks for that of the earth
-        magnitude = _EARTH
+        magnitude = EARTH
     return magnitude * direction.astype(np.float64) / np.linalg.norm(direction)
 
 
@@ -287,7 +287,7 @@ def write_scene(scene, path):
         raise ValueError("scene.terms is empty; a scene in a stage must have one or more")
     for term in scene.terms:
         term.elements(scene.mesh, scene.positions)  # or reading would refuse what was written
-    up_axis = scene.stage.up_axis if scene.stage else "Z" if np.argmax(np.abs(scene.gravity)) == 2 else "Y"
+    up_axis = scene.stage.up_axis if scene.stage else scene.up_axis
     pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
     layer, target, _ = scene_layer(scene.mesh, pins, up_axis, "Cloth")
     stage = Usd.Stage.Open(layer)

@@ -82,7 +82,7 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
     The points at the default time are the rest shape. A stage with time samples alone is read at its first sample, with a
     warning: support for that is deprecated, for nothing says that a first frame is at rest. Holes are left out. Polygons are
     cut into fans of triangles from their first corner, and turned where the prim is left-handed or mirrored by its transform,
-    so that triangle normals point out of the front. The up axis is reported, not changed.
+    so that triangle normals point out of the front. The up axis is kept.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
@@ -111,6 +111,7 @@ def _stage_mesh(stage, path, prim, kind, time):
     where = f"{path}, prim {found.GetPath()}"
     transform = local_to_metres(found, where, time)
     point_vertices = corner_coordinates = None
+    up_axis = str(UsdGeom.GetStageUpAxis(stage))
     try:
         points = placed(_rest_points(found, where, time), transform)
         if time is None:
@@ -121,12 +122,12 @@ def _stage_mesh(stage, path, prim, kind, time):
                 triangles = triangles[:, ::-1]
             at_vertices, at_corners = _texture_coordinates(found, len(points), corners)
             corner_coordinates = None if at_corners is None else at_corners[triangles]
-            mesh = kind(points, corners[triangles], texture_coordinates=at_vertices)
+            mesh = kind(points, corners[triangles], texture_coordinates=at_vertices, up_axis=up_axis)
         else:
             point_vertices = curve_vertices(found, len(points))
             edges = point_vertices[_curve_edges(found, len(points))]
             edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
-            mesh = kind(points[first_points(point_vertices)], edges=edges)
+            mesh = kind(points[first_points(point_vertices)], edges=edges, up_axis=up_axis)
         pins = _pins(found, point_vertices, len(points))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
@@ -138,7 +139,7 @@ def _stage_mesh(stage, path, prim, kind, time):
         prim=str(found.GetPath()),
         transform=transform,
         meters_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
-        up_axis=str(UsdGeom.GetStageUpAxis(stage)),
+        up_axis=up_axis,
         fps=rate if layer.HasFramesPerSecond() or layer.HasTimeCodesPerSecond() else None,
         time_codes_per_second=stage.GetTimeCodesPerSecond(),
         start=stage.GetStartTimeCode() if layer.HasStartTimeCode() else None,

@@ -27,7 +27,7 @@ class AnimationWriter(ChunkWriter):
     """
 
     def __init__(
-        self, output, mesh, fps, source=None, prim=None, pins=None, up_axis="Y", chunk=10, metadata=None, primvars=None
+        self, output, mesh, fps, source=None, prim=None, pins=None, up_axis=None, chunk=10, metadata=None, primvars=None
     ):
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
@@ -39,7 +39,7 @@ class AnimationWriter(ChunkWriter):
             source: A stage to write a layer over, or None.
             prim: Of a source: path or name of the prim. Without: name of the prim under /World, "Cloth" if None.
             pins: Vertex indices by name, written as GeomSubsets in the family "pins". A source has its own.
-            up_axis: "Y" or "Z"; a source has its own.
+            up_axis: "Y" or "Z", that of the mesh where not given; a source has its own.
             chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
             metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers or texts.
             primvars: Interpolation of each primvar that `append` will be given, by name: "vertex", a value for each
@@ -50,6 +50,7 @@ class AnimationWriter(ChunkWriter):
             ValueError: A parameter is not as above, or the output is a file of the source's stage.
         """
         super().__init__(output, mesh, chunk)
+        up_axis = up_axis or mesh.up_axis or "Y"
         check_scene(fps, up_axis)
         primvars = dict(primvars or {})
         check_primvars(primvars, mesh)
