@@ -1,5 +1,6 @@
 """Neighbourhoods of vertices against brute force."""
 
+import warnings
 from itertools import pairwise
 
 import numpy as np
@@ -44,6 +45,41 @@ def test_nearest(chosen, k):
     for around, distances in zip(found[1:], DISTANCES, strict=True):
         assert len(around) == k
         assert max(distances[j - 1] for j in around) <= np.sort(distances)[k - 1] * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("cells", [2, 3, 6, 9])
+def test_a_share_of_few_vertices_determines_rotations(cells, device):
+    """Below 101 vertices 2 % are one or two: it takes the nearest three, or more where these are on a line, and says so."""
+    mesh = wc.Mesh.grid(cells + 1, cells + 1)
+    n, points = len(mesh.points), mesh.points
+    with pytest.warns(
+        UserWarning, match=rf"nearest:2%.*: [12] of the {n} vertices determines? no rotation at {n} of them.*3 to 4"
+    ):
+        found = sets("nearest:2%", mesh)
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    for i, around in enumerate(found):
+        around = np.array(sorted(around, key=lambda j: distances[i, j]))
+        assert i in around and distances[i, around].max() <= np.sort(distances[i])[len(around) - 1] * (1 + 1e-12)
+        assert len(around) in (3, 4) and np.linalg.matrix_rank(points[around] - points[i]) == 2
+    turn = wc.polar(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    with pytest.warns(UserWarning, match="no rotation"):
+        measured = wc.analyze(
+            mesh, [points @ turn.T], measures=("rotation",), neighbourhood="nearest:2%", device=device, dtype="float64"
+        )
+    assert np.abs(measured["rotation"] - turn).max() < 1e-12
+
+
+def test_a_share_goes_as_far_as_a_line_does():
+    """Of a ribbon of two long rows, 40 times as far apart as their vertices; what is given as a number is taken as it is."""
+    ribbon = wc.Mesh.grid(60, 2, size=(1.0, 40 / 59), pattern="alternating")
+    with pytest.warns(UserWarning, match=r"3 of the 120 vertices determine no rotation at 120 of them.*, 4[0-9] to "):
+        found = sets("nearest:2%", ribbon)
+    for i, around in enumerate(found):
+        assert len({j // 60 for j in around}) == 2, i
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert {len(around) for around in sets("nearest:k=3", ribbon)} == {3}
+        assert {len(around) for around in sets("nearest:2%", wc.Mesh.grid(20, 20))} == {8}
 
 
 def test_two_per_cent_of_the_vertices_where_nothing_else_is_said():

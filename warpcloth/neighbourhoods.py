@@ -1,6 +1,7 @@
 """Sets of vertices around each vertex of a mesh: rings of neighbours, or the nearest points."""
 
 import re
+import warnings
 
 import numpy as np
 
@@ -9,6 +10,11 @@ from .rotation import point_sets
 
 _RULE = 'must be "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, or a set for each'
 _SHARE = 2.0  # per cent
+# Points whose spread across a line is at most this part of that along it lie on it: what they are wrong by across, they turn by
+# a hundred times.
+_LINE = 0.01
+# Of the nearest points so many are looked at for all vertices at once: only on very uneven meshes do more lie on a line.
+_FEW = 8
 
 
 def neighbourhoods(mesh, chosen):
@@ -21,7 +27,8 @@ def neighbourhoods(mesh, chosen):
     Args:
         mesh: The :class:`warpcloth.Mesh`.
         chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, which is
-            "nearest" too; or sets of vertices, (n, k) or n lists.
+            "nearest" too; or sets of vertices, (n, k) or n lists. Where a share of the vertices is fewer than three, or all on
+            one line, it takes the fewest nearest that determine a rotation, and warns.
 
     Returns:
         tuple: offsets (n + 1,) and members, int32: those of vertex i are members[offsets[i]:offsets[i + 1]].
@@ -74,18 +81,58 @@ def _nearest(mesh, used, chosen):
         members = np.concatenate(rows)
     else:
         k = int(value) if kind == "k" else int(np.ceil(value / 100.0 * len(points)))
-        if k < 3 or k > len(points):
+        if (kind == "k" and k < 3) or max(k, 3) > len(points):
             raise ValueError(
                 f"neighbourhood = {shown(chosen)}: is {k} of the {len(points)} vertices, must be 3 or more and at most all"
             )
-        members = np.empty((len(points), k), dtype=np.int32)
-        for start in range(0, len(points), 4096):
-            part = slice(start, start + 4096)
-            members[part] = np.sort(tree.query(points[part], k=k)[1], axis=1)
-        sizes = np.full(len(points), k)
-        members = members.ravel()
+        sizes, members = _sets(tree, k, widen=kind == "share")
+        if wide := np.count_nonzero(sizes > k):
+            warnings.warn(
+                f"neighbourhood = {shown(chosen)}: {k} of the {len(points)} vertices determine{'s' * (k == 1)} no rotation at "
+                f"{wide} of them; there it takes the fewest nearest that do, {sizes[sizes > k].min()} to {sizes.max()}",
+                stacklevel=2,
+            )
     if sizes.sum() > np.iinfo(np.int32).max:
         raise ValueError(f"neighbourhood = {shown(chosen)}: has {sizes.sum()} members in all, must be less than 2³¹")
     counts = np.zeros(len(used), dtype=np.int64)
     counts[vertices] = sizes
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), vertices[members].astype(np.int32)
+
+
+def _sets(tree, k, widen):
+    """The k nearest of each point of a tree; with ``widen`` more of them, until they determine a rotation.
+
+    Returns:
+        tuple: How many they are (n,), and all of them one set after another, each in order of index.
+    """
+    points, n = tree.data, tree.n
+    most = min(max(k, _FEW), n) if widen else k
+    todo = [(np.arange(start, min(start + 4096, n)), 3, most) for start in range(0, n, 4096)]
+    pieces, sizes = [], np.empty(n, dtype=np.int64)
+    while todo:
+        part, least, most = todo.pop()
+        near = tree.query(points[part], k=most)[1]
+        size = np.full(len(part), 0 if widen else k)
+        for count in range(least, most + 1):  # ends after few: three or four points are on a line seldom
+            unknown = np.flatnonzero(size == 0)
+            if not len(unknown):
+                break
+            size[unknown[~_on_a_line(points[near[unknown, :count]])]] = max(count, k)
+        open_, found = (size == 0) & (most < n), (size > 0) | (most == n)
+        size[size == 0] = n
+        if open_.any():
+            todo.append((part[open_], most + 1, min(2 * most, n)))
+        near = np.where(np.arange(most) < size[:, None], near, n)[found]
+        sizes[part[found]] = size[found]
+        pieces.append((part[found], np.sort(near, axis=1)))
+    ends, members = np.cumsum(sizes), np.empty(sizes.sum(), dtype=np.int32)
+    for part, near in pieces:
+        at = (ends - sizes)[part][:, None] + np.arange(near.shape[1])
+        members[at[near < n]] = near[near < n]
+    return sizes, members
+
+
+def _on_a_line(sets):
+    """Whether the points of each set (m, k, 3) lie on a line."""
+    spread = np.linalg.svd(sets - sets.mean(axis=1, keepdims=True), compute_uv=False)
+    return ~(spread[:, 1] > _LINE * spread[:, 0])
