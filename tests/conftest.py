@@ -1,4 +1,4 @@
-"""Options of the test run: the device, and the slow tests, which are left out unless -m says otherwise."""
+"""Options of the test run: the device, and the tests that are left out unless -m says otherwise."""
 
 import pytest
 
@@ -14,9 +14,14 @@ def device(request):
 
 
 def pytest_collection_modifyitems(config, items):
+    """Leaves out what is slow, and on another device than the CPU also what does not run there or takes long there."""
     if config.option.markexpr:
         return
-    slow = [item for item in items if item.get_closest_marker("slow")]
-    if slow:
-        config.hook.pytest_deselected(items=slow)
-        items[:] = [item for item in items if not item.get_closest_marker("slow")]
+    elsewhere = config.getoption("--device") != "cpu"
+    left_out = ("slow", "host") if elsewhere else ("slow",)
+
+    def kept(item):
+        return not any(map(item.get_closest_marker, left_out)) and ("device" in item.fixturenames or not elsewhere)
+
+    config.hook.pytest_deselected(items=[item for item in items if not kept(item)])
+    items[:] = filter(kept, items)

@@ -13,6 +13,7 @@ from warpcloth.chart.panels import point
 from warpcloth.chart.sweep import Store
 from warpcloth.cli import main
 
+pytestmark = pytest.mark.host
 EPS = np.finfo(np.float64).eps
 
 

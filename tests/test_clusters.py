@@ -389,6 +389,7 @@ def test_a_level_mobile_stays_level(device):
             assert np.abs(points[1:7] - rest[1:7]).max() < 1e-2
 
 
+@pytest.mark.host
 def test_a_mobile_moves_alike_with_two_methods(device):
     """XPBD and constrained dynamics end 4e-5 m apart after a second, as far as XPBD with half the step does from itself."""
     scene = mobile.scene(n=5)

@@ -316,6 +316,7 @@ def test_rounding_is_no_contradiction(linear, device):
 # --- statics and edges of what is allowed
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("options", [{}, {"linear": "factorised"}, {"stabilisation": "line-search"}, {"stabilisation": "none"}])
 @pytest.mark.parametrize(("substeps", "iterations"), [(1, 1), (1, 7), (5, 1)])
 def test_a_mass_hangs_as_long_as_the_material_says(substeps, iterations, options, device):

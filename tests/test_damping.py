@@ -269,6 +269,7 @@ SOLVERS["pbd"] = wc.PBD(substeps=1, iterations=1)
 SOLVERS["pbd per step"] = wc.PBD(substeps=1, iterations=7, stiffness="per-step")
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_damped_oscillator(name, device):
     """u = e^{−βt/2}(u₀ cos + (v₀ + βu₀/2)/ω' sin), approached with the order of the method. BDF2 needs two states for ds/dt."""

@@ -212,6 +212,7 @@ def test_03_pbd_hangs_too_long_by_the_known_amount(s, substeps, iterations, stif
     assert -1 - stepper.state.x.numpy()[1, 1] == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("form", ["vector", "scalar"])
 @pytest.mark.parametrize("sweep", ["coloured", "sequential", "constraint-averaged"])
 @pytest.mark.parametrize(("substeps", "iterations"), [(1, 1), (1, 7), (5, 1), (5, 7)])
@@ -458,6 +459,7 @@ def test_06_rate_on_one_spring(k, pull, across, device):
     assert len(errors) > 1 and np.abs(np.array(errors[1:]) / errors[:-1] / rate - 1.0).max() < 1e-6
 
 
+@pytest.mark.host
 def test_06_accelerations_take_a_root_of_the_iterations(device):
     """1 − rate is m/(h²k) for stiff springs, so that plain iterations grow like k; accelerated ones grow about like √k.
 
@@ -476,6 +478,7 @@ def test_06_accelerations_take_a_root_of_the_iterations(device):
         assert growth[name] < 0.65 and counts[name][2] < 0.1 * counts["none"][2]
 
 
+@pytest.mark.host
 def test_06_accelerations_pay(device):
     """The error of 200 accelerated iterations is below that of 2000 plain ones, beside Newton."""
     declared = swinging(8)
@@ -681,6 +684,7 @@ def check_fall(name, seconds, device):
     assert (strain > 1e-5) == walks
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("name", STEPPING)
 def test_08_rounding_of_a_fall(name, device):
     """float32: what solves for x − x̃ and damps keeps strain at the rounding of a place, 1.3 ε|x|/edge = 1e-5.
@@ -781,6 +785,7 @@ def hinge_angles(mesh, x):
 THREADS = ("structural", "shear")
 
 
+@pytest.mark.host
 @pytest.mark.parametrize(
     ("pattern", "pairs", "degrees", "keeps"),
     [
@@ -817,6 +822,7 @@ def test_09_a_net_that_cannot_bend_without_strain_loses_its_curvature(pattern, p
         assert kept[0] < 0.97 and kept[-1] < (0.0 if pairs == THREADS else 0.75)
 
 
+@pytest.mark.host
 def test_09_stiff_threads_lock_an_irregular_net(device):
     """A wide cantilever of Γ = 5 sinks by less the stiffer its threads are; the less, the finer it is; a jittered one by more.
 
@@ -911,6 +917,7 @@ def test_11_slivers_have_a_relative_guard(height, scale, dtype, device):
     assert energy.numpy()[0] == pytest.approx(0.5 * c * angle**2, rel=tolerance)
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("h", [1e-3, 2.5e-4])
 def test_11_a_hinge_folds_through_flat_and_goes_on(h, device):
     """θ jumps from π to −π: the force turns round, the energy ½c(θ − θ̄)², wrapped, does not jump; the run keeps its total.

@@ -64,6 +64,7 @@ def slopes(steps, errors):
     return np.diff(np.log(errors)) / np.diff(np.log(steps))
 
 
+@pytest.mark.host
 @each_integrator
 @each_solver
 def test_order_on_an_oscillator(name, integrator, device):

@@ -331,6 +331,7 @@ def test_fine_meshes_of_other_nets_stay_wrong(pattern, angle, bending, device):
     assert stays_wrong(pattern, angle, cantilevers((12, 24, 32), device, angle, pattern=pattern, bending=bending))
 
 
+@pytest.mark.host
 def test_an_irregular_net_locks_and_one_with_rows_across_does_not(device):
     """A stiff membrane takes the bending from the jittered net, which goes away with h, apart from its calibration."""
     hard, soft = {"stretching": 1e8, "width": 1.0}, {"stretching": 1e4, "width": 1.0}

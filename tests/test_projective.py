@@ -53,6 +53,7 @@ STRETCHES = {
 }
 
 
+@pytest.mark.host
 @pytest.mark.parametrize(
     "solver",
     [

@@ -85,7 +85,7 @@ class Gradient:
     def __init__(self, model, corrected=False, terms=None):
         self.model, self.terms = model, model.terms if terms is None else terms
         if model.device.is_cuda:
-            self._found = [gathered(model, elements) for elements in self.terms]
+            self._found = [gathered(model, elements, rows=False) for elements in self.terms]
             parts = tuple(part for part, _arrays in self._found)
             self._lanes = lanes(model)
             self._gather = model.kernel(gather_gradient, parts, model.dtype, corrected, self._lanes) if parts else None
