@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from warpcloth import limits
 from warpcloth.usd import FrameSequence, MeasureWriter, read_scene
 
 STAGE = """#usda 1.0
@@ -209,3 +210,47 @@ def test_holes_are_no_cloth(tmp_path):
         writer.append(0.0, {"strain": [1.0, 2.0]}, np.full((2, 3), 0.5))
     written = FrameSequence(tmp_path / "out.usda", attribute="primvars:strain")
     np.testing.assert_array_equal(written[0], [1.0, 2.0, np.nan])
+
+
+# --- sizes without end
+
+
+def run(n=5, solver=wc.Newton, output=None, **options):
+    cloth = wc.Scene(wc.Mesh.grid(n, n), density=0.1, terms=[wc.Spring(stiffness=10.0)])
+    step = {name: options.pop(name) for name in ("dt", "substeps", "iterations") if name in options} or {"substeps": 1}
+    return wc.simulate(cloth, solver(**step), output, **options)
+
+
+TOO_LARGE = [
+    (lambda path: run(substeps=10**18), "substeps is 1000000000000000000; it must be 10,000,000 or less"),
+    (lambda path: run(solver=wc.PBD, substeps=1, iterations=10**18), "iterations is 10+; it must be 10,000,000 or less"),
+    (lambda path: run(dt=1e-308), "dt is 1e-308 s; at fps 60 a frame must be 10,000,000 steps or less"),
+    (lambda path: run(dt=5e-324), "dt is 4.94066e-324 s; at fps 60 a frame must be"),
+    (lambda path: run(frames=10**12), "frames is 10+; it must be 1,000,000,000 or less"),
+    (
+        lambda path: run(frames=10**9, copies=100),
+        "frames is 1,000,000,000, which takes 60 TB of memory; it must fit in the .* that are free",
+    ),
+    (
+        lambda path: run(300, output=path / "out.usdc", frames=10**9),
+        r"frames is 1,000,000,000, which takes 2.16e\+03 TB of the disk of .*; it must fit in the .* that are free there",
+    ),
+    (lambda path: wc.Mesh.grid(10**6, 10**6), "nx = 1000000, ny = 1000000, which takes 88 TB of memory; it must fit in"),
+    (lambda path: wc.Mesh.grid(10**400, 3), "nx = 10+...0+: must be a whole number of vertices, at least 2 and at most"),
+    (lambda path: wc.Mesh.grid(3, 3, size=10**400), "size = 10+...0+: must be a finite positive length"),
+    (lambda path: wc.Mesh.chain(2**31 - 1), "n = 2147483647, which takes 189 GB of memory"),
+    (lambda path: run(device=[]), r"device is \[\]; on this machine there are cpu"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), TOO_LARGE, ids=[message[:40] for _, message in TOO_LARGE])
+def test_what_no_machine_takes(tmp_path, monkeypatch, make, message):
+    monkeypatch.setattr(limits, "available_memory", lambda: 16 * 10**9)
+    with pytest.raises(ValueError, match=f"^{message}"):
+        make(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_memory_is_known_where_the_tests_run():
+    assert limits.available_memory() > 10**8
+    assert limits.shown_bytes(999) == "999 bytes" and limits.shown_bytes(1.5e9) == "1.5 GB"

@@ -5,6 +5,8 @@ import reprlib
 
 import numpy as np
 
+from .limits import MOST
+
 _SHORT = reprlib.Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
 
@@ -32,10 +34,12 @@ def _is_finite(value):
         return False
 
 
-def whole(name, value, least):
-    """Checks that an option is a whole number."""
+def whole(name, value, least, most=MOST):
+    """Checks that an option is a whole number, and none without end."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name} is {shown(value)}; it must be a whole number of {least} or more")
+    if value > most:
+        raise ValueError(f"{name} is {shown(value)}; it must be {most:,} or less")
 
 
 def choice(name, value, allowed):

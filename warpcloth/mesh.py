@@ -1,16 +1,21 @@
 """The mesh of a cloth: NumPy arrays, validated once, and the topology that energies and solvers read."""
 
+import sys
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from .checks import choice
+from .checks import choice, shown
 from .kernels.deformation import FLATTEST
+from .limits import refuse_memory
 from .selection import select
 
 STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 UP_AXES = ("Y", "Z")
+_MOST_VERTICES = 2**31 - 1  # indices are int32
+# What building a grid takes at least: float64 positions and texture coordinates, int64 corners of two triangles.
+_BYTES_OF_A_VERTEX = 24 + 16 + 48
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -106,6 +111,7 @@ class Mesh:
         nx, ny = _count("nx", nx), _count("ny", ny)
         if pattern not in ("diagonal", "alternating", "equilateral"):
             raise ValueError(f'pattern = {pattern!r}: must be "diagonal", "alternating" or "equilateral"')
+        refuse_memory(f"nx = {nx}, ny = {ny}", _BYTES_OF_A_VERTEX * nx * ny)
         equilateral = pattern == "equilateral"
         if np.shape(size) != () and (equilateral or np.shape(size) != (2,)):
             raise ValueError(f"size = {size}: must be one length{'' if equilateral else ' or two'} for pattern = {pattern!r}")
@@ -145,6 +151,7 @@ class Mesh:
             ValueError: Fewer than two vertices, a length that is not positive, a direction that is not a vector.
         """
         n, length = _count("n", n), _length("length", length)
+        refuse_memory(f"n = {n}", _BYTES_OF_A_VERTEX * n)
         along = _coordinates("direction", [direction], 3)[0]
         if not along.any():
             raise ValueError(f"direction = {direction}: must not be zero")
@@ -442,12 +449,13 @@ def _repeated(rows):
 
 
 def _count(name, value):
-    if not isinstance(value, int | np.integer) or value < 2:
-        raise ValueError(f"{name} = {value!r}: must be a whole number of vertices, at least 2")
+    if not isinstance(value, int | np.integer) or not 2 <= value <= _MOST_VERTICES:
+        allowed = f"a whole number of vertices, at least 2 and at most {_MOST_VERTICES:,}"
+        raise ValueError(f"{name} = {shown(value)}: must be {allowed}")
     return int(value)
 
 
 def _length(name, value):
-    if not isinstance(value, int | float | np.number) or not 0 < value < np.inf:
-        raise ValueError(f"{name} = {value!r}: must be a finite positive length")
+    if not isinstance(value, int | float | np.number) or not 0 < value <= sys.float_info.max:
+        raise ValueError(f"{name} = {shown(value)}: must be a finite positive length")
     return float(value)

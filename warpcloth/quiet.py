@@ -5,6 +5,8 @@ import sys
 import tempfile
 from functools import cache
 
+from .checks import shown
+
 
 def leave_out_news():
     """Leaves Warp at warnings where its log level is still its own default; a level that is set later, or was before, holds."""
@@ -15,11 +17,19 @@ def leave_out_news():
 
 
 def find_device(name):
-    """The Warp device of a name, Warp being initialised by :func:`initialise_warp`."""
+    """The Warp device of a name, Warp being initialised by :func:`initialise_warp`.
+
+    Raises:
+        ValueError: This machine has no such device.
+    """
     import warp as wp
 
     initialise_warp()
-    return wp.get_device(name)
+    try:
+        return wp.get_device(name)
+    except (TypeError, ValueError, RuntimeError):  # of what is no name, or the name of none
+        there = ", ".join(device.alias for device in wp.get_devices())
+        raise ValueError(f"device is {shown(name)}; on this machine there are {there}") from None
 
 
 @cache

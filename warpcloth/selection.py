@@ -9,6 +9,9 @@ from .checks import shown
 # Points often come from float32 files, and 0.1 from a text: nearer than this share of the mesh's size is equal.
 _EQUAL = 1e-6
 
+_DEEPEST = 100  # brackets in brackets: each takes three calls of Python
+_EXCERPT = 60  # characters of a long text before and after what is wrong
+
 _TOKEN = re.compile(
     r"(?P<space>\s+)|(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),:])"
 )
@@ -74,7 +77,7 @@ class _Reader:
     """Recursive descent: each method reads one rule of the grammar and gives a mask of the vertices (n,)."""
 
     def __init__(self, mesh, text):
-        self.mesh, self.text, self.position = mesh, text, 0
+        self.mesh, self.text, self.position, self.depth = mesh, text, 0, 0
         self.tokens = []
         column = 0
         while column < len(text):
@@ -87,11 +90,13 @@ class _Reader:
         self.tokens.append(("end", "", len(text)))
 
     def fail(self, column, why):
-        raise ValueError(f"selection {self.text!r}, column {column + 1}: {why}")
+        first, last = max(0, column - _EXCERPT), column + _EXCERPT
+        part = "…" * (first > 0) + self.text[first:last] + "…" * (last < len(self.text))
+        raise ValueError(f"selection {part!r}, column {column + 1}: {why}")
 
     def expected(self, what):
         _, word, column = self.tokens[self.position]
-        self.fail(column, f"found {word!r}, expected {what}" if word else f"the text ends, expected {what}")
+        self.fail(column, f"found {shown(word)}, expected {what}" if word else f"the text ends, expected {what}")
 
     def accept(self, *words):
         """The next token if it is one of these words, else None."""
@@ -108,10 +113,11 @@ class _Reader:
         kind, word, column = self.tokens[self.position]
         if kind != "number":
             self.expected("a whole number" if whole else "a number")
-        if whole and not (word.isdecimal() and least <= int(word) <= most):
-            self.fail(column, f"found {word}, expected a whole number from {least} to {most}")
+        # Python turns no more than some thousand digits into a number, and no index has more than a float is sure of.
+        if whole and not (word.isdecimal() and least <= float(word) <= most):
+            self.fail(column, f"found {shown(word)[1:-1]}, expected a whole number from {least} to {most}")
         if not whole and not np.isfinite(float(word)):
-            self.fail(column, f"found {word}, expected a finite number")
+            self.fail(column, f"found {shown(word)[1:-1]}, expected a finite number")
         self.position += 1
         return int(word) if whole else float(word)
 
@@ -134,13 +140,20 @@ class _Reader:
         return chosen
 
     def factor(self):
-        if self.accept("not"):
-            return ~self.factor()
+        inverted = False
+        while self.accept("not"):
+            inverted = not inverted
+        column = self.tokens[self.position][2]
         if self.accept("("):
+            self.depth += 1
+            if self.depth > _DEEPEST:
+                self.fail(column, f"is {self.depth} brackets deep, must be {_DEEPEST} at most")
             chosen = self.selection()
             self.require(")")
-            return chosen
-        return self.vertices()
+            self.depth -= 1
+        else:
+            chosen = self.vertices()
+        return ~chosen if inverted else chosen
 
     def vertices(self):
         column = self.tokens[self.position][2]

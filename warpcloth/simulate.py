@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from .checks import whole
 from .frames import frames_of, state_of
+from .limits import MOST_FRAMES, refuse_disk, refuse_memory
 from .ordering import order_of_run
 from .status import Result, Status, sentence
 from .turns import in_turn
@@ -91,12 +93,12 @@ def simulate(
         ValueError: If an argument breaks a rule.
     """
     frames = scene.frames if frames is None else frames
-    if not isinstance(frames, (int, np.integer)) or frames < 1:
-        raise ValueError(f"frames is {frames!r}; it must be a whole number of 1 or more")
+    whole("frames", frames, 1, MOST_FRAMES)
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
     # First, for it refuses a wrong output before anything compiles.
     recorder = None if output is None else _File(scene, output, single_file)
+    _refuse_size(frames, scene, dtype, copies, output)
     start = time.perf_counter()
     model = scene.build(
         device=device, dtype=dtype, copies=copies, vary=vary, order=order_of_run(scene, solver), threads=threads
@@ -123,6 +125,15 @@ def simulate(
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), output)
+
+
+def _refuse_size(frames, scene, dtype, copies, output):
+    """Refuses more frames than memory, or the disk of an output, has room for: positions and velocities at least."""
+    what, numbers = f"frames is {frames:,}", 6 * len(scene.mesh.points) * (int(frames) + 1)
+    if output is None:
+        refuse_memory(what, np.dtype(dtype).itemsize * copies * numbers)
+    else:
+        refuse_disk(what, 4 * numbers, os.path.dirname(os.path.realpath(output)))
 
 
 def _ahead(model, output):

@@ -6,7 +6,8 @@ from pathlib import Path
 from .. import scene_files
 from ..mesh import UP_AXES
 from ..outputs import check_apart
-from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place
+from ..quiet import find_device
+from .terminal import Interrupted, Progress, as_json, check_writable, frames_folder_of, place
 
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files or a pattern such as "frames/*.obj", or arrays, .npz or .npy.

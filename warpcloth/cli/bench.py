@@ -4,9 +4,10 @@ from datetime import datetime, timezone
 
 from ..checks import whole
 from ..outputs import Output, check_apart
+from ..quiet import find_device
 from ..scene_files import assignments, options
 from .run import named_scene, solver_setup
-from .terminal import Interrupted, as_json, check_writable, find_device, open_bar, say
+from .terminal import Interrupted, as_json, check_writable, open_bar, say
 
 EPILOG = """\
 Without SCENE every solver runs hanging of growing sizes, and PBD Jacobi sweeps over the springs of net, in a few minutes. Each

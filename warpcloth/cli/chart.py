@@ -6,10 +6,11 @@ from collections import Counter
 
 from ..chart.figures import PICTURES
 from ..checks import number, whole
+from ..quiet import find_device
 from ..scene_files import assignments
 from . import stability
 from .run import named_scene
-from .terminal import add_dask, as_json, check_outputs, find_device, measuring
+from .terminal import add_dask, as_json, check_outputs, measuring
 
 TEXT = "Chart speed against accuracy, stability and failures."
 DIAGRAMS = ("time", "solver", "physics", "spectrum")

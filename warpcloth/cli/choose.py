@@ -4,8 +4,9 @@ import shlex
 import sys
 
 from .. import scene_files
+from ..quiet import find_device
 from .run import named_scene
-from .terminal import Interrupted, Settings, add_dask, as_json, executing, find_device
+from .terminal import Interrupted, Settings, add_dask, as_json, executing
 
 EPILOG = """\
 Each solver climbs from coarse settings to fine ones until it meets the tolerance or is dearer than what does; errors are RMS

@@ -8,7 +8,8 @@ from ..chart.figures import PICTURES, check_path
 from ..checks import whole
 from ..mesh import UP_AXES
 from ..outputs import TEXT, Output, check_apart
-from .terminal import Progress, as_json, check_writable, find_device
+from ..quiet import find_device
+from .terminal import Progress, as_json, check_writable
 
 _SHOWN = 8  # frames or exclusions of each that the summary names
 

@@ -11,8 +11,10 @@ import numpy as np
 
 from .. import scene_files
 from ..checks import whole
+from ..limits import refuse_memory
+from ..quiet import find_device
 from .run import named_scene
-from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place
+from .terminal import Interrupted, Progress, as_json, check_writable, frames_folder_of, place
 
 _FRAMES, _FPS = 24, 24.0
 
@@ -183,6 +185,7 @@ def _given(arguments):
                 f"the pins of {scene.name} do not move; give a scene whose pins have keyframes, or a mesh and --move"
             )
         if arguments.frames is not None:  # pins are at rest after the last keyframe
+            _refuse_size(arguments.frames, scene.mesh, keyframes.shape[1])
             keyframes = keyframes[np.minimum(np.arange(arguments.frames + 1), len(keyframes) - 1)]
         pins = Pins(scene.pins.vertices, keyframes)
         given = {"mesh": scene.mesh, "pins": pins, "fps": scene.fps, "stage": scene.stage, "up_axis": scene.up_axis}
@@ -232,6 +235,7 @@ def _handles(mesh, fixes, moves, frames):
             )
         owners[vertices] = number
     handles = np.flatnonzero(owners >= 0)
+    _refuse_size(frames, mesh, len(handles))
     time = np.linspace(0.0, 1.0, frames + 1)
     places = np.tile(mesh.points[handles], (frames + 1, 1, 1))
     for number, (_, _, move) in enumerate(groups):
@@ -239,6 +243,11 @@ def _handles(mesh, fixes, moves, frames):
             own = owners[handles] == number
             places[:, own] = _path(move, mesh.points[handles[own]], time)
     return handles, places
+
+
+def _refuse_size(frames, mesh, handles):
+    """Refuses more frames than memory has room for: the places of the handles, and of each frame points and angles."""
+    refuse_memory(f"frames is {frames:,}", 8 * frames * (3 * handles + 4 * len(mesh.points)))
 
 
 def _path(move, points, time):

@@ -8,8 +8,9 @@ import time
 from dataclasses import asdict, dataclass, replace
 
 from .. import scene_files
+from ..quiet import find_device
 from ..status import digits
-from .terminal import Interrupted, Progress, as_json, check_writable, find_device, frames_folder_of, place, say
+from .terminal import Interrupted, Progress, as_json, check_writable, frames_folder_of, place, say
 
 # A step that all solvers but the explicit ones take well; where no step is given the substeps come nearest to it.
 _STEPS_A_SECOND = 240

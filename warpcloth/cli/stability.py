@@ -9,9 +9,10 @@ from ..chart.sweep import kept, sweep
 from ..chart.tasks import SceneRef, Setup
 from ..checks import number, whole
 from ..model import DTYPES
+from ..quiet import find_device
 from ..scene_files import assignments, convert, options
 from ..solvers import SOLVERS
-from .terminal import as_json, check_outputs, find_device, measuring
+from .terminal import as_json, check_outputs, measuring
 
 _COUNT = 9
 

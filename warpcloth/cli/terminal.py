@@ -14,22 +14,10 @@ import numpy as np
 from ..chart.figures import PICTURES, check_path
 from ..checks import whole
 from ..outputs import Output, check_apart
-from ..quiet import initialise_warp
 
 
 class Interrupted(Exception):
     """A run was interrupted; the message says what is saved."""
-
-
-def find_device(name):
-    """The Warp device of a name, with Warp's greeting left out."""
-    import warp as wp
-
-    initialise_warp()
-    devices = [device.alias for device in wp.get_devices()]
-    if name not in devices and not (name == "cuda" and len(devices) > 1):
-        raise ValueError(f"device is {name!r}; on this machine there are {', '.join(devices)}")
-    return wp.get_device(name)
 
 
 def frames_folder_of(arguments):

@@ -12,6 +12,7 @@ from ..checks import choice, number, shown, whole
 from ..damping import Past, damped_terms, refuse_apart
 from ..integrators import INTEGRATORS
 from ..kernels import step as kernels
+from ..limits import MOST
 from ..model import Model
 from ..reset import Reset
 from ..scene import Scene
@@ -87,7 +88,9 @@ class Step:
         """Steps a frame at ``fps``."""
         if self.substeps is not None:
             return self.substeps
-        steps = 1.0 / (fps * self.dt)
+        steps = 1.0 / max(float(fps) * self.dt, 1e-300)
+        if steps > MOST:
+            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be {MOST:,} steps or less, not {steps:.3g}")
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be a whole number of steps, not {steps:g}")
         return round(steps)
