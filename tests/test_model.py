@@ -13,7 +13,7 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.model import DTYPES
-from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.operators import Energy, Gradient, RowSums, Sums
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS as KINDS
 
@@ -609,6 +609,47 @@ def test_a_sum_replaces_what_an_overflow_left(device):
     assert out.numpy()[0] == 2.0 * model.count
     sums.sum(values, model.count, out, accumulate=1)
     assert out.numpy()[0] == 4.0 * model.count
+
+
+@pytest.mark.parametrize("chunks", [1, 5, 256])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sums_of_any_number_of_chunks(chunks, dtype, device):
+    """One on the CPU, many on a GPU: sums, products and maxima of each copy, but for copies that are left out."""
+    model = scene().build(device=device, dtype=dtype, copies=COPIES)
+    random, n, rows = np.random.default_rng(5), model.per_copy, 37
+    a, b = (random.normal(size=(COPIES, n, 3)).astype(dtype) for _ in range(2))
+    c, d = (random.normal(size=(COPIES, rows)).astype(dtype) for _ in range(2))
+    weights, values = random.uniform(size=(COPIES, n)).astype(dtype), random.uniform(size=(COPIES, n))
+    active = wp.array([1, 0, 1], dtype=wp.int32, device=device)
+    of_vertices, of_rows = Sums(model), RowSums(model, rows)
+    for sums in (of_vertices, of_rows):
+        sums.partial = wp.zeros((COPIES, chunks), dtype=wp.float64, device=device)
+
+    def array(values, kind):
+        return wp.array(values.reshape(-1, 3) if kind is model.vec3 else values.ravel(), dtype=kind, device=device)
+
+    def found(launch, *given):
+        out = wp.full(COPIES, -1.0, dtype=wp.float64, device=device)
+        launch(*given, out)
+        return out.numpy()
+
+    exact = {
+        "sum": values.sum(axis=1),
+        "dot": (a * b.astype(float)).sum(axis=(1, 2)),
+        "rows": (c * d.astype(float)).sum(axis=1),
+    }
+    measured = {
+        "sum": found(lambda each, out: of_vertices.sum(each, n, out), array(values, wp.float64)),
+        "dot": found(lambda *each: of_vertices.dot(*each, active), array(a, model.vec3), array(b, model.vec3)),
+        "rows": found(lambda *each: of_rows.dot(*each, active), array(c, model.dtype), array(d, model.dtype)),
+    }
+    for name, total in exact.items():
+        some = slice(None) if name == "sum" else [0, 2]
+        # Products of vectors are rounded once in the precision of the model.
+        assert np.abs(measured[name] - total)[some].max() <= 8 * np.finfo(dtype).eps * n
+    largest = found(of_vertices.largest, array(weights, model.dtype), array(a, model.vec3))
+    assert largest == pytest.approx((weights * np.linalg.norm(a, axis=2)).max(axis=1), rel=8 * float(np.finfo(dtype).eps))
+    assert (found(of_rows.largest, array(np.abs(c).astype(float), wp.float64)) == np.abs(c).max(axis=1)).all()
 
 
 @pytest.mark.parametrize("names", [[name] for name in VARIED] + [list(VARIED)], ids=[*VARIED, "all at once"])

@@ -10,6 +10,7 @@ from test_projection import swinging
 import warpcloth as wc
 from warpcloth import linear
 from warpcloth.acceleration import LBFGS, Anderson, Chebyshev
+from warpcloth.kernels import accelerate
 from warpcloth.linear import CopyFactors
 from warpcloth.operators import Energy, Gradient, Hessian, Sums, constant_matrices
 from warpcloth.solvers.projective_dynamics import ACCELERATIONS
@@ -301,6 +302,23 @@ def test_residual_of_admm_hides_nothing(weight, device):
     expected = unbalanced(declared, stepper, device)
     assert expected > 1e-3 and stepper.results == [Result.ITERATIONS_USED_UP]
     assert expected <= 2.0 * stepper.residual[0]
+
+
+@pytest.mark.parametrize("chunks", [1, 5])
+def test_products_of_past_corrections_are_sums_over_chunks(chunks, device):
+    """sⱼ·∇φ, zⱼ·∇φ, and sⱼ·y and zⱼ·y with the y of a slot, of each copy: one chunk on the CPU, many on a GPU."""
+    random, copies, n, m, slot = np.random.default_rng(6), 2, 13, 3, 1
+    s, y, z = random.normal(size=(3, m, copies * n, 3))
+    gradient = random.normal(size=(copies * n, 3))
+    histories = (wp.array(each, dtype=wp.vec3d, device=device) for each in (s, y, z))
+    given = [wp.array([slot], dtype=wp.int32, device=device), wp.array(gradient, dtype=wp.vec3d, device=device), *histories, n]
+    partial = wp.zeros((copies, chunks, 4 * m), dtype=wp.float64, device=device)
+    out = wp.zeros((copies, 4 * m), dtype=wp.float64, device=device)
+    wp.launch(accelerate.partial_products(wp.float64), partial.shape, given, [partial], device=device)
+    wp.launch(accelerate.finish_products(), out.shape, [partial], [out], device=device)
+    pairs = [(a, b) for b in (gradient, y[slot]) for a in (s, z)]
+    exact = [(a * b).reshape(m, copies, -1).sum(axis=2) for a, b in pairs]
+    np.testing.assert_allclose(out.numpy(), np.vstack(exact).T, atol=3 * n * 8 * np.finfo(float).eps)
 
 
 @pytest.mark.parametrize("name", METHODS)
