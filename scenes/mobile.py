@@ -28,7 +28,7 @@ def scene(n: int = 9, stiffness: float = 500.0, bending: float = 1e-5, push: flo
         masses=masses,
         velocities=np.outer(points[:, 0], [0.0, 0.0, push / left]),
         terms=[
-            wc.RigidCluster(vertices=[[1, 2, 3], [4, 5, 6], *(first + np.arange(n))]),
+            wc.RigidCluster(vertices=[[1, 2, 3], [4, 5, 6], *(first + np.arange(n))], name="bars"),
             wc.Spring(pairs=[[0, 1], [3, 4], *np.column_stack([[2, 5, 6], first + n // 2])], stiffness=np.inf, name="strings"),
             wc.Spring(pairs="edges", stiffness=stiffness),
             wc.QuadraticBending(stiffness=bending),

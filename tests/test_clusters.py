@@ -6,14 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from pxr import Usd, UsdGeom
 from test_solvers import allocations
+from usd_validation import validate
 
 import warpcloth as wc
 from warpcloth.constraints import Constraints
+from warpcloth.lines import lines_of
 from warpcloth.operators import Energy, Gradient, Sums
-from warpcloth.scenes import mobile
+from warpcloth.scenes import bar_twist, chain, hanging, mobile
 from warpcloth.solvers.explicit import step_limits
 from warpcloth.status import Result
+from warpcloth.usd import FrameSequence
 
 EPS = np.finfo(np.float64).eps
 SWEEPS = ("coloured", "sequential", "constraint-averaged", "jacobi")
@@ -387,6 +391,37 @@ def test_a_level_mobile_stays_level(device):
         else:
             assert np.abs(points[[2, 5], 1] - points[[3, 6], 1]).max() < 1e-3
             assert np.abs(points[1:7] - rest[1:7]).max() < 1e-2
+
+
+@pytest.mark.parametrize(("ending", "single_file"), [("usda", False), ("usdc", True), ("usdz", False)])
+def test_the_file_of_a_mobile_has_its_bars_and_strings(tmp_path, ending, single_file):
+    path = str(tmp_path / f"mobile.{ending}")
+    scene = mobile.scene(n=3)
+    animation = wc.simulate(scene, wc.XPBD(substeps=20), output=path, frames=12, single_file=single_file)
+    stage, eps = Usd.Stage.Open(path), np.finfo(np.float32).eps
+    strings = sorted(map(list, scene.terms[1].pairs))
+    # Along each curve the vertices of a bar, from end to end, or the two of a string.
+    for name, lines in (("bars", [[2, 1, 3], [5, 4, 6]]), ("strings", strings)):
+        curves = UsdGeom.BasisCurves(stage.GetPrimAtPath(f"/World/{name}"))
+        assert list(curves.GetCurveVertexCountsAttr().Get()) == [len(line) for line in lines]
+        assert 0.0 < curves.GetWidthsAttr().Get()[0] < 0.03
+        assert curves.GetPointsAttr().GetTimeSamples() == list(range(13))
+        for code in (0, 12):
+            vertices = np.concatenate(lines)
+            shown = np.array(curves.GetPointsAttr().Get(code))
+            np.testing.assert_allclose(shown, animation.points[code][vertices], atol=eps)
+            np.testing.assert_allclose(curves.GetVelocitiesAttr().Get(code), animation.velocities[code][vertices], atol=eps)
+        assert np.abs(shown - np.array(curves.GetPointsAttr().Get(0))).max() > 0.05, "they move"
+        low, high = np.array(curves.GetExtentAttr().Get(12))
+        assert (low < shown.min(axis=0)).all() and (high > shown.max(axis=0)).all()
+    # What measures the file finds the cloth, not its strings.
+    assert FrameSequence(path).shape == (13, len(scene.mesh.points), 3)
+    assert validate(path) == []
+
+
+def test_what_triangles_show_has_no_lines():
+    for scene in (hanging.scene(n=4), chain.scene(), bar_twist.scene(cells=1)):
+        assert lines_of(scene) == {}
 
 
 @pytest.mark.host

@@ -11,6 +11,7 @@ import warp as wp
 from .checks import whole
 from .frames import frames_of, state_of
 from .limits import MOST_FRAMES, refuse_disk, refuse_memory
+from .lines import lines_of
 from .ordering import order_of_run
 from .status import Result, Status, sentence
 from .turns import in_turn
@@ -301,7 +302,8 @@ class _File:
         stage, self.single_file = scene.stage, single_file
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis)
+            lines = lines_of(scene)
+            self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis, lines=lines)
         else:
             self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim)
         self.append = self.writer.append

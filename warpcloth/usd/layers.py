@@ -4,7 +4,7 @@ import os
 import warnings
 
 import numpy as np
-from pxr import Ar, Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
+from pxr import Ar, Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
 
 from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh, triangles_of_faces
 from .targets import SAMPLED, Target
@@ -13,6 +13,7 @@ from .values import array_of
 # Attributes of the artist's prim that would be used instead of ours, or beside ours with values of another motion.
 _BLOCKED = ("accelerations", "primvars:normals", "primvars:normals:indices")
 _COLOUR = (0.17, 0.35, 0.58)
+_LINE_COLOUR = (0.05, 0.05, 0.05)
 # Curves are drawn as tubes this thick, as a part of the mean edge length.
 CURVE_WIDTH = 0.05
 
@@ -52,7 +53,12 @@ def scene_layer(mesh, pins, up_axis, name):
         geometry.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
         geometry.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     else:
-        geometry, target = _define_curves(stage, path, mesh)
+        paths = edge_paths(mesh.edges, len(mesh.points))
+        lengths = np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1)
+        geometry, target = _define_curves(stage, path, paths, CURVE_WIDTH * lengths.mean())
+        primvar = UsdGeom.PrimvarsAPI(geometry).CreatePrimvar(VERTEX_PRIMVAR, Sdf.ValueTypeNames.IntArray)
+        primvar.SetInterpolation(UsdGeom.Tokens.vertex)
+        primvar.Set(Vt.IntArray.FromNumpy(target.point_vertices))
     for name, value in target.samples({"points": mesh.points}).items():
         geometry.GetPrim().GetAttribute(name).Set(value)
     _add_primvars(geometry, mesh)
@@ -62,25 +68,44 @@ def scene_layer(mesh, pins, up_axis, name):
     return layer, target, root_metadata(stage)
 
 
-def _define_curves(stage, path, mesh):
-    """An edge mesh as linear curves that follow its edges, so that a chain is one curve with its vertices in order.
+def define_lines(layer, mesh, lines):
+    """Defines linear curves beside a cloth, along pairs of vertices of its mesh.
 
-    Where curves meet they each have a point for the vertex: a primvar says which vertex each point is.
+    Args:
+        layer: Of `scene_layer`.
+        mesh: The `Mesh`.
+        lines: Pairs (E, 2) and a thickness [m] by name; a prim has the name as far as letters, digits and _ go.
+
+    Returns:
+        list: The `Target` of each, to be sampled with all vertices of the mesh.
     """
-    paths = edge_paths(mesh.edges, len(mesh.points))
-    point_vertices = np.concatenate(paths).astype(np.int32)
-    lengths = np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1)
-    width = float(np.float32(CURVE_WIDTH * lengths.mean()))
+    stage, targets = Usd.Stage.Open(layer), []
+    material = UsdShade.Material.Get(stage, "/World/Looks/Cloth")
+    for name, (pairs, width) in lines.items():
+        path = f"/World/{Tf.MakeValidIdentifier(name)}"
+        while stage.GetPrimAtPath(path):
+            path += "_"
+        paths = [each for each in edge_paths(pairs, len(mesh.points)) if each[0] != each[1]]
+        curves, target = _define_curves(stage, path, paths, width)
+        for attribute, value in target.samples({"points": mesh.points}).items():
+            curves.GetPrim().GetAttribute(attribute).Set(value)
+        curves.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*_LINE_COLOUR)])
+        bind_material(curves.GetPrim(), material)
+        targets.append(target)
+    return targets
+
+
+def _define_curves(stage, path, paths, width):
+    """Linear curves along paths of vertices; where curves meet they each have a point for the vertex."""
+    width = float(np.float32(width))
     curves = UsdGeom.BasisCurves.Define(stage, path)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
     curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
     curves.CreateCurveVertexCountsAttr([len(vertices) for vertices in paths])
     curves.CreateWidthsAttr([width])
     curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-    primvar = UsdGeom.PrimvarsAPI(curves).CreatePrimvar(VERTEX_PRIMVAR, Sdf.ValueTypeNames.IntArray)
-    primvar.SetInterpolation(UsdGeom.Tokens.vertex)
-    primvar.Set(Vt.IntArray.FromNumpy(point_vertices))
-    return curves, Target(path, mesh.triangles, point_vertices=point_vertices, half_width=width / 2)
+    point_vertices = np.concatenate(paths).astype(np.int32)
+    return curves, Target(path, np.empty((0, 3), np.int32), point_vertices=point_vertices, half_width=width / 2)
 
 
 def edge_paths(edges, count):

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from .chunks import ChunkWriter, check_scene
-from .layers import over_layer, scene_layer
+from .layers import define_lines, over_layer, scene_layer
 from .targets import check_primvars
 
 
@@ -19,7 +19,8 @@ class AnimationWriter(ChunkWriter):
     with more corners than three have the mean over the triangles that they were cut into.
 
     Edge meshes become linear BasisCurves along paths of edges (a chain: one curve, its vertices in order); where curves
-    meet each has a point for the vertex, and `primvars:warpcloth:vertex` says which vertex a point is.
+    meet each has a point for the vertex, and `primvars:warpcloth:vertex` says which vertex a point is. Lines are curves of the
+    same kind beside a mesh of triangles.
 
     Attributes:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
@@ -27,7 +28,18 @@ class AnimationWriter(ChunkWriter):
     """
 
     def __init__(
-        self, output, mesh, fps, source=None, prim=None, pins=None, up_axis=None, chunk=10, metadata=None, primvars=None
+        self,
+        output,
+        mesh,
+        fps,
+        source=None,
+        prim=None,
+        pins=None,
+        up_axis=None,
+        chunk=10,
+        metadata=None,
+        primvars=None,
+        lines=None,
     ):
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
@@ -44,6 +56,8 @@ class AnimationWriter(ChunkWriter):
             metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers or texts.
             primvars: Interpolation of each primvar that `append` will be given, by name: "vertex", a value for each
                 vertex, or "uniform", one for each triangle.
+            lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth, such as
+                `lines.lines_of` finds them in a scene. With a source none.
 
         Raises:
             FileNotFoundError: The output's folder or the source does not exist.
@@ -60,14 +74,17 @@ class AnimationWriter(ChunkWriter):
             target = replace(target, primvars=primvars)
             # Clips have samples alone; a name, type and interpolation have to stand on the stage itself.
             target.declare(rest, [f"primvars:{name}" for name in primvars])
+            targets = [target, *define_lines(rest, mesh, lines or {})]
         else:
-            if pins:
-                raise ValueError("pins: a source has its own, and a layer over it writes none; leave them out")
+            for name, given in (("pins", pins), ("lines", lines)):
+                if given:
+                    raise ValueError(f"{name}: a source has its own, and a layer over it writes none; leave them out")
             rest, target, root_metadata, stage, files = over_layer(source, prim, mesh, primvars)
+            targets = [target]
             if stage.start is not None:
                 self._start = stage.start * fps / stage.time_codes_per_second
         root_metadata |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
-        self._put_on(rest, [target], root_metadata, metadata, source, files)
+        self._put_on(rest, targets, root_metadata, metadata, source, files)
 
     def append(self, points, velocities, primvars=None):
         """Adds a frame; every `chunk` frames they are written.
@@ -83,6 +100,10 @@ class AnimationWriter(ChunkWriter):
         """
         self._check_open()
         vectors = {"points": self._checked("points", points), "velocities": self._checked("velocities", velocities)}
-        target, primvars = self._targets[0], self._checked_primvars(primvars)
-        samples = target.samples(vectors, primvars)
-        self._append(self._start + self.frames, {f"{target.prim}.{name}": value for name, value in samples.items()})
+        values = [self._checked_primvars(primvars), *[{}] * (len(self._targets) - 1)]
+        samples = {
+            f"{target.prim}.{name}": value
+            for target, own in zip(self._targets, values, strict=True)
+            for name, value in target.samples(vectors, own).items()
+        }
+        self._append(self._start + self.frames, samples)

@@ -1,0 +1,51 @@
+"""Lines that show what the triangles of a mesh do not: strings and bars, which terms hold between vertices of no triangle."""
+
+import numpy as np
+
+# Thickness of springs and of rigid bodies, in mean lengths of the edges of the mesh.
+_SPRING, _BODY = 0.05, 0.15
+
+
+def lines_of(scene):
+    """Pairs of vertices that a term joins, one of them at least without a triangle.
+
+    Those of a spring are its own, those of a rigid body the shortest tree over its vertices without a triangle. A mesh of edges
+    alone shows all of its vertices already.
+
+    Args:
+        scene: The :class:`warpcloth.Scene`.
+
+    Returns:
+        dict: Pairs (E, 2) and a thickness [m] by label of the term; of terms of one label all pairs, as thick as the thickest.
+    """
+    mesh = scene.mesh
+    lines = {}
+    if not len(mesh.triangles) or not len(mesh.isolated):
+        return lines
+    loose = np.zeros(len(mesh.points), dtype=bool)
+    loose[mesh.isolated] = True
+    length = mesh.edge_lengths.mean()
+    for term in scene.terms:
+        found = term.elements(mesh, scene.positions)
+        if found.cells is not None:
+            bodies = np.split(found.stencil[:, 0], found.cells[1:-1])
+            pairs = np.concatenate([_tree(mesh.points, body[loose[body]]) for body in bodies])
+        elif found.stencil.shape[1] == 2:
+            pairs = found.stencil[loose[found.stencil].any(axis=1)]
+        else:
+            continue
+        if len(pairs):
+            before, thickness = lines.get(found.label, (pairs[:0], 0.0))
+            own = (_SPRING if found.cells is None else _BODY) * length
+            lines[found.label] = np.concatenate([before, pairs]), max(thickness, own)
+    return lines
+
+
+def _tree(points, vertices):
+    """Pairs (k−1, 2) of vertices (k,) that join them all, of the least length in sum."""
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
+    if len(vertices) < 2:
+        return np.empty((0, 2), dtype=np.int32)
+    apart = np.linalg.norm(points[vertices][:, None] - points[vertices], axis=2)
+    return vertices[np.column_stack(minimum_spanning_tree(apart).nonzero())]
