@@ -86,6 +86,29 @@ def test_locking_alone_is_over_the_same_net_with_a_soft_membrane(device):
     assert rolled == pytest.approx(1.5, rel=0.01) and value[0] < rolled[0]
 
 
+@pytest.mark.parametrize("holding", locking._HOLDING)
+def test_what_stiff_edges_leave_free_is_counted(holding):
+    """3 + boundary edges, a vertex each of rows and columns, or rigid motion alone."""
+    panel = next(panel for panel in locking.PANELS if panel.key == "freedom")
+    law = panel.laws[panel.follows[holding]]
+    for n in locking._COUNTED[:4]:
+        ((boundary, left),) = of(locking.counted(holding, n), "freedom", holding).T
+        assert left == law(boundary)
+
+
+def test_a_net_that_has_no_freedom_left_keeps_its_curvature_along_its_lines_alone(device):
+    """Turned from them it loses the more; regular edges of triangles and rows bend in any direction, irregular ones do not."""
+    kept = {}
+    for holding in locking._HOLDING:
+        for degrees in (0.0, 45.0):
+            ((left, kept[holding, degrees]),) = of(locking.nearly_rigid(holding, degrees, device), "left", holding).T
+            assert left < {"rows and columns": 1.3, "both diagonals": 0.03}.get(holding, 0.4)
+    for loose in ("rows and columns", "edges"):
+        assert [kept[loose, degrees] for degrees in (0.0, 45.0)] == pytest.approx([1.0, 1.0], abs=1e-4)
+    assert max(kept["edges, jittered", degrees] for degrees in (0.0, 45.0)) < 0.95
+    assert kept["both diagonals", 0.0] == pytest.approx(1.0, abs=1e-4) and kept["both diagonals", 45.0] < 0.5
+
+
 @pytest.mark.slow
 def test_what_has_no_stiffness_slides_on(device):
     """Springs alone: three lengths of edge keep the curvature to (κh)², others lose more and more of it."""

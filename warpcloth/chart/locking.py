@@ -9,12 +9,20 @@ Apart from it each net has its own bending stiffness, the error of its pattern, 
 cantilever shows while its membrane is soft. Divided by it, what is left is locking, and falls with h⁴. Regular nets lock there
 too, though less: their curvature varies, and their sides curl.
 
+How far a net can give way depends on the freedom that its stiff edges leave (:mod:`warpcloth.freedom`): rows and columns alone
+leave more than one degree of freedom a vertex, all edges of triangles 3 + those of the boundary, however fine they are, and a
+grid with both diagonals none but rigid motion. With so little left a net bends only if it is regular and bent along its own
+lines.
+
 Springs alone end in no shape: what is left has no stiffness, and slides on along its wrinkles.
 """
+
+from dataclasses import replace
 
 import numpy as np
 
 from ..equilibrium import SETTLED, equilibrium
+from ..freedom import rank_of
 from ..kernels.terms.dihedral_bending import rest_state
 from ..mesh import Mesh
 from ..scene import Scene
@@ -41,8 +49,14 @@ _LET_GO = (("equilateral", 0.0), ("jittered", 0.0), ("jittered", 20.0), ("jitter
 SOFT, STIFF = 1e4, 1e8
 _DECADES = {8: range(4, 11), 16: range(4, 10)}
 _CANTILEVERS = [(pattern, n) for pattern in ("equilateral", "jittered") for n in (6, 8, 12, 16, 24)] + [("alternating", 8)]
+# Nets of springs whose freedom is counted and that are rolled up while all but rigid, K/D = 1e9, by what holds.
+_HOLDING = {"rows and columns": "diagonal", "edges": "equilateral", "edges, jittered": "jittered", "both diagonals": "diagonal"}
+_COUNTED = (5, 9, 17, 33, 65)  # vertices a side
+_TURNED = (0.0, 15.0, 30.0, 45.0)  # [°]
+_ALL_BUT_RIGID = 1e9
 _ONSET = "costs as much as bending"
 _LAW, _KEPT, _FREE = "κ²h⁴K/576D", "nothing lost", "no locking"
+_ROWS, _EDGES, _RIGID = "n² + 2n, n = 1 + B/4", "3 + B", "6, rigid motion"
 
 
 def ratio(curvature, h, K):
@@ -108,6 +122,24 @@ PANELS = (
         ("log", "log"),
         laws={"D": lambda x: 1.0},
     ),
+    Panel(
+        "freedom",
+        "What stiff edges leave: 3 + those of the boundary, or nothing",
+        "boundary edges B",
+        "degrees of freedom left",
+        ("log", "log"),
+        laws={_ROWS: lambda B: (1 + B / 4) ** 2 + 2 * (1 + B / 4), _EDGES: lambda B: 3 + B, _RIGID: lambda B: 6.0},
+        follows={"rows and columns": _ROWS, "edges": _EDGES, "edges, jittered": _EDGES, "both diagonals": _RIGID},
+    ),
+    Panel(
+        "left",
+        "All but rigid, K/D = 1e9/m², and turned by 0, 15, 30 and 45°",
+        "degrees of freedom left, less rigid motion, a vertex",
+        "part of the curvature kept, h = 1/8 m",
+        laws={_KEPT: lambda x: 1.0},
+        follows=dict.fromkeys(("rows and columns", "edges"), _KEPT),
+        limits=(0.0, 1.1),
+    ),
 )
 
 
@@ -116,6 +148,8 @@ def tasks(device):
     found = [task(imposed, device=device)]
     found += [task(relaxed, pattern=pattern, elements=n, moduli=_MODULI, device=device) for pattern, n in _RELAXED]
     found += [task(let_go, pattern=pattern, degrees=turn, device=device) for pattern, turn in _LET_GO]
+    found += [task(counted, holding=holding, n=n) for holding in _HOLDING for n in _COUNTED]
+    found += [task(nearly_rigid, holding=holding, degrees=turn, device=device) for holding in _HOLDING for turn in _TURNED]
     return found + [task(cantilever, pattern=pattern, elements=n, device=device) for pattern, n in _CANTILEVERS]
 
 
@@ -142,24 +176,65 @@ def relaxed(pattern, elements, moduli, device):
     """A sheet whose hinges are at rest on the cylinder and whose springs are in the plane, for K of these values over D."""
     h = 1.0 / elements
     flat = strip(pattern, np.radians(NETS[pattern]), h).mesh
-    rolled = Mesh(rolled_up(flat.points, CURVATURE), flat.triangles)
     area = flat.triangle_areas.sum()
     series, found = f"{pattern}, h = 1/{elements} m", []
     for K in moduli:
-        terms = [
-            Spring(stiffness=np.sqrt(0.75) * K * D, rest_lengths=flat.edge_lengths),
-            DihedralBending(stiffness=D),
-        ]
-        scene = Scene(rolled, density=D, terms=terms, gravity=(0.0, 0.0, 0.0))
-        rest, x = equilibrium(scene, device=device), ratio(CURVATURE, h, K)
+        (scene, rest), x = _at_rest(flat, flat.edges, K, device), ratio(CURVATURE, h, K)
         if rest.status.result not in SETTLED:
             found += [point(panel, series, x, None, rest.status.message) for panel in ("cost", "kept")]
             continue
-        settled = Scene(rolled, density=D, positions=rest.points, terms=terms)
+        settled = replace(scene, positions=rest.points)
         strained = energies(settled, device=device, dtype="float64")[0].sum()
         found.append(point("cost", series, x, strained / (0.5 * D * CURVATURE**2 * area)))
-        found.append(point("kept", series, x, kept(flat, rolled.points, rest.points)))
+        found.append(point("kept", series, x, kept(flat, scene.mesh.points, rest.points)))
     return found
+
+
+def _at_rest(flat, pairs, K, device):
+    """The scene of a flat mesh whose hinges are at rest when rolled up and whose springs when flat, and its rest shape."""
+    rolled = Mesh(rolled_up(flat.points, CURVATURE), flat.triangles)
+    lengths = np.linalg.norm(flat.points[pairs[:, 1]] - flat.points[pairs[:, 0]], axis=1)
+    terms = [
+        Spring(pairs=pairs, stiffness=np.sqrt(0.75) * K * D, rest_lengths=lengths),
+        DihedralBending(stiffness=D),
+    ]
+    scene = Scene(rolled, density=D, terms=terms, gravity=(0.0, 0.0, 0.0))
+    return scene, equilibrium(scene, device=device)
+
+
+def held(holding, mesh):
+    """Pairs of vertices (E, 2) of a net that hold their distance, one of `_HOLDING`."""
+    if holding.startswith("edges"):
+        return mesh.edges
+    # Of right triangles, the longest side of which is the diagonal of a cell.
+    diagonal = mesh.edge_lengths > 1.2 * mesh.edge_lengths.min()
+    if holding == "rows and columns":
+        return mesh.edges[~diagonal]
+    one, two, *others = mesh.hinges.T
+    across = np.linalg.norm(mesh.points[two] - mesh.points[one], axis=1) > 1.2 * mesh.edge_lengths.min()
+    return np.concatenate([mesh.edges, np.stack(others, axis=1)[across]])
+
+
+def counted(holding, n):
+    """What the springs of a square net of n² vertices leave free, or of a jittered one as large."""
+    pattern = _HOLDING[holding]
+    mesh = strip(pattern, 0.0, 1.0 / (n - 1)).mesh if pattern == "jittered" else Mesh.grid(n, n, pattern=pattern)
+    return [point("freedom", holding, len(mesh.boundary_edges), _left(mesh, held(holding, mesh)))]
+
+
+def _left(mesh, pairs):
+    return 3 * len(mesh.points) - rank_of(pairs, np.ones(len(mesh.points), dtype=bool))
+
+
+def nearly_rigid(holding, degrees, device):
+    """The part of its curvature that a net of very stiff springs keeps at rest, by the freedom that they leave."""
+    flat = strip(_HOLDING[holding], np.radians(degrees), 1.0 / 8).mesh
+    pairs = held(holding, flat)
+    scene, rest = _at_rest(flat, pairs, _ALL_BUT_RIGID, device)
+    settled = rest.status.result in SETTLED
+    value = kept(flat, scene.mesh.points, rest.points) if settled else None
+    free = (_left(flat, pairs) - 6) / len(flat.points)
+    return [point("left", holding, free, value, "" if settled else rest.status.message)]
 
 
 def kept(mesh, imposed, points):

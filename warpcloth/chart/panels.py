@@ -81,6 +81,8 @@ def plot_panels(path, panels, rows, title):
 
 
 def _draw(axes, panel, rows):
+    from matplotlib.ticker import LogLocator
+
     axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
     series = {}
     for row in rows:
@@ -110,6 +112,8 @@ def _draw(axes, panel, rows):
         if scale == "log" and high < 100.0 * low:  # its numbers, as there may be no power of ten
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter("{x:g}")
+            if high > 10.0 * low:
+                axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))  # more would run into one another
     axes.tick_params(which="both", colors=GREY, labelsize=8)
     axes.grid(True, which="major", linewidth=0.3, color="0.85")
     axes.spines[["top", "right"]].set_visible(False)

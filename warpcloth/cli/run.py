@@ -5,9 +5,11 @@ import os
 import statistics
 import sys
 import time
+import warnings
 from dataclasses import asdict, dataclass, replace
 
 from .. import scene_files
+from ..freedom import freedom
 from ..quiet import find_device
 from ..status import digits
 from .terminal import Interrupted, Progress, as_json, check_writable, frames_folder_of, place, say
@@ -145,7 +147,15 @@ def info(arguments):
         facts["solver"] = _solver_facts(arguments, setup, scene.fps)
         if setup.limits:
             facts["solver"] |= dict(zip(("limit_about_rest", "limit_in_motion"), setup.limits, strict=True))
-    facts["model"] = model.report()
+    facts["model"], free = model.report(), freedom(scene)
+    facts["freedom"] = asdict(free) | {"locked": free.locked}
+    if free.locked:
+        leave = "are so many that they may leave" if free.counted else "leave"
+        warnings.warn(
+            f"{free.edges:,} hard or stiff edges {leave} nothing to bend once the cloth is not flat; make them softer, or hold "
+            "the edges of triangles alone, which leaves 3 + boundary edges",
+            stacklevel=2,
+        )
     print(as_json(facts) if arguments.json else f"{scene}\n{_info_text(facts)}")
     hint = setup.solver and _hint(arguments, setup, scene)
     if hint:
@@ -158,6 +168,13 @@ def _info_text(facts):
     lines = ["parameters: " + (", ".join(f"{k}={v!r}" for k, v in facts["scene"]["parameters"].items()) or "none")]
     lines.append(f"model on {model['device']}, {model['dtype']}: {model['bytes']:,} bytes")
     lines += [f"  {term['term']}: {term['elements']} elements, {term['bytes']:,} bytes" for term in model["terms"]]
+    free = facts["freedom"]
+    if free["edges"]:
+        most, least = ("up to ", " or more") if free["counted"] else ("", "")
+        lines.append(
+            f"hard or stiff edges: {free['edges']:,}, of rank {most}{free['rank']:,} in {free['coordinates']:,} coordinates; "
+            f"{free['left']:,}{least} degrees of freedom are left, {free['rigid']} of them rigid motion"
+        )
     if solver:
         lines.append(f"solver: {_solver_line(solver)}")
         if "limit_about_rest" in solver:
