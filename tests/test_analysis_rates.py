@@ -1,5 +1,7 @@
 """Rates of deforming surfaces: rigid turns, constant velocity gradients, and the order of each method."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from continuum import (
@@ -17,6 +19,7 @@ from continuum import (
     rounding,
     skew,
     strains,
+    symmetric,
     thread_rates,
     tumbling,
     turn,
@@ -93,6 +96,67 @@ def test_a_constant_velocity_gradient(name, neighbourhood, dtype, device):
         bounded(found["velocity_gradient"][1:] * dt, L, bound)
         bounded(found["rate_of_strain"][1:] * dt, 0.5 * (L + L.T), bound)
         bounded(found["spin"][1:] * dt, 0.5 * (L - L.T), bound)
+
+
+def turned_rate(method, axis, angle, before, normal):
+    """DΔt of a small strain (3, 3), given as it is before the turn: the law of docs/measures.md, in the tangent plane."""
+    half, k = turn(axis, angle / 2.0), np.outer(axis, axis)
+    E, across, n = half @ before @ half.T, np.eye(3) - k, half @ normal
+    G = k + across / np.cos(angle / 2.0)
+    if method == "forward":
+        D, n = (np.cos(angle) - 1.0) * across + symmetric(half @ half @ before), normal
+    elif method == "midpoint":
+        D, n = G @ E @ G, G @ n
+    else:
+        mean = 0.5 * np.trace(across @ E) * across
+        rest = across @ E @ across - mean
+        shear = k @ E @ across + across @ E @ k
+        D = k @ E @ k + mean + shear * (angle / 2.0) / np.sin(angle / 2.0) + rest * angle / np.sin(angle)
+        n = G @ n
+    P = np.eye(3) - np.outer(n, n) / (n @ n)
+    return P @ D @ P
+
+
+@on_both
+@pytest.mark.parametrize("degrees", [10.0, 30.0, 90.0, 150.0, 170.0])
+@pytest.mark.parametrize("axis", AXES)
+def test_what_a_turn_does_to_the_rate_of_strain(axis, degrees, neighbourhood, device):
+    """The law of small strains, dilation, stretch and shear, to their square; stretch rates are right at any angle."""
+    mesh, size, angle = flat(), 1e-5, np.radians(degrees)
+    a = AXES[axis] / np.linalg.norm(AXES[axis])
+    for plane in ([[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -0.6]], [[0.2, 0.5], [0.5, -0.3]]):
+        E = np.zeros((3, 3))
+        E[:2, :2] = plane
+        E = size * TILT @ E @ TILT.T
+        places = [mesh.points, mesh.points @ (turn(a, angle) @ expm(E)).T]
+        for method in ("midpoint", "logarithm", "forward"):
+            given = {"rates": method, "neighbourhood": neighbourhood, "device": device}
+            found = wc.analyze(mesh, places, dt=1.0, measures=("rate_of_strain", "stretch_rate"), **given)
+            steep = 1.0 / np.cos(angle / 2.0) ** 4  # second derivatives in E
+            bounded(
+                found["rate_of_strain"][1], turned_rate(method, a, angle, E, TILT[:, 2]), 4.0 * steep * size**2 + 1e-12 * steep
+            )
+            stretches = np.sort(np.linalg.eigvalsh(plane))[::-1] * size
+            bounded(found["stretch_rate"][1], stretches, size**2 + 1e-12)
+
+
+TURNS = ("N", "N", "e₁", "e₁", "45°")  # axes of the columns of the table in docs/measures.md
+
+
+@pytest.mark.parametrize("degrees", [10, 30, 90, 150])
+def test_what_a_turn_does_to_a_dilation(degrees, device):
+    """The table, and of a turn about the normal the closed form of any dilation."""
+    text = (Path(__file__).parents[1] / "docs" / "measures.md").read_text(encoding="utf-8")
+    (row,) = (line.split("|")[2:-1] for line in text.splitlines() if line.startswith(f"| {degrees}° |"))
+    mesh, angle, e = flat(), np.radians(degrees), 0.2
+    largest = []
+    for name, method in zip(TURNS, ("midpoint", "logarithm", "midpoint", "logarithm", "logarithm"), strict=True):
+        axis = TILT[:, 0] + TILT[:, 2] if name == "45°" else AXES[name]
+        places = [mesh.points, np.exp(e) * mesh.points @ turn(axis, angle).T]
+        found = wc.analyze(mesh, places, dt=1.0, measures=("rate_of_strain",), rates=method, device=device)
+        largest.append(np.linalg.eigvalsh(found["rate_of_strain"][1]).max() / e)
+    assert [float(cell) for cell in row] == pytest.approx(largest, abs=6e-4)
+    assert largest[:2] == pytest.approx([2.0 * np.sinh(e) / (np.cosh(e) + np.cos(angle)) / e, 1.0], rel=1e-9)
 
 
 @on_both
