@@ -8,7 +8,7 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
 import warpcloth as wc
 from warpcloth.chart import elastica
@@ -45,35 +45,39 @@ def draw(axes, mesh, seen, values, colours):
     paint(axes, corners[..., :2], corners[..., 2].mean(axis=1), faces, 0.4)
 
 
-def finish(figure, axes, colours, most, label, extend):
-    """Equal scales, no axes, and a bar of the colours from 0 to ``most``."""
+def finish(figure, axes, colours, norm, ticks, label, extend="neither"):
+    """Equal scales, no axes, and a bar of the colours with ticks."""
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.axis("off")
-    scale = ScalarMappable(Normalize(0.0, most), colours)
-    bar = figure.colorbar(scale, ax=axes, shrink=0.6, aspect=14, pad=0.01, extend=extend, ticks=[0.0, most / 2, most])
+    scale = ScalarMappable(norm, colours)
+    bar = figure.colorbar(scale, ax=axes, shrink=0.6, aspect=14, pad=0.01, extend=extend)
+    bar.set_ticks(ticks, labels=[f"{tick:.3g}" for tick in ticks], minor=False)
+    bar.minorticks_off()
     bar.set_label(label, color=GREY, fontsize=8)
     bar.ax.tick_params(labelsize=8, colors=GREY)
     bar.outline.set_visible(False)
 
 
-def picture_hanging(moments=(0.0, 0.25, 0.4, 0.5, 0.75, 1.0, 1.25), worst=0.0015):
-    """The hanging cloth side by side at some moments [s], coloured by strain up to ``worst``."""
+def picture_hanging(moments=(0.0, 0.25, 0.4, 0.5, 0.75, 1.0, 1.25), least=1e-4):
+    """The hanging cloth side by side at some moments [s], coloured by strain from ``least`` to the largest of the whole run."""
     scene = hanging.scene(n=64, duration=1.25)
     animation = wc.simulate(scene, wc.Newton(dt=1 / 240))
     assert animation.status.ok, animation.status
+    most = max(strain(scene.mesh, np.asarray(points, dtype=float)).max() for points in animation.points)
+    norm = LogNorm(100.0 * least, 100.0 * most)  # what is pinned is strained a hundred times as much as the rest
     figure, axes = plt.subplots(figsize=(11.0, 2.6))
     left = 0.0
     for time in moments:
         points = np.asarray(animation.points[round(time * scene.fps)], dtype=float)
         seen = View().project(points)
         seen[:, 0] += left - seen[:, 0].min()
-        draw(axes, scene.mesh, seen, strain(scene.mesh, points) / worst, COLOURS)
+        draw(axes, scene.mesh, seen, norm(100.0 * np.maximum(strain(scene.mesh, points), least)), COLOURS)
         axes.plot(*seen[scene.pins.vertices, :2].T, "o", color="black", markersize=3.5)
         right = seen[:, 0].max()
         axes.text((left + right) / 2, 0.47, f"{time:g} s", ha="center", color=GREY)
         left = right + 0.15
-    finish(figure, axes, COLOURS, 100.0 * worst, "strain [%]", "both")
+    finish(figure, axes, COLOURS, norm, [0.01, 0.1, 1.0, 100.0 * most], "strain [%]", "min")
     save(figure, "hanging.png")
 
 
@@ -121,7 +125,7 @@ def picture_deformation(frames=(0, 16, 32, 48), most=150.0):
             else:
                 left = seen[:, 0].max() + gap
         left = max(left, seen[:, 0].max() + 0.3)
-    finish(figure, axes, COLOURS, most, "rotation [°]", "neither")
+    finish(figure, axes, COLOURS, Normalize(0.0, most), [0.0, most / 2, most], "rotation [°]")
     save(figure, "deformation.png")
 
 
