@@ -1,11 +1,18 @@
 """Input that is wrong: refused in one sentence that says what, where and what is allowed, before anything runs."""
 
+import os
+import re
+import resource
+
 import numpy as np
 import pytest
+from pxr import UsdUtils
 
 import warpcloth as wc
 from warpcloth import limits
-from warpcloth.usd import FrameSequence, MeasureWriter, read_scene
+from warpcloth.cli import main
+from warpcloth.cli.terminal import printable
+from warpcloth.usd import AnimationWriter, FrameSequence, MeasureWriter, read_scene
 
 STAGE = """#usda 1.0
 (
@@ -254,3 +261,146 @@ def test_what_no_machine_takes(tmp_path, monkeypatch, make, message):
 def test_memory_is_known_where_the_tests_run():
     assert limits.available_memory() > 10**8
     assert limits.shown_bytes(999) == "999 bytes" and limits.shown_bytes(1.5e9) == "1.5 GB"
+
+
+# --- at the command line: one sentence, whatever the matter is
+
+
+def npy(text):
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+BROKEN_ARRAYS = [
+    (npy(b"{'descr': '<f4', 'shape': (4, 16, 3), }\n"), "eader"),
+    (npy(b"{'descr': '<f4', 'fortran_order': Fals\ne, 'shape': (4, \n"), "header"),
+    (npy(b"((((" * 2000 + b"\n"), "header"),
+    (npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-4, 4, 3)}\n"), ""),
+    (npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999999999999999, 4, 3)}\n"), ""),
+    (npy(b"{'descr': 'O', 'fortran_order': False, 'shape': (2, 4, 3)}\n"), ""),
+    (b"PK\x03\x04 no archive", ""),
+    (b"", ""),
+]
+
+
+@pytest.mark.parametrize(("content", "message"), BROKEN_ARRAYS)
+@pytest.mark.parametrize("ending", ["npy", "npz"])
+def test_broken_arrays(tmp_path, content, message, ending):
+    path = tmp_path / f"frames.{ending}"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"^{path}: .*{message if ending == 'npy' else ''}"):
+        wc.open_sequence(path, mesh=wc.Mesh.grid(2, 2))
+
+
+def test_gaps_without_end(tmp_path):
+    """Of three frames some hundred million are missing, or the number of one is none that NumPy holds."""
+    for name in ("cloth_0.obj", "cloth_1.obj", "cloth_900000000.obj"):
+        (tmp_path / name).write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n")
+    with pytest.raises(ValueError, match=f"^{tmp_path}: more than 1,000,000 frames are missing, from 1 to 900000000 and on"):
+        _ = wc.open_sequence(tmp_path).missing
+    (tmp_path / f"cloth_{10**30}.obj").write_text("")
+    with pytest.raises(ValueError, match="has a number of 31 digits in its name, must have 15 at most"):
+        wc.open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["run", "a\nb.usda"], "'a\\\\nb.usda': a path in USD must be UTF-8 without line breaks"),
+        (["run", os.fsdecode(b"\xff.usda")], "'\\\\udcff.usda': a path in USD must be UTF-8"),
+        (["run", "hanging", "-o", "a\nb.usdc"], "a\\\\nb.usdc': a path in USD must be UTF-8"),
+        (["run", "hanging", "-o", os.fsdecode(b"\xff.usdc")], "\\\\udcff.usdc': a path in USD must be UTF-8"),
+        (
+            ["run", "hanging", "-o", "o.usdc", "--frames", str(10**12)],
+            "frames is 1000000000000; it must be 1,000,000,000 or less",
+        ),
+        (
+            ["run", "hanging", "-o", "o.usdc", "-s", "dt=1e-308"],
+            "dt is 1e-308 s; at fps 60 a frame must be 10,000,000 steps or",
+        ),
+        (["run", "hanging", "-o", "o.usdc", "-s", f"substeps={10**18}"], "it must be 10,000,000 or less"),
+        (
+            ["deform", "cloth.usda", "--move", "all", "--translate", "0", "0", "1", "-o", "o.usdc", "--frames", "10000000000"],
+            "frames is 10000000000; it must be 10,000,000 or less",
+        ),
+        (["info", "utf8.usda"], "utf8.usda: it holds text that is no valid UTF-8"),
+        (["info", "huge.usda"], r"an edge of the mesh is 1e\+38 m long"),
+        (["info", "memory.py"], "memory.py, line 2: MemoryError"),
+        (
+            ["run", "later.py", "-o", "o.usdc"],
+            "there is not enough memory, a smaller mesh, fewer copies or frames take less: 16",
+        ),
+        (["run", "disk.py", "-o", "o.usdc"], "a file could not be read or written: No space left on device"),
+        (["run", "deep.py", "-o", "o.usdc"], "something is nested too deep to be read"),
+    ],
+)
+def test_one_line_at_the_command_line(tmp_path, monkeypatch, capfd, arguments, line):
+    monkeypatch.chdir(tmp_path)
+    for name in (b"a\nb.usda", b"\xff.usda", b"cloth.usda"):
+        with open(name, "w") as file:
+            file.write(STAGE)
+    (tmp_path / "utf8.usda").write_bytes(STAGE.encode().replace(b'"Spring"', b'"Spr\xff\xfeing"'))
+    (tmp_path / "huge.usda").write_text(STAGE.replace("(1, 0, 0)", "(1e38, 0, 0)").replace("(0, 0, 1)", "(0, 0, -1e38)"))
+    (tmp_path / "memory.py").write_text("def scene():\n    raise MemoryError\n")
+    raised = {"later": "MemoryError('16 GiB')", "disk": "OSError(28, 'No space left on device')", "deep": "RecursionError"}
+    for name, error in raised.items():  # past what is said of a scene file, as in a step
+        text = f"import warpcloth as wc\nclass Broken(wc.Scene):\n    def build(self, **_):\n        raise {error}\n"
+        make = "def scene():\n    return Broken(wc.Mesh.grid(3, 3), density=1.0, terms=[wc.Spring(stiffness=1.0)])\n"
+        (tmp_path / f"{name}.py").write_text(text + make)
+    before = set(os.listdir(b"."))
+    assert main(arguments) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and err.count("\n") == 1 and err.startswith("warpcloth: ") and re.search(line, err), err
+    assert set(os.listdir(b".")) == before
+
+
+def test_names_do_not_steer_the_terminal(tmp_path, capfd):
+    """A stage whose name, attribute and type hold escape sequences: they are shown as such."""
+    named = STAGE.replace(
+        "double warpcloth:density", 'string warpcloth:name = "a\\x1b[31mred\\x07\\u202e"\n    double warpcloth:density'
+    )
+    (tmp_path / "cloth.usda").write_text(named)
+    assert main(["info", str(tmp_path / "cloth.usda")]) == 0
+    assert capfd.readouterr().out.startswith(r"a\x1b[31mred\x07")
+    (tmp_path / "cloth.usda").write_text(STAGE.replace('"Spring"', '"Spr\\x1b[2Jing"'))
+    assert main(["info", str(tmp_path / "cloth.usda")]) == 2
+    _, err = capfd.readouterr()
+    assert "\x1b" not in err and "ing" in err
+    assert printable("αβ ä\u2028\u202e\x9b\udcff\t\n") == "αβ ä\\u2028\\u202e\\x9b\\udcff\t\n"
+
+
+@pytest.mark.parametrize("ending", ["usda", "usdc", "usdz"])
+def test_a_full_disk_at_the_last_file_loses_nothing(tmp_path, ending):
+    """A limit on the size of a file stands for the disk: chunks are below it, the one file of all frames is not."""
+    mesh = wc.Mesh.grid(8, 8)
+    frames = np.random.default_rng(0).normal(size=(40, 64, 3)).astype(np.float32)
+    writer = AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, chunk=5)
+    for points in frames:
+        writer.append(points, points)
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limit[1]))  # of about 30 kB a chunk
+    try:
+        with pytest.raises(OSError, match=rf"^{tmp_path}/out.{ending}: could not be written.*; all frames are in ") as caught:
+            writer.close(single_file=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert "\n" not in str(caught.value) and str(caught.value).endswith(writer.path)
+    np.testing.assert_array_equal(FrameSequence(writer.path), frames)
+
+
+@pytest.mark.parametrize("kept", [0.5, 0.99])
+def test_a_package_that_is_cut_is_not_taken_for_whole(tmp_path, monkeypatch, kept):
+    """pxr does not notice a disk that is full while it packs: what it leaves is read before the frames are removed."""
+
+    def pack(*paths):
+        real(*paths)
+        os.truncate(paths[1], int(kept * os.path.getsize(paths[1])))
+        return True
+
+    real = UsdUtils.CreateNewUsdzPackage
+    monkeypatch.setattr(UsdUtils, "CreateNewUsdzPackage", pack)
+    points = wc.Mesh.grid(3, 3).points
+    writer = AnimationWriter(tmp_path / "out.usdz", wc.Mesh.grid(3, 3), 24)
+    writer.append(points, points)
+    with pytest.raises(OSError, match=r"out\.usdz: could not be written; all frames are in "):
+        writer.close()
+    np.testing.assert_array_equal(FrameSequence(writer.path), np.float32([points]))

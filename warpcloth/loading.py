@@ -90,6 +90,8 @@ def read_arrays(path, name=None):
     logging.getLogger("trimesh").addHandler(_QUIET)
     try:
         scene = trimesh.load_scene(path, process=False, maintain_order=True, **ENDINGS[ending])
+    except ModuleNotFoundError:  # of what would guess the encoding of a text
+        raise ValueError(f"{path}: cannot be read as {ending}, it is no UTF-8") from None
     except Exception as error:  # the readers raise whatever a broken file makes them stumble over
         raise ValueError(f"{path}: cannot be read as {ending}, {type(error).__name__}: {error}") from error
     found = {node: scene.graph[node] for node in scene.graph.nodes_geometry}

@@ -191,7 +191,7 @@ def list_scenes(folder):
     for path in sorted(folder.glob("*.py")):
         try:
             tree = ast.parse(path.read_bytes())
-        except (SyntaxError, ValueError) as error:
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # the last two of what is nested too deep
             listed.append(Listed(path.stem, f"cannot be read: {error}"))
             continue
         function = next((n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "scene"), None)

@@ -15,8 +15,12 @@ import glob
 import operator
 import os
 import re
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -28,6 +32,7 @@ from . import checks
 from .loading import ENDINGS, WELDED, read_arrays
 from .mesh import STAGE_ENDINGS, Mesh, Surface
 
+_MOST_MISSING = 1_000_000
 _FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
 
 
@@ -90,12 +95,16 @@ class Sequence:
         """
         intervals = np.diff(self.labels)
         spacing = intervals.min() if len(intervals) else 1
-        multiples = np.rint(intervals / spacing).astype(np.int64)
+        multiples = np.rint(intervals / spacing)
         gaps = np.flatnonzero(multiples > 1)
         uneven = np.abs(intervals / spacing - multiples) > 1e-6  # a time code has fewer than ten digits, and float64 sixteen
         if uneven.any() or (self.labels.dtype.kind == "f" and 3 * len(gaps) > max(3, len(intervals))):
             return []
-        return [(self.labels[gap] + k * spacing).item() for gap in gaps for k in range(1, multiples[gap])]
+        if (multiples[gaps] - 1.0).sum() > _MOST_MISSING:
+            first, last = self.labels[[gaps[0], gaps[0] + 1]].tolist()
+            where = "" if self.path is None else f"{self.path}: "
+            raise ValueError(f"{where}more than {_MOST_MISSING:,} frames are missing, from {first} to {last} and on")
+        return [(self.labels[gap] + k * spacing).item() for gap in gaps for k in range(1, int(multiples[gap]))]
 
 
 def open_sequence(path, prim=None, fps=None, mesh=None):
@@ -135,7 +144,7 @@ def open_sequence(path, prim=None, fps=None, mesh=None):
             return _open_npz(path, fps)
         if path.lower().endswith(".npy"):
             return _open_npy(path, fps, mesh)
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if Path(path).suffix.lower() in ENDINGS:
         raise ValueError(f'{path}: is one mesh; it must be a folder of them, or a pattern such as "{Path(path).parent}/*.obj"')
@@ -210,6 +219,8 @@ def _open_files(path, found, prim, fps):
         digits = re.findall(r"\d+", file.stem)
         if not digits:
             raise ValueError(f"{file}: has no number in its name, which must tell its place among the frames")
+        if len(digits[-1]) > 15:
+            raise ValueError(f"{file}: has a number of {len(digits[-1])} digits in its name, must have 15 at most")
         other = numbered.setdefault(int(digits[-1]), file)
         if other != file:
             raise ValueError(
@@ -245,19 +256,34 @@ def _read_file(paths, prim, expected, count, frame):
 def _open_npz(path, fps):
     if not zipfile.is_zipfile(path):
         raise ValueError("is no .npz file")
-    with np.load(path, allow_pickle=False) as archive:
+    with _numpy_reads(), np.load(path, allow_pickle=False) as archive:
         lacking = sorted({"points", "triangles"} - set(archive.files))
         if lacking:
             raise ValueError(f"has no array {lacking[0]!r}, only {', '.join(archive.files) or 'none'}")
         triangles = archive["triangles"]
         times = archive["times"] if "times" in archive.files and fps is None else None
-    points = _mapped(path, "points.npy")
+    with _numpy_reads():
+        points = _mapped(path, "points.npy")
     if points.ndim != 3:
         raise ValueError(f"points has shape {points.shape}; it must be (frames, vertices, 3)")
     mesh = Surface(points[0], triangles)
     count, read, precision = _array("points", points, mesh)
     times = _even(count, fps) if times is None else _increasing(times, count)
     return Sequence(mesh, np.arange(count), times, read, path, declared=False, precision=precision, files=(path,))
+
+
+@contextmanager
+def _numpy_reads():
+    """Has one kind of error where NumPy reads a file: it raises what a broken header or archive makes it stumble over."""
+    try:
+        yield
+    except ValueError:
+        raise
+    except (
+        *(OSError, EOFError, MemoryError, OverflowError, TypeError, KeyError, SyntaxError, RuntimeError, RecursionError),
+        *(NotImplementedError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
+    ) as error:
+        raise ValueError(f"cannot be read, its header or data are broken ({error})") from error
 
 
 def _mapped(path, member):
@@ -278,7 +304,8 @@ def _mapped(path, member):
 
 
 def _open_npy(path, fps, mesh):
-    points = np.lib.format.open_memmap(path, mode="r")
+    with _numpy_reads():
+        points = np.lib.format.open_memmap(path, mode="r")
     if mesh is None:
         raise ValueError("has no triangles; give a rest mesh that has them (--rest), or an .npz file")
     count, read, precision = _array("points", points, mesh)

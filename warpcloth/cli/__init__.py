@@ -7,6 +7,7 @@ what a scene file declares; with ``--debug`` the traceback stands above the line
 """
 
 import argparse
+import contextlib
 import sys
 import traceback
 import warnings
@@ -14,7 +15,7 @@ import warnings
 import numpy as np
 
 from . import analyze, bench, chart, choose, compare, deform, options, run
-from .terminal import Interrupted, say, show_warning
+from .terminal import Interrupted, Printable, say, show_warning
 
 
 def main(argv=None):
@@ -26,8 +27,10 @@ def main(argv=None):
     Returns:
         int: The exit code.
     """
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), contextlib.redirect_stdout(Printable(sys.stdout)):
         warnings.showwarning = show_warning
+        # NumPy's words on a number that is not finite: whoever meets one says so by name, or it was to be expected.
+        warnings.filterwarnings("ignore", ".* encountered in ", RuntimeWarning)
         debug = False
         try:
             parser = _parser()
@@ -56,7 +59,13 @@ def main(argv=None):
 def _sentence(error, debug):
     """What an error says; ours are sentences, others need their kind, and a hint at how to see more."""
     if isinstance(error, OSError):
-        return f"{error.filename}: {error.strerror}" if error.strerror and error.filename else error
+        if error.strerror is None:
+            return error
+        return f"{error.filename or 'a file could not be read or written'}: {error.strerror}"
+    if isinstance(error, MemoryError):
+        return f"there is not enough memory, a smaller mesh, fewer copies or frames take less: {error}".removesuffix(": ")
+    if isinstance(error, RecursionError):
+        return f"something is nested too deep to be read: {error}"
     if isinstance(error, ImportError) and error.name is None:  # a sentence about an extra, no module that broke
         return error
     if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError):

@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,9 @@ import numpy as np
 from ..chart.figures import PICTURES, check_path
 from ..checks import whole
 from ..outputs import Output, check_apart
+
+# Categories of Unicode: control, format (which turns the direction of a text too), halves of a code, ends of lines.
+_STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 class Interrupted(Exception):
@@ -207,9 +211,29 @@ def _plain(value):
 
 
 def show_warning(message, category, filename, lineno, file=None, line=None):
-    print(f"warpcloth: warning: {message}", file=sys.stderr)
+    print(f"warpcloth: warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)
 
 
 def say(message, code):
-    print("warpcloth:", " ".join(str(message).split()), file=sys.stderr)
+    print("warpcloth:", printable(" ".join(str(message).split())), file=sys.stderr)
     return code
+
+
+def printable(text):
+    """A text with escapes in place of what steers a terminal or cannot be written, which a name in a file may have."""
+    if text.isprintable():
+        return text
+    return "".join(c if c in "\n\t" or unicodedata.category(c) not in _STEERING else repr(c)[1:-1] for c in text)
+
+
+class Printable:
+    """A stream that is written as :func:`printable` has it."""
+
+    def __init__(self, stream):
+        self._stream = stream
+
+    def write(self, text):
+        return self._stream.write(printable(text))
+
+    def __getattr__(self, name):
+        return getattr(self._stream, name)

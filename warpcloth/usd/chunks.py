@@ -4,13 +4,15 @@ import os
 import re
 import secrets
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdUtils
+from pxr import Sdf, Usd, UsdUtils
 
 from .layers import flatten, relative_path
 from .stage import METADATA_KEY, followed
+from .values import refuse_path, sentences
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -115,7 +117,10 @@ class ChunkWriter:
         self._write_chunk()
         self._closed = True
         if self._chunks and (single_file or self._output.suffix == ".usdz"):
-            self._write_single_file()
+            try:
+                self._write_single_file()
+            except OSError as error:
+                raise OSError(f"{error}; all frames are in {self.path}") from error
 
     def _append(self, time, samples):
         """Adds a frame: at a time code values by path of attribute; every `chunk` frames they are written."""
@@ -238,10 +243,11 @@ class ChunkWriter:
         self._copy_frames(single)
         finished = self._run / f"finished{self._output.suffix}"
         if packed:
-            if not UsdUtils.CreateNewUsdzPackage(str(single), str(finished)):
-                raise OSError(f"{finished}: could not be written")
+            with _writing(self._output):
+                if not UsdUtils.CreateNewUsdzPackage(str(single), str(finished)) or not _is_whole(finished):
+                    raise OSError(f"{self._output}: could not be written")
         elif self._output.suffix == ".usda":
-            export(Sdf.Layer.FindOrOpen(str(single)), finished)
+            _export(Sdf.Layer.FindOrOpen(str(single)), finished, self._output)
         else:
             os.replace(single, finished)
         os.replace(finished, self._output)
@@ -258,8 +264,18 @@ class ChunkWriter:
             for attribute in self._attributes():
                 for time in chunk.ListTimeSamplesForPath(attribute):
                     layer.SetTimeSample(attribute, time, chunk.QueryTimeSample(attribute, time))
-            if not layer.Save():
-                raise OSError(f"{single}: could not be written")
+            with _writing(self._output):
+                if not layer.Save():
+                    raise OSError(f"{self._output}: could not be written")
+
+
+def _is_whole(package):
+    """Whether all of a package is on the disk: pxr does not notice one that is full."""
+    try:
+        with zipfile.ZipFile(package) as archive:
+            return archive.testzip() is None
+    except zipfile.BadZipFile:
+        return False
 
 
 def frames_folder(output):
@@ -269,6 +285,7 @@ def frames_folder(output):
 
 
 def _check_output(output):
+    refuse_path(output)
     if output.suffix not in _ENDINGS:
         raise ValueError(f"output = {output}: must end with one of {', '.join(_ENDINGS)}")
     if not output.parent.is_dir():
@@ -308,9 +325,11 @@ def export(layer, path, unfinished_in=None):
 
 def _export(layer, file, meant=None):
     """Writes a layer to a file that is ``meant`` for a path."""
-    try:
-        written, reason = layer.Export(str(file)), ""
-    except Tf.ErrorException as error:
-        written, reason = False, f": {error.args[0].commentary}"
-    if not written:
-        raise OSError(f"{meant or file}: could not be written{reason}")
+    with _writing(meant or file):
+        if not layer.Export(str(file)):
+            raise OSError(f"{meant or file}: could not be written")
+
+
+def _writing(path):
+    """Has what pxr says of a file that cannot be written raised as one sentence."""
+    return sentences(path, OSError, "could not be written: ")

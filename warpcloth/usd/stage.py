@@ -14,6 +14,7 @@ from .values import (
     check_stage,
     reason_of,
     refuse_outside,
+    refuse_path,
     rows_of,
     sentences,
     time_codes_of,
@@ -169,10 +170,7 @@ def open_stage(path):
         ValueError: It is no USD stage, or has units, rates or times that are none, see `values.check_stage`.
     """
     path = os.fspath(path)
-    try:
-        path.encode()
-    except UnicodeEncodeError:
-        raise ValueError(f"{path!r}: the path is no valid UTF-8, which USD needs") from None
+    refuse_path(path)
     if not os.path.isfile(path):
         raise FileNotFoundError(f"{path}: there is no such file")
     # pxr keeps a layer while anyone uses it, and would show an earlier result that has been replaced since.

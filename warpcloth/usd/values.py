@@ -1,6 +1,8 @@
 """Values of a stage, each read with a check: what is wrong is refused by its name before it reaches any arithmetic."""
 
 import math
+import os
+import unicodedata
 import warnings
 from contextlib import contextmanager, redirect_stderr
 from io import StringIO
@@ -17,26 +19,33 @@ _listening = False
 
 
 @contextmanager
-def sentences(path):
-    """Has what pxr says of a file in one sentence each: its errors raised, its warnings as those of Python.
+def sentences(path, raised=ValueError, what=""):
+    """Has what pxr says of a file in one sentence each: its errors ``raised``, its warnings as those of Python.
+
+    Args:
+        path: The file.
+        raised: The type of the error.
+        what: What it says before the words of pxr.
 
     Raises:
-        ValueError: pxr has met an error.
+        ValueError: pxr has met an error; or of the type that is given.
     """
     global _listening
-    if _listening:  # each listener is told everything
-        yield
-        return
-    _listening, heard = True, UsdUtils.CoalescingDiagnosticDelegate()
+    heard = None if _listening else UsdUtils.CoalescingDiagnosticDelegate()  # each listener is told everything
+    _listening = True
     try:
         yield
     except Tf.ErrorException as error:
-        raise ValueError(f"{path}: {reason_of(error)}") from None
+        raise raised(f"{path}: {what}{reason_of(error)}") from None
+    except UnicodeDecodeError:  # of a name or text that pxr hands over
+        raise raised(f"{path}: {what}it holds text that is no valid UTF-8") from None
     finally:
-        _listening = False
-        said = heard.TakeUncoalescedDiagnostics()
-    for text in dict.fromkeys(_plain(each.commentary) for each in said):  # not where an error says what is wrong
-        warnings.warn(f"{path}: {text}", stacklevel=4)
+        if heard:
+            _listening = False
+            said = heard.TakeUncoalescedDiagnostics()
+    if heard:
+        for text in dict.fromkeys(_plain(each.commentary) for each in said):  # not where an error says what is wrong
+            warnings.warn(f"{path}: {text}", stacklevel=4)
 
 
 def reason_of(error):
@@ -48,6 +57,17 @@ def reason_of(error):
 def _plain(text):
     """Without the line breaks of pxr, and without the address of the stage in memory."""
     return " ".join(text.partition(" (instantiating stage on")[0].split())
+
+
+def refuse_path(path):
+    """Refuses a path that no layer can refer to.
+
+    Raises:
+        ValueError: It has control characters, such as a line break, or is no UTF-8.
+    """
+    text = os.fspath(path)
+    if any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
+        raise ValueError(f"{text!r}: a path in USD must be UTF-8 without line breaks and other control characters")
 
 
 def check_stage(stage, path):
@@ -104,6 +124,8 @@ def value_of(attribute, time=None):
     try:
         with redirect_stderr(StringIO()):  # pxr prints by itself what it cannot turn into a value of Python
             return attribute.Get(Usd.TimeCode.Default() if time is None else time)
+    except UnicodeDecodeError:
+        raise ValueError(f"{attribute.GetName()} is no valid UTF-8") from None
     except (Tf.ErrorException, TypeError) as error:
         raise ValueError(f"{attribute.GetName()} cannot be read ({reason_of(error)})") from None
 
