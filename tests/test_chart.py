@@ -56,8 +56,9 @@ def summaries(percentiles, name="stretch", unit="1"):
         (Scale(2.0, 6.0), "viridis", [2.0, 4.0, 6.0, 1.0, 9.0, -np.inf, np.inf], [0.0, 0.5, 1.0, 0.0, 1.0, 0.0, 1.0]),
         (Scale(0.9, 1.2, 1.0), "coolwarm", [0.8, 1.0, 1.2, 0.0, np.inf], [0.0, 0.5, 1.0, 0.0, 1.0]),
         (Scale(0.1, 0.3, 0.0), "coolwarm", [-0.3, 0.0, 0.3], [0.0, 0.5, 1.0]),
+        (Scale(0.1, 0.3, 0.0, colormap="RdBu"), "RdBu", [-0.3, 0.0, 0.3], [0.0, 0.5, 1.0]),
     ],
-    ids=["sequential", "diverging", "all on one side"],
+    ids=["sequential", "diverging", "all on one side", "of one's choice"],
 )
 def test_ends_and_middle_have_the_colours_of_the_map(scale, name, values, places):
     """An odd number of stops has one in the middle, of matplotlib's 256 none is; between stops colours are linear."""
@@ -158,6 +159,24 @@ def test_both_sides_have_the_colours_of_the_scale(turn, tmp_path):
     assert (width, height) == (1080, 975)
     assert share(path, lit(scale, 0.2)) == pytest.approx(half, rel=0.01)
     assert share(path, lit(scale, np.nan)) == pytest.approx(half, rel=0.01)
+
+
+@pytest.mark.parametrize("size", [(1.0, 1.0), (2.0, 1.0), (1.0, 2.0)], ids=["square", "wide", "high"])
+def test_two_panels_show_both_sides(size, tmp_path):
+    """Of two layers each panel shows the one that faces it; wide panels stand one above another."""
+    scale, path = Scale(0.0, 1.0), tmp_path / "layers.png"
+    sheet = SQUARE * [*size, 1.0]
+    points, triangles = np.concatenate([sheet, sheet + np.array([0.0, 0.0, 0.1])]), np.concatenate([HALVES, HALVES + 4])
+    draw(path, points, triangles, [0.1, 0.1, 0.9, 0.9], scale, view=FRONT, both_sides=True)
+    height, width = imread(path).shape[:2]
+    panel = 900 * np.array(size) / max(size)
+    wide = size[0] > size[1]
+    assert (width, height) == pytest.approx([panel[0] * (1 + (not wide)) + 180, (panel[1] + 45) * (1 + wide) + 75], abs=30)
+    for value in (0.9, 0.1):
+        assert share(path, lit(scale, value)) == pytest.approx(np.prod(panel / 1.03), rel=0.02), value
+    behind = View(30.0, 20.0, window=(-1.0, 2.0, 0.0, 1.0)).opposite()
+    assert (behind.azimuth, behind.elevation, behind.window) == (-150.0, -20.0, (-2.0, 1.0, 0.0, 1.0))
+    assert behind.project(points) == pytest.approx(View(30.0, 20.0).project(points) * [-1.0, 1.0, -1.0])
 
 
 def test_a_vertex_colours_a_third_of_its_triangles(tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.image import imread
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from usd_validation import validate
 
@@ -252,6 +253,29 @@ def test_stills_and_plots_are_pictures(cloth, tmp_path, capsys):
         assert str(tmp_path / name) in said
 
 
+def test_stills_are_seen_from_where_one_asks(cloth, tmp_path, capsys):
+    """Both sides are the pictures from in front and from straight behind, one above the other."""
+
+    def still(name, *options):
+        command = ["analyze", str(cloth), "--still", str(tmp_path / f"{name}.png"), "--still-frames", "6", *options]
+        assert main(command) == 0, capsys.readouterr().err
+        return imread(tmp_path / f"{name}_6.png")[75:, :, :3]
+
+    places = {"front": ("0", "60"), "back": ("180", "-60")}
+    front, back = (still(name, "--azimuth", a, "--elevation", e)[:, :900] for name, (a, e) in places.items())
+    both = still("both", "--azimuth", "0", "--elevation", "60", "--both-sides")[:, :900]
+    height = len(both) // 2
+    assert len(front) == pytest.approx(height - 45, abs=1) and not np.array_equal(front, back)
+    for whole, part in ((front, both[:height]), (back, both[height:])):  # a pixel may be another, and at the foot are words
+        assert np.abs(part[: height - 45] - whole[: height - 45]).mean() < 0.01
+    assert not np.array_equal(still("steep", "--elevation", "80"), still("flat", "--elevation", "10"))
+    shades = still("grey", "--colormap", "gray")
+    assert np.ptp(shades, axis=2).max() < 0.01 < np.ptp(still("own"), axis=2).max()
+    assert main(["analyze", str(cloth), "-o", str(tmp_path / "grey.usda"), "--colormap", "gray"]) == 0
+    stage = Usd.Stage.Open(str(tmp_path / "grey.usda"))
+    assert stage.GetRootLayer().customLayerData["warpcloth"]["legend"]["map"] == "gray"
+
+
 def test_one_file(cloth, tmp_path, capsys):
     for name, more in (("a.usdz", []), ("b.usdc", ["--single-file"])):
         assert main(["analyze", str(cloth), "-o", str(tmp_path / name), *more]) == 0
@@ -303,6 +327,12 @@ WRONG = [
     ("CLOTH --still a.png --still-frames 99", "stills: frame 99 is not measured"),
     ("CLOTH --still-frames 2", "--still-frames is given without --still"),
     ("CLOTH --still a.jpg", "the ending is '.jpg'"),
+    ("CLOTH --azimuth 10", "--azimuth is given without --still"),
+    ("CLOTH --elevation 10 -o out.usdc", "--elevation is given without --still"),
+    ("CLOTH --both-sides", "--both-sides is given without --still"),
+    ("CLOTH --colormap viridis", "--colormap is given without --still and -o"),
+    ("CLOTH --still a.png --colormap virdis", "colormap is 'virdis'; it must be a colour map of matplotlib, such as viridis"),
+    ("CLOTH --still a.png --azimuth nan", "azimuth is nan"),
     ("CLOTH --plot a.txt", "a.txt"),
     ("CLOTH --range 2 1 -o out.usdc", "low must be below high"),
     ("CLOTH --csv gone/t.csv", "gone"),

@@ -2,7 +2,7 @@
 
 import warnings
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -68,6 +68,9 @@ def write_report(
     single_file=False,
     up_axis=None,
     progress=None,
+    view=None,
+    both_sides=False,
+    colormap=None,
 ):
     """Measures all rows of an analysis and writes them, in memory that does not grow but for the plot's percentiles.
 
@@ -86,6 +89,9 @@ def write_report(
         single_file: Whether the stage is one file, see :class:`warpcloth.usd.AnimationWriter`.
         up_axis: "Y" or "Z", of what does not say its own.
         progress: Function called with (row, rows) after each, or None.
+        view: The :class:`warpcloth.chart.View` of the stills, if not its default; its up axis is that of the animation.
+        both_sides: Whether stills show the cloth from straight behind too, see :func:`warpcloth.chart.draw`.
+        colormap: Name of a colour map of matplotlib, if not that which :class:`warpcloth.chart.Scale` has by itself.
 
     Returns:
         :class:`Report`.
@@ -97,6 +103,10 @@ def write_report(
     listed = {name: measure for measure in analyzer.measures for name in scalar_names(measure)}
     report = Report(extremes={name: Extremes() for name in listed})
     _check(analyzer, listed, usd, stills, colour, curves)
+    if colormap is not None:
+        from .chart.colour import check_colormap
+
+        check_colormap(colormap)
     _check_pictures(plot, stills)
     check_apart([usd, csv, json, npz, plot, *(stills or {}).values()], analyzer.sequence.files)
     if (usd or stills) and colour != "none" and (stills or colour or _can_colour()):
@@ -108,7 +118,10 @@ def write_report(
         log = stack.enter_context(JsonWriter(json, _input(analyzer), {m.name: m for m in analyzer.measures})) if json else None
         writers += [log] if log else []
         archive = stack.enter_context(_archive(analyzer, npz)) if npz else None
-        shown = _Shown(analyzer, report, listed, usd, stills, curves, single_file, up_axis, stack) if usd or stills else None
+        shown = None
+        if usd or stills:
+            looks = view, both_sides, colormap
+            shown = _Shown(analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack)
         try:
             for sample in analyzer:
                 values = {}
@@ -254,14 +267,15 @@ def _archive(analyzer, path):
 class _Shown:
     """What is looked at: a stage and pictures, coloured by one scalar on one scale."""
 
-    def __init__(self, analyzer, report, listed, usd, stills, curves, single_file, up_axis, stack):
+    def __init__(self, analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack):
+        view, self.both_sides, colormap = looks
         self.analyzer, self.name, self.curves, self.stills = analyzer, report.coloured, curves, stills or {}
         self.over, self.scale, metadata = analyzer.sequence.stage is not None, None, {"analysis": _input(analyzer)}
         if self.name:
             from .chart import Scale
 
             self.unit = listed[self.name].unit
-            self.scale = Scale(*report.scale, _neutral(listed[self.name]))
+            self.scale = Scale(*report.scale, _neutral(listed[self.name]), colormap)
             metadata["legend"] = self.scale.legend(self.name, self.unit)
         areas = analyzer.mesh.triangle_areas
         areas = areas[np.isfinite(areas) & (areas > 0.0)]  # others have no segments
@@ -272,7 +286,8 @@ class _Shown:
             from .chart import View
 
             places = {pair.frame for pair in analyzer.pairs if sequence.labels[pair.frame] in self.stills}
-            self.view = View(up_axis=up_axis).fit(sequence[place] for place in sorted(places))
+            view = replace(view or View(), up_axis=up_axis)
+            self.view = view.fit(sequence[place] for place in sorted(places))
         self.writer, self.rate = None, _rate(sequence)
         if usd:
             from .usd import MeasureWriter
@@ -323,6 +338,7 @@ class _Shown:
                 unit=self.unit,
                 view=self.view,
                 directions=segments,
+                both_sides=self.both_sides,
             )
 
     def _time_code(self, sample):

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from ..checks import number
+from ..checks import number, shown
 from .figures import require_matplotlib
 
 SEQUENTIAL = "viridis"
@@ -29,16 +29,20 @@ class Scale:
         high: Value at the upper end.
         neutral: Value in the middle of a diverging map, about which the ends are moved apart until they are symmetric. None
             is a sequential map.
+        colormap: Name of a map of matplotlib, if not `DIVERGING` with a neutral value and `SEQUENTIAL` without.
 
     Raises:
-        ValueError: A value is not finite, or low is not below high.
+        ValueError: A value is not finite, low is not below high, or matplotlib has no such map.
     """
 
     low: float
     high: float
     neutral: float | None = None
+    colormap: str | None = None
 
     def __post_init__(self):
+        if self.colormap is not None:
+            check_colormap(self.colormap)
         number("low", self.low)
         number("high", self.high)
         if not self.low < self.high:
@@ -52,7 +56,7 @@ class Scale:
     @property
     def map(self):
         """Name of the map, as matplotlib has it."""
-        return SEQUENTIAL if self.neutral is None else DIVERGING
+        return self.colormap or (SEQUENTIAL if self.neutral is None else DIVERGING)
 
     def srgb(self, values):
         """Colours (…, 3) of values (…) in sRGB, for plots.
@@ -123,6 +127,23 @@ def range_over(summaries, neutral=None):
 def to_linear(colours):
     """sRGB to linear Rec. 709, as IEC 61966-2-1 has it."""
     return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+
+
+def check_colormap(name):
+    """Refuses what is no colour map of matplotlib.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        ValueError: Naming maps that look alike, or some that it has.
+    """
+    require_matplotlib()
+    from difflib import get_close_matches
+
+    from matplotlib import colormaps
+
+    if not isinstance(name, str) or name not in colormaps:
+        near = get_close_matches(str(name), list(colormaps), 3) or ["viridis", "cividis", "coolwarm", "RdBu"]
+        raise ValueError(f"colormap is {shown(name)}; it must be a colour map of matplotlib, such as {', '.join(near)}")
 
 
 @cache

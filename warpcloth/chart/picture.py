@@ -9,8 +9,8 @@ from .colour import EXCLUDED
 from .figures import GREY, check_path, save
 from .view import View, brightness
 
-# Inches: the longer side of what is shown, what is beside and above it, and gaps.
-_SIDE, _RIGHT, _TOP, _GAP = 6.0, 1.2, 0.5, 0.15
+# Inches: the longer side of what is shown, what is beside, above and, of several panels, below it, and gaps.
+_SIDE, _RIGHT, _TOP, _FOOT, _GAP = 6.0, 1.2, 0.5, 0.3, 0.15
 # Points: edges in the colour of their triangle close the hairlines between neighbours, at 150 dots per inch from 0.8 on.
 _EDGE, _LINE = 0.8, 0.7
 # The bar has the colours in full light, from which shaded ones must not stray far.
@@ -18,7 +18,9 @@ _LEAST_LIGHT = 0.85
 _GREYS = (0.0, 1.0, 0.5)
 
 
-def draw(path, points, triangles, values, scale, on="triangle", title="", unit="1", view=None, directions=None):
+def draw(
+    path, points, triangles, values, scale, on="triangle", title="", unit="1", view=None, directions=None, both_sides=False
+):
     """Writes a PNG of a cloth in parallel projection, coloured on both sides, with a bar of the colours.
 
     A value of a vertex colours a third of each triangle beside it, the part that is nearest in barycentric coordinates. Dark
@@ -37,6 +39,7 @@ def draw(path, points, triangles, values, scale, on="triangle", title="", unit="
             points if it is None or without a window.
         directions: Segments to draw on the cloth, as a dictionary from names to (centres (E, 3) [m], vectors (E, 3) [m] from
             end to end); the first are black, the second white, the third grey. Those that are not finite are left out.
+        both_sides: Whether the cloth is also seen from straight behind, in a second panel; each says from where it is seen.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -50,10 +53,26 @@ def draw(path, points, triangles, values, scale, on="triangle", title="", unit="
     view = view or View()
     if view.window is None:
         view = view.fit([points])
+    views = [view, view.opposite()] if both_sides else [view]
+    figure, panels, beside = _layout(view.window, title, len(views))
+    colours = scale.srgb(values if on == "triangle" else values[triangles])
+    for axes, one in zip(panels, views, strict=True):
+        left, right, bottom, top = one.window
+        axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+        axes.axis("off")
+        if both_sides:
+            text = f"from azimuth {one.azimuth:g}°, elevation {one.elevation:g}°".replace("-", "−")
+            axes.text(0.02, 0.0, text, transform=axes.transAxes, va="top", fontsize=8, color=GREY)
+        unplaced = _paint_cloth(axes, one, points, triangles, colours, on, directions)
+    _explain(figure, beside, scale, unit, bool(np.isnan(values).any()), unplaced)
+    save(figure, path)
+
+
+def _paint_cloth(axes, view, points, triangles, colours, on, directions):
+    """Draws the triangles and directions as they are seen; how many triangles have a corner that is not finite."""
     corners = view.project(points)[triangles]
     placed = np.isfinite(corners).all(axis=(1, 2))
-    colours = scale.srgb(values if on == "triangle" else values[triangles])[placed]
-    outlines, colours = (_whole if on == "triangle" else _thirds)(corners[placed], colours)
+    outlines, colours = (_whole if on == "triangle" else _thirds)(corners[placed], colours[placed])
     widths = np.full(len(outlines), _EDGE)
     depths = outlines[..., 2].mean(axis=1)
     if directions:
@@ -63,10 +82,8 @@ def draw(path, points, triangles, values, scale, on="triangle", title="", unit="
         depths = np.append(depths, segments[..., 2].mean(axis=1) + lengths / 2.0)
         outlines = np.concatenate([outlines, segments[:, np.minimum(np.arange(outlines.shape[1]), 1)]])
         colours, widths = np.concatenate([colours, greys]), np.append(widths, np.full(len(segments), _LINE))
-    figure, axes, beside = _layout(view.window, title)
     paint(axes, outlines[..., :2], depths, colours, widths)
-    _explain(figure, beside, scale, unit, bool(np.isnan(values).any()), int((~placed).sum()))
-    save(figure, path)
+    return int((~placed).sum())
 
 
 def paint(axes, outlines, depths, colours, widths):
@@ -125,20 +142,27 @@ def _segments(view, directions):
     return np.concatenate(ends), np.concatenate(greys)
 
 
-def _layout(window, title):
-    """A figure, its axes for the window, and axes for the bar; they depend on nothing but the window."""
+def _layout(window, title, count=1):
+    """A figure, ``count`` axes as large as the window, and axes for the bar; they depend on nothing but the window.
+
+    Panels that are higher than wide stand side by side, others one above another.
+    """
     from matplotlib.figure import Figure
 
     left, right, bottom, top = window
     width, height = np.array([right - left, top - bottom]) * _SIDE / max(right - left, top - bottom)
-    size = np.array([width + _RIGHT, max(height, 2.0) + _TOP])
+    columns, rows = (count, 1) if width <= height else (1, count)
+    foot = _FOOT if count > 1 else 0.0
+    height = max(height, (2.0 - rows * foot) / rows)
+    size = np.array([columns * width + _RIGHT, rows * (height + foot) + _TOP])
     figure = Figure(figsize=size)
-    axes = figure.add_axes([0.0, 0.0, width / size[0], 1.0 - _TOP / size[1]])
-    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-    axes.axis("off")
+    panels = []
+    for k in range(count):
+        corner = np.array([k % columns * width, (rows - 1 - k // columns) * (height + foot) + foot])
+        panels.append(figure.add_axes([*(corner / size), *([width, height] / size)]))
     figure.text(_GAP / size[0], 1.0 - 0.3 * _TOP / size[1], title, va="center", color=GREY, parse_math=False)
-    beside = figure.add_axes([(width + _GAP) / size[0], 0.25, _GAP / size[0], 0.5])
-    return figure, axes, beside
+    beside = figure.add_axes([(columns * width + _GAP) / size[0], 0.25, _GAP / size[0], 0.5])
+    return figure, panels, beside
 
 
 def _explain(figure, beside, scale, unit, excluded, unplaced):

@@ -62,6 +62,12 @@ class View:
         (left, bottom), (right, top) = (middle - half).tolist(), (middle + half).tolist()
         return replace(self, window=(left, right, bottom, top))
 
+    def opposite(self):
+        """The view from straight behind, of the same window."""
+        azimuth = (self.azimuth + 360.0) % 360.0 - 180.0
+        window = self.window and (-self.window[1], -self.window[0], *self.window[2:])
+        return replace(self, azimuth=azimuth, elevation=-self.elevation, window=window)
+
     def project(self, points):
         """Right, up and towards the viewer (…, 3) of points or vectors (…, 3)."""
         a, e = np.radians([self.azimuth, self.elevation])

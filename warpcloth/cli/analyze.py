@@ -17,6 +17,7 @@ What cannot be measured is left out and listed, as points that are not finite or
   warpcloth analyze cache.usdc --measure stretch area_ratio -o measured.usdc --plot measured.png
   warpcloth analyze frames/ --fps 24 --rest pattern.obj --neighbourhood 1-ring --measure rotation residual --csv table.csv
   warpcloth analyze cache.usdc --lag 3 --measure rate_of_strain stretch_rate -o rates.usdc --still one.png --still-frames 24
+  warpcloth analyze cache.usdc --still turned.png --azimuth 60 --elevation 10 --both-sides --colormap cividis
 """
 _SENTENCES = 8
 _MATERIALS = {"neo-hookean": "NeoHookeanMembrane", "stvk": "StVKMembrane", "corotated": "CorotatedMembrane"}
@@ -65,6 +66,14 @@ def add_arguments(parser):
     add("--npz", metavar="FILE", help="the measures themselves, (frames, elements, …)")
     add("--plot", metavar="FILE", help="percentiles over time, .png, .svg or .pdf")
     add("--still", metavar="FILE", help="pictures, .png; the number of the frame is put before the ending")
+    add("--azimuth", type=float, metavar="DEGREES", help="of the viewer of --still about the vertical, -38 where not given")
+    add("--elevation", type=float, metavar="DEGREES", help="of the viewer of --still above the horizontal, 24 where not given")
+    add("--both-sides", action="store_true", help="show the cloth from straight behind too in each --still")
+    add(
+        "--colormap",
+        metavar="NAME",
+        help="a colour map of matplotlib, such as cividis; where not given viridis, or coolwarm about what is undeformed",
+    )
     add("--still-frames", type=float, nargs="+", metavar="FRAME", help="of which frames; of the last where not given")
 
 
@@ -82,6 +91,7 @@ def analyze(arguments):
     if arguments.output:
         frames_folder_of(arguments)  # refuses an ending that is none
     started = time.perf_counter()
+    view = _view(arguments)
     analyzer = _analyzer(arguments)
     stills, progress = _stills(arguments, analyzer), Progress(len(analyzer), first="measuring")
     try:
@@ -99,6 +109,9 @@ def analyze(arguments):
             single_file=arguments.single_file,
             up_axis=arguments.up_axis,
             progress=progress,
+            view=view,
+            both_sides=arguments.both_sides,
+            colormap=arguments.colormap,
         )
     except KeyboardInterrupt:
         files = ", ".join(filter(None, files.values())) or "no file"
@@ -190,6 +203,20 @@ def _stills(arguments, analyzer):
     width = max(len(f"{label:g}") for label in labels)
     chosen = arguments.still_frames or [labels[-1]]
     return {frame: path.with_name(f"{path.stem}_{f'{frame:g}'.zfill(width)}{path.suffix}") for frame in chosen}
+
+
+def _view(arguments):
+    """The view of the pictures, or None without any."""
+    given = {name: value for name in ("azimuth", "elevation") if (value := getattr(arguments, name)) is not None}
+    if arguments.still is None:
+        for name in (*given, *(["both-sides"] if arguments.both_sides else [])):
+            raise ValueError(f"--{name} is given without --still, the name of the pictures")
+        if arguments.colormap is not None and arguments.output is None:
+            raise ValueError("--colormap is given without --still and -o, which have colours")
+        return None
+    from ..chart import View
+
+    return View(**given)
 
 
 def _extremes(extremes):
