@@ -252,6 +252,13 @@ def test_the_residual_has_a_unit(name, weight, device):
     assert status.message.endswith(f": {kind.measure} {digits(status.residual)} {unit} ({compared})")
 
 
+def test_a_hard_constraint_has_another_residual(device):
+    """There is no force to be unbalanced, and the sentence names what is measured instead."""
+    hard = replace(scene("hanging", n=4), terms=[wc.Spring(stiffness=np.inf)])
+    status = wc.simulate(hard, wc.XPBD(substeps=2), device=device, frames=1).status
+    assert f": largest move of a vertex in the last sweep, over h², {digits(status.residual)} times gravity (" in status.message
+
+
 def test_rounding_is_no_failure():
     said = sentence(Result.ROUNDED, "float32", 0.037, *wc.Newton.residual[::2], tolerance=0.001)
     assert said == (

@@ -259,7 +259,7 @@ class Watch:
         """The :class:`Status` of a run with a solver, whose copies ended with these."""
         results = [Result.DIVERGED if copy in self.messages else result for copy, result in enumerate(results)]
         result = max(results, key=list(Result).index)
-        kind, measure, unit = solver.residual, None, None
+        kind, measure, unit = solver.residual_on(self.model), None, None
         copy = int(np.argmax(residual))  # the first that is NaN, if any
         if kind is not None:
             measure, unit = kind.measure, kind.unit if self.gravity[copy] > 0.0 else kind.weightless

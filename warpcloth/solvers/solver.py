@@ -51,6 +51,10 @@ class Step:
     dt: float | None = None
     substeps: int | None = None
 
+    def residual_on(self, model):
+        """The residual that its steps report on a model, where that depends on the terms."""
+        return self.residual
+
     @property
     def divides(self):
         """Whether several threads can share the steps of one cloth."""

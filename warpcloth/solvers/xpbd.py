@@ -76,6 +76,11 @@ class XPBD(ImplicitStep):
     def ordered(self):
         return self.sweep in IN_PLACE
 
+    def residual_on(self, model):
+        if any(elements.hard for elements in model.terms):
+            return self.residual._replace(measure="largest move of a vertex in the last sweep, over h²,")
+        return self.residual
+
     @property
     def divides(self):
         return self.sweep == "coloured"
