@@ -148,7 +148,7 @@ def test_balance_that_is_no_minimum_is_left(name, device):
     """In exact symmetry no force says so, but the Hessian does: nudged, they fall and hang."""
     rest = wc.equilibrium(UNSTABLE[name], device=device)
     assert rest.status.result in SETTLED, rest.status
-    assert rest.points[:, 1].mean() < -0.4
+    assert rest.points[:, 1].mean() < -0.4 and rest.stable
 
 
 def test_float32_comes_near_float64(device):
@@ -252,6 +252,8 @@ def test_rigid_motions_are_no_instability(device):
     assert free.stable and abs(free.lowest_eigenvalue) < 1e-9
     held = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, pins="corners"), device=device)
     assert held.stable and held.lowest_eigenvalue > 1e-3
+    pinned = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, pins="all"), device=device)
+    assert pinned.stable and pinned.lowest_eigenvalue == np.inf
     unfinished = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms), iterations=20, device=device)
     assert not unfinished.stable and np.isnan(unfinished.lowest_eigenvalue)
     assert "; not a rest shape: " in unfinished.status.message
