@@ -7,6 +7,7 @@ import numpy as np
 
 from .arap import Arap
 from .checks import number, refuse, shown, whole
+from .interrupts import recording
 from .mesh import Mesh
 from .scene import checked_pins
 
@@ -92,6 +93,7 @@ def deform(
         :class:`Deformation`.
 
     Raises:
+        BlockingIOError, Interrupted, OSError: As :func:`warpcloth.simulate`.
         ValueError: If an argument breaks a rule, as :class:`warpcloth.Arap` has them too, or a frame overflows; the frames
             before it are in ``output``.
     """
@@ -108,11 +110,11 @@ def deform(
         _refuse_beyond_float32(pins.keyframes, fps)
     # First, for it refuses a wrong output before anything is factorised.
     recorder = _Memory(mesh, frames) if output is None else _File(mesh, pins, fps, output, single_file, stage, up_axis)
-    start = time.perf_counter()
-    arap = Arap(mesh, pins.vertices, weights=weights, energy=energy, device=device, dtype=dtype)
-    timings = {"factorise": time.perf_counter() - start, "frames": []}
     results, points = [], None
-    try:
+    with recording(recorder, frames - 1):
+        start = time.perf_counter()
+        arap = Arap(mesh, pins.vertices, weights=weights, energy=energy, device=device, dtype=dtype)
+        timings = {"factorise": time.perf_counter() - start, "frames": []}
         for frame, places in enumerate(pins.keyframes):
             start = time.perf_counter()
             initial = None if points is None else arap.carry(points, pins.keyframes[frame - 1], places)
@@ -128,8 +130,6 @@ def deform(
             results.append((result.energies[-1], result.iterations, result.converged, angles.max()))
             if progress is not None:
                 progress(frame, frames - 1)
-    finally:
-        recorder.close()
     energies, iterations, converged, largest = (np.array(values) for values in zip(*results, strict=True))
     points, angles = recorder.read()
     return Deformation(points, angles, largest, energies, iterations, converged, np.arange(frames) / fps, timings, output)
@@ -166,6 +166,9 @@ class _Memory:
     def close(self):
         pass
 
+    def saved(self):
+        return "nothing was saved"
+
     def read(self):
         return self.points, self.angles
 
@@ -185,6 +188,13 @@ class _File:
 
     def append(self, points, velocities, angles):
         self.writer.append(points, velocities, {PRIMVAR: np.degrees(angles)})
+
+    @property
+    def frames(self):
+        return self.writer.frames
+
+    def saved(self):
+        return self.writer.saved()
 
     def close(self):
         self.writer.close(single_file=self.single_file)

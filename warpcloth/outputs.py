@@ -1,8 +1,14 @@
 """Files that are there whole or not at all."""
 
 import contextlib
+import errno
 import os
 import secrets
+import socket
+import sys
+import warnings
+
+from .interrupts import deferred
 
 TEXT = {"encoding": "utf-8", "newline": ""}
 
@@ -30,6 +36,7 @@ class Output:
 
     Attributes:
         path: The file, once it is closed.
+        finished: Whether it is.
     """
 
     def __init__(self, path, mode, **options):
@@ -45,7 +52,7 @@ class Output:
             raise FileNotFoundError(f"{path}: the folder {self.folder} does not exist")
         if os.path.exists(target) and not os.path.isfile(target):
             raise ValueError(f"{path}: is no regular file; it must be one, or free")
-        self.path = os.fspath(path)
+        self.path, self.finished = os.fspath(path), False
         self._target, self._unfinished = target, f"{target}.{secrets.token_hex(4)}.unfinished"
         self.file = open(self._unfinished, mode, **options)
 
@@ -63,9 +70,11 @@ class Output:
         if self.file.closed:
             return
         try:
-            self.finish()
-            self.file.close()
-            os.replace(self._unfinished, self._target)
+            with deferred():
+                self.finish()
+                self.file.close()
+                os.replace(self._unfinished, self._target)
+                self.finished = True
         except BaseException:
             self.discard()
             raise
@@ -84,3 +93,74 @@ class Output:
     def parts(self):
         """Further files that are open."""
         return ()
+
+
+class Lock:
+    """Keeps other writers away from an output: a file beside it, `.<name>.lock`, which the system frees when its process ends.
+
+    So a process that was killed leaves a file that holds nobody up, and that the next writer removes when it is done. Folders
+    of a network are locked for all their machines where the file system does that.
+
+    Args:
+        output: Path of the output.
+
+    Raises:
+        BlockingIOError: Another writer has it, of this process or of another one.
+
+    Warns:
+        UserWarning: The file system of the folder has no locks.
+    """
+
+    def __init__(self, output):
+        self._path = os.path.join(os.path.dirname(output), f".{os.path.basename(output)}.lock")
+        self._file, self._process = None, os.getpid()
+        while True:
+            try:
+                file = open(self._path, "a+", encoding="utf-8")
+            except PermissionError:  # that of another user, who may have left it; if there is none the folder is another's
+                file = open(self._path, encoding="utf-8")
+            try:
+                _lock(file)
+            except OSError as error:
+                file.seek(0)
+                with contextlib.suppress(OSError):
+                    holder = file.read(200).strip()
+                file.close()
+                if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
+                    warnings.warn(f"{output}: its folder takes no locks; keep other runs away from it", stacklevel=5)
+                    return
+                raise BlockingIOError(
+                    f"{output}: is being written by {holder or 'another run'}; wait until it ends, or give another output"
+                ) from None
+            # Or the writer before has removed the file between, and the next one would make another.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), os.stat(self._path)):
+                    break
+            file.close()
+        self._file = file
+        with contextlib.suppress(OSError):  # of a full disk; it is for the message alone
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}")
+            file.flush()
+
+    def release(self):
+        """Lets others write; once is enough. In a process that was forked from the writer's it does nothing."""
+        if self._file is None or self._process != os.getpid():
+            return
+        with contextlib.suppress(OSError):
+            os.remove(self._path)
+        self._file.close()
+        self._file = None
+
+
+def _lock(file):
+    """Locks a file for this process, or raises an OSError at once."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(2**20)  # beyond what is read, for nobody else could read what is locked
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

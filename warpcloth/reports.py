@@ -1,11 +1,12 @@
 """An analysis as files: a USD stage with its measures, tables, arrays, plots and pictures, written row by row."""
 
 import warnings
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .interrupts import Interrupted
 from .measures import scalars
 from .outputs import check_apart
 from .summaries import CsvWriter, JsonWriter, Summary, summarise
@@ -112,16 +113,18 @@ def write_report(
     if (usd or stills) and colour != "none" and (stills or colour or _can_colour()):
         report.coloured = colour or next(iter(listed))
         report.scale = _range(analyzer, report.coloured, listed[report.coloured], colour_range)
-    kept = []
-    with ExitStack() as stack:
+    kept, opened = [], []
+    with _interruptible(report, len(analyzer), opened), ExitStack() as stack:
         writers = [stack.enter_context(CsvWriter(csv))] if csv else []
         log = stack.enter_context(JsonWriter(json, _input(analyzer), {m.name: m for m in analyzer.measures})) if json else None
         writers += [log] if log else []
         archive = stack.enter_context(_archive(analyzer, npz)) if npz else None
+        opened += filter(None, (*writers, archive))
         shown = None
         if usd or stills:
             looks = view, both_sides, colormap
             shown = _Shown(analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack)
+            opened += filter(None, [shown.writer])
         try:
             for sample in analyzer:
                 values = {}
@@ -160,8 +163,22 @@ def write_report(
         from .chart import plot_percentiles
 
         along = "frame" if analyzer.sequence.times is None else "time"
-        plot_percentiles(plot, kept, along, {name: measure.neutral for name, measure in listed.items()})
+        with _interruptible(report, len(analyzer), opened):
+            plot_percentiles(plot, kept, along, {name: measure.neutral for name, measure in listed.items()})
     return report
+
+
+@contextmanager
+def _interruptible(report, rows, opened):
+    """Says at an interrupt which of the writers that were opened have the rows until then in a file."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        tables = ", ".join(writer.path for writer in opened if getattr(writer, "finished", False))
+        said = [f"they are in {tables}"] if tables else []
+        said += [writer.saved() for writer in opened if getattr(writer, "kept", 0)]
+        saved = "; ".join(said) or "nothing was saved"
+        raise Interrupted(f"interrupted after {report.rows} of {rows} frames; {saved}") from None
 
 
 def scalar_names(measure):

@@ -10,6 +10,7 @@ import warp as wp
 
 from .checks import whole
 from .frames import frames_of, state_of
+from .interrupts import recording
 from .limits import MOST_FRAMES, refuse_disk, refuse_memory
 from .lines import lines_of
 from .ordering import order_of_run
@@ -91,24 +92,26 @@ def simulate(
         others go on; one that diverged is NaN from there.
 
     Raises:
-        ValueError: If an argument breaks a rule.
+        BlockingIOError: If another process, or thread, is writing ``output``.
+        Interrupted: If the user interrupts, a KeyboardInterrupt; it says which frames are in ``output``.
+        OSError: If a file cannot be written; it says the same.
+        ValueError: If an argument breaks a rule, or the scene's stage has changed and no longer fits the frames.
     """
     frames = scene.frames if frames is None else frames
     whole("frames", frames, 1, MOST_FRAMES)
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
     # First, for it refuses a wrong output before anything compiles.
-    recorder = None if output is None else _File(scene, output, single_file)
-    _refuse_size(frames, scene, dtype, copies, output)
-    start = time.perf_counter()
-    model = scene.build(
-        device=device, dtype=dtype, copies=copies, vary=vary, order=order_of_run(scene, solver), threads=threads
-    )
-    stepper = solver.bind(model)
-    timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds, "frames": []}
-    recorder = recorder or _Memory(model, frames)
-    watch = Watch(model, stepper.h)
-    try:
+    recorder = _Memory(frames, copies) if output is None else _File(scene, output, single_file)
+    with recording(recorder, frames):
+        _refuse_size(frames, scene, dtype, copies, output)
+        start = time.perf_counter()
+        model = scene.build(
+            device=device, dtype=dtype, copies=copies, vary=vary, order=order_of_run(scene, solver), threads=threads
+        )
+        stepper = solver.bind(model)
+        timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds, "frames": []}
+        watch = Watch(model, stepper.h)
         recorder.append(*state_of(stepper))
         if progress is not None:
             progress(0, frames)
@@ -120,8 +123,6 @@ def simulate(
                 recorder.append(frame.points, frame.velocities)
                 if progress is not None:
                     progress(number, frames)
-    finally:
-        recorder.close()
     status = watch.status(frame.results, frame.residual, solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
@@ -275,19 +276,22 @@ class Watch:
 class _Memory:
     """Keeps frames in memory, in the precision of the run."""
 
-    def __init__(self, model, frames):
-        n, copies = model.per_copy, model.copies
-        self.frames, self.shape = 0, (copies, n, 3) if copies > 1 else (n, 3)
-        self.points = np.empty((frames + 1, *self.shape), model.numpy_dtype)
-        self.velocities = np.empty_like(self.points)
+    def __init__(self, frames, copies):
+        self.frames, self._most, self._copies = 0, frames + 1, copies
 
     def append(self, points, velocities):
+        if self.frames == 0:
+            self.shape = (self._copies, len(points) // self._copies, 3) if self._copies > 1 else points.shape
+            self.points, self.velocities = (np.empty((self._most, *self.shape), points.dtype) for _ in range(2))
         self.points[self.frames] = points.reshape(self.shape)
         self.velocities[self.frames] = velocities.reshape(self.shape)
         self.frames += 1
 
     def close(self):
         pass
+
+    def saved(self):
+        return "nothing was saved"
 
     def read(self):
         return self.points[: self.frames], self.velocities[: self.frames]
@@ -306,7 +310,11 @@ class _File:
             self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis, lines=lines)
         else:
             self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim)
-        self.append = self.writer.append
+        self.append, self.saved = self.writer.append, self.writer.saved
+
+    @property
+    def frames(self):
+        return self.writer.frames
 
     def close(self):
         self.writer.close(single_file=self.single_file)

@@ -2,8 +2,9 @@
 animations, charts and benchmarks methods.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
-saved), 2 wrong use (one line on stderr), 130 interrupted. Any other error ends with 2 and one line as well, for most come of
-what a scene file declares; with ``--debug`` the traceback stands above the line.
+saved), 2 wrong use (one line on stderr); as shells have it 130 interrupted by Ctrl-C and 143 by SIGTERM (a line says what is
+saved). Any other error ends with 2 and one line as well, for most come of what a scene file declares; with ``--debug`` the
+traceback stands above the line.
 """
 
 import argparse
@@ -14,8 +15,9 @@ import warnings
 
 import numpy as np
 
+from ..interrupts import Interrupts
 from . import analyze, bench, chart, choose, compare, deform, options, run
-from .terminal import Interrupted, Printable, say, show_warning
+from .terminal import Printable, say, show_warning
 
 
 def main(argv=None):
@@ -27,7 +29,7 @@ def main(argv=None):
     Returns:
         int: The exit code.
     """
-    with warnings.catch_warnings(), contextlib.redirect_stdout(Printable(sys.stdout)):
+    with warnings.catch_warnings(), contextlib.redirect_stdout(Printable(sys.stdout)), Interrupts() as interrupts:
         warnings.showwarning = show_warning
         # NumPy's words on a number that is not finite: whoever meets one says so by name, or it was to be expected.
         warnings.filterwarnings("ignore", ".* encountered in ", RuntimeWarning)
@@ -46,10 +48,9 @@ def main(argv=None):
             if options.asks_for_help(arguments):
                 return options.show_help(arguments)
             return arguments.command(arguments)
-        except Interrupted as interrupted:
-            return say(interrupted, 130)
-        except KeyboardInterrupt:
-            return say("interrupted; nothing was saved", 130)
+        except KeyboardInterrupt as interrupted:
+            interrupts.ignore()
+            return say(str(interrupted) or "interrupted", interrupts.code)
         except (Exception, SystemExit) as error:
             if debug:
                 traceback.print_exc()

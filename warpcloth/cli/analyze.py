@@ -7,7 +7,7 @@ from .. import scene_files
 from ..mesh import UP_AXES
 from ..outputs import check_apart
 from ..quiet import find_device
-from .terminal import Interrupted, Progress, as_json, check_writable, frames_folder_of, place
+from .terminal import Progress, as_json, check_writable, frames_folder_of, place
 
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files or a pattern such as "frames/*.obj", or arrays, .npz or .npy.
@@ -113,9 +113,6 @@ def analyze(arguments):
             both_sides=arguments.both_sides,
             colormap=arguments.colormap,
         )
-    except KeyboardInterrupt:
-        files = ", ".join(filter(None, files.values())) or "no file"
-        raise Interrupted(f"interrupted after {progress.frame or 0} of {len(analyzer)} frames; they are in {files}") from None
     finally:
         progress.close()
     facts = {

@@ -14,7 +14,7 @@ from ..checks import whole
 from ..limits import refuse_memory
 from ..quiet import find_device
 from .run import named_scene
-from .terminal import Interrupted, Progress, as_json, check_writable, frames_folder_of, place
+from .terminal import Progress, as_json, check_writable, frames_folder_of, place
 
 _FRAMES, _FPS = 24, 24.0
 
@@ -119,38 +119,35 @@ def deform(arguments):
     device = find_device(arguments.device)
     options = {option: getattr(arguments, option) for option in ("weights", "energy", "iterations", "tolerance", "dtype")}
     progress = Progress(frames, first="factorising")
-    try:
+    with progress.of(arguments.output):
         found = deform(
             **given, **options, device=device, output=arguments.output, single_file=arguments.single_file, progress=progress
         )
-    except KeyboardInterrupt:
-        raise Interrupted(progress.interrupted(arguments.output)) from None
-    finally:
         progress.close()
-    late = np.flatnonzero(~found.converged)
-    unmet = f"{len(late)} of the frames did not converge, the first is {late[0]}" if len(late) else "converged"
-    facts = {
-        "mesh": name,
-        "source": arguments.mesh,
-        "parameters": values,
-        "converged": not len(late),
-        "message": unmet,
-        "vertices": len(given["mesh"].points),
-        "handles": len(given["pins"].vertices),
-        "frames": frames,
-        "seconds_per_frame": statistics.median(found.timings["frames"]),
-        "factorise_seconds": found.timings["factorise"],
-        "median_iterations": float(np.median(found.iterations)),
-        "most_iterations": int(found.iterations.max()),
-        "largest_angle": math.degrees(found.largest_angles.max()),
-        "last_energy": float(found.energies[-1]),
-        **options,
-        "device": str(device),
-        "file": arguments.output,
-        "frames_folder": frames_folder_of(arguments),
-    }
-    print(as_json(facts) if arguments.json else _summary(facts))
-    return 0
+        late = np.flatnonzero(~found.converged)
+        unmet = f"{len(late)} of the frames did not converge, the first is {late[0]}" if len(late) else "converged"
+        facts = {
+            "mesh": name,
+            "source": arguments.mesh,
+            "parameters": values,
+            "converged": not len(late),
+            "message": unmet,
+            "vertices": len(given["mesh"].points),
+            "handles": len(given["pins"].vertices),
+            "frames": frames,
+            "seconds_per_frame": statistics.median(found.timings["frames"]),
+            "factorise_seconds": found.timings["factorise"],
+            "median_iterations": float(np.median(found.iterations)),
+            "most_iterations": int(found.iterations.max()),
+            "largest_angle": math.degrees(found.largest_angles.max()),
+            "last_energy": float(found.energies[-1]),
+            **options,
+            "device": str(device),
+            "file": arguments.output,
+            "frames_folder": frames_folder_of(arguments),
+        }
+        print(as_json(facts) if arguments.json else _summary(facts))
+        return 0
 
 
 def _summary(facts):

@@ -12,7 +12,7 @@ from .. import scene_files
 from ..freedom import freedom
 from ..quiet import find_device
 from ..status import digits
-from .terminal import Interrupted, Progress, as_json, check_writable, frames_folder_of, place, say
+from .terminal import Progress, as_json, check_writable, frames_folder_of, place, say
 
 # A step that all solvers but the explicit ones take well; where no step is given the substeps come nearest to it.
 _STEPS_A_SECOND = 240
@@ -39,7 +39,7 @@ def run(arguments):
         take_choice(arguments, device)
     setup = solver_setup(arguments, scene, device)
     progress = Progress(frames, _hint(arguments, setup, scene))
-    try:
+    with progress.of(arguments.output):
         animation = simulate(
             scene if setup.model is None else _Built(scene, setup.model),
             setup.checked,
@@ -51,36 +51,33 @@ def run(arguments):
             progress=progress,
             threads=arguments.threads,
         )
-    except KeyboardInterrupt:
-        raise Interrupted(progress.interrupted(arguments.output)) from None
-    finally:
         progress.close()
-    status = animation.status
-    facts = {
-        "scene": scene.name,
-        "source": str(source.path),
-        "parameters": values,
-        "status": status.result.value,
-        "message": status.message,
-        "frames": status.frame,
-        "frames_asked": frames,
-        "seconds_per_frame": statistics.median(animation.timings["frames"]),
-        "compile_seconds": setup.seconds + animation.timings["compile"],
-        "worst_strain": animation.worst_strain,
-        "residual": status.residual,
-        "residual_measure": status.measure,
-        "residual_unit": status.unit,
-        **_solver_facts(arguments, setup, scene.fps),
-        "device": str(device),
-        "dtype": arguments.dtype,
-        "threads": arguments.threads,
-        "file": arguments.output,
-        "frames_folder": frames_folder_of(arguments),
-    }
-    print(as_json(facts) if arguments.json else _summary(facts))
-    if status.ok:
-        return 0
-    return say(f"{status.message}; the last good frame is {status.frame}, in {arguments.output}", 1)
+        status = animation.status
+        facts = {
+            "scene": scene.name,
+            "source": str(source.path),
+            "parameters": values,
+            "status": status.result.value,
+            "message": status.message,
+            "frames": status.frame,
+            "frames_asked": frames,
+            "seconds_per_frame": statistics.median(animation.timings["frames"]),
+            "compile_seconds": setup.seconds + animation.timings["compile"],
+            "worst_strain": animation.worst_strain,
+            "residual": status.residual,
+            "residual_measure": status.measure,
+            "residual_unit": status.unit,
+            **_solver_facts(arguments, setup, scene.fps),
+            "device": str(device),
+            "dtype": arguments.dtype,
+            "threads": arguments.threads,
+            "file": arguments.output,
+            "frames_folder": frames_folder_of(arguments),
+        }
+        print(as_json(facts) if arguments.json else _summary(facts))
+        if status.ok:
+            return 0
+        return say(f"{status.message}; the last good frame is {status.frame}, in {arguments.output}", 1)
 
 
 def _own_output(scene):

@@ -14,14 +14,11 @@ import numpy as np
 
 from ..chart.figures import PICTURES, check_path
 from ..checks import whole
+from ..interrupts import Interrupted
 from ..outputs import Output, check_apart
 
 # Categories of Unicode: control, format (which turns the direction of a text too), halves of a code, ends of lines.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
-
-
-class Interrupted(Exception):
-    """A run was interrupted; the message says what is saved."""
 
 
 def frames_folder_of(arguments):
@@ -186,11 +183,24 @@ class Progress:
         if self.bar is not None:
             self.bar.close()
 
-    def interrupted(self, output):
-        """What a run leaves that ends here."""
-        if self.frame is None:
-            return "interrupted before the first frame; nothing was saved"
-        return f"interrupted after frame {self.frame} of {self.frames}; frames 0 to {self.frame} are in {output}"
+    @contextlib.contextmanager
+    def of(self, output):
+        """Closes the bar, however the block ends; an interrupt after the last frame says where the frames are.
+
+        Raises:
+            Interrupted: The user did, then or before; what makes the frames says the rest by itself.
+        """
+        try:
+            yield
+        except Interrupted:
+            raise
+        except KeyboardInterrupt:
+            if self.frame is None:
+                raise Interrupted("interrupted before the first frame; nothing was saved") from None
+            done = f"interrupted after frame {self.frame}, the last one"
+            raise Interrupted(f"{done}; frames 0 to {self.frame} are in {output}") from None
+        finally:
+            self.close()
 
 
 def as_json(facts):

@@ -4,17 +4,24 @@ import os
 import re
 import secrets
 import shutil
+import sys
+import warnings
+import weakref
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from pxr import Sdf, Usd, UsdUtils
 
+from ..interrupts import deferred
+from ..outputs import Lock
 from .layers import flatten, relative_path
-from .stage import METADATA_KEY, followed
+from .stage import METADATA_KEY, followed, identity
 from .values import refuse_path, sentences
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+_COMPLETE = "complete"  # a file in the folder of a run that has all of its frames, until it is packed
 
 
 class ChunkWriter:
@@ -30,14 +37,19 @@ class ChunkWriter:
 
     Every file is written under another name, complete, and then renamed; the root is replaced after each chunk. So a
     process killed at any moment leaves a result that opens, with at most one chunk of frames missing, and the result of
-    an earlier run stays whole until the first chunk of this one stands. Files are not forced to the disk (fsync): a
-    killed process loses nothing by that, a power failure may lose the newest chunks. Memory holds one chunk. The folder
-    belongs to the file: move them together, or make one file of them with `close(single_file=True)`. One writer at a
-    time for an output.
+    an earlier run stays whole until the first chunk of this one stands, or for .usdz the whole of it. Files are not forced
+    to the disk (fsync): a killed process loses nothing by that, a power failure may lose the newest chunks. Memory holds
+    one chunk. The folder belongs to the file: move them together, or make one file of them with `close(single_file=True)`.
+    An output has one writer at a time, of all processes; another one is refused.
+
+    An interrupt (Ctrl-C) waits for a chunk, and for `close`, to be finished; a second one does not. What a run left in the
+    folder is removed by the next one to the same output, but for what that reads, and for a .usdz that had all of its frames
+    and was not packed.
 
     Attributes:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
         frames: Number of frames appended.
+        kept: Number of those that are in the file.
     """
 
     # Of all sampled prims: name of their set of value clips; a set in a source below with the same name is not seen.
@@ -66,14 +78,15 @@ class ChunkWriter:
         # A name never used before: pxr may still hold layers of an earlier run in this process, and would show those.
         self._run = self._folder / f"{self._output.suffix[1:]}-{secrets.token_hex(4)}"
         self.path = str(self._run / "animation.usdc" if self._output.suffix == ".usdz" else self._output)
-        self.frames = 0
+        self.frames = self.kept = 0
+        self._given, self._packing, self._lock = os.fspath(output), False, None
         self._span = None  # first and last time code appended
         self._pending = []
         self._chunks = []  # (first time code, file) of each chunk that stands
         self._closed = False
 
-    def _put_on(self, rest, targets, root_metadata, metadata, source=None, files=()):
-        """Says what the samples are put on.
+    def _put_on(self, rest, targets, root_metadata, metadata, source=None, files=(), refit=None):
+        """Says what the samples are put on, and takes the output for this writer.
 
         Args:
             rest: Layer of all that is not sampled; it has the sampled attributes without samples.
@@ -82,6 +95,11 @@ class ChunkWriter:
             metadata: Numbers and texts for customLayerData, or None.
             source: File of the artist's stage below, or None.
             files: Real paths of all files of that stage.
+            refit: Function that raises a ValueError if the source, read again, no longer fits the frames.
+
+        Raises:
+            BlockingIOError: Another writer has the output.
+            ValueError: The output is a file of the source's stage.
         """
         if os.path.realpath(self._output) in files:
             raise ValueError(f"output = {self._output}: is a file of the source's stage, which must not be changed")
@@ -89,6 +107,9 @@ class ChunkWriter:
         self._source = None if source is None else Path(os.path.abspath(source))
         facts = {METADATA_KEY: {**_facts(metadata or {}), "prim": targets[0].prim}}
         self._root_metadata = {**root_metadata, "customLayerData": facts}
+        self._files, self._refit = {file: identity(file) for file in files}, refit
+        self._lock = Lock(self._output)
+        weakref.finalize(self, self._lock.release)  # where nobody closes
 
     def __enter__(self):
         return self
@@ -98,8 +119,21 @@ class ChunkWriter:
             self.close()
         elif not self._closed:
             # What there is may be worth a look; it stays in chunks, for nobody waits for one file.
-            self._write_chunk()
-            self._closed = True
+            try:
+                self._write_chunk()
+                self._closed = True
+            finally:
+                self._lock.release()
+
+    def saved(self):
+        """Says how many frames there are, and in which file."""
+        if not self.kept:
+            return "nothing was saved"
+        path = self._given
+        if self.path != str(self._output):
+            path = os.path.join(os.path.dirname(path), os.path.relpath(self.path, self._output.parent))
+        packing = f", and {self._given} was not made" if path != self._given else f", with {self._folder.name} beside it"
+        return f"frames 0 to {self.kept - 1} are in {path}" + (packing if self._packing else "")
 
     def close(self, single_file=False):
         """Writes what is pending. Without a single frame nothing is written.
@@ -111,16 +145,54 @@ class ChunkWriter:
 
         Raises:
             OSError: A file could not be written; the chunks that stand stay.
+            ValueError: The source has changed meanwhile and no longer fits the frames, which stay in chunks.
+
+        Warns:
+            UserWarning: The source has changed, but fits; or there are frames of an earlier run that was not packed.
         """
         if self._closed:
             return
-        self._write_chunk()
-        self._closed = True
-        if self._chunks and (single_file or self._output.suffix == ".usdz"):
-            try:
-                self._write_single_file()
-            except OSError as error:
-                raise OSError(f"{error}; all frames are in {self.path}") from error
+        try:
+            with deferred(not isinstance(sys.exc_info()[1], KeyboardInterrupt)):
+                self._write_chunk()
+                self._closed = True
+                if self._chunks:
+                    self._packing = single_file or self._output.suffix == ".usdz"
+                    self._check_source()
+                    if self._packing:
+                        self._write_single_file()
+                        self._packing = False
+        except OSError as error:
+            self._keep_chunks()
+            raise OSError(f"{error}; {self.saved()}") from error
+        finally:
+            self._lock.release()
+
+    def _keep_chunks(self):
+        """Gives chunks that stand a root in their folder, where the output cannot be written."""
+        if self._closed or not (self._run / "rest.usdc").exists():
+            return
+        before, self.path = self.path, str(self._run / "animation.usdc")
+        try:
+            (self._run / _COMPLETE).touch()
+            self._write_chunk()
+        except OSError:  # a full disk takes nothing anywhere
+            self.path = before
+
+    def _check_source(self):
+        """Notices where the files of the source are no longer those that were read."""
+        changed = [file for file, before in self._files.items() if identity(file) != before]
+        if not changed:
+            return
+        try:
+            with sentences(changed[0]):
+                for layer in filter(None, map(Sdf.Layer.Find, changed)):
+                    layer.Reload()
+                self._refit()
+        except (OSError, ValueError) as error:
+            now = f"has changed during the run and no longer fits ({error})"
+            raise ValueError(f"{changed[0]}: {now}; {self.saved()}") from None
+        warnings.warn(f"{changed[0]}: has changed during the run; the frames are of what it was before", stacklevel=4)
 
     def _append(self, time, samples):
         """Adds a frame: at a time code values by path of attribute; every `chunk` frames they are written."""
@@ -166,10 +238,16 @@ class ChunkWriter:
 
     def _write_chunk(self):
         """Writes the pending frames as a clip, and a root that has it."""
-        if not self._pending:
-            return
+        if self._pending:
+            with deferred():
+                self._write_pending()
+
+    def _write_pending(self):
         if not self._chunks:
             self._start_run()
+        elif not self._chunks[-1][1].exists():  # USD would make the folder again, and a file without the frames before
+            self.kept, last = 0, self.frames - len(self._pending) - 1
+            raise FileNotFoundError(f"{self._run}: has been removed during the run, with frames 0 to {last}")
         layer = self._declared(Sdf.Layer.CreateAnonymous(".usdc"))
         for time, values in self._pending:
             for attribute, value in values.items():
@@ -182,8 +260,8 @@ class ChunkWriter:
         chunks = [*self._chunks, (self._pending[0][0], path)]
         self._write_root(chunks)
         # Only now, so that a chunk whose writing was interrupted is written again by close.
-        self._chunks, self._pending = chunks, []
-        if len(chunks) == 1:
+        self._chunks, self._pending, self.kept = chunks, [], self.frames
+        if len(chunks) == 1 and self._output.suffix != ".usdz":
             self._remove_other_runs()
 
     def _start_run(self):
@@ -230,11 +308,23 @@ class ChunkWriter:
         """Removes what earlier runs to the same output left, now that the output no longer refers to it."""
         own_kind = re.compile(re.escape(self._output.suffix[1:]) + "-[0-9a-f]{8}")
         for folder in self._folder.iterdir():
-            if folder != self._run and own_kind.fullmatch(folder.name):
-                shutil.rmtree(folder)
+            inside = os.path.join(os.path.realpath(folder), "")
+            read = any(file.startswith(inside) for file in self._files)
+            if read or folder == self._run or not own_kind.fullmatch(folder.name):
+                continue
+            if (folder / _COMPLETE).exists():
+                warnings.warn(
+                    f"{folder / 'animation.usdc'}: has all frames of an earlier run that was not packed, and is kept; "
+                    "remove its folder once nobody needs them",
+                    stacklevel=5,
+                )
+            else:
+                shutil.rmtree(folder, ignore_errors=True)  # a file that another process has open is worth no run
 
     def _write_single_file(self):
         packed = self._output.suffix == ".usdz"
+        if packed:
+            (self._run / _COMPLETE).touch()
         flat = self._declared(flatten(self._base_paths(), self._describe, None if packed else self._output.parent))
         for attribute in self._attributes():
             flat.GetAttributeAtPath(attribute).ClearInfo("timeSamples")
@@ -250,10 +340,13 @@ class ChunkWriter:
             _export(Sdf.Layer.FindOrOpen(str(single)), finished, self._output)
         else:
             os.replace(single, finished)
-        os.replace(finished, self._output)
+        _rename(finished, self._output)
         self.path = str(self._output)
+        (self._run / _COMPLETE).unlink(missing_ok=True)
         shutil.rmtree(self._run)
-        if not any(self._folder.iterdir()):
+        with suppress(OSError):  # it may have gone, or be in use, by a run to another ending
+            if packed:
+                self._remove_other_runs()
             self._folder.rmdir()
 
     def _copy_frames(self, single):
@@ -320,7 +413,14 @@ def export(layer, path, unfinished_in=None):
     path = Path(path)
     unfinished = Path(unfinished_in or path.parent) / f"unfinished{path.suffix}"
     _export(layer, unfinished, path)
-    os.replace(unfinished, path)
+    _rename(unfinished, path)
+
+
+def _rename(finished, path):
+    try:
+        os.replace(finished, path)
+    except OSError as error:
+        raise OSError(f"{path}: could not be written: {error.strerror or error}") from None
 
 
 def _export(layer, file, meant=None):

@@ -12,6 +12,7 @@ from .stage import (
     find_prim,
     first_points,
     followed,
+    identity,
     local_to_metres,
     moving_space,
     open_stage,
@@ -62,7 +63,7 @@ class FrameSequence:
             raise ValueError(f'attribute = {attribute!r}: must be "points", "velocities" or a primvar, "primvars:<name>"')
         path = followed(path)  # USD looks for the frames beside a link, and not beside the file that it stands for
         self._file = os.path.abspath(path)
-        self._identity = _identity(self._file)  # before it is opened, so that no change is missed
+        self._identity = identity(self._file)  # before it is opened, so that no change is missed
         with sentences(path):
             self._open(path, prim, attribute, scale)
 
@@ -163,7 +164,7 @@ class FrameSequence:
 
     def _values(self, frame):
         """What the file has of a frame, a vertex once."""
-        if _identity(self._file) not in (None, self._identity):
+        if identity(self._file) not in (None, self._identity):
             raise RuntimeError(
                 f"{self._file}: has been written again since these frames were opened; open it again, "
                 "and give runs that are to be compared an output each"
@@ -187,12 +188,3 @@ class FrameSequence:
             yield
         except ValueError as error:
             raise ValueError(f"{self._where}: {error}") from None
-
-
-def _identity(path):
-    """What differs between a file and any that takes its place; None where there is none."""
-    try:
-        status = os.stat(path)
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size

@@ -18,6 +18,7 @@ from .layers import (
     root_metadata,
     scene_layer,
 )
+from .stage import read_stage_mesh
 from .targets import DISPLAY_COLOUR, check_primvars
 
 
@@ -90,17 +91,21 @@ class MeasureWriter(ChunkWriter):
             self._checked("points of the rest shape", mesh.points)
             rest, target, facts = _scene(mesh, up_axis, primvars, coloured)
             facts |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
-            stage, path, files = Usd.Stage.Open(rest), None, ()
+            stage, path, files, refit = Usd.Stage.Open(rest), None, (), None
             material = UsdShade.Material.Get(stage, "/World/Looks/Cloth")
         else:
             rest, target, stage = _over(source, mesh, primvars, coloured)
             facts, path, files = _facts_of(stage, source), source.path, files_of(stage)
             material = _show_colours(stage, source, with_mesh=bool(coloured)) if coloured or directions else None
             self._stage = stage
+
+            def refit():
+                artist_prim(read_stage_mesh(source.path, source.prim, type(source.mesh), time=0.0), mesh)
+
         self._directions = dict(directions)
         self._nowhere = middle(mesh)
         targets = define_directions(stage, target.prim, mesh, directions, material, self._nowhere) if directions else []
-        self._put_on(rest, [target, *targets], facts, metadata, path, files)
+        self._put_on(rest, [target, *targets], facts, metadata, path, files, refit)
 
     def append(self, time_code, primvars, colours=None, directions=None, points=None):
         """Adds a frame; every `chunk` frames they are written.

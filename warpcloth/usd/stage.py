@@ -156,6 +156,15 @@ def followed(path):
     return os.path.realpath(path) if os.path.islink(path) else path
 
 
+def identity(path):
+    """What differs between a file and any that takes its place; None where there is none."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
+
+
 def open_stage(path):
     """Opens a stage as it is on disk now.
 

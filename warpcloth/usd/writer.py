@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 from .chunks import ChunkWriter, check_scene
-from .layers import define_lines, over_layer, scene_layer
+from .layers import artist_prim, define_lines, over_layer, scene_layer
+from .stage import read_stage_mesh
 from .targets import check_primvars
 
 
@@ -68,7 +69,7 @@ class AnimationWriter(ChunkWriter):
         check_scene(fps, up_axis)
         primvars = dict(primvars or {})
         check_primvars(primvars, mesh)
-        self._start, files = 0.0, ()
+        self._start, files, refit = 0.0, (), None
         if source is None:
             rest, target, root_metadata = scene_layer(mesh, pins, up_axis, prim or "Cloth")
             target = replace(target, primvars=primvars)
@@ -83,8 +84,12 @@ class AnimationWriter(ChunkWriter):
             targets = [target]
             if stage.start is not None:
                 self._start = stage.start * fps / stage.time_codes_per_second
+
+            def refit():
+                artist_prim(read_stage_mesh(source, stage.prim, time=0.0), mesh)
+
         root_metadata |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
-        self._put_on(rest, targets, root_metadata, metadata, source, files)
+        self._put_on(rest, targets, root_metadata, metadata, source, files, refit)
 
     def append(self, points, velocities, primvars=None):
         """Adds a frame; every `chunk` frames they are written.

@@ -1,0 +1,121 @@
+"""Interrupts, by Ctrl-C and, of the command, by SIGTERM too: a file that is being finished is finished first."""
+
+import os
+import signal
+import sys
+import threading
+from contextlib import contextmanager, suppress
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupted(KeyboardInterrupt):
+    """The user interrupted; the message says what is saved, and where."""
+
+
+@contextmanager
+def deferred(first=True):
+    """Lets an interrupt wait until this block has ended; a second one comes at once.
+
+    Of the main thread, for interrupts come nowhere else. A signal that ends the process without being heard, as SIGTERM does
+    outside the command, is left alone.
+
+    Args:
+        first: Whether there was none before, for which this block is being run.
+    """
+    if not first or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    before = {number: handler for number, handler in before.items() if callable(handler)}
+    came = []
+
+    def note(number, frame):
+        came.append(number)
+        if len(came) > 1:
+            before[number](number, frame)
+
+    for number in before:
+        signal.signal(number, note)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        before[came[0]](came[0], None)
+
+
+@contextmanager
+def recording(recorder, frames):
+    """Closes what keeps frames, however the block ends.
+
+    Args:
+        recorder: It has ``frames``, how many it was given, ``close()``, and ``saved()``, which says where they are.
+        frames: How many it would be given, after the first.
+
+    Raises:
+        Interrupted: The user interrupted; it says what is saved.
+    """
+    try:
+        try:
+            yield
+        finally:
+            recorder.close()
+    except KeyboardInterrupt:
+        when = f"after frame {recorder.frames - 1} of {frames}" if recorder.frames else "before the first frame"
+        raise Interrupted(f"interrupted {when}; {recorder.saved()}") from None
+
+
+class Interrupts:
+    """What the command makes of them: SIGTERM comes as Ctrl-C does, once; then nothing disturbs what is said of it.
+
+    Attributes:
+        code: 128 and the number of the signal, as shells have it: 130 of Ctrl-C, 143 of SIGTERM.
+    """
+
+    def __init__(self):
+        self.code = 128 + signal.SIGINT
+
+    def __enter__(self):
+        self._before = {}
+        if threading.current_thread() is threading.main_thread():
+            own = {signal.SIGINT: (signal.default_int_handler, leave), signal.SIGTERM: (signal.SIG_DFL, leave)}
+            for number, replaced in own.items():  # whoever has another handler, or ignores them, knows why
+                if signal.getsignal(number) in replaced:
+                    self._before[number] = signal.signal(number, self._interrupt)
+        return self
+
+    def __exit__(self, *error):
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _interrupt(self, number, _frame):
+        self.code = 128 + number
+        raise KeyboardInterrupt
+
+    def ignore(self):
+        """From now on they do nothing until the end of the block."""
+        for number in self._before:
+            signal.signal(number, signal.SIG_IGN)
+
+
+def leave(number, _frame):
+    """Ends the process at once, without a traceback; nobody knows what an import makes of an exception."""
+    with suppress(Exception):  # it may have come in the middle of another flush
+        sys.stdout.flush()
+    os.write(2, b"warpcloth: interrupted\n")
+    os._exit(128 + number)
+
+
+def leave_while_loading():
+    """Makes interrupts end the command while its modules load, which takes a second, and once it has said its last word."""
+    ran = sys.orig_argv[sys.orig_argv.index("-m") + 1 :][:1] if sys.argv[:1] == ["-m"] and "-m" in sys.orig_argv else []
+    name = ran[0].partition(".")[0] if ran else os.path.basename(sys.argv[0] if sys.argv else "").partition(".")[0]
+    if name == "warpcloth" and threading.current_thread() is threading.main_thread():
+        for number, replaced in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+            if signal.getsignal(number) is replaced:
+                signal.signal(number, leave)
+
+
+leave_while_loading()
