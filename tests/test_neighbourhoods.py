@@ -2,6 +2,8 @@
 
 import warnings
 from itertools import pairwise
+from pathlib import Path
+from runpy import run_path
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 import warpcloth as wc
 from warpcloth.neighbourhoods import neighbourhoods
 
+ROOT = Path(__file__).parents[1]
 GRID = wc.Mesh.grid(7, 6, size=(1.0, 0.9), pattern="alternating")
 SHEET = wc.Mesh(np.concatenate([[[0.5, 0.0, 0.5]], GRID.points]), GRID.triangles + 1)  # vertex 0 is in no triangle
 DISTANCES = np.linalg.norm(SHEET.points[1:, None] - SHEET.points[None, 1:], axis=2)
@@ -100,3 +103,33 @@ WRONG = "ring 3-ring nearest:k=2 nearest:k=99 nearest:k=3.5 nearest:k= nearest:r
 def test_refused(chosen):
     with pytest.raises(ValueError, match="neighbour"):
         neighbourhoods(SHEET, chosen)
+
+
+STUDY = run_path(str(ROOT / "benchmarks" / "neighbourhoods.py"))
+
+
+def test_the_study_of_neighbourhoods():
+    """The table of docs/measures.md, as it is printed: to half of its last digit, and what other rounding may add."""
+    text = (ROOT / "docs" / "measures.md").read_text(encoding="utf-8")
+    rows = {line.split("|")[1].strip(" `"): line.split("|")[2:-1] for line in text.splitlines() if line.startswith("| `")}
+    for kind, *numbers in STUDY["table"]():
+        assert [float(cell) for cell in rows[kind]] == pytest.approx(numbers, rel=0.055), kind
+
+
+def test_blur_and_noise_of_a_neighbourhood():
+    """Blur is in proportion to the share, on any mesh; noise makes F wrong by √(24π) σ/(h m), and DΔt by as much."""
+    errors, blur = STUDY["errors"], {}
+    for n, kinds in ((33, ("nearest:5%", "nearest:10%")), (49, ("nearest:5%",))):
+        for kind in kinds:
+            blur[n, kind] = errors(STUDY["sheet"](n), kind, 0.0, 0, 1.0)[1]
+    assert blur[33, "nearest:10%"] / blur[33, "nearest:5%"] == pytest.approx(2.0, rel=0.15)
+    # Irregular sets are not about their vertex, which the finer mesh has less of.
+    assert blur[49, "nearest:5%"] / blur[33, "nearest:5%"] == pytest.approx(1.0, rel=0.1)
+    mesh, noise = STUDY["sheet"](33), 1e-3
+    quiet = STUDY["known"](mesh.points, 0.5 * STUDY["DT"], 1e-3)[1]  # one long wave blurs nothing
+    size_of_D = np.sqrt((quiet**2).sum(axis=(1, 2)).mean())
+    for kind, m in (("nearest:1%", 11), ("nearest:2%", 22), ("nearest:5%", 55)):
+        found = np.array([errors(mesh, kind, noise, seed, 1e-3)[1] for seed in range(4)]) * [1.0, size_of_D * STUDY["DT"]]
+        wanted = np.sqrt(24.0 * np.pi) * noise * mesh.edge_lengths.mean() * 32 / m
+        # 400 inner vertices, whose sets overlap, and a grid that is no disc.
+        assert np.sqrt((found**2).mean(axis=0)) == pytest.approx(2 * [wanted], rel=0.1), kind
