@@ -3,16 +3,17 @@
 import os
 import re
 import resource
+import zipfile
 
 import numpy as np
 import pytest
-from pxr import UsdUtils
+from pxr import Usd
 
 import warpcloth as wc
 from warpcloth import limits
 from warpcloth.cli import main
 from warpcloth.cli.terminal import printable
-from warpcloth.usd import AnimationWriter, FrameSequence, MeasureWriter, read_scene
+from warpcloth.usd import AnimationWriter, FrameSequence, MeasureWriter, packages, read_scene
 
 STAGE = """#usda 1.0
 (
@@ -391,16 +392,72 @@ def test_a_full_disk_at_the_last_file_loses_nothing(tmp_path, ending):
 def test_a_package_that_is_cut_is_not_taken_for_whole(tmp_path, monkeypatch, kept):
     """pxr does not notice a disk that is full while it packs: what it leaves is read before the frames are removed."""
 
-    def pack(*paths):
-        real(*paths)
-        os.truncate(paths[1], int(kept * os.path.getsize(paths[1])))
-        return True
+    def is_whole(package):
+        os.truncate(package, int(kept * os.path.getsize(package)))
+        return real(package)
 
-    real = UsdUtils.CreateNewUsdzPackage
-    monkeypatch.setattr(UsdUtils, "CreateNewUsdzPackage", pack)
+    real = packages._is_whole
+    monkeypatch.setattr(packages, "_is_whole", is_whole)
     points = wc.Mesh.grid(3, 3).points
     writer = AnimationWriter(tmp_path / "out.usdz", wc.Mesh.grid(3, 3), 24)
     writer.append(points, points)
     with pytest.raises(OSError, match=r"out\.usdz: could not be written; frames 0 to 0 are in "):
         writer.close()
     np.testing.assert_array_equal(FrameSequence(writer.path), np.float32([points]))
+
+
+def test_a_package_holds_no_file_from_elsewhere(tmp_path):
+    """Textures of the stage's folders are packed, of a referenced layer's too; a file from outside keeps its path."""
+    for name in (
+        "show/tex/a.png",
+        "show/tex/b.1001.png",
+        "show/tex/b.1002.png",
+        "library/set.usda",
+        "library/t.png",
+        "secret.txt",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(name)
+    (tmp_path / "show/link.png").symlink_to(tmp_path / "secret.txt")
+    assets = {
+        "near": "@./tex/a.png@",
+        "tiles": "@./tex/b.<UDIM>.png@",
+        "above": "@../secret.txt@",
+        "root": "@/etc/hostname@",
+        "link": "@./link.png@",
+        "gone": "@./gone.png@",
+    }
+    given = "".join(f"    asset {name} = {path}\n" for name, path in assets.items())
+    given += "    asset[] several = [@./tex/a.png@, @../secret.txt@]\n"
+    text = STAGE.replace("    uniform token orientation", given + "    uniform token orientation")
+    (tmp_path / "show/cloth.usda").write_text(text + 'def "Set" (references = @../library/set.usda@)\n{\n}\n')
+    (tmp_path / "library/set.usda").write_text(
+        '#usda 1.0\n(\n    defaultPrim = "S"\n)\ndef "S"\n{\n    asset shown = @./t.png@\n}\n'
+    )
+    scene = read_scene(tmp_path / "show/cloth.usda")
+    with pytest.warns(UserWarning) as warned:
+        wc.simulate(scene, wc.Newton(substeps=1), output=tmp_path / "out.usdz")
+    said = sorted({str(warning.message).partition(":")[0] for warning in warned})
+    assert said == ["../secret.txt", "./link.png", "/etc/hostname", str(tmp_path / "show/gone.png")]
+    with zipfile.ZipFile(tmp_path / "out.usdz") as archive:
+        packed = {name.partition("/")[2]: archive.read(name).decode() for name in archive.namelist()[1:]}
+    assert packed == {
+        name.rpartition("/")[2]: name
+        for name in ("show/tex/a.png", "show/tex/b.1001.png", "show/tex/b.1002.png", "library/t.png")
+    }
+    stage = Usd.Stage.Open(str(tmp_path / "out.usdz"))
+    found = {name: stage.GetPrimAtPath("/Cloth").GetAttribute(name).Get() for name in (*assets, "several")}
+    assert [found[name].path for name in ("above", "root", "link")] == [
+        "../secret.txt",
+        "/etc/hostname",
+        "./link.png",
+    ]
+    assert found["gone"] is None
+    assert found["near"].resolvedPath.endswith("/a.png]") and found["tiles"].path.endswith("/b.<UDIM>.png")
+    assert [asset.path.rpartition("/")[2] for asset in found["several"]] == ["a.png", "secret.txt"]
+    assert stage.GetPrimAtPath("/Set").GetAttribute("shown").Get().resolvedPath.endswith("/t.png]")
+    # Out of a package, too.
+    with pytest.warns(UserWarning, match="there is no such file"):  # USD finds no tiles in a package
+        again = wc.simulate(read_scene(tmp_path / "out.usdz"), wc.Newton(substeps=1), output=tmp_path / "again.usdz")
+    with zipfile.ZipFile(again.output) as archive:
+        assert {name.rpartition("/")[2] for name in archive.namelist()[1:]} == {"a.png", "t.png"}

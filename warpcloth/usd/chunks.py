@@ -7,16 +7,16 @@ import shutil
 import sys
 import warnings
 import weakref
-import zipfile
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Sdf, Usd
 
 from ..interrupts import deferred
 from ..outputs import Lock
-from .layers import flatten, relative_path
+from .layers import flatten, named_from, relative_path
+from .packages import Contents
 from .stage import METADATA_KEY, followed, identity
 from .values import refuse_path, sentences
 
@@ -325,7 +325,9 @@ class ChunkWriter:
         packed = self._output.suffix == ".usdz"
         if packed:
             (self._run / _COMPLETE).touch()
-        flat = self._declared(flatten(self._base_paths(), self._describe, None if packed else self._output.parent))
+        contents = Contents(self._run)
+        named = contents.named if packed else named_from(self._output.parent)
+        flat = self._declared(flatten(self._base_paths(), self._describe, named))
         for attribute in self._attributes():
             flat.GetAttributeAtPath(attribute).ClearInfo("timeSamples")
         single = self._run / f"{self._output.stem}.usdc"
@@ -334,8 +336,7 @@ class ChunkWriter:
         finished = self._run / f"finished{self._output.suffix}"
         if packed:
             with _writing(self._output):
-                if not UsdUtils.CreateNewUsdzPackage(str(single), str(finished)) or not _is_whole(finished):
-                    raise OSError(f"{self._output}: could not be written")
+                contents.write(single, finished, self._output)
         elif self._output.suffix == ".usda":
             _export(Sdf.Layer.FindOrOpen(str(single)), finished, self._output)
         else:
@@ -360,15 +361,6 @@ class ChunkWriter:
             with _writing(self._output):
                 if not layer.Save():
                     raise OSError(f"{self._output}: could not be written")
-
-
-def _is_whole(package):
-    """Whether all of a package is on the disk: pxr does not notice one that is full."""
-    try:
-        with zipfile.ZipFile(package) as archive:
-            return archive.testzip() is None
-    except zipfile.BadZipFile:
-        return False
 
 
 def frames_folder(output):

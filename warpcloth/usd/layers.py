@@ -1,10 +1,9 @@
 """What all frames share: the layer that an animation is put on, a complete stage or one over an artist's."""
 
 import os
-import warnings
 
 import numpy as np
-from pxr import Ar, Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
 
 from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh, triangles_of_faces
 from .targets import SAMPLED, Target
@@ -335,14 +334,13 @@ def root_metadata(stage):
     return facts
 
 
-def flatten(base_paths, describe, folder=None):
+def flatten(base_paths, describe, named):
     """One layer with everything that the given layers compose to, without their clips.
 
     Args:
         base_paths: Files of the layers, strongest first.
         describe: Function that writes the root's metadata on a layer.
-        folder: Where the layer will be, for paths of other files (textures). None if it will be packed with them: then
-            files that are missing already are left out, with a warning, for a package with a missing file is refused.
+        named: Function that gives the path of a file (a texture) in the layer, from its path before and the stage.
 
     Returns:
         Sdf.Layer: Anonymous.
@@ -351,20 +349,16 @@ def flatten(base_paths, describe, folder=None):
     # Rates first: they decide how the times of the layers below are scaled.
     describe(root)
     root.subLayerPaths = [os.path.abspath(path) for path in base_paths]
-    flat = Usd.Stage.Open(root).Flatten(addSourceFileComment=False)
+    stage = Usd.Stage.Open(root)
+    flat = stage.Flatten(addSourceFileComment=False)
     describe(flat)
-
-    def relative(path):
-        return relative_path(path, folder) if os.path.isabs(path) and os.path.exists(path) else path
-
-    def present(path):
-        if "<UDIM>" in path or Ar.GetResolver().Resolve(path):
-            return path
-        warnings.warn(f"{path}: there is no such file, the package is made without it", stacklevel=2)
-        return ""
-
-    UsdUtils.ModifyAssetPaths(flat, present if folder is None else relative)
+    UsdUtils.ModifyAssetPaths(flat, lambda path: named(path, stage))
     return flat
+
+
+def named_from(folder):
+    """For `flatten` the paths of files as a layer in a folder names them; those that are not there stay."""
+    return lambda path, _: relative_path(path, folder) if os.path.isabs(path) and os.path.exists(path) else path
 
 
 def relative_path(path, folder):
