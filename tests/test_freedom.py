@@ -89,6 +89,7 @@ def test_pieces_and_loose_vertices_count_by_themselves():
         (wc.Scene(wc.Mesh.grid(5, 5), density=0.1, terms=[wc.StVKMembrane(stiffness=1e3)]), False),
         (wc.Scene(wc.Mesh.grid(5, 5), density=0.1, terms=[wc.StVKMembrane(stiffness=1e7)]), True),
         (wc.Scene(wc.Mesh.chain(5), density=0.1, terms=[wc.Spring(stiffness=1e9)]), False),  # bends without strain
+        (wc.Scene(wc.Mesh.chain(5), density=0.1, terms=[wc.Spring(stiffness=np.inf)]), True),
     ],
     ids=lambda given: given.name if isinstance(given, wc.Scene) else str(given),
 )

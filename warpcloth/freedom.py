@@ -115,9 +115,9 @@ def _held(scene):
         pairs = elements.stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2) if triangles else elements.stencil
         K = np.repeat(stiffness, 3) if triangles else 2.0 / np.sqrt(3.0) * stiffness
         radius = FOLD * np.linalg.norm(mesh.points[pairs[:, 1]] - mesh.points[pairs[:, 0]], axis=1)
-        with np.errstate(divide="ignore"):  # springs between vertices in one position
-            holds = 0.5 * K * (FOLD**-2 / 24.0) ** 2 > 0.5 * D / radius**2 + weight
-        found.append(np.sort(pairs[holds], axis=1))
+        with np.errstate(divide="ignore", invalid="ignore"):  # springs between vertices in one position
+            stiff = 0.5 * K * (FOLD**-2 / 24.0) ** 2 > 0.5 * D / radius**2 + weight
+        found.append(np.sort(pairs[stiff | np.isinf(K)], axis=1))
         hard |= bool(np.isinf(stiffness).any())
     return np.unique(np.concatenate(found), axis=0), hard
 
