@@ -3,16 +3,20 @@
 import os
 import re
 import resource
+import subprocess
+import sys
 import zipfile
 
 import numpy as np
 import pytest
+import warp as wp
 from pxr import Usd
 
 import warpcloth as wc
 from warpcloth import limits
 from warpcloth.cli import main
 from warpcloth.cli.terminal import printable
+from warpcloth.quiet import initialise_warp
 from warpcloth.usd import AnimationWriter, FrameSequence, MeasureWriter, packages, read_scene
 
 STAGE = """#usda 1.0
@@ -461,3 +465,83 @@ def test_a_package_holds_no_file_from_elsewhere(tmp_path):
         again = wc.simulate(read_scene(tmp_path / "out.usdz"), wc.Newton(substeps=1), output=tmp_path / "again.usdz")
     with zipfile.ZipFile(again.output) as archive:
         assert {name.rpartition("/")[2] for name in archive.namelist()[1:]} == {"a.png", "t.png"}
+
+
+# --- a cache of kernels that is broken
+
+
+@pytest.fixture
+def kernel(tmp_path, monkeypatch):
+    """A kernel whose compiled files are in a folder of its own; and how to have them loaded again."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def double(x: wp.array(dtype=float)):
+        i = wp.tid()
+        x[i] = 2.0 * x[i]
+
+    initialise_warp()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+
+    def loaded_again():
+        double.module.execs.clear()
+        double.module.mark_modified()
+        x = wp.array([1.0, 2.0], dtype=float, device="cpu")
+        wp.launch(double, 2, inputs=[x], device="cpu")
+        assert x.numpy().tolist() == [2.0, 4.0]
+        (folder,) = tmp_path.iterdir()
+        return {path.suffix: path for path in folder.iterdir()}
+
+    return loaded_again
+
+
+DAMAGES = {
+    "empty": lambda data: b"",
+    "cut": lambda data: data[: len(data) // 2],
+    "garbage": lambda data: bytes(np.random.default_rng(0).integers(0, 256, len(data), np.uint8)),
+    "without names": lambda data: data.replace(b"cpu_forward", b"cpu_f\0\0\0\0\0\0"),
+}
+
+
+@pytest.mark.parametrize("ending", [".o", ".meta"])
+def test_a_broken_cache_mends_itself(kernel, ending):
+    for damage, broken in DAMAGES.items():
+        path = kernel()[ending]
+        whole = path.read_bytes()
+        path.write_bytes(broken(whole))
+        kernel()
+        assert path.read_bytes() == whole or ending == ".o", damage
+        path.unlink()
+        kernel()
+
+
+def test_a_full_cache_is_said(tmp_path, kernel):
+    """LLVM would end the process, with the exit code of a run that diverged; once compiled a kernel needs no room."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limit[1]))
+    try:
+        with pytest.raises(OSError, match=r"File too large.*where Warp keeps compiled kernels .WARP_CACHE_PATH names another"):
+            kernel()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    kernel()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limit[1]))
+    try:
+        kernel()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+
+
+@pytest.mark.parametrize("cache", ["full", pytest.param("file/cache", marks=pytest.mark.slow)])
+def test_a_cache_that_takes_nothing_is_no_divergence(tmp_path, cache):
+    (tmp_path / "file").write_text("")
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / cache), "PYTHONPATH": os.pathsep.join(sys.path)}
+    arguments = ["run", "hanging", "-p", "n=3", "--frames", "1", "-s", "substeps=1", "-o", str(tmp_path / "o.usdc")]
+    code = f"""
+import resource, sys
+import warpcloth.cli
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
+sys.exit(warpcloth.cli.main({arguments}))"""
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 2 and ended.stdout == "", ended
+    assert re.fullmatch(rf"warpcloth: {tmp_path}/{cache}[^\n]*, where Warp keeps compiled kernels [^\n]*\n", ended.stderr)
+    assert not (tmp_path / "o.usdc").exists()

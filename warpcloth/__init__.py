@@ -9,6 +9,7 @@ from .arap import Arap
 from .compare import Comparison, compare
 from .deform import Deformation, deform
 from .equilibrium import Equilibrium, equilibrium
+from .kernel_cache import mend
 from .mesh import Mesh
 from .quiet import leave_out_news
 from .rotation import kabsch, polar, svd
@@ -75,6 +76,7 @@ __all__ = [
 ]
 
 leave_out_news()
+mend()
 
 
 def __dir__():

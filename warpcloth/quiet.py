@@ -6,6 +6,7 @@ import tempfile
 from functools import cache
 
 from .checks import shown
+from .kernel_cache import described
 
 
 def leave_out_news():
@@ -34,7 +35,11 @@ def find_device(name):
 
 @cache
 def initialise_warp():
-    """Initialises Warp; that there is no driver is no news where only a CPU is asked for."""
+    """Initialises Warp; that there is no driver is no news where only a CPU is asked for.
+
+    Raises:
+        OSError: The folder of compiled kernels cannot be made.
+    """
     import warp as wp
 
     try:
@@ -47,6 +52,8 @@ def initialise_warp():
         try:
             os.dup2(said.fileno(), 2)
             wp.init()
+        except OSError as error:
+            raise described(error, error.filename) from None
         finally:
             os.dup2(before, 2)
             os.close(before)
