@@ -182,7 +182,7 @@ def test_commands(address, tmp_path, monkeypatch, capsys):
         assert "leave one out" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert main([*chart, "--dask", address]) == 2
-    assert "pip install 'warpcloth[dask]'" in capsys.readouterr().err
+    assert "pip install -e '.[dask]' in the checkout" in capsys.readouterr().err
 
 
 def _free():

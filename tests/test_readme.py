@@ -1,26 +1,47 @@
 """What the README shows works as it stands there, and its tables name all that there is."""
 
+import os
 import re
 import shlex
-import shutil
+import subprocess
+import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.cli import main
+from warpcloth.cli import _parser
 from warpcloth.measures import MEASURES
-from warpcloth.scenes import hanging
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = [(m[1], m[2]) for m in re.finditer(r"^```(\w+)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)]
-EXAMPLE, CURTAIN, DEFORMATION, ANALYSIS, COPIES, ROTATIONS = (text for language, text in BLOCKS if language == "python")
-(STAGE,) = (text for language, text in BLOCKS if language == "usda")
-COMMANDS = [line for language, text in BLOCKS if language == "sh" for line in text.splitlines() if line.startswith("warpcloth")]
+
+
+def blocks(text):
+    """(language, text) of each block."""
+    return [(m[1], m[2]) for m in re.finditer(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)]
+
+
+# Text of each section that has a block, by heading, and of each file that is shown, by name.
+BY_SECTION = dict(part.partition("\n")[::2] for part in re.split(r"^## ", README, flags=re.MULTILINE)[1:])
+BY_SECTION = {heading: text for heading, text in BY_SECTION.items() if blocks(text)}
+FILES = {m[1]: m[2] for m in re.finditer(r"`([\w.]+)`:\n\n```\w+\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)}
+EXAMPLE, DEFORMATION, ANALYSIS, COPIES, ROTATIONS = (
+    text for language, text in blocks(README) if language == "python" and text not in FILES.values()
+)
+COMMANDS = [
+    line for language, text in blocks(README) if language == "sh" for line in text.splitlines() if line[:9] == "warpcloth"
+]
+# Packages by extra.
+OPTIONAL = (ROOT / "pyproject.toml").read_text(encoding="utf-8").partition("[project.optional-dependencies]")[2]
+EXTRAS = {
+    name: re.findall(r'"(\w+)', packages)
+    for name, packages in re.findall(r"^(\w+) = \[(.*)\]$", OPTIONAL.partition("\n[")[0], re.MULTILINE)
+}
 
 
 def test_the_python_example(tmp_path, monkeypatch, capsys):
@@ -35,7 +56,7 @@ def test_the_python_example(tmp_path, monkeypatch, capsys):
 
 def test_the_deformation(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    exec(compile(DEFORMATION, "README.md", "exec"), {"wc": wc})
+    exec(compile(DEFORMATION, "README.md", "exec"), {})
     converged, angle = capsys.readouterr().out.splitlines()[-2:]
     assert converged.startswith("True ") and np.radians(115.0) < float(angle) < np.radians(125.0)
     assert (tmp_path / "twisted.usdc").is_file()
@@ -45,6 +66,7 @@ def test_the_analysis(capsys):
     names = {}
     exec(compile(ANALYSIS, "README.md", "exec"), names)
     measured, around = names["measured"], names["around"]
+    np.testing.assert_array_equal(names["rolled"][0], names["mesh"].points)
     np.testing.assert_allclose(measured["stretch"][-1, :, 0], 1.15, rtol=1e-12)
     # A chord is shorter than its arc, by (κ/19)²/24.
     np.testing.assert_allclose(measured["stretch"][-1, :, 1], 1.0, atol=(1.5 / 19) ** 2 / 24 * 1.01)
@@ -67,15 +89,6 @@ def test_every_measure_is_in_the_docs():
             assert row[1] == ("×".join(map(str, measure.shape)) or "–") and row[2] == measure.unit, measure.name
 
 
-@pytest.fixture(scope="module")
-def animations(tmp_path_factory):
-    """A folder with animations that commands of the README measure."""
-    folder = tmp_path_factory.mktemp("animations")
-    for name, solver in (("hanging", wc.Newton(substeps=4)), ("coarse", wc.XPBD(substeps=8, iterations=1))):
-        wc.simulate(hanging.scene(n=8, duration=0.1), solver, output=str(folder / f"{name}.usdc"))
-    return folder
-
-
 def test_the_rotations():
     names = {}
     exec(compile(ROTATIONS, "README.md", "exec"), names)
@@ -84,20 +97,81 @@ def test_the_rotations():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_commands(command, animations, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
-    (tmp_path / "curtain.py").write_text(CURTAIN, encoding="utf-8")
-    (tmp_path / "cloth.usda").write_text(STAGE, encoding="utf-8")
-    arguments = shlex.split(command)[1:]
-    if arguments[0] in ("analyze", "compare"):
-        shutil.copytree(animations, tmp_path, dirs_exist_ok=True)
-    if arguments[0] in ("run", "deform") and "--frames" not in arguments:
-        arguments += ["--frames", "2"]
-    assert main(arguments) == 0, capsys.readouterr().err
-    for option in ("-o", "--csv", "--plot", "--npz", "--report"):
-        if option in arguments:
-            assert (tmp_path / arguments[arguments.index(option) + 1]).is_file()
+def test_every_command_is_one(command):
+    assert _parser().parse_args(shlex.split(command, comments=True)[1:]).command
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))], ids=str)
+def test_what_is_to_be_installed_is_there(path):
+    """From a checkout, for warpcloth is on no index."""
+    text = path.read_text(encoding="utf-8")
+    assert "warpcloth[" not in text
+    for given in re.findall(r"pip install ([^`&#\n]*)", text):
+        assert (given.strip() == "-e .") or re.fullmatch(r"-e '\.\[(\w+)\]'", given.strip()), given
+    assert set(re.findall(r"'\.\[(\w+)\]'", text)) <= set(EXTRAS)
+
+
+def test_what_a_refusal_says_to_install_is_there():
+    said = []
+    for path in (ROOT / "warpcloth").rglob("*.py"):
+        said += re.findall(r"pip install [^\n]*", path.read_text(encoding="utf-8"))
+    assert len(said) > 3
+    for line in said:
+        assert re.match(r"pip install -e (['\"])\.\[(\w+)\]\1(``)? in the checkout", line)[2] in EXTRAS, line
+
+
+# Read by Python as it starts: packages that are not installed are not found.
+ABSENT = """
+from importlib.machinery import PathFinder
+
+find = PathFinder.find_spec
+absent = {!r}
+PathFinder.find_spec = lambda name, *more: None if name.partition(".")[0] in absent else find(name, *more)
+"""
+# Modules of packages that are called otherwise.
+MODULES = {"libigl": "igl", "pillow": "PIL"}
+# The two commands are what .ci/run does, word for word; a cluster needs more than one machine, see test_cluster.
+SECTIONS = [
+    heading
+    for heading, text in BY_SECTION.items()
+    if heading not in ("Two commands", "On a cluster") and any(block not in FILES.values() for _, block in blocks(text))
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("heading", SECTIONS)
+def test_a_section_as_it_stands(heading, tmp_path):
+    """All of its blocks, one after the other in one folder with the files that the README names, each in a process of its own.
+
+    What the README has not said to install up to the end of the section cannot be imported.
+    """
+    named = set(re.findall(r"'\.\[(\w+)\]'", README[: README.index(f"## {heading}\n")] + BY_SECTION[heading])) - {"test"}
+    there = {package for extra in named for package in EXTRAS[extra]}
+    absent = {package for extra in set(EXTRAS) - {"test"} for package in EXTRAS[extra]} - there
+    tools, folder = tmp_path / "tools", tmp_path / "folder"
+    tools.mkdir()
+    folder.mkdir()
+    (tools / "sitecustomize.py").write_text(ABSENT.format({MODULES.get(package, package) for package in absent}))
+    command = tools / "warpcloth"
+    command.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m warpcloth "$@"\n')
+    command.chmod(0o755)
+    for name, text in FILES.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    environment = os.environ | {
+        "PYTHONPATH": f"{tools}{os.pathsep}{ROOT}",
+        "PATH": f"{tools}{os.pathsep}{os.environ['PATH']}",
+        "WARPCLOTH_CACHE": str(tmp_path / "cache"),
+    }
+    for language, text in blocks(BY_SECTION[heading]):
+        if text in FILES.values():
+            continue
+        run = {"python": [sys.executable, "-c", text], "sh": ["bash", "-ec", text]}[language]
+        done = subprocess.run(run, cwd=folder, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0 and "Traceback" not in done.stderr, f"{text}\n{done.stdout}\n{done.stderr}"
+    words = shlex.split(" ".join(text for language, text in blocks(BY_SECTION[heading]) if language == "sh"))
+    for option, name in pairwise(words):
+        if option in ("-o", "--csv", "--plot", "--npz", "--report"):
+            assert (folder / name).is_file(), name
 
 
 @pytest.mark.parametrize(

@@ -297,7 +297,7 @@ def test_a_stage_without_colours(cloth, tmp_path, monkeypatch, capsys):
         stage = Usd.Stage.Open(str(tmp_path / f"{name}.usdc"))
         assert not stage.GetPrimAtPath("/World/Cloth").GetAttribute("primvars:displayColor").GetNumTimeSamples()
     assert main(["analyze", str(cloth), "-o", str(tmp_path / "b.usdc"), "--colour", "stretch_1"]) == 2
-    assert "pip install 'warpcloth[chart]'" in capsys.readouterr().err
+    assert "pip install -e '.[chart]' in the checkout" in capsys.readouterr().err
 
 
 def test_help_on_measures(capsys):

@@ -61,7 +61,7 @@ class Arap:
     - "clamped": the same, negative ones 0. Gives up linear precision: of a flat mesh L x = 0 no longer holds inside.
     - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges take the place of those of the mesh (Fisher
       et al. 2007); negative at most on the boundary. Of manifolds that can be oriented. Needs libigl:
-      ``pip install 'warpcloth[intrinsic]'``.
+      ``pip install -e '.[intrinsic]'`` in the checkout.
     - "uniform": 1 for each edge; the only ones for an edge mesh.
 
     "spokes_and_rims" takes "cotangent" alone.
@@ -347,7 +347,7 @@ def _edge_weights(mesh, weights):
     n = len(mesh.points)
     if weights == "intrinsic":
         if not importlib.util.find_spec("igl"):
-            raise ImportError('weights = "intrinsic" needs libigl: pip install "warpcloth[intrinsic]"')
+            raise ImportError('weights = "intrinsic" needs libigl: pip install -e ".[intrinsic]" in the checkout')
         import igl
 
         triangles = igl.bfs_orient(mesh.triangles.astype(np.int64))[0]  # which its flips rely on

@@ -79,7 +79,7 @@ def connect(address):
     try:
         from distributed import Client, KilledWorker
     except ImportError:
-        raise ImportError("a Dask cluster needs dask and distributed: pip install 'warpcloth[dask]'") from None
+        raise ImportError("a Dask cluster needs dask and distributed: pip install -e '.[dask]' in the checkout") from None
     scheduler = _scheduler(address)
     log = logging.getLogger("distributed.client")  # tells with tracebacks what is raised below
     level = log.level

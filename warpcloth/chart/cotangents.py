@@ -91,7 +91,7 @@ def measure(device, libigl):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they say is drawn here
         found = [each for part in (_weights, _kites, _bends, _fans) for each in part(choices, device)]
-    reason = "needs libigl: pip install 'warpcloth[intrinsic]'"
+    reason = "needs libigl: pip install -e '.[intrinsic]' in the checkout"
     return found + [point(panel.key, "intrinsic Delaunay", 180.0, None, reason) for panel in PANELS if not libigl]
 
 

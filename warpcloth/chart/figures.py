@@ -18,7 +18,7 @@ def require_matplotlib():
         ImportError: matplotlib is not installed.
     """
     if not importlib.util.find_spec("matplotlib"):
-        raise ImportError("colours and charts need matplotlib: pip install 'warpcloth[chart]'")
+        raise ImportError("colours and charts need matplotlib: pip install -e '.[chart]' in the checkout")
 
 
 def check_path(path, endings):
