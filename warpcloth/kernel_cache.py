@@ -37,9 +37,9 @@ def _mended(load):
             return load(module, device, block_dim, *arguments, **options)
         try:
             loaded = load(module, device, block_dim, *arguments, **options)
-            if device.is_cpu:  # a binary may be whole for the linker, and lack what it should have
-                for kernel in list(loaded.kernel_names):
-                    loaded.get_kernel_hooks(kernel)
+            # A binary may be whole for the linker, and lack what it should have; CUDA notices that itself.
+            if device.is_cpu and any(loaded.get_kernel_hooks(kernel).forward is None for kernel in list(loaded.kernel_names)):
+                raise RuntimeError(f"{folder}: a kernel is not there")
             return loaded
         except Exception:  # of many kinds; if it was not for these files it comes again
             refuse_full(os.path.dirname(folder))
