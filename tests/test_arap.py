@@ -454,7 +454,7 @@ def test_arguments_of_a_solve_are_checked(options, message, device):
 
 def test_intrinsic_weights_name_what_is_missing(monkeypatch):
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r'needs libigl: pip install "warpcloth\[intrinsic\]"'):
+    with pytest.raises(ImportError, match=r"needs libigl: pip install -e '\.\[intrinsic\]' in the checkout"):
         wc.Arap(kite(60.0), [0], weights="intrinsic")
 
 

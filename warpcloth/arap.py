@@ -347,7 +347,7 @@ def _edge_weights(mesh, weights):
     n = len(mesh.points)
     if weights == "intrinsic":
         if not importlib.util.find_spec("igl"):
-            raise ImportError('weights = "intrinsic" needs libigl: pip install -e ".[intrinsic]" in the checkout')
+            raise ImportError("weights = 'intrinsic' needs libigl: pip install -e '.[intrinsic]' in the checkout")
         import igl
 
         triangles = igl.bfs_orient(mesh.triangles.astype(np.int64))[0]  # which its flips rely on

@@ -115,17 +115,9 @@ def _parser():
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
-        sub.add_argument(
-            "-s",
-            nargs="+",
-            action="extend",
-            default=[],
-            metavar="option=value",
-            help="options of the solver; -s help lists them",
-        )
-        sub.add_argument(
-            "-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene; -p help lists them"
-        )
+        for option, metavar, text in (("-s", "option=value", "of the solver"), ("-p", "parameter=value", "of the scene")):
+            text = f"{text}; {option} help lists them"
+            sub.add_argument(option, nargs="+", action="extend", default=[], metavar=metavar, help=text)
         sub.add_argument("--prim", help="path or name of the prim of a stage with several")
         sub.add_argument("--pins", metavar="SELECTION", help="vertices that stand still where they start, for the scene's pins")
     info.add_argument("--advise", action="store_true", help="say which terms, precision and resolution matter, by trying")
