@@ -174,7 +174,7 @@ def split(term: Term, dtype):
         rest: wp.array(dtype=rest_type),
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
-        ratio: dtype,
+        ratio: wp.array(dtype=dtype),
         scale: wp.array(dtype=dtype),
         steps: int,
         # in and out
@@ -186,7 +186,7 @@ def split(term: Term, dtype):
     ):
         e = wp.tid()
         r = rest_of(rest, e)
-        part = ratio * shared(scale, e)
+        part = shared(ratio, e) * shared(scale, e)
         w2 = part * shared(stiffness, e) * measure(r)
         y = y_of(stencil, e, r, x, d)
         v = y + take(u, e)
@@ -202,7 +202,7 @@ def split(term: Term, dtype):
 
 @cache
 def scatter_splitting(term: Term, dtype):
-    """Kernel over elements: adds Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N].
+    """Kernel over elements: adds max(1, 1/r) Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N].
 
     For the CPU, in order: nothing is atomic.
     """
@@ -218,7 +218,7 @@ def scatter_splitting(term: Term, dtype):
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
-        ratio: dtype,
+        ratio: wp.array(dtype=dtype),
         scale: wp.array(dtype=dtype),
         u: wp.array(dtype=y_type),
         gap: wp.array(dtype=y_type),
@@ -232,7 +232,9 @@ def scatter_splitting(term: Term, dtype):
         r = rest_of(rest, e)
         apart = take(gap, e)
         moved = take(change, e)
-        pull = apart + (ratio * shared(scale, e) * shared(stiffness, e) * measure(r)) * take(u, e)
+        part = shared(ratio, e)
+        most = wp.max(part, dtype(1.0)) / part
+        pull = apart + (part * shared(scale, e) * shared(stiffness, e) * measure(r)) * take(u, e)
         for i in range(K):
             w = weight(r, i)
             a = w[0] * apart[0]
@@ -243,7 +245,7 @@ def scatter_splitting(term: Term, dtype):
                 b += w[m] * moved[m]
                 c += w[m] * pull[m]
             v = vertex(stencil, K * e + i)
-            put(primal, v, vector(primal, v) + a)
+            put(primal, v, vector(primal, v) + most * a)
             put(dual, v, vector(dual, v) + b)
             put(force, v, vector(force, v) + c)
 
@@ -265,7 +267,7 @@ def gather_splitting(term: Term, dtype):
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
-        ratio: dtype,
+        ratio: wp.array(dtype=dtype),
         scale: wp.array(dtype=dtype),
         u: wp.array(dtype=y_type),
         gap: wp.array(dtype=y_type),
@@ -283,9 +285,11 @@ def gather_splitting(term: Term, dtype):
             e = incidences[n] // K
             r = rest[e]
             w = weight(r, incidences[n] - e * K)
-            pull = gap[e] + (ratio * scale[e] * stiffness[e] * measure(r)) * u[e]
+            part = ratio[e]
+            most = wp.max(part, dtype(1.0)) / part
+            pull = gap[e] + (part * scale[e] * stiffness[e] * measure(r)) * u[e]
             for m in range(M):
-                a += w[m] * gap[e][m]
+                a += (most * w[m]) * gap[e][m]
                 b += w[m] * change[e][m]
                 c += w[m] * pull[m]
         primal[v] = primal[v] + a

@@ -248,7 +248,7 @@ def test_a_step_starts_afresh(name, device):
 def test_residuals_of_admm(device):
     """The forces of y − z and of what z moved by, the largest of any vertex that moves; both end at 0."""
     declared = swinging(8)
-    solver = wc.ADMM(substeps=1, iterations=7)
+    solver = wc.ADMM(substeps=1, iterations=7, weight=1.0)
     before, last = (replace(solver, iterations=count).bind(declared.build(device=device, dtype="float64")) for count in (6, 7))
     before.step()
     last.step()

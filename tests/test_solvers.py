@@ -316,6 +316,7 @@ def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
         (lambda: wc.ADMM(substeps=1, iterations=0), "iterations is 0"),
         (lambda: wc.ADMM(substeps=1, tolerance=-1.0), "tolerance is -1.0"),
         (lambda: wc.ADMM(substeps=1, weight=0.0), "weight is 0.0"),
+        (lambda: wc.ADMM(substeps=1, weight="car"), "weight is 'car'; it must be 'auto' or a number above 0"),
     ],
 )
 def test_options_are_checked(make, message):

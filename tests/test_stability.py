@@ -383,11 +383,19 @@ def test_06_and_08_few_iterations_fall_behind_as_stiffness_grows(device):
 
 
 def test_07_weights_of_admm(device):
-    """The error has its minimum between a weight that is too small and one that stalls; the best weight goes down with k."""
-    weights = [1e-4, 1e-2, 1.0, 1e2]
-    (rows,) = mapped(HANGING, [Setup("admm")], "stiffness", [1e-2, 1.0, 1e2], "weight", weights, 60, device=device)
+    """The error has its minimum between a weight that is too small and one that stalls, within the grid's factor at the line.
+
+    The line goes down with the root of the stiffness.
+    """
+    weights, given = [1e-3, 3e-2, 1.0, 30.0], {"fixed": {"iterations": 50}, "device": device}
+    (rows,) = mapped(HANGING, [Setup("admm")], "stiffness", [1e-2, 1.0, 30.0], "weight", weights, 60, duration=0.4, **given)
     best = np.array([[cell["error"] for cell in row] for row in rows]).argmin(axis=0)
     assert best.tolist() == sorted(best, reverse=True) and best[0] > best[-1]
+    ratios = np.array([[cell["rules"]["r = 1/(2hω)"] for cell in row] for row in rows])
+    assert all(1.0 / 30.0 < ratios[i, k] < 30.0 for k, i in enumerate(best))
+    assert ratios[0] / ratios[0, 0] == pytest.approx(np.sqrt([1.0, 100.0, 3000.0]), rel=1e-6)
+    assert ratios[:, 0] / ratios[0, 0] == pytest.approx(np.array(weights) / weights[0], rel=1e-6)
+    assert "r = 1/(2hω)" not in rules(HANGING.load(), wc.ADMM(dt=1 / 60), 10), "which auto is on by itself"
 
 
 @pytest.mark.parametrize("solver", ["pbd", "xpbd"])
@@ -614,7 +622,7 @@ def test_a_map_is_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (kept.append(self), saving(self, *a, **k)))
     survey, cells = made_up()
     survey = replace(survey, scene=SceneRef("a$^$.py"))
-    plot_maps(tmp_path / "map.png", survey, cells)
+    plot_maps(tmp_path / "map.png", survey, cells, 0.01)
     (axes,) = kept[0].axes
     mesh, line, known = axes.collections
     colours = np.asarray(mesh.get_array())
@@ -628,8 +636,10 @@ def test_a_map_is_drawn(tmp_path, monkeypatch):
     assert path[np.isclose(path[:, 0], -3.0)][:, 1] == pytest.approx(0.5)
     assert np.array_equal(known.get_paths()[0].vertices, path), "the line beyond which the reference is not known"
     texts = {text.get_text() for text in kept[0].legends[0].get_texts()}
-    named = {"stable", "inaccurate", "stalled", "stable or inaccurate", "refused", "slow", "diverged at once", "in the end"}
-    assert texts == named | {"2/ω_max", KNOWN}
+    named = {"stable", "inaccurate: off by more than 1 % of the size", "stalled", "stable or inaccurate, not known", "refused"}
+    named |= {"slow", "diverged at once", "diverged in the end", "2/ω_max: largest stable step about the rest shape"}
+    assert texts == named | {f"{KNOWN}: beyond, it is known less well"}
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0.001", "0.01", "0.1", "1"]
     assert "iterations 3" in kept[0]._suptitle.get_text() and axes.get_title() == "newton"
     for ending in ("svg", "pdf"):
         plot_maps(tmp_path / f"map.{ending}", survey, cells)

@@ -222,8 +222,17 @@ class Hessian:
         return block_diag(self.matrices(), format="csr")
 
 
-def constant_matrices(model, s, weight=1.0):
-    """s·M + weight·Σ k A GᵀG of each copy, G the weights of y, as scipy matrices (n, n) [N/m]; pins are the identity."""
+def constant_blocks(model, elements):
+    """k A GᵀG of each element, G the weights of y, (E, K, K) [N/m]."""
+    K = elements.term.vertices
+    blocks = wp.zeros((elements.count, K * K), dtype=wp.float64, device=model.device)
+    kernel = model.kernel(assemble.constant_blocks, elements.term, model.dtype)
+    model.launch(kernel, elements.count, elements.arguments, [blocks])
+    return blocks.numpy().reshape(-1, K, K)
+
+
+def constant_matrices(model, s):
+    """s·M + Σ k A GᵀG of each copy, G the weights of y, as scipy matrices (n, n) [N/m]; pins are the identity."""
     from scipy.sparse import coo_matrix
 
     n, B = model.per_copy, model.copies
@@ -232,14 +241,11 @@ def constant_matrices(model, s, weight=1.0):
     vertices = np.arange(n)
     rows, columns, values = [vertices], [vertices], [diagonal]
     for elements in model.terms:
-        blocks = wp.zeros((elements.count, elements.term.vertices**2), dtype=wp.float64, device=model.device)
-        kernel = model.kernel(assemble.constant_blocks, elements.term, model.dtype)
-        model.launch(kernel, elements.count, elements.arguments, [blocks])
         stencil = elements.stencil.numpy()[: elements.per_copy]
         K = stencil.shape[1]
         rows.append(np.repeat(stencil, K, axis=1).ravel())
         columns.append(np.tile(stencil, K).ravel())
-        values.append(weight * blocks.numpy().reshape(B, -1))
+        values.append(constant_blocks(model, elements).reshape(B, -1))
     rows, columns, values = np.concatenate(rows), np.concatenate(columns), np.concatenate(values, axis=1)
     free = free[:n]  # pins are those of the scene, in every copy
     keep = (free[rows] & free[columns]) | (np.arange(len(rows)) < n)

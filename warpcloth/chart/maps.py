@@ -21,30 +21,33 @@ _PLAIN = {
     "refused": (1.0, 1.0, 1.0),
 }
 _EARLY, _LATE = np.array([0.42, 0.02, 0.11]), np.array([0.87, 0.47, 0.40])
-# Of each rule; black where beyond it a run diverges.
+# Of each rule, with what it says; black where beyond it a run diverges.
 _STYLES = {
-    "2/ω_max": "-",
-    "2/√(2 Σk/m)": "--",
-    "forward Euler": "-.",
-    "ω λ_max = 2": (0, (1, 1)),
-    "Gauss–Seidel, |z| = 1": (0, (4, 1, 1, 1, 1, 1)),
-    "h² = m/(k(L/l − 1))": "-",
-    "1 + Σk h²/m iterations": "--",
-    "a ring an iteration": "-.",
-    KNOWN: (0, (1, 2)),
+    "2/ω_max": ("-", "largest stable step about the rest shape"),
+    "2/√(2 Σk/m)": ("--", "stable in any motion"),
+    "forward Euler": ("-.", "energy grows a hundredfold in the run"),
+    "ω λ_max = 2": ((0, (1, 1)), "Jacobi sweeps overshoot beyond"),
+    "Gauss–Seidel, |z| = 1": ((0, (4, 1, 1, 1, 1, 1)), "sweeps in their order overshoot beyond"),
+    "h² = m/(k(L/l − 1))": ("-", "beyond, a step has several minima"),
+    "1 + Σk h²/m iterations": ("--", "needed across stiff springs"),
+    "a ring an iteration": ("-.", "pins are not felt everywhere beyond"),
+    "r = 1/(2hω)": ((0, (5, 1)), "the weight that converges fastest"),
+    KNOWN: ((0, (1, 2)), "beyond, it is known less well"),
 }
 # Of what is stable or inaccurate.
 _UNSURE = {"facecolor": _PLAIN["stable"], "edgecolor": _PLAIN["inaccurate"], "hatch": "///", "linewidth": 0.0}
-_TICKS = 5
+_TICKS = 4
+_SMALL, _TEXT = 9.5, 11.0  # sizes of letters [pt]
 
 
-def plot_maps(path, survey, cells):
+def plot_maps(path, survey, cells, accuracy=None):
     """Draws what became of each cell, a panel for each method, and where the rules of :mod:`warpcloth.chart.rules` are 1.
 
     Args:
         path: The file, .png, .svg or .pdf.
         survey: The :class:`warpcloth.chart.stability.Survey`.
         cells: (setup, y, x) as :meth:`warpcloth.chart.stability.Survey.table` gives them.
+        accuracy: What is inaccurate, to say so, or None.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -57,27 +60,27 @@ def plot_maps(path, survey, cells):
     count = len(survey.setups)
     columns = min(count, 4)
     lines = math.ceil(count / columns)
-    figure = Figure(figsize=(max(3.1 * columns, 5.5), 2.7 * lines + 1.3), layout="constrained")
+    figure = Figure(figsize=(max(2.9 * columns, 6.0), 2.6 * lines + 2.0), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
     places = [_places(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
     shown = {}
     for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
         axes.pcolormesh(*map(_edges, places), _colours(rows), edgecolors="white", linewidth=0.4)
         _hatch(axes, places, rows)
-        for name, dashes in _STYLES.items():
+        for name, (dashes, _) in _STYLES.items():
             style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
             if _line(axes, places, rows, name, style):
                 shown[name] = style
-        axes.set_title(str(setup), fontsize=9, color=GREY)
+        axes.set_title(str(setup), fontsize=_TEXT, color=GREY)
         for of, name, values, at in zip("xy", (survey.x, survey.y), (survey.xs, survey.ys), places, strict=True):
-            few = slice(0, None, math.ceil(len(values) / _TICKS))
-            axes.set(**{f"{of}ticks": at[few], f"{of}ticklabels": [f"{value:.2g}" for value in values[few]]})
+            ticks, numbers = _ticks(name, values, at)
+            axes.set(**{f"{of}ticks": ticks, f"{of}ticklabels": numbers})
             if (of == "x" and k >= count - columns) or (of == "y" and k % columns == 0):
-                getattr(axes, f"set_{of}label")(AXES[name].label, color=GREY, fontsize=9)
-        axes.tick_params(colors=GREY, labelsize=8, labelbottom=k >= count - columns)
+                getattr(axes, f"set_{of}label")(AXES[name].label, color=GREY, fontsize=_TEXT)
+        axes.tick_params(colors=GREY, labelsize=_SMALL, labelbottom=k >= count - columns)
     for axes in panels[count:]:
         axes.remove()
-    _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row})
+    _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row}, accuracy)
     rest = ", ".join(f"{name} {value:.4g}" for name, value in survey.fixed.items())
     figure.suptitle(
         f"{survey.scene}, {survey.duration:g} s of motion" + (f", {rest}" if rest else ""),
@@ -91,6 +94,16 @@ def plot_maps(path, survey, cells):
 def _places(name, values):
     """Where the values stand along an axis."""
     return np.log10(values) if AXES[name].logarithmic else np.asarray(values, dtype=np.float64)
+
+
+def _ticks(name, values, at):
+    """Where numbers stand along an axis, and their texts: powers of ten where there are some, else a few of the values."""
+    if AXES[name].logarithmic and at[-1] - at[0] >= 1.0:
+        powers = np.arange(math.ceil(at[0] - 1e-6), at[-1] + 1e-6)
+        powers = powers[:: math.ceil(len(powers) / _TICKS)]
+        return powers, [f"{10.0**power:g}" if abs(power) < 4 else f"$10^{{{power:.0f}}}$" for power in powers]
+    few = slice(0, None, math.ceil(len(values) / _TICKS))
+    return at[few], [f"{value:.3g}" for value in values[few]]
 
 
 def _edges(at):
@@ -136,23 +149,28 @@ def _line(axes, places, rows, name, style):
     return True
 
 
-def _legend(figure, shown, verdicts):
+def _legend(figure, shown, verdicts, accuracy):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
+    said = {"unsure": "stable or inaccurate, not known"}
+    if accuracy:
+        said["inaccurate"] = f"inaccurate: off by more than {100.0 * accuracy:g} % of the size"
     entries = [
-        Patch(**_UNSURE, label="stable or inaccurate")
+        Patch(**_UNSURE, label=said[verdict])
         if verdict == "unsure"
-        else Patch(fc=colour, ec=GREY, lw=0.5, label=verdict)
+        else Patch(fc=colour, ec=GREY, lw=0.5, label=said.get(verdict, verdict))
         for verdict, colour in _PLAIN.items()
         if verdict in verdicts
     ]
     if "diverged" in verdicts:
-        entries += [Patch(color=_EARLY, label="diverged at once"), Patch(color=_LATE, label="in the end")]
+        entries += [Patch(color=_EARLY, label="diverged at once"), Patch(color=_LATE, label="diverged in the end")]
     entries += [
-        Line2D([], [], color=style["colors"], linestyle=style["linestyles"][0], label=name) for name, style in shown.items()
+        Line2D([], [], color=style["colors"], linestyle=style["linestyles"][0], label=f"{name}: {_STYLES[name][1]}")
+        for name, style in shown.items()
     ]
-    figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8, labelcolor=GREY)
+    columns = 3 if figure.get_size_inches()[0] > 9.0 else 2 if figure.get_size_inches()[0] > 8.0 else 1
+    figure.legend(handles=entries, loc="outside lower center", ncols=columns, frameon=False, fontsize=_SMALL, labelcolor=GREY)
 
 
 def write_table(path, survey, cells):

@@ -8,6 +8,7 @@ from ..integrators import INTEGRATORS
 from ..kernels.term import HessianPolicy
 from ..operators import Hessian
 from ..solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
+from ..solvers.admm import best_weights
 from ..solvers.explicit import step_limits
 from ..sweeps import colours
 from ..terms import Spring
@@ -44,6 +45,8 @@ def rules(scene, record, steps):
     - ``Gauss–Seidel, |z| = 1``: of sweeps in their order, beyond which energy grows by :data:`GROWTH` in the steps of the run,
       see :func:`largest_ordered`.
     - ``1 + Σk h²/m iterations``: those that projections need across springs, for accelerated ones the root.
+    - ``r = 1/(2hω)``: the weight of ADMM over the least that :func:`warpcloth.solvers.admm.best_weights` gives an element, the
+      stiffest: above it stalls, below it oscillates.
     - ``a ring an iteration``: how many edges lie between pins and the furthest vertex, over the sweeps.
 
     Args:
@@ -73,6 +76,8 @@ def rules(scene, record, steps):
     if isinstance(record, ProjectiveDynamics):
         needed = 1.0 + 2.0 * (he / step_limits(model)[1]) ** 2
         found["1 + Σk h²/m iterations"] = (needed if record.acceleration == "none" else np.sqrt(needed)) / record.iterations
+    if isinstance(record, ADMM) and record.weight != "auto":
+        found["r = 1/(2hω)"] = record.weight / min(best_weights(model, elements, he).min() for elements in model.terms)
     if isinstance(record, (Newton, ProjectiveDynamics, ADMM, XPBD, ConstrainedDynamics)):
         found["h² = m/(k(L/l − 1))"] = he * np.sqrt(concave_rate(model))
     return found

@@ -69,7 +69,7 @@ def chart(arguments):
         if arguments.csv:
             write_table(arguments.csv, survey, cells)
         if arguments.output:
-            plot_maps(arguments.output, survey, cells)
+            plot_maps(arguments.output, survey, cells, arguments.accuracy)
     methods = [str(setup) for setup in survey.setups]
     if arguments.json:
         axes = {survey.x: survey.xs, survey.y: survey.ys}
