@@ -5,7 +5,7 @@ import csv
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -17,7 +17,16 @@ from warpcloth.chart.digest import scene_digest
 from warpcloth.chart.setups import RUNS, STEPS, label, setups_of_runs, setups_of_steps
 from warpcloth.chart.sweep import Store
 from warpcloth.chart.tasks import SceneRef, Setup
-from warpcloth.chart.work_precision import cheapest, front, left_out, solver_diagram, spectrum_diagram, time_diagram, write_csv
+from warpcloth.chart.work_precision import (
+    cheapest,
+    front,
+    left_out,
+    solver_diagram,
+    spectrum_diagram,
+    spread,
+    time_diagram,
+    write_csv,
+)
 from warpcloth.cli import main
 from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
@@ -243,7 +252,7 @@ def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
     ]
     points = [{"iterations": n, "gap": 1.0 / n, "ms": 40.0 + n} for n in (1, 2, 4)]
     rows.append({"solver": "xpbd", "label": "xpbd", "status": "ok", "reason": "", "points": points, "floor": 1e-9})
-    found = {"scene": "a$^$.py", "frame": 1, "rate": 60.0, "dtype": "float64", "machine": {"device": "cpu"}, "rows": rows}
+    found = {"scene": "a$^$.py", "frame": 1, "rate": 60.0, "dtype": "float64", "machine": machine.machine(), "rows": rows}
     said = [("newton, 2 settings", "refused: hard"), ("newton 8", "refused: soft"), ("admm 1", "refused: hard")]
     assert left_out(found) == said
     fronts.plot_solver(tmp_path / "solver.png", found)
@@ -263,6 +272,18 @@ def test_below_the_error_of_the_reference_nothing_is_better():
     assert front(rows, 3.0) == [0, 1] and front(rows, 2.5) == [0, 1, 2] and front(rows) == [0, 1, 2]
     near = [row | {"error": 0.001 * row["error"]} for row in rows]
     assert [row["solver"] for row in cheapest(near, 0.0081)] == ["s3"] and len(cheapest(near)) == 4
+
+
+def test_a_lead_within_the_spread_is_none():
+    """Of two settings as quick, for all that is known, the one of less error is on the front; so in strains by themselves."""
+    rows = [
+        {"status": "ok", "ms_per_second": 60.0 * ms, "ms": ms, "spread": [ms - off, ms + off], "error": a, "strain_error": b}
+        for ms, off, a, b in ((1.0, 0.3, 4.0, 1.0), (1.2, 0.3, 2.0, 3.0), (2.0, 0.1, 1.0, 2.0), (2.3, 0.1, 0.5, 0.1))
+    ]
+    assert spread(rows[0]) == pytest.approx((42.0, 78.0)) and spread({"ms_per_second": 3.0}) == (3.0, 3.0)
+    assert front(rows) == [1, 2, 3] and front(rows, name="strain_error") == [0, 3]
+    rows[3]["spread"] = [2.0, 2.6]
+    assert front(rows) == [1, 3]
 
 
 def test_nothing_beats_the_front():
@@ -346,16 +367,32 @@ def test_time_diagram(device, tmp_path, drawn):
     assert float(lines[0]["error"]) == found["rows"][0]["error"] and float(lines[0]["strain_error"]) > 0.0
     axes, strains, _notes = drawn[0].axes
     text = text_of(drawn[0])
-    numbered = front(found["rows"])
+    fronts_of = {name: front(found["rows"], found["reference"][name], name) for name in ("error", "strain_error")}
+    numbered = sorted(set().union(*fronts_of.values()), key=lambda i: found["rows"][i]["ms_per_second"])
     assert all(f"{i}  {found['rows'][place]['label']}" in text for i, place in enumerate(numbered, 1))
     assert name + ": diverged" in text
     shown = {label for _, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    assert {"explicit", "newton", "error of the reference", "nothing is better in both"} <= shown
+    assert shown == {"error of the reference", "nothing is better in both", "quartiles of the times"}
+    assert f"{found['machine']['cores']} cores, Warp" in drawn[0]._suptitle.get_text()
     good = [row for row in found["rows"] if row["status"] == "ok"]
     for panel, name in ((axes, "error"), (strains, "strain_error")):
         points = np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() not in ("None", "")])
         assert sorted(map(tuple, points)) == sorted((row["ms_per_second"], row[name]) for row in good)
         assert floor_of(panel, "error of the reference") == found["reference"][name] < min(points[:, 1])
+        ends = {each.get_text(): each for each in panel.texts if not each.get_text().isdigit()}
+        assert set(ends) == {
+            row["solver"] + " " * (i != "") + i for row in good for i in [row["options"].get("integrator", "")]
+        }
+        last = max((row for row in good if row["label"].startswith("newton bdf2")), key=lambda row: row["ms_per_second"])
+        assert ends["newton bdf2"].xy == (last["ms_per_second"], last[name])
+        boxes = [each.get_window_extent() for each in ends.values()]
+        assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+        bars = np.concatenate([np.array(each.get_segments()) for each in panel.collections])[:, :, 0]
+        assert np.allclose(sorted(bars.tolist()), sorted(map(list, map(spread, good))))
+        (joined,) = (line for line in panel.lines if line.get_label() == "nothing is better in both")
+        assert joined.get_xydata().tolist() == [
+            [found["rows"][i]["ms_per_second"], found["rows"][i][name]] for i in fronts_of[name]
+        ]
 
 
 def test_a_chart_of_errors_needs_motion(tmp_path):
@@ -389,7 +426,7 @@ def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
         run = {"executor": executor, "device": device, "limit": 0.5, "frames": 12}
         one = solver_diagram(SMALL, solvers=["newton", "admm"], **run)
         other = spectrum_diagram(SceneRef("hanging", {"n": 4}), **run)
-    assert [row["label"] for row in one["rows"]] == ["newton", "admm weight=1", "admm weight=0.1"]
+    assert [row["label"] for row in one["rows"]] == ["newton", "admm", "admm weight=1"]
     assert one["rate"] == 240.0 and one["frame"] == 12 and one["seed"] == 0 and len(other["rows"]) == 5
     # Smaller steps are nearer to their matrix.
     assert np.all(np.diff([row["contraction"] for row in other["rows"]]) < 0.0)
@@ -401,7 +438,7 @@ def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
         for line, row in zip(axes.lines, one["rows"], strict=False):
             gaps = [max(point["gap"], row["floor"]) for point in row["points"]]
             assert np.array_equal(line.get_xydata(), np.transpose([[point[name] for point in row["points"]], gaps]))
-    assert "admm weight=1: diverged: a gap of 1e+07" in text_of(drawn[0]).replace("\n  ", " ")
+    assert "admm: diverged: a gap of 1e+07" in text_of(drawn[0]).replace("\n  ", " ")
     assert [list(line.get_ydata()) for line in drawn[1].axes[0].lines] == [row["eigenvalues"] for row in other["rows"]]
     floors = [line for line in drawn[1].axes[1].lines if line.get_label() == "rounding of the places"]
     assert [line.get_ydata()[0] for line in floors] == [row["floor"] for row in other["rows"]]

@@ -3,7 +3,8 @@
 import textwrap
 
 from .figures import GREY, PICTURES, check_path, number_axis, save
-from .work_precision import WITHIN, cheapest, left_out
+from .machine import in_words
+from .work_precision import WITHIN, cheapest, front, left_out, spread
 
 # Each solver has its colour and marker in every picture.
 _STYLES = {
@@ -17,7 +18,8 @@ _STYLES = {
     "constrained-dynamics": ("tab:green", "p"),
 }
 _DASHES = ("-", "--", ":", "-.")
-_WIDTH, _LINES = 52, 60  # of the texts beside a picture
+_WIDTH, _LINES = 46, 48  # of the texts beside a picture
+_SMALL, _TEXT = 8.5, 10.0  # sizes of letters [pt]
 # Of a motion, with what is written along them.
 _ERRORS = {
     "error": "error: RMS of all vertices and frames, over the size",
@@ -26,10 +28,11 @@ _ERRORS = {
 
 
 def plot_time(path, found):
-    """Draws the error of each setting over its time, those that nothing beats as a numbered line with their names beside it.
+    """Draws the error of each setting over its time with the quartiles of that, and names each line at its end.
 
-    A second panel has the 99th percentile of the error of strains. What has no error is named with the reason; in both panels
-    the error of the reference solution is a line, and no point below means anything.
+    Two panels have the error of positions and the 99th percentile of the error of strains. In each those that nothing beats by
+    more than times spread are joined and numbered, with their names beside it. What has no error is named with the reason; the
+    error of the reference solution is a line, and no point below means anything.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -40,36 +43,44 @@ def plot_time(path, found):
         ImportError: matplotlib is not installed.
         ValueError: The path has another ending.
     """
-    best = sorted((row for row in found["rows"] if row.get("front")), key=lambda row: row["ms_per_second"])
-    texts = [f"{number}  {row['label']}" for number, row in enumerate(best, 1)]
+    rows, reference = found["rows"], found["reference"]
+    fronts = {name: front(rows, reference[name], name) for name in _ERRORS}
+    best = sorted(set().union(*fronts.values()), key=lambda i: rows[i]["ms_per_second"])
+    texts = [f"{number}  {rows[i]['label']}" for number, i in enumerate(best, 1)]
     texts += [
         "",
         f"cheapest within {100.0 * WITHIN:g} %:",
-        *(row["label"] for row in cheapest(found["rows"], found["reference"]["error"])),
+        *(row["label"] for row in cheapest(rows, reference["error"])),
     ]
     texts += _missing("not drawn:", found)
     figure, panels, notes = _figure(path, texts)
     lines = {}
-    for row in found["rows"]:
+    for row in rows:
         if row["status"] == "ok":
-            lines.setdefault((row["solver"], row["options"].get("integrator")), []).append(row)
-    for (solver, _), rows in lines.items():
-        rows.sort(key=lambda row: row["ms_per_second"])
+            lines.setdefault((row["solver"], row["options"].get("integrator", "euler")), []).append(row)
+    ends = {axes: [] for axes in panels}
+    for (solver, integrator), line in lines.items():
+        line.sort(key=lambda row: row["ms_per_second"])
         colour, marker = _STYLES[solver]
         for axes, name in zip(panels, _ERRORS, strict=True):
-            x, y = ([row[of] for row in rows] for of in ("ms_per_second", name))
-            axes.plot(x, y, color=colour, linewidth=0.5, alpha=0.6)
-            axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none", label=solver)
-    x, y = ([row[name] for row in best] for name in ("ms_per_second", "error"))
-    panels[0].plot(x, y, color="gold", linewidth=4.0, zorder=0, label="nothing is better in both")
+            x, y = ([row[of] for row in line] for of in ("ms_per_second", name))
+            axes.plot(x, y, color=colour, linewidth=0.7, alpha=0.6)
+            axes.hlines(y, *zip(*map(spread, line), strict=True), color=colour, linewidth=2.5, alpha=0.45)
+            axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none")
+            ends[axes].append((x[-1], y[-1], solver if integrator == "euler" else f"{solver} {integrator}", colour))
     for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
-        for number, row in enumerate(best, 1):
-            place = (row["ms_per_second"], row[name])
-            axes.annotate(str(number), place, (-4, -4), textcoords="offset points", ha="right", va="top", fontsize=8)
-        _floor(axes, found["reference"][name], "error of the reference")
+        x, y = ([rows[i][of] for i in fronts[name]] for of in ("ms_per_second", name))
+        axes.plot(x, y, color="gold", linewidth=5.0, zorder=0, label="nothing is better in both")
+        for i in fronts[name]:
+            place, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": _TEXT}
+            axes.annotate(str(best.index(i) + 1), place, (-4, -4), textcoords="offset points", **below)
+        axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="quartiles of the times")
+        _floor(axes, reference[name], "error of the reference")
         axes.set(xlabel="ms for a second of motion", ylabel=text)
-    title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}, {found['machine']['device']}"
-    _finish(figure, panels, notes, title, texts)
+    title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}"
+    _finish(figure, panels, notes, title, texts, found)
+    for axes, of in ends.items():
+        _name_ends(figure, axes, of)
     save(figure, path)
 
 
@@ -103,8 +114,8 @@ def plot_solver(path, found):
             _floor(axes, floor, "rounding of the objective")
     panels[0].set_ylabel("gap of the objective, 1 at x̃")
     step = f"a step of 1/{found['rate']:g} s after {found['frame']} frames"
-    title = f"{found['scene']}, {step}, {found['dtype']}, {found['machine']['device']}"
-    _finish(figure, panels, notes, title, texts)
+    title = f"{found['scene']}, {step}, {found['dtype']}"
+    _finish(figure, panels, notes, title, texts, found)
     save(figure, path)
 
 
@@ -138,7 +149,7 @@ def plot_spectrum(path, found):
     panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
     panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
     title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
-    _finish(figure, panels, notes, title, texts)
+    _finish(figure, panels, notes, title, texts, found)
     save(figure, path)
 
 
@@ -153,6 +164,40 @@ def _missing(head, found):
     return ["", head, *lines] if lines else []
 
 
+def _name_ends(figure, axes, ends):
+    """Writes beside the end of each line what it is, in its colour, as near as none is over another or outside.
+
+    Args:
+        figure: Of the axes, which are otherwise finished.
+        axes: A panel.
+        ends: (x, y, text, colour) of each line.
+    """
+    from matplotlib.patheffects import withStroke
+
+    low, high = axes.get_xlim()
+    axes.set_xlim(low, high * (high / low) ** 0.3)  # room for names
+    number_axis(axes.xaxis)
+    figure.draw_without_rendering()  # sizes are known then
+    style, taken = {"fontsize": _SMALL, "va": "center", "path_effects": [withStroke(linewidth=2.5, foreground="white")]}, []
+    for x, y, text, colour in sorted(ends, key=lambda end: -end[1]):
+        note = axes.annotate(
+            text, (x, y), (7, 0), textcoords="offset points", annotation_clip=False, zorder=1.9, color=colour, **style
+        )
+        note.set_in_layout(False)
+        for shift in range(120):
+            for side, up in ((side, up) for up in (-3 * shift, 3 * shift) for side in ("left", "right")):
+                note.set(ha=side)
+                note.xyann = (7 if side == "left" else -7, up)
+                box, around = note.get_window_extent(), axes.bbox
+                inside = around.y0 <= box.y0 and box.y1 <= around.y1 and around.x0 <= box.x0 and box.x1 <= around.x1
+                if inside and not box.count_overlaps(taken):
+                    break
+            else:
+                continue
+            break
+        taken.append(box.padded(2.0))
+
+
 def _figure(path, texts):
     """A figure with two panels on logarithmic scales, and one for texts."""
     check_path(path, PICTURES)
@@ -160,25 +205,28 @@ def _figure(path, texts):
 
     if len(texts) > _LINES:
         texts[_LINES:] = [f"… {len(texts) - _LINES} lines more in the table"]
-    height = max(5.0, 0.155 * (len(texts) + 14))
-    figure = Figure(figsize=(12.6, height), layout="constrained")
-    *axes, notes = figure.subplots(1, 3, width_ratios=[1.6, 1.6, 1.0])
+    height = max(5.4, 0.165 * (len(texts) + 14))
+    figure = Figure(figsize=(13.0, height), layout="constrained")
+    *axes, notes = figure.subplots(1, 3, width_ratios=[1.7, 1.7, 1.0])
     for each in axes:
         each.set(xscale="log", yscale="log")
         each.grid(True, which="major", linewidth=0.3, color="0.8")
-        each.tick_params(which="both", colors=GREY, labelsize=8)
+        each.tick_params(which="both", colors=GREY, labelsize=_TEXT)
+        each.xaxis.label.set_size(_TEXT + 1.0)
+        each.yaxis.label.set_size(_TEXT + 1.0)
         each.spines[["top", "right"]].set_visible(False)
     notes.axis("off")
     return figure, axes, notes
 
 
-def _finish(figure, axes, notes, title, texts):
-    """Title, legend, and the texts below it."""
+def _finish(figure, axes, notes, title, texts, found):
+    """Title with the machine, legend, and the texts below it."""
     known = {}
     for each in axes:
         number_axis(each.xaxis)
         known.update(zip(*reversed(each.get_legend_handles_labels()), strict=True))
-    notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=7, borderaxespad=0.0)
-    top = 1.0 - 0.155 * (len(known) + 1) / figure.get_size_inches()[1]
-    notes.text(0.0, top, "\n".join(texts), fontsize=7, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
-    figure.suptitle(title, fontsize=9, color=GREY, parse_math=False)
+    notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=_SMALL, borderaxespad=0.0)
+    top = 1.0 - 0.19 * (len(known) + 1) / figure.get_size_inches()[1]
+    notes.text(0.0, top, "\n".join(texts), fontsize=_SMALL, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
+    title = f"{title}, on {in_words(found['machine'])}"
+    figure.suptitle(title, fontsize=_TEXT + 1.0, color=GREY, parse_math=False)

@@ -41,6 +41,12 @@ def name(device="cpu"):
     return ", ".join([platform.node(), facts["processor"], *([] if facts["device"] == "cpu" else [facts["device"]])])
 
 
+def in_words(facts):
+    """The device of :func:`machine`, of a CPU its name and cores, and the version of Warp, as a title has them."""
+    device = facts["device"] if facts["device"] != "cpu" else f"{facts['processor']}, {facts['cores']} cores"
+    return f"{device}, Warp {facts['warp']}"
+
+
 def processor():
     """The name on the package; Linux alone says it in a file."""
     try:

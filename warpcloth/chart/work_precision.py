@@ -216,20 +216,33 @@ def cheapest(rows, floor=0.0):
     return list(found.values())
 
 
-def front(rows, floor=0.0):
-    """Places of the rows that no other beats in both time and error, the fastest first.
+def front(rows, floor=0.0, name="error"):
+    """Places of the rows that no other beats in both time and error by more than times spread, the fastest first.
+
+    A row whose error another leaves behind in a time that may as well be its own, within the quartiles of both, is not on it.
 
     Args:
         rows: Of :func:`time_diagram`.
         floor: Error of the reference: what is below it is as good as any other there.
+        name: The error, "error" or "strain_error".
     """
-    places = [i for i, row in enumerate(rows) if _has_error(row)]
-    found, least = [], float("inf")
-    for i in sorted(places, key=lambda i: (rows[i]["ms_per_second"], rows[i]["error"])):
-        if rows[i]["error"] < least:
-            found.append(i)
-            least = rows[i]["error"] if rows[i]["error"] > floor else -1.0
-    return found
+    places = [i for i, row in enumerate(rows) if row["status"] == "ok" and row[name] is not None]
+    levels, spreads = {i: max(rows[i][name], floor) for i in places}, {i: spread(rows[i]) for i in places}
+    order = {i: (rows[i]["ms_per_second"], rows[i][name], i) for i in places}
+
+    def beats(i, j):
+        if levels[i] == levels[j]:
+            return order[i] < order[j]
+        return levels[i] < levels[j] and spreads[i][0] <= spreads[j][1]
+
+    return sorted((j for j in places if not any(beats(i, j) for i in places)), key=order.get)
+
+
+def spread(row):
+    """The quartiles of what a second of motion takes, (low, high) [ms]; both its median where they are not known."""
+    if not row.get("spread"):
+        return row["ms_per_second"], row["ms_per_second"]
+    return tuple(each * row["ms_per_second"] / row["ms"] for each in row["spread"])
 
 
 def left_out(found):
