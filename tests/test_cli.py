@@ -4,7 +4,9 @@ import contextlib
 import json
 import math
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -17,9 +19,10 @@ import warpcloth.cli.run
 import warpcloth.usd
 from warpcloth import scene_files
 from warpcloth.cli import main
+from warpcloth.outputs import Lock
 from warpcloth.scene import Scene
 from warpcloth.solvers import explicit
-from warpcloth.usd import FrameSequence
+from warpcloth.usd import FrameSequence, chunks
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["hanging", "-p", "n=5"]
@@ -534,3 +537,122 @@ def test_a_process_that_is_interrupted_leaves_a_file_that_opens(tmp_path):
     assert "interrupted after frame " in err and err.count("\n") == 1
     saved = int(err.split("frames 0 to ")[1].split()[0])
     assert abs(len(FrameSequence(output)) - 1 - saved) <= 1  # a frame may be kept and not yet counted
+
+
+def interrupt_in(monkeypatch, target, attribute, number, call=1, times=1):
+    """Raises a signal where a function is called for the given time, so many times."""
+    real, calls = getattr(target, attribute), []
+
+    def interrupting(*args, **kwargs):
+        calls.append(args)
+        if len(calls) == call:
+            for _ in range(times):
+                signal.raise_signal(number)
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(target, attribute, interrupting)
+
+
+# Where an interrupt comes, as (what is called then, the how many-th call), and the frames that there are then of 25.
+MOMENTS = {
+    "a chunk": (chunks.ChunkWriter, "_write_pending", 2, 20),
+    "its root": (chunks.ChunkWriter, "_write_root", 2, 20),
+    "the last chunk": (chunks.ChunkWriter, "_write_pending", 3, 25),
+    "the source": (chunks.ChunkWriter, "_check_source", 1, 25),
+    "one file": (chunks.ChunkWriter, "_copy_frames", 1, 25),
+    "removing": (chunks.shutil, "rmtree", 1, 25),
+    "the summary": (warpcloth.cli.run, "_summary", 1, 25),
+}
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["ctrl-c", "sigterm"])
+@pytest.mark.parametrize("ending", ["usdc", "usdz"])
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_an_interrupt_finishes_the_file_and_says_what_is_in_it(moment, ending, number, code, tmp_path, capfd, monkeypatch):
+    target, attribute, call, frames = MOMENTS[moment]
+    output = tmp_path / f"out.{ending}"
+    interrupt_in(monkeypatch, target, attribute, number, call)
+    found = run(capfd, "run", *SMALL, "--frames", 24, "--single-file", "-o", output)
+    last = f"frame {frames - 1} of 24" if moment != "the summary" else "frame 24, the last one"
+    assert found == (code, "", f"warpcloth: interrupted after {last}; frames 0 to {frames - 1} are in {output}\n")
+    assert len(FrameSequence(output)) == frames
+    assert list(tmp_path.iterdir()) == [output]
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.parametrize("ending", ["usdc", "usdz"])
+@pytest.mark.parametrize("moment", ["its root", "the last chunk", "one file", "removing"])
+def test_a_second_interrupt_comes_at_once_and_loses_nothing(moment, ending, tmp_path, capfd, monkeypatch):
+    """The file that is named has what is said, whatever was made of it, and stays when the same command runs again."""
+    target, attribute, call, _ = MOMENTS[moment]
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patched:
+        interrupt_in(patched, target, attribute, signal.SIGINT, call, times=2)
+        code, out, err = run(capfd, "run", *SMALL, "--frames", 24, "--single-file", "-o", f"out.{ending}")
+    assert (code, out, err.count("\n")) == (130, "", 1)
+    last, path = re.search(r"; frames 0 to (\d+) are in ([^ ,\n]+)", err).groups()
+    before = np.asarray(FrameSequence(path))
+    assert len(before) == int(last) + 1 >= (25 if moment in ("one file", "removing") else 10)
+    assert ("was not made" in err) == (path != f"out.{ending}")
+    code, _, err = run(capfd, "run", *SMALL, "--frames", 3, "-o", f"out.{ending}")
+    assert code == 0 and len(FrameSequence(f"out.{ending}")) == 4
+    complete = path != f"out.{ending}" and int(last) == 24
+    assert ("has all frames of an earlier run that was not packed, and is kept" in err) == complete
+    if complete:
+        np.testing.assert_array_equal(FrameSequence(path), before)
+
+
+def test_interrupts_in_the_frames_before_and_after_them(tmp_path, capfd, monkeypatch):
+    """Before the first frame nothing is left; in frames one ends the run and a second one leaves it in chunks."""
+    output, watch = tmp_path / "out.usdz", sys.modules["warpcloth.simulate"].Watch
+    with monkeypatch.context() as patched:
+        interrupt_in(patched, watch, "__init__", signal.SIGINT)
+        found = run(capfd, "run", *SMALL, "-o", output)
+    assert found == (130, "", "warpcloth: interrupted before the first frame; nothing was saved\n")
+    assert list(tmp_path.iterdir()) == []
+    with monkeypatch.context() as patched:
+        interrupt_in(patched, watch, "passes", signal.SIGTERM, call=13)
+        interrupt_in(patched, chunks.Contents, "write", signal.SIGINT)
+        code, _, err = run(capfd, "run", *SMALL, "-o", output)
+    assert code == 130 and "after frame 12 of 60; frames 0 to 12 are in " in err and err.endswith(" was not made\n")
+    assert len(FrameSequence(re.search(r"are in (\S+),", err)[1])) == 13
+
+
+# Begins an import, and comes in the middle of it.
+SITE = """
+import os, signal, sys
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "warpcloth.rotation":
+            os.kill(os.getpid(), signal.{})
+
+sys.meta_path.insert(0, Finder())
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("how", [["-m", "warpcloth"], ["-m", "warpcloth.cli"], ["warpcloth"]])
+def test_an_interrupt_while_modules_load_is_one_line(how, name, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(SITE.format(name))
+    (tmp_path / "warpcloth").write_text("import sys\nfrom warpcloth.cli import main\nsys.exit(main())\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    argv = [sys.executable, *how, "scenes"]
+    found = subprocess.run(argv, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert (found.returncode, found.stdout) == (128 + getattr(signal, name), "")
+    assert found.stderr == "warpcloth: interrupted\n"
+
+
+def test_an_output_that_another_process_writes_is_refused(tmp_path, capfd):
+    """In one line and at once; a file that a lock left behind, of a process that is gone, is no lock."""
+    output, left = tmp_path / "out.usdc", tmp_path / ".out.usdc.lock"
+    left.write_text("process 1 on nowhere")
+    assert run(capfd, "run", *SMALL, "--frames", 2, "-o", output)[0] == 0
+    assert not left.exists() and len(FrameSequence(output)) == 3
+    lock = Lock(output)
+    try:
+        refused(capfd, ["run", *SMALL, "-o", output], f"is being written by process {os.getpid()} on {socket.gethostname()}")
+        refused(capfd, ["deform", "bar_twist", "-o", output], "wait until it ends, or give another output")
+    finally:
+        lock.release()
+    assert len(FrameSequence(output)) == 3 and not left.exists()

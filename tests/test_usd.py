@@ -1,12 +1,17 @@
 """USD files: what is read, what is written, and what is left when the writer is killed."""
 
+import errno
+import gc
 import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +21,10 @@ import warp.examples
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from usd_validation import validate
 
+from warpcloth.analysis import Analyzer
 from warpcloth.mesh import Mesh
-from warpcloth.usd import AnimationWriter, FrameSequence, read_mesh, read_stage_mesh
+from warpcloth.reports import write_report
+from warpcloth.usd import AnimationWriter, FrameSequence, chunks, read_mesh, read_stage_mesh
 
 EPS = np.finfo(np.float32).eps
 FRAMES = 8
@@ -903,6 +910,228 @@ def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step, single_file):
         np.testing.assert_allclose(points, motion(mesh, frame, -1.0 if step <= 3 else 1.0)[0], atol=4 * EPS)
 
 
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+@pytest.mark.parametrize("ending", ["usda", "usdc", "usdz"])
+def test_a_reader_finds_a_whole_file_at_any_moment(tmp_path, monkeypatch, ending, single_file):
+    """Before and after each rename, when it opens what was there before or the new frames so far."""
+    mesh, output, seen = Mesh.grid(5, 4), tmp_path / f"out.{ending}", []
+    write(output, mesh, frames=30, sign=-1.0)
+    real = os.replace
+
+    def look():
+        for path in {str(output), writer.path}:
+            if os.path.exists(path):
+                found = FrameSequence(path)
+                sign = -1.0 if len(found) == 30 else 1.0
+                seen.append(len(found))
+                for frame, points in enumerate(found):
+                    np.testing.assert_allclose(points, motion(mesh, frame, sign)[0], atol=4 * EPS)
+
+    def replace(*paths):
+        look()
+        real(*paths)
+        look()
+
+    writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
+    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace)
+    for frame in range(FRAMES):
+        writer.append(*motion(mesh, frame))
+    writer.close(single_file=single_file)
+    assert set(seen) == {30, 3, 6, 8}
+
+
+def test_an_output_has_one_writer_at_a_time(tmp_path):
+    """Of two threads that begin together one is refused or comes later; both endings beside each other go on."""
+    mesh, output = Mesh.grid(4, 4), tmp_path / "out.usdc"
+
+    def run(sign):
+        together.wait()
+        try:
+            return write(output, mesh, sign=sign)
+        except BlockingIOError as error:
+            return str(error)
+
+    for _ in range(20):
+        together = threading.Barrier(2, timeout=60.0)
+        with ThreadPoolExecutor(2) as pool:
+            found = list(pool.map(run, (1.0, -1.0)))
+        assert str(output) in found
+        assert all(text == str(output) or f"{output}: is being written by process {os.getpid()} on " in text for text in found)
+        points = np.asarray(FrameSequence(output))
+        sign = np.sign(points[1, 0, 2])
+        for frame in range(FRAMES):
+            np.testing.assert_allclose(points[frame], motion(mesh, frame, sign)[0], atol=4 * EPS)
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["out.usdc", "out_frames"]
+    with AnimationWriter(output, mesh, 24) as writer:
+        writer.append(*motion(mesh, 0))
+        write(tmp_path / "out.usdz", mesh)
+    assert len(FrameSequence(output)) == 1 and len(FrameSequence(tmp_path / "out.usdz")) == FRAMES
+
+
+def test_a_writer_that_nobody_closed_or_that_failed_holds_nobody_up(tmp_path):
+    mesh, output = Mesh.grid(4, 4), tmp_path / "out.usdc"
+    writer = AnimationWriter(output, mesh, 24)
+    writer.append(*motion(mesh, 0))
+    with pytest.raises(BlockingIOError):
+        write(output, mesh)
+    del writer
+    gc.collect()
+    with pytest.raises(ValueError, match="velocities"), AnimationWriter(output, mesh, 24) as writer:
+        writer.append(mesh.points, mesh.points[:1])
+    with pytest.raises(ValueError, match="source"), AnimationWriter(output, mesh, 24) as writer:
+        raise ValueError("source")
+    assert len(FrameSequence(write(output, mesh))) == FRAMES
+
+
+HOLDER = """
+import os, sys
+sys.path[:0] = {path!r}
+from test_usd import Mesh, motion
+from warpcloth.usd import AnimationWriter
+writer = AnimationWriter(sys.argv[1], Mesh.grid(4, 4), 24)
+writer.append(*motion(Mesh.grid(4, 4), 0))
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_writer_of_another_process_is_waited_for_until_it_is_killed(tmp_path):
+    mesh, output = Mesh.grid(4, 4), tmp_path / "out.usdc"
+    script = HOLDER.format(path=[str(Path(__file__).parent), *sys.path])
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", script, str(output)], **pipes) as holder:
+        assert holder.stdout.readline() == "ready\n"
+        with pytest.raises(BlockingIOError, match=rf"out\.usdc: is being written by process {holder.pid} on .*; wait"):
+            write(output, mesh)
+        holder.kill()
+        holder.wait()
+    assert (tmp_path / ".out.usdc.lock").exists()
+    assert len(FrameSequence(write(output, mesh))) == FRAMES
+    assert not (tmp_path / ".out.usdc.lock").exists()
+
+
+def test_a_folder_without_locks_warns(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("warpcloth.outputs._lock", refuse)
+    with pytest.warns(UserWarning, match=r"out\.usdc: its folder takes no locks; keep other runs away from it"):
+        write(tmp_path / "out.usdc", Mesh.grid(4, 4))
+    assert len(FrameSequence(tmp_path / "out.usdc")) == FRAMES
+
+
+def spoil(folder, act):
+    """Does to a source, or to what stands of an output, what nobody should do during a run."""
+    stage, output = folder / "artist.usda", folder / "out.usdc"
+    if act == "delete":
+        stage.unlink()
+    elif act == "garble":
+        stage.write_text("garbage")
+    elif act == "triangles":
+        artist_stage(stage, Mesh.grid(3, 3))
+    elif act == "touch":
+        stage.write_text(stage.read_text() + "# said later\n")
+    elif act == "frames":
+        shutil.rmtree(folder / "out_frames")
+    elif act == "folder":
+        if output.exists():
+            output.unlink()
+        output.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("act", "ending", "single_file", "message", "kept"),
+    [
+        *(
+            (act, *how, "has changed during the run and no longer fits", FRAMES)
+            for act in ("delete", "garble", "triangles")
+            for how in (("usdc", False), ("usdc", True), ("usdz", True))
+        ),
+        ("frames", "usdc", False, "has been removed during the run, with frames 0 to 2; nothing was saved", 0),
+        ("folder", "usdc", False, "out.usdc: could not be written: Is a directory; frames 0 to 5 are in ", 6),
+    ],
+)
+def test_what_changes_during_a_run_is_noticed(tmp_path, act, ending, single_file, message, kept):
+    """In one sentence, which says where the frames are; no later run removes them."""
+    source = artist_stage(tmp_path / "artist.usda", Mesh.grid(5, 4))
+    original, mesh, output = Path(source).read_text(), read_mesh(source), tmp_path / f"out.{ending}"
+    writer = AnimationWriter(output, mesh, 24, source=source, chunk=CHUNK)
+    with pytest.raises((ValueError, OSError), match=message) as caught:
+        try:
+            for frame in range(FRAMES):
+                writer.append(*motion(mesh, frame))
+                if frame == CHUNK:
+                    spoil(tmp_path, act)
+        finally:
+            writer.close(single_file=single_file)
+    assert "\n" not in str(caught.value) and writer.kept == kept
+    assert not output.is_file() or ending != "usdz"
+    Path(source).write_text(original)
+    if kept:
+        assert f"frames 0 to {kept - 1} are in {writer.path}" in str(caught.value)
+        sequence = np.asarray(FrameSequence(writer.path))
+        assert len(sequence) == kept
+        np.testing.assert_allclose(sequence[-1], motion(mesh, kept - 1)[0], rtol=0, atol=1e-5)
+    if output.is_dir():
+        output.rmdir()
+    path = writer.path
+    del writer
+    if path != str(output):
+        with pytest.warns(UserWarning, match="has all frames of an earlier run that was not packed, and is kept"):
+            write(output, mesh, source=source)
+        assert len(FrameSequence(path)) == kept
+
+
+@pytest.mark.parametrize("ending", ["usdc", "usdz"])
+def test_a_source_that_changes_and_fits_is_said(tmp_path, ending):
+    source = artist_stage(tmp_path / "artist.usda", Mesh.grid(5, 4))
+    mesh = read_mesh(source)
+    with (
+        pytest.warns(UserWarning, match=r"artist\.usda: has changed during the run; the frames are of what it was before"),
+        AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, source=source, chunk=CHUNK) as writer,
+    ):
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame))
+            spoil(tmp_path, "touch" if frame == CHUNK else None)
+    assert len(FrameSequence(tmp_path / f"out.{ending}")) == FRAMES
+
+
+@pytest.mark.parametrize("cut", [False, True], ids=["ended", "cut-short"])
+def test_a_run_that_was_cut_short_is_recovered_under_its_own_name(tmp_path, cut):
+    """What is read is not removed, not by what is made of it and not where that is cut short in its turn."""
+    mesh, output = Mesh.grid(5, 4), tmp_path / "out.usdz"
+    writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
+    for frame in range(2 * CHUNK):
+        writer.append(*motion(mesh, frame))
+    left = writer.path
+    del writer  # killed: nothing is packed
+    gc.collect()
+    analyzer = Analyzer(None, left)
+    if cut:
+        with pytest.raises(KeyboardInterrupt):
+            write_report(analyzer, usd=output, progress=lambda row, _: interrupt_twice(row == 4))
+    else:
+        write_report(analyzer, usd=output)
+        for frame, points in enumerate(FrameSequence(output)):
+            np.testing.assert_allclose(points, motion(mesh, frame)[0], atol=4 * EPS)
+    again = np.asarray(FrameSequence(left))
+    assert len(again) == 2 * CHUNK
+    np.testing.assert_allclose(again[-1], motion(mesh, 2 * CHUNK - 1)[0], atol=4 * EPS)
+
+
+def interrupt_twice(now):
+    """Of which the second comes while the first has the file packed."""
+    if now:
+        real = chunks.Contents.write
+
+        def write(*_):
+            chunks.Contents.write = real
+            raise KeyboardInterrupt
+
+        chunks.Contents.write = write
+        raise KeyboardInterrupt
+
+
 VICTIM = """
 import itertools, os, sys
 sys.path[:0] = {path!r}
@@ -944,11 +1173,16 @@ def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, ending, with_source, 
         victim.send_signal(signal.SIGKILL)
         assert victim.wait() == -signal.SIGKILL
         check_survivor(output, mesh, log.read_text(), source)
-        # The next run is not disturbed by what is left, and clears it away.
-        write(output, mesh, source=source or None)
+        # The next run is not disturbed by what is left, and clears it away; but not what was only to be packed.
+        folder = tmp_path / f"{trial}_frames"
+        complete = [path.parent for path in folder.glob("usdz-*/complete")]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            write(output, mesh, source=source or None)
         assert len(FrameSequence(output)) == FRAMES
-        left = list((tmp_path / f"{trial}_frames").glob("*"))
-        assert len(left) == (0 if ending == "usdz" else 1)
+        left = list(folder.glob("*"))
+        assert left == complete if ending == "usdz" else len(left) == 1
+        assert not list(tmp_path.glob(".*.lock"))
 
 
 def check_survivor(output, mesh, log, source):

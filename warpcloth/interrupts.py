@@ -109,13 +109,20 @@ def leave(number, _frame):
 
 
 def leave_while_loading():
-    """Makes interrupts end the command while its modules load, which takes a second, and once it has said its last word."""
-    ran = sys.orig_argv[sys.orig_argv.index("-m") + 1 :][:1] if sys.argv[:1] == ["-m"] and "-m" in sys.orig_argv else []
-    name = ran[0].partition(".")[0] if ran else os.path.basename(sys.argv[0] if sys.argv else "").partition(".")[0]
-    if name == "warpcloth" and threading.current_thread() is threading.main_thread():
+    """Makes interrupts end the command while its modules load, which takes a second, and once it has said its last word.
+
+    Processes that it starts to measure in end without a word.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    processes = sys.modules.get("multiprocessing.process")
+    end = signal.SIG_DFL if processes and processes.parent_process() else leave
+    ran = sys.orig_argv[sys.orig_argv.index("-m") + 1] if sys.argv[:1] == ["-m"] and "-m" in sys.orig_argv else None
+    ran = ran or os.path.basename(sys.argv[0] if sys.argv else "")
+    if ran.partition(".")[0] == "warpcloth":
         for number, replaced in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
             if signal.getsignal(number) is replaced:
-                signal.signal(number, leave)
+                signal.signal(number, end)
 
 
 leave_while_loading()

@@ -160,7 +160,7 @@ class Progress:
     """Counts frames, and shows them on a terminal."""
 
     def __init__(self, frames=None, hint=None, first="compiling"):
-        self.frame, self.frames, self.hint = None, frames, hint
+        self.frame, self.frames, self.hint, self.closed = None, frames, hint, False
         self.bar = open_bar(frames, first, "{n_fmt} of {total_fmt} frames{postfix}, {remaining} left")
 
     def __call__(self, frame, frames):
@@ -180,15 +180,16 @@ class Progress:
             self.bar.update()
 
     def close(self):
+        self.closed = True
         if self.bar is not None:
             self.bar.close()
 
     @contextlib.contextmanager
     def of(self, output):
-        """Closes the bar, however the block ends; an interrupt after the last frame says where the frames are.
+        """Closes the bar, however the block ends; an interrupt once it is closed says where the frames are.
 
         Raises:
-            Interrupted: The user did, then or before; what makes the frames says the rest by itself.
+            Interrupted: The user did, then or before the first frame; between them whoever makes the frames says the rest.
         """
         try:
             yield
@@ -197,6 +198,8 @@ class Progress:
         except KeyboardInterrupt:
             if self.frame is None:
                 raise Interrupted("interrupted before the first frame; nothing was saved") from None
+            if not self.closed:
+                raise
             done = f"interrupted after frame {self.frame}, the last one"
             raise Interrupted(f"{done}; frames 0 to {self.frame} are in {output}") from None
         finally:

@@ -72,12 +72,12 @@ class ChunkWriter:
             raise ValueError(f"chunk = {chunk}: must be a whole number, at least 1")
         self._chunk = int(chunk)
         self._counts = {"vertex": len(mesh.points), "uniform": len(mesh.triangles)}
-        self._folder = frames_folder(self._output)
+        self._folder, self._packed = frames_folder(self._output), self._output.suffix == ".usdz"
         if self._folder.exists() and not self._folder.is_dir():
             raise ValueError(f"{self._folder}: is a file, must be free for the folder of frames")
         # A name never used before: pxr may still hold layers of an earlier run in this process, and would show those.
         self._run = self._folder / f"{self._output.suffix[1:]}-{secrets.token_hex(4)}"
-        self.path = str(self._run / "animation.usdc" if self._output.suffix == ".usdz" else self._output)
+        self.path = str(self._run / "animation.usdc" if self._packed else self._output)
         self.frames = self.kept = 0
         self._given, self._packing, self._lock = os.fspath(output), False, None
         self._span = None  # first and last time code appended
@@ -154,10 +154,10 @@ class ChunkWriter:
             return
         try:
             with deferred(not isinstance(sys.exc_info()[1], KeyboardInterrupt)):
-                self._write_chunk()
+                self._packing = single_file or self._packed
+                self._write_chunk(last=True)
                 self._closed = True
                 if self._chunks:
-                    self._packing = single_file or self._output.suffix == ".usdz"
                     self._check_source()
                     if self._packing:
                         self._write_single_file()
@@ -236,11 +236,13 @@ class ChunkWriter:
         """Paths of all sampled attributes."""
         return [f"{target.prim}.{name}" for target in self._targets for name in target.attributes]
 
-    def _write_chunk(self):
+    def _write_chunk(self, last=False):
         """Writes the pending frames as a clip, and a root that has it."""
-        if self._pending:
-            with deferred():
+        with deferred():
+            if self._pending:
                 self._write_pending()
+            if last and self._packed and self._chunks:
+                (self._run / _COMPLETE).touch()
 
     def _write_pending(self):
         if not self._chunks:
@@ -261,7 +263,7 @@ class ChunkWriter:
         self._write_root(chunks)
         # Only now, so that a chunk whose writing was interrupted is written again by close.
         self._chunks, self._pending, self.kept = chunks, [], self.frames
-        if len(chunks) == 1 and self._output.suffix != ".usdz":
+        if len(chunks) == 1 and not self._packed:
             self._remove_other_runs()
 
     def _start_run(self):
@@ -322,11 +324,8 @@ class ChunkWriter:
                 shutil.rmtree(folder, ignore_errors=True)  # a file that another process has open is worth no run
 
     def _write_single_file(self):
-        packed = self._output.suffix == ".usdz"
-        if packed:
-            (self._run / _COMPLETE).touch()
         contents = Contents(self._run)
-        named = contents.named if packed else named_from(self._output.parent)
+        named = contents.named if self._packed else named_from(self._output.parent)
         flat = self._declared(flatten(self._base_paths(), self._describe, named))
         for attribute in self._attributes():
             flat.GetAttributeAtPath(attribute).ClearInfo("timeSamples")
@@ -334,7 +333,7 @@ class ChunkWriter:
         _export(flat, single)
         self._copy_frames(single)
         finished = self._run / f"finished{self._output.suffix}"
-        if packed:
+        if self._packed:
             with _writing(self._output):
                 contents.write(single, finished, self._output)
         elif self._output.suffix == ".usda":
@@ -346,7 +345,7 @@ class ChunkWriter:
         (self._run / _COMPLETE).unlink(missing_ok=True)
         shutil.rmtree(self._run)
         with suppress(OSError):  # it may have gone, or be in use, by a run to another ending
-            if packed:
+            if self._packed:
                 self._remove_other_runs()
             self._folder.rmdir()
 

@@ -1,0 +1,81 @@
+"""Interrupts wait for what is being finished, once; who ignores them, or has a handler of his own, keeps it."""
+
+import signal
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from warpcloth.interrupts import Interrupted, Interrupts, deferred, recording
+
+
+def test_the_first_interrupt_waits_and_a_second_one_does_not():
+    done = []
+    with pytest.raises(KeyboardInterrupt), deferred():
+        signal.raise_signal(signal.SIGINT)
+        done.append("first")
+    with pytest.raises(KeyboardInterrupt), deferred():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        done.append("second")
+    with pytest.raises(KeyboardInterrupt), deferred(first=False):
+        signal.raise_signal(signal.SIGINT)
+        done.append("second")
+    with pytest.raises(KeyboardInterrupt), deferred():
+        with deferred():
+            signal.raise_signal(signal.SIGINT)
+            done.append("inner")
+        done.append("outer")
+    assert done == ["first", "inner", "outer"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_error_comes_before_the_interrupt_that_waits():
+    with pytest.raises(OSError, match="full"), deferred():
+        signal.raise_signal(signal.SIGINT)
+        raise OSError("full")
+
+
+def test_other_threads_and_handlers_are_left_alone():
+    def run():
+        with deferred(), Interrupts() as interrupts:
+            return interrupts.code, signal.getsignal(signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(run).result() == (130, signal.default_int_handler)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with deferred(), Interrupts():
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_the_command_has_the_code_of_its_signal_and_says_it_undisturbed(number, code):
+    with Interrupts() as interrupts:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+        interrupts.ignore()
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGTERM)
+        assert interrupts.code == code
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_an_interrupt_says_what_was_recorded():
+    class Recorder:
+        frames, closed = 0, False
+
+        def close(self):
+            self.closed = True
+
+        def saved(self):
+            return "they are here"
+
+    recorder = Recorder()
+    for frames, when in ((0, "before the first frame"), (3, "after frame 2 of 9")):
+        recorder.frames = frames
+        with pytest.raises(Interrupted, match=f"^interrupted {when}; they are here$"), recording(recorder, 9):
+            raise KeyboardInterrupt
+        assert recorder.closed
