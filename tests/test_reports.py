@@ -385,7 +385,11 @@ def test_an_interruption_keeps_rows_and_without_any_what_was_there(frame, kept, 
         return sequence.read(place)
 
     monkeypatch.setattr("warpcloth.sequences.open_sequence", lambda *_: replace(sequence, read=read))
+    capsys.readouterr()
     assert main(["analyze", str(cloth), "--reference", "previous", *outputs]) == 130
+    saved = "nothing was saved" if kept else f"they are in {', '.join(outputs[1::2])}"
+    rows = f"interrupted after {0 if kept else frame - 1} of 6 frames"
+    assert capsys.readouterr().err == f"warpcloth: {rows}; {saved}\n"
     after = {path: path.read_bytes() for path in tmp_path.iterdir()}
     assert after.keys() == before.keys() and (after == before) is kept
     assert kept or len((tmp_path / "t.csv").read_text().splitlines()) == 1 + 2 * (frame - 1)
