@@ -94,10 +94,15 @@ def BasisCurves "Cloth"
 """
 
 WRONG_STAGES = [  # the text, what stands in place of a part of it, the sentence after the path
-    (STAGE, "metersPerUnit = 1", "metersPerUnit = -1", "metersPerUnit is -1.0, must be a finite number above 0"),
+    (STAGE, "metersPerUnit = 1", "metersPerUnit = -1", r"metersPerUnit is -1.0, must be a number of 1e-18 to 1e\+18"),
     (STAGE, "kilogramsPerUnit = 1", "kilogramsPerUnit = nan", "kilogramsPerUnit is nan, must be"),
     (STAGE, '"Y"', '"X"', 'upAxis is \'X\', must be "Y" or "Z"'),
-    (STAGE, "timeCodesPerSecond = 24", "timeCodesPerSecond = 0", "timeCodesPerSecond is 0.0, must be a finite number above 0"),
+    (
+        STAGE,
+        "timeCodesPerSecond = 24",
+        "timeCodesPerSecond = 0",
+        r"timeCodesPerSecond is 0.0, must be a number of 1e-06 to 1e\+06",
+    ),
     (STAGE, "timeCodesPerSecond = 24", "timeCodesPerSecond = -24", "timeCodesPerSecond is -24.0, must be"),
     (STAGE, "framesPerSecond = 24", "framesPerSecond = inf", "framesPerSecond is inf, must be"),
     (STAGE, "startTimeCode = 0", "startTimeCode = -1e18", r"startTimeCode is -1e\+18, must be a number of -1e\+09 to 1e\+09"),

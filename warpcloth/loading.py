@@ -193,7 +193,7 @@ def _arrays(path, geometry, transform, drop_unused):
     triangles = np.asarray(geometry.faces, dtype=np.int64)
     if not np.array_equal(transform, np.eye(4)):
         points = points @ transform[:3, :3].T + transform[:3, 3]
-        if np.linalg.det(transform[:3, :3]) < 0:  # a mirror turns the front of a triangle to the back
+        if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # a mirror turns the front of a triangle to the back
             triangles = triangles[:, ::-1]
     # Of an OBJ trimesh takes the mean of the *indices* that a vertex has at a seam: unrelated coordinates.
     st = None if ending == ".obj" else getattr(geometry.visual, "uv", None)

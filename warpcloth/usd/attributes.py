@@ -161,9 +161,9 @@ class Values:
 
 
 def _kind(type_name):
-    """What a type holds, whatever its precision: text or numbers, one or several, how many components."""
+    """What a type holds, whatever its precision: text, numbers or nothing known, one or several, how many components."""
     default = type_name.scalarType.defaultValue
-    return isinstance(default, str), type_name.isArray, np.shape(default)
+    return default is None, isinstance(default, str), type_name.isArray, np.shape(default)
 
 
 def has_api(prim, name):

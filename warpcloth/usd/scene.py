@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
+from ..limits import MOST_FRAMES
 from ..mesh import Mesh
 from ..scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
@@ -136,8 +137,8 @@ def _duration(stage, values, fps):
     if duration is None:
         seconds = stage.GetEndTimeCode() - stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
         return max(0.0, np.floor(seconds / stage.GetTimeCodesPerSecond() * fps * (1 + 1e-9)) / fps) or 1.0
-    if not 0.0 < duration < np.inf:
-        raise ValueError(f"warpcloth:duration is {duration} s, must be finite and above 0")
+    if not 0.0 < float(duration) * fps <= MOST_FRAMES:
+        raise ValueError(f"warpcloth:duration is {duration} s, must be finite and above 0, and {MOST_FRAMES:,} frames at most")
     return float(duration)
 
 

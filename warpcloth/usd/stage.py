@@ -119,7 +119,7 @@ def _stage_mesh(stage, path, prim, kind, time):
             _refuse_moving_topology(found)
         if found.IsA(UsdGeom.Mesh):
             corners, triangles = _corners(found, len(points))
-            if np.linalg.det(transform[:3, :3]) < 0:
+            if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # the sign alone, for the rest may overflow
                 triangles = triangles[:, ::-1]
             at_vertices, at_corners = _texture_coordinates(found, len(points), corners)
             corner_coordinates = None if at_corners is None else at_corners[triangles]

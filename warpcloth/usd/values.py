@@ -1,6 +1,5 @@
 """Values of a stage, each read with a check: what is wrong is refused by its name before it reaches any arithmetic."""
 
-import math
 import os
 import unicodedata
 import warnings
@@ -14,6 +13,10 @@ from ..checks import shown
 
 # Beyond it neighbouring time codes, which are float64, are more than 1e-7 apart, and frames cannot be told by them.
 MOST_TIME_CODE = 1e9
+# Frames and time codes in a second: from one in eleven days to one a microsecond.
+_RATES = (1e-6, 1e6)
+# Metres and kilograms in a unit: a light year is 1e16 m.
+_UNITS = (1e-18, 1e18)
 
 _listening = False
 
@@ -84,19 +87,17 @@ def check_stage(stage, path):
         "kilogramsPerUnit": UsdPhysics.GetStageKilogramsPerUnit(stage),
     }
     for name, value in units.items():
-        _refuse_unless(0.0 < value < math.inf, path, name, value, "a finite number above 0")
+        _refuse_outside(path, name, value, *_UNITS)
     axis = UsdGeom.GetStageUpAxis(stage)
-    _refuse_unless(axis in ("Y", "Z"), path, "upAxis", str(axis), '"Y" or "Z"')
+    if axis not in ("Y", "Z"):
+        raise ValueError(f'{path}: upAxis is {shown(str(axis))}, must be "Y" or "Z"')
     for layer in stage.GetUsedLayers():
         where = path if layer == stage.GetRootLayer() else f"{path}, layer {layer.identifier}"
         for name in ("timeCodesPerSecond", "framesPerSecond"):
             rate = getattr(layer, name)
-            _refuse_unless(0.0 < rate < math.inf, where, name, rate, "a finite number above 0")
+            _refuse_outside(where, name, rate, *_RATES)
         for name in ("startTimeCode", "endTimeCode"):
-            code = getattr(layer, name)
-            _refuse_unless(
-                abs(code) <= MOST_TIME_CODE, where, name, code, f"a number of -{MOST_TIME_CODE:g} to {MOST_TIME_CODE:g}"
-            )
+            _refuse_outside(where, name, getattr(layer, name), -MOST_TIME_CODE, MOST_TIME_CODE)
 
 
 def check_composed(prim, path):
@@ -110,9 +111,9 @@ def check_composed(prim, path):
             raise ValueError(f"{path}, prim {prim.GetPath()}: {_plain(str(error))} It must be there")
 
 
-def _refuse_unless(good, where, name, value, rule):
-    if not good:
-        raise ValueError(f"{where}: {name} is {shown(value)}, must be {rule}")
+def _refuse_outside(where, name, value, least, most):
+    if not least <= value <= most:
+        raise ValueError(f"{where}: {name} is {shown(value)}, must be a number of {least:g} to {most:g}")
 
 
 def value_of(attribute, time=None):
