@@ -75,17 +75,18 @@ def _default(row):
 
 
 class _Refused:
-    """A value that no option takes."""
+    """A value that no option takes; one of words is asked with a text, so that it names those."""
 
 
 def _allowed(call, name, parameter):
     """What a solver's record or the function of a scene says of a value that it refuses; else what its type takes."""
     kinds = scene_files.kinds_of_parameter(parameter)
+    refused = "?" if str in kinds else _Refused()
     for more in ({}, {"substeps": 1}):  # a record wants a step before it looks at the rest
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                call(**{**more, name: _Refused()})
+                call(**{**more, name: refused})
         except Exception as error:
             said, _, rule = str(error).partition("; it must be ")
             if rule and said.startswith(f"{name} is "):
