@@ -166,7 +166,8 @@ def test_commands(address, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
     monkeypatch.setattr(clusters, "_ANSWER", 0.5)
     chart = ["chart", "work-precision", "chain", "-p", "links=3", "--frames", "2", "--solvers", "explicit"]
-    stability = "chart stability chain -p links=3 --x dt --y stiffness --x-range 1e-3 1e-1 3 --y-range 1 10 2 --steps 4".split()
+    stability = "chart stability chain -p links=3 --x dt --y stiffness --x-range 1e-3 1e-1 3 --y-range 1 10 2".split()
+    stability += ["--steps", "4", "--duration", "0.01"]
     choose = ["choose", "chain", "-p", "links=3", "--frames", "2", "--tolerance", "1%", "--solvers", "explicit"]
     for command in (chart, [*stability, "--solvers", "explicit"], choose):
         assert main([*command, "--dask", address]) == 0, capsys.readouterr().err

@@ -670,7 +670,7 @@ def run(capfd, *words):
 def test_the_command(tmp_path, capfd, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
     given = ["hanging", "-p", "n=4", "--x", "dt", "--x-range", 1e-3, 1e-1, 3, "--y", "stiffness", "--y-range", 1, 100, 2]
-    given += ["--steps", 8, "--workers", 1, "--solvers", "explicit", "pbd:iterations=4,sweep=sequential"]
+    given += ["--steps", 8, "--duration", 0.1, "--workers", 1, "--solvers", "explicit", "pbd:iterations=4,sweep=sequential"]
     code, out, err = run(capfd, *given, "-o", tmp_path / "m.png", "--csv", tmp_path / "m.csv")
     assert code == 0, err
     assert re.match(r"explicit: \d stable, .*\d diverged\npbd iterations=4 sweep=sequential: ", out)
