@@ -118,10 +118,10 @@ class DeviceElements:
         values = self.stiffness.numpy()[by_copy].reshape(model.copies, -1)
         return values[:, 0] if values.size and (values == values[:, :1]).all() else None
 
-    def softened(self):
-        """The same elements with a stiffness of 1 where it is infinite."""
+    def with_unit_stiffness(self):
+        """The same elements with a stiffness of 1, or 0 where it is 0."""
         stiffness = self.stiffness.numpy()
-        array = wp.array(np.where(np.isinf(stiffness), 1.0, stiffness).astype(stiffness.dtype), device=self.stiffness.device)
+        array = wp.array((stiffness > 0.0).astype(stiffness.dtype), device=self.stiffness.device)
         return replace(self, stiffness=array, hard=False)
 
     @property

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from .balance import GAIN, STRETCHED, Balance
 from .checks import whole
 from .frames import frames_of, state_of
 from .interrupts import recording
@@ -111,7 +112,7 @@ def simulate(
         )
         stepper = solver.bind(model)
         timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds, "frames": []}
-        watch = Watch(model, stepper.h)
+        watch = Watch(model, stepper)
         recorder.append(*state_of(stepper))
         if progress is not None:
             progress(0, frames)
@@ -159,77 +160,44 @@ def of_copies(values):
 class Watch:
     """Tells a copy that has diverged from one that is merely fast, from frames alone and for every solver.
 
-    The mass-weighted root mean square speed of a cloth is measured against what can have made it: v₀ + √(2U₀/m) + √(2 g l) +
-    g t, with U₀ the elastic energy of the start and l its size, plus the largest speed of the pins once for each frame (pins
-    can swing a cloth up without end), plus l a second, below which nothing is called fast. Of hard constraints the start
-    counts with what closes their gap in one step. Ten times that is called diverged, and so are what is not finite and a step
-    of the solver that says so: a diverging run grows by a factor a step and passes any such bound at once.
+    Diverged is what is not finite, a step of the solver that says so, what has gained energy that nothing put in, and an edge
+    so long that no energy of the run suffices for it; see :mod:`warpcloth.balance`.
 
     Frames come in the order of the scene.
 
     Args:
         model: The :class:`warpcloth.model.Model`.
-        h: Step of the solver [s].
-        slowest: What is never called fast, in l a second; 0 for what starts as noise.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+        stretched: Strain of an edge from which its energy is asked for.
 
     Attributes:
         good: The last good frame of each copy (B,).
         alive: Whether a copy is still good (B,).
-        fastest: Largest speed in a good frame, over what can have made it (B,).
+        growth: Largest energy of motion and height in a good frame, over what the sources can have put in (B,).
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
     """
 
     @in_turn
-    def __init__(self, model, h, slowest=1.0):
+    def __init__(self, model, stepper, stretched=STRETCHED):
         scene = model.scene
+        self._stretched = stretched
         self.model, self.rest = model, scene.mesh.edge_lengths[scene.mesh.edge_lengths > 0.0]
         self.ends = scene.mesh.edges[scene.mesh.edge_lengths > 0.0].T.astype(np.intp)
         self.worst_strain, self.messages = np.zeros(model.copies), {}
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
-        self.fastest = np.zeros(model.copies)
-        start = (model.positions, model.velocities, model.mass, model.inverse_mass)
-        points, velocities, mass, inverse = (model.in_scene_order(array.numpy()).astype(np.float64) for array in start)
-        self.mass = np.where(inverse > 0.0, mass, 0.0).reshape(model.copies, -1)
-        self.total = np.where(self.mass.any(axis=1), self.mass.sum(axis=1), 1.0)
-        self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
-        size = np.linalg.norm(np.ptp(points.reshape(model.copies, -1, 3), axis=1), axis=1)
-        self.start = self._speed(velocities) + np.sqrt(2.0 * self.gravity * size) + self._stored_speed(h)
-        self.start += slowest * size
-        self.pins = 0.0
-        if scene.pins.keyframes is not None and len(scene.pins.keyframes) > 1:
-            moves = np.linalg.norm(np.diff(scene.pins.keyframes, axis=0), axis=-1)
-            self.pins = moves.max(initial=0.0) * scene.fps
-
-    def _speed(self, velocities):
-        """Mass-weighted root mean square speed of the free vertices of each copy [m/s]."""
-        velocities = velocities.astype(np.float64)
-        squares = np.einsum("ij,ij->i", velocities, velocities).reshape(self.model.copies, -1)
-        return np.sqrt((self.mass * squares).sum(axis=1) / self.total)
-
-    def _stored_speed(self, h):
-        """√(2U/m) of each copy at the start [m/s]; a hard constraint counts as ½m(gap/h)²."""
-        from .operators import Energy, Sums
-
-        model = self.model
-        speeds = np.zeros(model.copies)
-        for hard in (False, True):
-            terms = tuple(elements.softened() if hard else elements for elements in model.terms if elements.hard == hard)
-            if not terms:
-                continue
-            energy = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
-            Energy(model, Sums(model), terms=terms).add(model.positions, energy)
-            speeds += np.sqrt(2.0 * energy.numpy()) / (h if hard else np.sqrt(self.total))
-        return speeds
+        self.growth, self.balance = np.zeros(model.copies), Balance(model, stepper)
 
     def passes(self, frame, points, velocities, results):
         """Whether any copy is still good; marks those that no longer are, and puts NaN in their place."""
         B, n = self.model.copies, self.model.per_copy
         finite = (np.isfinite(points) & np.isfinite(velocities)).reshape(B, 3 * n)
-        with np.errstate(over="ignore", invalid="ignore"):
-            speed, gained = self._speed(velocities), self.gravity * frame / self.model.scene.fps + self.pins * frame
-        limit = 10.0 * (self.start + gained)
+        gains, strain = self.balance.gains(frame, points, velocities), self._strain(points.reshape(B, n, 3))
         stepped = np.array([result is not Result.DIVERGED for result in results])
-        for copy in np.flatnonzero(self.alive & ~(finite.all(axis=1) & (speed <= limit) & stepped)):
+        good = finite.all(axis=1) & stepped & (gains <= GAIN)
+        long = np.flatnonzero(self.alive & good & (strain > self._stretched))
+        long = [copy for copy in long if not self.balance.suffices(copy, points, self._stretched * self.rest.min())]
+        good[long] = False
+        for copy in np.flatnonzero(self.alive & ~good):
             self.alive[copy] = False
             where = f"diverged in frame {frame}" + (f", copy {copy}" if B > 1 else "")
             wrong = np.flatnonzero(~finite[copy])
@@ -237,24 +205,30 @@ class Watch:
                 self.messages[copy] = f"{where}: vertex {wrong[0] // 3} is not finite"
             elif not stepped[copy]:
                 self.messages[copy] = f"{where}: the forces of a step are not finite"
-            else:
+            elif copy in long:
                 self.messages[copy] = (
-                    f"{where}: a mean speed of {speed[copy]:.3g} m/s, above the {limit[copy]:.3g} m/s that its energy allows"
+                    f"{where}: an edge has a strain of {100.0 * strain[copy]:.3g} %, for which the energy of the run "
+                    "does not suffice"
                 )
+            else:
+                self.messages[copy] = f"{where}: {self.balance.sentence(copy)}"
         self.good[self.alive] = frame
-        with np.errstate(divide="ignore", invalid="ignore"):
-            self.fastest = np.where(self.alive, np.fmax(self.fastest, speed / (0.1 * limit)), self.fastest)
+        self.growth = np.where(self.alive, np.fmax(self.growth, gains), self.growth)
+        self.worst_strain = np.where(self.alive, np.fmax(self.worst_strain, strain), self.worst_strain)
         for array in (points, velocities):
             array.reshape(B, n, 3)[~self.alive] = np.nan
-        if not self.alive.any():
-            return False
+        return bool(self.alive.any())
+
+    def _strain(self, points):
+        """Largest |l/L − 1| of an edge of each copy, of points (B, n, 3); NaN of copies that are no longer good."""
         squares = np.zeros((int(self.alive.sum()), len(self.rest)))
-        for column in np.moveaxis(points.reshape(B, n, 3)[self.alive], -1, 0):  # a fifteenth of the time of rows of three
-            column = column.astype(np.float64)
-            squares += (column.take(self.ends[1], axis=1) - column.take(self.ends[0], axis=1)) ** 2
-        strain = np.abs(np.sqrt(squares) / self.rest - 1.0).max(axis=1, initial=0.0)
-        self.worst_strain[self.alive] = np.maximum(self.worst_strain[self.alive], strain)
-        return True
+        with np.errstate(over="ignore", invalid="ignore"):
+            for column in np.moveaxis(points[self.alive], -1, 0):  # a fifteenth of the time of rows of three
+                column = column.astype(np.float64)
+                squares += (column.take(self.ends[1], axis=1) - column.take(self.ends[0], axis=1)) ** 2
+            found = np.full(self.model.copies, np.nan)
+            found[self.alive] = np.abs(np.sqrt(squares) / self.rest - 1.0).max(axis=1, initial=0.0)
+        return found
 
     def status(self, results, residual, solver):
         """The :class:`Status` of a run with a solver, whose copies ended with these."""
@@ -263,7 +237,7 @@ class Watch:
         kind, measure, unit = solver.residual_on(self.model), None, None
         copy = int(np.argmax(residual))  # the first that is NaN, if any
         if kind is not None:
-            measure, unit = kind.measure, kind.unit if self.gravity[copy] > 0.0 else kind.weightless
+            measure, unit = kind.measure, kind.unit if self.balance.weighs[copy] else kind.weightless
         if self.messages:
             message = "; ".join(self.messages[copy] for copy in sorted(self.messages))
         else:

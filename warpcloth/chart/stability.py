@@ -32,8 +32,8 @@ class Trial:
     Attributes:
         points: (frames+1, B, n, 3) [m].
         good: The last good frame of each copy (B,).
-        growth: Largest energy of motion in a good frame, over what the start, gravity, time and rounding can have given to it
-            (B,).
+        growth: Largest energy of motion and height in a good frame, over what the start, falling and rounding can have given
+            (B,), see :class:`warpcloth.balance.Balance`.
         reasons: A sentence for each copy, "" if nothing is to be said.
         results: :class:`warpcloth.status.Result` of each copy.
         steps_per_frame: Steps a frame.
@@ -52,7 +52,7 @@ class Slow(Exception):
 
 
 def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", limit=60.0):
-    """Runs a scene as `simulate` does; noise counts as diverged as well, once it has a hundred times the energy it can have.
+    """Runs a scene as `simulate` does, and calls the same runs diverged but for strain, which the reference tells.
 
     Raises:
         Slow: After ``limit`` seconds, looked at each frame.
@@ -64,9 +64,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
         warnings.simplefilter("ignore")  # of steps too large, which are the subject
         stepper = record.bind(model)
     frames, B = scene.frames, copies
-    # What rounding of places gives to a velocity in a step of ωh = 2, ω²h ε l, adds up as a walk does.
-    rounding = 4.0 / stepper.h * np.finfo(model.numpy_dtype).eps * math.sqrt(frames * stepper.steps_per_frame)
-    watch = Watch(model, stepper.h, slowest=rounding)
+    watch = Watch(model, stepper, stretched=np.inf)
     points = np.full((frames + 1, B, model.per_copy, 3), np.nan)
     points[0] = model.positions.numpy().reshape(B, -1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -81,7 +79,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
                 raise Slow(f"stopped after {limit:g} s, in frame {frame} of {frames}")
     said = [watch.messages.get(copy, each.value if each in _FAILED else "") for copy, each in enumerate(stepper.results)]
     said = [text.replace(f", copy {copy}:", ":") for copy, text in enumerate(said)]  # which is of the row, not of the map
-    return Trial(points, watch.good, watch.fastest**2, said, list(stepper.results), stepper.steps_per_frame)
+    return Trial(points, watch.good, watch.growth, said, list(stepper.results), stepper.steps_per_frame)
 
 
 def measure(

@@ -44,6 +44,10 @@ class Explicit(Step):
     def divides(self):
         return True
 
+    @property
+    def staggered(self):
+        return self.scheme == "symplectic"
+
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
 

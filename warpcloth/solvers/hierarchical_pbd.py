@@ -45,7 +45,7 @@ class HierarchicalPBD(Step):
         ValueError: If an option breaks a rule.
     """
 
-    ordered = True
+    ordered = closes = True
 
     iterations: int = 20
     coarse_iterations: int = 5

@@ -37,6 +37,8 @@ class PBD(Step):
         ValueError: If an option breaks a rule.
     """
 
+    closes = True
+
     iterations: int = 20
     sweep: str = "coloured"
     alpha: float = 0.0

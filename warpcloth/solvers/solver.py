@@ -35,13 +35,15 @@ class Step:
         dt: Step [s]; 1/(fps·dt) must be a whole number.
         substeps: Steps a frame.
         ordered: Whether the result depends on the order of elements by more than rounding.
+        staggered: Whether velocities are those of half a step before the positions.
+        closes: Whether a step may close a gap whatever the stiffness.
         residual: The :class:`warpcloth.status.Residual` that its steps report, or None.
 
     Raises:
         ValueError: If both or neither are given, or they are not above 0.
     """
 
-    ordered = False
+    ordered = staggered = closes = False
     residual = None
 
     def __init_subclass__(cls, **options):

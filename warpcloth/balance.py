@@ -1,0 +1,340 @@
+"""The balance of energy of a run: what a cloth has against what its sources can have put into it.
+
+A cloth is judged by its kinetic energy and its height, which are never more than all of its energy. Elastic energy is left out:
+sweeps that end too early store a huge ½kx² without exploding, and strain is judged apart.
+
+Symplectic Euler has its velocities half a step before its positions. Of x″ = −ω²x it keeps v² + ω²x² − hω²xv, and near its
+limit ωh = 2 this is far below v², at ωh = 1.995 up to 199 times. With the velocity at the time of the position,
+u = v − ½hω²x, the same is u² + ω²x²(1 − ω²h²/4), so that below the limit u² never exceeds it: u is judged, not v.
+
+What puts energy in is a :class:`Source`. A new kind of them is an entry of :data:`SOURCES`.
+"""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from .operators import Energy, Gradient, Sums
+from .turns import TURN
+
+# A run has diverged when it has this many times the energy that its sources can have put in. What holds has up to 1.4 times
+# that with unconverged or large steps, 1.3 times with sweeps averaged by vertex and 1.9 times with hierarchical ones, which
+# conserve no momentum; what explodes passes every bound.
+GAIN = 3.0
+# A run has diverged when an edge has this strain and the energy for it was not there. The fewest sweeps that hold a cloth give
+# up to 6.4 (one a step of 1/60 s, averaged by vertex); a cloth that falls as if nothing held it passes 10 soon.
+STRETCHED = 10.0
+# More patches of pins than these are taken for one, whose pins move within it.
+_PATCHES = 32
+
+
+class Elastic:
+    """U of the soft terms of a model, ∂U/∂x, and gaps; kernels and scratch are made when first needed."""
+
+    def __init__(self, model):
+        self.model = model
+        self.soft = tuple(elements for elements in model.terms if not elements.hard)
+        self.hard = tuple(elements for elements in model.terms if elements.hard)
+
+    @cached_property
+    def _sums(self):
+        return Sums(self.model)
+
+    @cached_property
+    def _energy(self):
+        return Energy(self.model, self._sums, terms=self.soft)
+
+    @cached_property
+    def _gradient(self):
+        return Gradient(self.model, terms=self.soft)
+
+    def energy(self, x):
+        """U [J] of the soft terms of each copy at x, (B,)."""
+        return self._value(self._energy, x) if self.soft else np.zeros(self.model.copies)
+
+    def gaps(self, x, terms):
+        """½Σ gap² of the constraints of terms, which is their energy with a stiffness of 1, (B,)."""
+        unit = tuple(elements.with_unit_stiffness() for elements in terms)
+        return self._value(Energy(self.model, self._sums, terms=unit), x) if unit else np.zeros(self.model.copies)
+
+    def gradient(self, x):
+        """∂U/∂x [N] of the soft terms at x, (B·n, 3), in the order of the scene."""
+        gradient = self.model.vectors()
+        self._gradient.add(x, gradient)
+        return self.model.in_scene_order(gradient.numpy()).astype(np.float64)
+
+    def put(self, points):
+        """Points (B·n, 3) in the order of the scene as the model has them, on its device."""
+        model = self.model
+        if model.order is not None:
+            points = points.reshape(model.copies, -1, 3)[:, model.order]
+        return model.array(points.reshape(-1, 3), model.vec3)
+
+    def _value(self, energy, x):
+        found = wp.zeros(self.model.copies, dtype=wp.float64, device=self.model.device)
+        energy.add(x, found)
+        return found.numpy()
+
+
+class Source:
+    """What puts energy into a cloth. All its numbers are upper bounds.
+
+    Attributes:
+        name: For sentences.
+    """
+
+    name = "a source"
+
+    def energy(self, frame, speed):
+        """What it has put in until a frame, (B,) [J]; frames are asked for once each, in order from 1.
+
+        Args:
+            frame: Number of the frame.
+            speed: Largest RMS speed of each copy in any frame before, and what falling adds in one frame, (B,) [m/s].
+        """
+        return 0.0
+
+    def speed(self, frame):
+        """Speed by which it carries along all that it moves, in a frame [m/s]: energy is that of the motion beside it."""
+        return 0.0
+
+    def stored(self, frame):
+        """What it has put in beside, (B,) [J]; costly, and only asked for where all else does not suffice."""
+        return 0.0
+
+
+class Start(Source):
+    """Motion and elastic energy at the start.
+
+    Of hard constraints it is the energy of closing their gaps in a step: N of them, with gaps in a row, move what hangs on them
+    by up to Σ gap ≤ √(N Σ gap²), at twice the speed that hₑ gives with midpoint or a relaxation of 2. Of solvers whose sweeps
+    ``closes`` soft constraints as well, these count likewise.
+    """
+
+    name = "the start"
+
+    def __init__(self, balance, stepper):
+        model, elastic = balance.model, balance.elastic
+        closed = elastic.hard + (elastic.soft if stepper.options.closes else ())
+        velocities = model.in_scene_order(model.velocities.numpy()).astype(np.float64)
+        self._energy = balance.kinetic(velocities) + elastic.energy(model.positions)
+        gaps = sum(elements.per_copy for elements in closed) * elastic.gaps(model.positions, closed)
+        self._energy += 4.0 * balance.total * gaps / stepper.he**2
+
+    def energy(self, frame, speed):
+        return self._energy
+
+
+class Pins(Source):
+    """Pins that keyframes move.
+
+    Pins that are joined by edges are a patch. Where a patch moves as a rigid body, the cloth could move with it, and beside
+    that motion it keeps its energy: a change δ of the speed of the patch, over the whole cloth, adds at most ½δ² + δ·speed to
+    the energy of a mass, and nothing else does but lifting. What patches store by moving against one another costs at most as
+    much as to deform the start with them, each vertex by the mean of their motions with weights 1/distance².
+    """
+
+    name = "moving pins"
+
+    def __init__(self, balance, _stepper):
+        scene, self._balance = balance.model.scene, balance
+        self._stored, self._seen = np.zeros(balance.model.copies), 0
+        self._kicked, pins = 0.0, scene.pins
+        self._points, self._frames = scene.positions, pins.keyframes
+        self._patches = self._found()
+        share = np.where(np.isin(np.arange(len(self._points)), pins.vertices), 0.0, scene.vertex_masses)
+        share = share / share.sum() if share.any() else share
+        places = np.column_stack([self._points, np.ones(len(self._points))])
+        spread, middle = (share[:, None] * places).T @ places, share @ places
+        speeds, kicks, rises = [], [], []
+        for patch, maps in zip(self._patches, self._maps, strict=True):
+            beside = self._frames[:, patch] - np.einsum("fij,pj->fpi", maps, places[pins.vertices[patch]])
+            moves, own = (np.diff(each, axis=0, prepend=each[:1], append=each[-1:]) for each in (maps, beside))
+            turns, own_turns = (np.diff(each, axis=0, prepend=0.0 * each[:1]) for each in (moves, own))
+            for found, of_maps, of_pins in ((speeds, moves, own), (kicks, turns, own_turns)):
+                mean = np.sqrt(np.maximum(np.einsum("fij,jk,fik->f", of_maps, spread, of_maps), 0.0))
+                found.append(scene.fps * (mean + np.linalg.norm(of_pins, axis=-1).max(axis=1)))
+            rises.append((maps - maps[0]) @ middle)
+        self._speeds, self._kicks = np.max(speeds, axis=0), np.max(kicks, axis=0)
+        gravity = balance.model.gravity.numpy().astype(np.float64)
+        heights = np.max(-np.einsum("pfi,bi->pfb", np.array(rises), gravity), axis=0)
+        self._lifted = balance.total * np.maximum.accumulate(np.maximum(heights, 0.0))
+
+    def _found(self):
+        """Indices of the pins of each patch."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        scene = self._balance.model.scene
+        vertices, n = scene.pins.vertices, len(scene.mesh.points)
+        place = np.full(n, -1)
+        place[vertices] = np.arange(len(vertices))
+        a, b = place[scene.mesh.edges.T]
+        joined = (a >= 0) & (b >= 0)
+        graph = coo_array((np.ones(joined.sum()), (a[joined], b[joined])), shape=(len(vertices), len(vertices)))
+        count, labels = connected_components(graph, directed=False)
+        return [np.arange(len(vertices))] if count > _PATCHES else [np.flatnonzero(labels == k) for k in range(count)]
+
+    @cached_property
+    def _maps(self):
+        """The rigid motion of each patch since the start, as affine maps (F, 3, 4)."""
+        from .rotation import kabsch
+
+        found = []
+        for patch in self._patches:
+            frames = self._frames[:, patch]
+            turned = np.asarray(kabsch(frames[0], frames))
+            middles = frames.mean(axis=1)
+            found.append(np.concatenate([turned, (middles - turned @ middles[0])[:, :, None]], axis=-1))
+        return found
+
+    @cached_property
+    def _weights(self):
+        """Of each vertex and patch, (n, P)."""
+        from scipy.spatial import cKDTree
+
+        pins = self._points[self._balance.model.scene.pins.vertices]
+        distances = np.stack([cKDTree(pins[patch]).query(self._points)[0] for patch in self._patches], axis=1)
+        weights = np.maximum(distances, 1e-9 * np.ptp(self._points, axis=0).max()) ** -2.0
+        return weights / weights.sum(axis=1, keepdims=True)
+
+    def energy(self, frame, speed):
+        kick, total = self._kicks[frame] if frame < len(self._kicks) else 0.0, self._balance.total
+        self._kicked = self._kicked + total * kick * (speed + self.speed(frame) + 0.5 * kick)
+        return self._kicked + self._lifted[min(frame, len(self._lifted) - 1)]
+
+    def speed(self, frame):
+        return self._speeds[frame] if frame < len(self._speeds) else 0.0
+
+    def stored(self, frame):
+        elastic, pins = self._balance.elastic, self._balance.model.scene.pins.vertices
+        while self._seen < min(frame, len(self._frames) - 1):
+            self._seen += 1
+            points = np.zeros_like(self._points)
+            for weight, maps in zip(self._weights.T, self._maps, strict=True):
+                matrix = maps[self._seen]
+                points += weight[:, None] * (self._points @ matrix[:, :3].T + matrix[:, 3])
+            points[pins] = self._frames[self._seen]
+            x = elastic.put(np.tile(points, (self._balance.model.copies, 1)))
+            self._stored = np.maximum(self._stored, elastic.energy(x))
+        return self._stored
+
+
+def _moving(balance, stepper):
+    keyframes = balance.model.scene.pins.keyframes
+    moves = keyframes is not None and keyframes.shape[1] and (keyframes != keyframes[0]).any()
+    return Pins(balance, stepper) if moves else None
+
+
+# Functions of (balance, stepper), each of which gives a source, or None for a scene that has none of its kind.
+SOURCES = [Start, _moving]
+
+
+class Balance:
+    """Compares the energy of each copy, frame by frame, with what the sources of the scene can have put in.
+
+    Energies are counted from the lowest height that a copy has had, so that falling is no source of its own.
+
+    Args:
+        model: The :class:`warpcloth.model.Model`.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper` of a solver that is bound to it.
+
+    Attributes:
+        mass, total: Of the free vertices (B, n) and of all of them (B,) [kg].
+        elastic: :class:`Elastic` of the model.
+        sources: The sources of the scene.
+        has, given: What each copy has, and can have been given, in the frame that was asked for last, (B,) [J].
+    """
+
+    def __init__(self, model, stepper):
+        self.model = model
+        self._h = stepper.h
+        self._staggered = stepper.options.staggered
+        arrays = (model.positions, model.mass, model.inverse_mass)
+        points, mass, inverse = (model.in_scene_order(array.numpy()).astype(np.float64) for array in arrays)
+        self.mass = np.where(inverse > 0.0, mass, 0.0).reshape(model.copies, -1)
+        self.total = self.mass.sum(axis=1)
+        self._gravity = model.gravity.numpy().astype(np.float64)
+        self._moment, self._lowest, self._fastest = self._moments(points), np.zeros(model.copies), np.zeros(model.copies)
+        self.elastic = Elastic(model)
+        # Rounding of positions gives a velocity of at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up as a walk does.
+        farthest = np.abs(points).reshape(model.copies, -1).max(axis=1)
+        rounded = 4.0 * np.finfo(model.numpy_dtype).eps * farthest
+        self._rounding = 0.5 * self.total * (rounded / self._h) ** 2
+        self._rounded_height = self.total * np.linalg.norm(self._gravity, axis=1) * rounded
+        found = (make(self, stepper) for make in SOURCES)
+        self.sources = [source for source in found if source is not None]
+
+    def kinetic(self, velocities):
+        """½Σ m v² of each copy [J]."""
+        squares = np.einsum("ij,ij->i", velocities, velocities).reshape(self.mass.shape)
+        return 0.5 * (self.mass * squares).sum(axis=1)
+
+    def gains(self, frame, points, velocities):
+        """What each copy has over what it can have been given, (B,).
+
+        Args:
+            frame: Number of the frame; they come in order from 1.
+            points: (B·n, 3) [m] in the order of the scene.
+            velocities: (B·n, 3) [m/s].
+        """
+        with np.errstate(all="ignore"):
+            points, velocities = points.astype(np.float64, copy=False), velocities.astype(np.float64, copy=False)
+            kinetic, height = self.kinetic(velocities), self._height(points)
+            self._lowest = np.fmin(self._lowest, height)
+            per_frame = 1.0 / self.model.scene.fps
+            speed = self._fastest + np.linalg.norm(self._gravity, axis=1) * per_frame
+            given = sum(source.energy(frame, speed) for source in self.sources) - self._lowest
+            given = given + self._rounding * frame * per_frame / self._h + self._rounded_height
+            carried = max(source.speed(frame) for source in self.sources)
+            found = self._gain(kinetic, height, carried, given)
+            if (found > GAIN).any():
+                with TURN:
+                    if self._staggered and self.elastic.soft:
+                        kinetic = np.fmin(kinetic, self.kinetic(self._at_positions(points, velocities)))
+                    given = given + sum(source.stored(frame) for source in self.sources)
+                found = self._gain(kinetic, height, carried, given)
+            root = np.sqrt(2.0 * kinetic / np.where(self.total > 0.0, self.total, 1.0))
+            self._fastest = np.where(found <= GAIN, np.fmax(self._fastest, root), self._fastest)
+        return found
+
+    @property
+    def weighs(self):
+        """Whether each copy has gravity, (B,)."""
+        return self._gravity.any(axis=1)
+
+    def sentence(self, copy):
+        """What a copy has gained by the last frame."""
+        names = [source.name for source in self.sources] + ["falling"] * bool(self.weighs[copy])
+        names = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+        return (
+            f"it has gained energy, {self.has[copy]:.3g} J of motion and height, of which {names} can have put in no more "
+            f"than {self.given[copy]:.3g} J"
+        )
+
+    def suffices(self, copy, points, stretch):
+        """Whether what a copy can have been given by the last frame suffices for an edge ``stretch`` m too long."""
+        with TURN:
+            x = self.elastic.put(points)
+            energy, gaps = self.elastic.energy(x)[copy], self.elastic.gaps(x, self.elastic.hard)[copy]
+        return energy <= GAIN * self.given[copy] and gaps < 0.5 * stretch**2
+
+    def _gain(self, kinetic, height, carried, given):
+        beside = np.maximum(np.sqrt(kinetic) - carried * np.sqrt(0.5 * self.total), 0.0) ** 2
+        self.has, self.given = beside + height - self._lowest, given
+        return np.where(self.has > 0.0, self.has / self.given, np.where(self.has <= 0.0, 0.0, np.nan))
+
+    def _moments(self, points):
+        return np.einsum("bi,bij->bj", self.mass, points.reshape(*self.mass.shape, 3))
+
+    def _height(self, points):
+        """Potential energy of gravity since the start [J]."""
+        return -((self._moments(points) - self._moment) * self._gravity).sum(axis=1)
+
+    def _at_positions(self, points, velocities):
+        """Velocities half a kick later, when the positions are these."""
+        mass, shape = self.mass[..., None], (*self.mass.shape, 3)
+        forces = mass * self._gravity[:, None] - self.elastic.gradient(self.elastic.put(points)).reshape(shape)
+        kicks = np.divide(forces, mass, out=np.zeros(shape), where=mass > 0.0)
+        return velocities + 0.5 * self._h * kicks.reshape(-1, 3)
