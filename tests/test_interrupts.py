@@ -17,7 +17,7 @@ def test_the_first_interrupt_waits_and_a_second_one_does_not():
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
         done.append("second")
-    with pytest.raises(KeyboardInterrupt), deferred(first=False):
+    with pytest.raises(KeyboardInterrupt), deferred(patience=0):
         signal.raise_signal(signal.SIGINT)
         done.append("second")
     with pytest.raises(KeyboardInterrupt), deferred():
@@ -56,7 +56,7 @@ def test_the_command_has_the_code_of_its_signal_and_says_it_undisturbed(number, 
     with Interrupts() as interrupts:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
-        interrupts.ignore()
+        interrupts.over = True
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGTERM)
         assert interrupts.code == code

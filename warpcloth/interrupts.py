@@ -14,16 +14,16 @@ class Interrupted(KeyboardInterrupt):
 
 
 @contextmanager
-def deferred(first=True):
+def deferred(patience=1):
     """Lets an interrupt wait until this block has ended; a second one comes at once.
 
     Of the main thread, for interrupts come nowhere else. A signal that ends the process without being heard, as SIGTERM does
     outside the command, is left alone.
 
     Args:
-        first: Whether there was none before, for which this block is being run.
+        patience: How many interrupts wait; 0 where there was one already, for which this block is being run.
     """
-    if not first or threading.current_thread() is not threading.main_thread():
+    if not patience or threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in _SIGNALS}
@@ -32,7 +32,7 @@ def deferred(first=True):
 
     def note(number, frame):
         came.append(number)
-        if len(came) > 1:
+        if len(came) > patience:
             before[number](number, frame)
 
     for number in before:
@@ -72,10 +72,11 @@ class Interrupts:
 
     Attributes:
         code: 128 and the number of the signal, as shells have it: 130 of Ctrl-C, 143 of SIGTERM.
+        over: Whether they do nothing any more.
     """
 
     def __init__(self):
-        self.code = 128 + signal.SIGINT
+        self.code, self.over = 128 + signal.SIGINT, False
 
     def __enter__(self):
         self._before = {}
@@ -87,17 +88,14 @@ class Interrupts:
         return self
 
     def __exit__(self, *error):
+        self.over = True  # or one that comes in the next line would be lost for whoever is told
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def _interrupt(self, number, _frame):
-        self.code = 128 + number
-        raise KeyboardInterrupt
-
-    def ignore(self):
-        """From now on they do nothing until the end of the block."""
-        for number in self._before:
-            signal.signal(number, signal.SIG_IGN)
+        if not self.over:
+            self.code = 128 + number
+            raise KeyboardInterrupt
 
 
 def leave(number, _frame):

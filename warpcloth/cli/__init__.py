@@ -49,7 +49,7 @@ def main(argv=None):
                 return options.show_help(arguments)
             return arguments.command(arguments)
         except KeyboardInterrupt as interrupted:
-            interrupts.ignore()
+            interrupts.over = True
             return say(str(interrupted) or "interrupted", interrupts.code)
         except (Exception, SystemExit) as error:
             if debug:

@@ -1,5 +1,8 @@
 """USD stages: a cloth or a scene read from one, an animation or measures written as one. Nothing else here imports pxr."""
 
+from . import modules as modules  # first
+
+# isort: split
 from .frames import FrameSequence
 from .measures import MeasureWriter
 from .scene import read_scene, write_scene

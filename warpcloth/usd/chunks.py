@@ -153,7 +153,7 @@ class ChunkWriter:
         if self._closed:
             return
         try:
-            with deferred(not isinstance(sys.exc_info()[1], KeyboardInterrupt)):
+            with deferred(0 if isinstance(sys.exc_info()[1], KeyboardInterrupt) else 1):
                 self._packing = single_file or self._packed
                 self._write_chunk(last=True)
                 self._closed = True
