@@ -10,7 +10,7 @@ import zipfile
 import numpy as np
 import pytest
 import warp as wp
-from pxr import Usd
+from pxr import Sdf, Usd
 
 import warpcloth as wc
 from warpcloth import limits
@@ -18,6 +18,7 @@ from warpcloth.cli import main
 from warpcloth.cli.terminal import printable
 from warpcloth.quiet import initialise_warp
 from warpcloth.usd import AnimationWriter, FrameSequence, MeasureWriter, packages, read_scene
+from warpcloth.usd.values import value_of
 
 STAGE = """#usda 1.0
 (
@@ -189,6 +190,32 @@ def test_wrong_stages(tmp_path, capfd, text, old, new, message):
         read_scene(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("left", [0.0, 0.01, 0.5, 0.9, 0.999])
+def test_a_crate_that_is_cut(tmp_path, capfd, left):
+    path = tmp_path / "cloth.usdc"
+    (tmp_path / "cloth.usda").write_text(STAGE)
+    Sdf.Layer.FindOrOpen(str(tmp_path / "cloth.usda")).Export(str(path))
+    os.truncate(path, int(left * os.path.getsize(path)))
+    with pytest.raises(ValueError, match=f"^{path}: is no USD stage ") as caught:
+        read_scene(path)
+    assert "\n" not in str(caught.value) and capfd.readouterr().err == ""
+
+
+def test_a_value_that_python_has_not(tmp_path):
+    """A crate may hold any type where an attribute says another, and pxr then raises what it likes."""
+
+    class Broken:
+        def GetName(self):
+            return "points"
+
+        def Get(self, time):
+            print("TypeError: No to_python converter", file=sys.stderr)
+            raise TypeError("No to_python converter")
+
+    with pytest.raises(ValueError, match=r"^points cannot be read \(No to_python converter\)$"):
+        value_of(Broken())
 
 
 @pytest.mark.parametrize("text", [STAGE, CURVES], ids=["mesh", "curves"])

@@ -1,6 +1,7 @@
 """Values of a stage, each read with a check: what is wrong is refused by its name before it reaches any arithmetic."""
 
 import os
+import textwrap
 import unicodedata
 import warnings
 from contextlib import contextmanager, redirect_stderr
@@ -58,8 +59,8 @@ def reason_of(error):
 
 
 def _plain(text):
-    """Without the line breaks of pxr, and without the address of the stage in memory."""
-    return " ".join(text.partition(" (instantiating stage on")[0].split())
+    """Without the line breaks of pxr and the address of the stage in memory, and not longer than anyone reads."""
+    return textwrap.shorten(text.partition(" (instantiating stage on")[0], 500, placeholder=" …")
 
 
 def refuse_path(path):
