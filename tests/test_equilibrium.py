@@ -169,6 +169,28 @@ def test_what_rounding_hides_is_no_rest_shape(device):
     assert rest.status.message.startswith("rounding hides the rest shape in float32")
 
 
+def test_a_sheet_too_stiff_to_move_is_no_rest_shape(device):
+    """Its whole weight is left unbalanced, 1 in the residual but for an ulp to either side, which decides nothing."""
+    mesh = wc.Mesh.grid(5, 5)
+    for density in (0.1, 0.3, 0.7, 1e-3):
+        sheet = wc.Scene(mesh, density=density, terms=[wc.Spring(stiffness=1e18)], pins=[0, 4])
+        rest = wc.equilibrium(sheet, device=device)
+        assert rest.status.result not in SETTLED and not rest.stable, rest.status
+        assert rest.status.residual == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_what_is_at_rest_without_weight_is_settled(dtype, device):
+    """The forces at the start are rounding, and those that are left are as large: nothing that a rest shape could hide."""
+    for seed in range(4):
+        mesh = wc.Mesh.grid(5, 5)
+        mesh = wc.Mesh(mesh.points + 0.05 * np.random.default_rng(seed).normal(size=mesh.points.shape), mesh.triangles)
+        for terms in ([wc.Spring(stiffness=1e3), wc.DihedralBending(stiffness=1e-3)], [wc.NeoHookeanMembrane(stiffness=1e3)]):
+            rest = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, gravity=(0, 0, 0)), dtype=dtype, device=device)
+            assert rest.status.result in SETTLED and rest.stable, rest.status
+            assert np.abs(rest.points - mesh.points).max() < (1e-2 if dtype == "float32" else 1e-6)
+
+
 def test_a_saddle_that_is_not_left_is_reported(device, monkeypatch):
     """What no nudge moves away from is in balance, and said to be no more."""
     monkeypatch.setattr("warpcloth.minimise.Minimiser.curves_down", lambda self, tolerance: True)

@@ -55,7 +55,8 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
         scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
         tolerance: Of the residual, see :class:`Equilibrium`, and of the unbalanced acceleration of each vertex over gravity's
             (without any, over the largest at the start). Where rounding leaves more at a vertex, the descent ends when nothing
-            is left to gain, and the residual decides; with more than the weight unbalanced it does not pass for a rest shape.
+            is left to gain, and the residual decides; with half the weight or more unbalanced it does not pass for a rest
+            shape. Without gravity there is no load to hide.
         load_steps: Parts in which gravity comes on and pins move along their keyframes. Pins that turn far need several.
         iterations: The most Newton iterations in all.
         device: A Warp device.
@@ -89,7 +90,8 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     residual, began = descent.residual, result.value
     if result is Result.ROUNDED and residual <= tolerance:
         result = Result.CONVERGED
-    elif result is Result.ROUNDED and residual > 1.0:  # forces beyond the weight: nothing says that the rest shape is near
+    # A sheet that nothing has moved leaves its weight, but for an ulp. Without gravity a start at rest leaves its own rounding.
+    elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity[0] > 0.0:
         result, began = Result.STALLED, f"rounding hides the rest shape in {dtype}"
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
     use = None if result in SETTLED else "not a rest shape"
