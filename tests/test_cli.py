@@ -652,6 +652,15 @@ def test_an_interrupt_while_modules_load_is_one_line(module, how, name, more, tm
     assert found.stderr == f"warpcloth: interrupted{more}\n"
 
 
+def test_an_interrupt_that_python_makes_another_error_of_is_one(capfd, monkeypatch):
+    class Field:
+        def __set_name__(self, *_):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(scene_files, "folders", lambda: type("New", (), {"field": Field()}))
+    assert run(capfd, "scenes") == (130, "", "warpcloth: interrupted\n")
+
+
 def test_an_output_that_another_process_writes_is_refused(tmp_path, capfd):
     """In one line and at once; a file that a lock left behind, of a process that is gone, is no lock."""
     output, left = tmp_path / "out.usdc", tmp_path / ".out.usdc.lock"

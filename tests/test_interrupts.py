@@ -1,6 +1,8 @@
 """Interrupts wait for what is being finished, once; who ignores them, or has a handler of his own, keeps it."""
 
 import signal
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -61,6 +63,21 @@ def test_the_command_has_the_code_of_its_signal_and_says_it_undisturbed(number, 
         signal.raise_signal(signal.SIGTERM)
         assert interrupts.code == code
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_an_interrupt_in_a_destructor_is_not_lost(capfd):
+    class Freed:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    hook, end = sys.unraisablehook, time.monotonic() + 60.0
+    with Interrupts() as interrupts:
+        with pytest.raises(KeyboardInterrupt):
+            Freed()
+            while time.monotonic() < end:
+                pass
+        assert interrupts.code == 143
+    assert sys.unraisablehook is hook and capfd.readouterr().err == ""
 
 
 def test_an_interrupt_says_what_was_recorded():

@@ -85,12 +85,23 @@ class Interrupts:
             for number, replaced in own.items():  # whoever has another handler, or ignores them, knows why
                 if signal.getsignal(number) in replaced:
                     self._before[number] = signal.signal(number, self._interrupt)
+        self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
         return self
 
     def __exit__(self, *error):
         self.over = True  # or one that comes in the next line would be lost for whoever is told
+        sys.unraisablehook = self._hook
         for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    def _unraisable(self, unraisable):
+        """Lets an interrupt that came in a destructor, where Python drops it, come again in a moment."""
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            self._hook(unraisable)
+        elif not self.over:
+            again = threading.Timer(0.01, signal.raise_signal, [self.code - 128])
+            again.daemon = True
+            again.start()
 
     def _interrupt(self, number, _frame):
         if not self.over:

@@ -52,6 +52,9 @@ def main(argv=None):
             interrupts.over = True
             return say(str(interrupted) or "interrupted", interrupts.code)
         except (Exception, SystemExit) as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):  # Python makes another error of one that comes in a new class
+                interrupts.over = True
+                return say("interrupted", interrupts.code)
             if debug:
                 traceback.print_exc()
             return say(_sentence(error, debug), 2)
