@@ -190,7 +190,7 @@ def test_tables_are_whole(head, names):
 def test_the_table_of_residuals_is_that_of_the_solvers():
     methods = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
     rows = re.findall(
-        r"^\| `(\w+)` \| (.+) \| (.+) \| (.+) \| (.+) \|$", methods.split("## What the residual")[1], re.MULTILINE
+        r"^\| `(\w+)` \| (.+) \| (.+) \| (.+) \| (.+) \|$", methods.split("## The residual of a run")[1], re.MULTILINE
     )
     found = {name: (measure, weightless, unit, held == "`tolerance`") for name, measure, unit, weightless, held in rows}
     solvers = {record.__name__: record for record in SOLVERS.values() if record.residual is not None}
