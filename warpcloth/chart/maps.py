@@ -25,7 +25,7 @@ _EARLY, _LATE = np.array([0.42, 0.02, 0.11]), np.array([0.87, 0.47, 0.40])
 _STYLES = {
     "2/ω_max": ("-", "largest stable step about the rest shape"),
     "2/√(2 Σk/m)": ("--", "stable in any motion"),
-    "forward Euler": ("-.", "energy grows a hundredfold in the run"),
+    "forward Euler": ("-.", "energy grows tenfold in the run"),
     "ω λ_max = 2": ((0, (1, 1)), "Jacobi sweeps overshoot beyond"),
     "Gauss–Seidel, |z| = 1": ((0, (4, 1, 1, 1, 1, 1)), "sweeps in their order overshoot beyond"),
     "h² = m/(k(L/l − 1))": ("-", "beyond, a step has several minima"),
