@@ -1,6 +1,6 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
-from . import interrupts as interrupts  # first: it answers those that come while the others load, which takes a second
+from . import interrupts as interrupts  # first: it handles interrupts while the other modules load, which takes a second
 
 # isort: split
 from . import checks, ordering

@@ -1,4 +1,4 @@
-"""``python -m warpcloth``, the command ``warpcloth``."""
+"""Lets ``python -m warpcloth`` run the command ``warpcloth``."""
 
 import sys
 

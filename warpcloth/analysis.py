@@ -71,9 +71,9 @@ class Analyzer:
         neighbourhood: None for triangles; of vertices "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m],
             "nearest:2%" of all vertices, or a set of vertices for each. Fixed by the rest shape.
         rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt then; "logarithm", exact
-            for a constant L. All for turns below 180° from frame to frame, and D for small ones: a strain counts 1/cos²(θ/2)
-            times by midpoint where a frame turns by θ, up to θ/sin θ times by logarithm. A first frame, which
-            has none before it, has none.
+            for a constant L. All need turns below 180° from frame to frame. D is accurate for small turns: if a frame turns by
+            θ, midpoint makes a strain 1/cos²(θ/2) times too large, and logarithm up to θ/sin θ times. The first frame, which
+            has none before it, has no rates.
         directions: Warp and weft: "st" for the texture coordinates, or a vector (3,) in the rest shape.
         material: A membrane term for energy and stress, such as :class:`warpcloth.NeoHookeanMembrane`.
         device: A Warp device.

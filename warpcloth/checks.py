@@ -35,7 +35,7 @@ def _is_finite(value):
 
 
 def whole(name, value, least, most=MOST):
-    """Checks that an option is a whole number, and none without end."""
+    """Checks that an option is a whole number from ``least`` to ``most``."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name} is {shown(value)}; it must be a whole number of {least} or more")
     if value > most:

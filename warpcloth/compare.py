@@ -26,7 +26,8 @@ class Comparison:
 
     Attributes:
         same_topology: Whether both have the same number of vertices and the same triangles, in the same order.
-        up_axes: "Y" or "Z" of a and of b, None where the input does not say. Where they differ b was turned to the axis of a.
+        up_axes: The up axes of a and b, "Y" or "Z", or None if the input does not say. If they differ, b was turned to the axis
+            of a.
         times: Times of the frames (F,) [s].
         frames: Their indices in a and in b (F, 2).
         labels: Their numbers as the files have them (F, 2).
@@ -108,11 +109,11 @@ def compare(
         frames: Compare only that many frames after the first that both have.
         device: A Warp device.
         progress: Function called with (frame, frames) once each frame is compared, ``frames`` being those after the first.
-        up_axis: "Y" or "Z" of both, where they say nothing or are to have another than they say. Where one is Y up and the
-            other Z up, b is turned about x by 90° to the axis of a: (x, y, z) of Z up is (x, z, −y) of Y up. One that says
-            nothing is taken as the other.
-        up_axis_a: The same of a alone.
-        up_axis_b: The same of b alone.
+        up_axis: "Y" or "Z", the up axis of both, which overrides what they say. If one is Y up and the other Z up, b is turned
+            about x by 90° to the axis of a: (x, y, z) of Z up is (x, z, −y) of Y up. An animation that does not say its axis
+            is taken to have that of the other.
+        up_axis_a: The up axis of a alone.
+        up_axis_b: The up axis of b alone.
 
     Returns:
         :class:`Comparison`.
@@ -170,14 +171,14 @@ def opened(name, source, prim=None, fps=None):
 
 
 def up_axis_of(name, sequence, given):
-    """The up axis that is given for a sequence, or its own."""
+    """Returns the up axis that is given for a sequence, or its own."""
     if given is not None:
         choice(name, given, UP_AXES)
     return given or sequence.up_axis
 
 
 def _turned(b, axis_a, axis_b):
-    """b with its frames turned to the up axis of a, exactly; as it is where the axes are one or either is not known."""
+    """Turns the frames of b to the up axis of a, without rounding; leaves b alone if the axes agree or one is not known."""
     if axis_a is None or axis_b is None or axis_a == axis_b:
         return b
     columns, signs = ([0, 2, 1], [1.0, 1.0, -1.0]) if axis_a == "Y" else ([0, 2, 1], [1.0, -1.0, 1.0])

@@ -87,7 +87,7 @@ def deform(
         single_file: Whether ``output`` is to be one file in the end, with nothing beside it.
         progress: Function called with (frame, frames) once each frame is kept, ``frames`` being those after the first; or None.
         stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; ``output`` is then a layer over it.
-        up_axis: "Y" or "Z", of an output that is no layer; that of the mesh where not given.
+        up_axis: Up axis of an output that is not a layer, "Y" or "Z"; by default that of the mesh.
 
     Returns:
         :class:`Deformation`.

@@ -22,13 +22,13 @@ class Equilibrium(NamedTuple):
 
     Attributes:
         points: (n, 3) [m].
-        status: How it ended, see :class:`warpcloth.status.Result`, with the residual: Σ‖fᵢ‖, the unbalanced forces of all free
-            vertices, over the whole load Σmᵢ‖g‖ (without gravity, over what it was at the start).
+        status: How it ended, see :class:`warpcloth.status.Result`, with the residual: the sum Σ‖fᵢ‖ of the unbalanced forces of
+            all free vertices, divided by the whole load Σmᵢ‖g‖ (without gravity, by its value at the start).
         iterations: Newton iterations in all, each round of proximal steps counting as one more.
-        lowest_eigenvalue: Of the Hessian of the energy over the free vertices [N/m]; NaN where the descent did not end in
-            balance.
+        lowest_eigenvalue: Lowest eigenvalue of the Hessian of the energy over the free vertices [N/m]; NaN if the descent did
+            not end in balance.
         stable: Whether the descent ended in balance and no eigenvalue is negative by more than rounding and the tolerance
-            leave open: no small move lowers the energy to second order. Moves that cost nothing, such as those of a body
+            explain. Then no small move lowers the energy to second order. Moves that cost nothing, such as those of a body
             that nothing holds, have the eigenvalue 0 and count as stable.
     """
 
@@ -41,9 +41,9 @@ class Equilibrium(NamedTuple):
 
 @in_turn
 def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cpu", dtype="float64", linear="factorised"):
-    """The shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins where they end.
+    """Finds the shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins in their final positions.
 
-    Pins with keyframes end at the last of these, all others stay where they start.
+    Pins with keyframes end at the last keyframe; all others stay where they start.
 
     Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
     the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
@@ -57,7 +57,7 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
             (without any, over the largest at the start). Where rounding leaves more at a vertex, the descent ends when nothing
             is left to gain, and the residual decides; with half the weight or more unbalanced it does not pass for a rest
             shape. Without gravity there is no load to hide.
-        load_steps: Parts in which gravity comes on and pins move along their keyframes. Pins that turn far need several.
+        load_steps: Number of steps in which gravity grows and pins move along their keyframes. Pins that turn far need several.
         iterations: The most Newton iterations in all.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
@@ -96,7 +96,7 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
     use = None if result in SETTLED else "not a rest shape"
     if result is Result.SADDLE:
-        use = f"not stable, for the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
+        use = f"not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
     unit = RESIDUAL.unit if minimiser.gravity[0] > 0.0 else RESIDUAL.weightless
     message = sentence(result, dtype, residual, RESIDUAL.measure, unit, tolerance, use=use)
     if result is Result.STALLED:
@@ -111,7 +111,7 @@ class _Descent:
     def __init__(self, minimiser, base, tolerance, iterations):
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
         self.used, self.moved = 0, 0.0
-        self.scale = None  # of the first descent: without gravity a later one begins at its own rounding
+        self.scale = None  # from the first descent: without gravity a later one would be scaled by its own rounding
         model = minimiser.model
         self.load = float(minimiser.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64))
         self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
@@ -131,7 +131,7 @@ class _Descent:
 
     @property
     def residual(self):
-        """What is left unbalanced of the load, after the last descent."""
+        """The fraction of the load that is unbalanced after the last descent."""
         return self.unbalanced / self.load
 
     def _settle(self, s, load, most):
@@ -150,7 +150,7 @@ class _Descent:
 
 
 def _move_pins(pins, base, part):
-    """Puts pins with keyframes where they are after ``part`` of these, of 1; in place."""
+    """Moves pins with keyframes, in place, to their positions after the fraction ``part`` of the keyframes."""
     if pins.keyframes is None:
         return
     at = part * (len(pins.keyframes) - 1)

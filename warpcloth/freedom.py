@@ -1,10 +1,10 @@
-"""How many degrees of freedom hard and stiff edges leave a cloth: the rank of the Jacobian of their lengths.
+"""Counts the degrees of freedom that hard and stiff edges leave a cloth, by the rank of the Jacobian of their lengths.
 
-E edges between n vertices hold at most E of 3n coordinates (Maxwell 1864, *On the calculation of the equilibrium and stiffness
-of frames*). All edges of a triangulated disc are independent, and so leave 3 + its boundary edges, 6 of these rigid motion,
-however fine it is; a closed surface is rigid (Gluck 1975, *Almost all simply connected closed surfaces are rigid*), and so is a
-grid with both diagonals in each cell. The count is of general position: a flat or evenly curved cloth may have more freedom,
-as a regular net has, which bends in any one direction, and loses it as it leaves that shape.
+E edges between n vertices remove at most E of 3n degrees of freedom (Maxwell 1864, *On the calculation of the equilibrium and
+stiffness of frames*). All edges of a triangulated disc are independent. However fine it is, it keeps 3 degrees of freedom plus
+one for each boundary edge, 6 of them rigid motion. A closed surface is rigid (Gluck 1975, *Almost all simply connected closed
+surfaces are rigid*), and so is a grid with both diagonals in each cell. The count holds in general position. A flat or evenly
+curved cloth may have more freedom: a regular net bends in any one direction, and loses that freedom as it leaves this shape.
 """
 
 from dataclasses import dataclass
@@ -13,26 +13,27 @@ import numpy as np
 
 from .terms import CorotatedMembrane, DihedralBending, NeoHookeanMembrane, QuadraticBending, Spring, StVKMembrane
 
-# Free vertices up to which the rank is found, in a second or a few; time and memory grow faster than they do.
+# Most free vertices for which the rank is computed, in a few seconds; time and memory grow faster than their number.
 MOST = 20_000
-# Edges that a fold is round, whose cost says whether an edge is stiff.
+# Radius, in edges, of the fold whose cost decides whether an edge is stiff.
 FOLD = 4.0
-# Of unit rows: nets of so many vertices have squares of singular values of 1e-9 and more, and zeros rounded to some 1e-13.
+# Squares of singular values below this are 0, for rows of unit length. Nets of up to MOST vertices have nonzero ones of 1e-9
+# and more, and zeros that round to some 1e-13.
 _ZERO = 1e-11
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """What edges that hold their lengths leave free, in general position.
+    """Degrees of freedom that edges of fixed length leave, in general position.
 
     Attributes:
-        edges: How many hold, each pair of vertices once, without those between pinned vertices.
-        hard: Whether some are hard.
-        coordinates: Of vertices that are not pinned.
-        rank: Of the Jacobian of the lengths with respect to these.
+        edges: Number of edges that hold their length. Each pair of vertices counts once, pairs of pinned vertices do not count.
+        hard: Whether some of them are hard.
+        coordinates: Number of coordinates of the vertices that are not pinned.
+        rank: Rank of the Jacobian of the lengths with respect to these coordinates.
         left: Degrees of freedom that are left, ``coordinates`` − ``rank``.
-        rigid: How many of them each piece of cloth has if it is one body that hangs on its pins.
-        counted: Whether ``rank`` is the most that so many edges can have, for the mesh is too large to find it.
+        rigid: Degrees of freedom of the pieces of cloth, each as one rigid body that hangs on its pins.
+        counted: Whether ``rank`` is only an upper bound from the number of edges, because the mesh is too large to compute it.
     """
 
     edges: int
@@ -45,17 +46,17 @@ class Freedom:
 
     @property
     def locked(self):
-        """Whether nothing but rigid motion is left, and so nothing to bend; where ``counted``, whether that may be."""
+        """Whether only rigid motion is left, so the cloth cannot bend; with ``counted``, whether that is possible."""
         return self.edges > 0 and self.left <= self.rigid
 
 
 def freedom(scene):
-    """What the hard and stiff edges of a scene leave free.
+    """Counts the degrees of freedom that the hard and stiff edges of a scene leave.
 
-    Springs hold their pairs and membranes the edges of their triangles, where they are hard or stiff: bent round a fold of
-    radius r = 4h a net strains by (h/r)²/24, and where that costs more than bending and weight, K/2·((h/r)²/24)² > D/2r² + ρgL,
-    the edge holds. K is 2k/√3 of springs, Et of membranes, D that of all bending terms, L the diagonal of the bounding box.
-    Limits, which hold only when they are reached, and rigid clusters are left out.
+    Springs hold their pairs, and membranes the edges of their triangles, if they are hard or stiff. A net that bends round a
+    fold of radius r = 4h strains by (h/r)²/24. An edge is stiff if that costs more than bending and weight,
+    K/2·((h/r)²/24)² > D/2r² + ρgL. K is 2k/√3 for springs and Et for membranes, D is the sum over all bending terms, and L the
+    diagonal of the bounding box. Limits, which act only when they are reached, and rigid clusters are left out.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
@@ -77,8 +78,8 @@ def freedom(scene):
 def rank_of(pairs, free):
     """Rank of the Jacobian of the lengths of pairs (E, 2) with respect to the vertices that are free (n,), in general position.
 
-    JᵀJ at random positions has so many eigenvalues that are not 0; those below a small ε are counted by the signs of the pivots
-    of JᵀJ − ε (Sylvester's law of inertia).
+    The rank is the number of nonzero eigenvalues of JᵀJ at random positions. The signs of the pivots of JᵀJ − ε, with a small
+    ε, count them (Sylvester's law of inertia).
     """
     from scipy.sparse import csr_array, identity
     from scipy.sparse.linalg import splu
@@ -99,12 +100,12 @@ def rank_of(pairs, free):
 
 
 def _held(scene):
-    """Pairs of vertices whose distance is held (E, 2), each once, and whether by something hard."""
+    """Finds the pairs of vertices whose distance is held (E, 2), each once, and whether some of them are hard."""
     mesh, found, hard = scene.mesh, [np.empty((0, 2), dtype=np.int64)], False
     area, size = mesh.triangle_areas.sum(), np.linalg.norm(np.ptp(mesh.points, axis=0))
     bending = [term.stiffness for term in scene.terms if isinstance(term, (QuadraticBending, DihedralBending))]
     D = sum(float(np.max(stiffness)) for stiffness in bending)
-    # Of edges alone no fold strains anything.
+    # A mesh of edges alone does not strain in a fold.
     weight = scene.vertex_masses.sum() / area * np.linalg.norm(scene.gravity) * size if area else np.inf
     for term in scene.terms:
         triangles = isinstance(term, (CorotatedMembrane, StVKMembrane, NeoHookeanMembrane))
@@ -123,7 +124,7 @@ def _held(scene):
 
 
 def _rigid(mesh, pairs, free):
-    """Degrees of freedom of the pieces of cloth, each moved as one body about its pinned vertices."""
+    """Counts the degrees of freedom of the pieces of cloth, each a rigid body that can move about its pinned vertices."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

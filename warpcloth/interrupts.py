@@ -1,4 +1,4 @@
-"""Interrupts, by Ctrl-C and, of the command, by SIGTERM too: a file that is being finished is finished first."""
+"""Handles interrupts by Ctrl-C, and in the command by SIGTERM too, so that a file that is being finished is finished first."""
 
 import os
 import signal
@@ -15,13 +15,13 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def deferred(patience=1):
-    """Lets an interrupt wait until this block has ended; a second one comes at once.
+    """Holds an interrupt back until this block has ended; a second one is raised at once.
 
-    Of the main thread, for interrupts come nowhere else. A signal that ends the process without being heard, as SIGTERM does
-    outside the command, is left alone.
+    This applies to the main thread, since interrupts arrive nowhere else. A signal without a handler, which ends the process as
+    SIGTERM does outside the command, is left alone.
 
     Args:
-        patience: How many interrupts wait; 0 where there was one already, for which this block is being run.
+        patience: How many interrupts are held back; 0 if this block runs because of an interrupt.
     """
     if not patience or threading.current_thread() is not threading.main_thread():
         yield
@@ -48,14 +48,15 @@ def deferred(patience=1):
 
 @contextmanager
 def recording(recorder, frames):
-    """Closes what keeps frames, however the block ends.
+    """Closes a recorder of frames, however the block ends.
 
     Args:
-        recorder: It has ``frames``, how many it was given, ``close()``, and ``saved()``, which says where they are.
-        frames: How many it would be given, after the first.
+        recorder: Object with ``frames``, the number of frames it was given, ``close()``, and ``saved()``, which says where they
+            are.
+        frames: Number of frames it would be given in all, after the first.
 
     Raises:
-        Interrupted: The user interrupted; it says what is saved.
+        Interrupted: The user interrupted; the message says which frames are saved.
     """
     try:
         try:
@@ -68,11 +69,11 @@ def recording(recorder, frames):
 
 
 class Interrupts:
-    """What the command makes of them: SIGTERM comes as Ctrl-C does, once; then nothing disturbs what is said of it.
+    """Interrupts of the command: SIGTERM acts like Ctrl-C, and further signals cannot disturb the message about the first.
 
     Attributes:
-        code: 128 and the number of the signal, as shells have it: 130 of Ctrl-C, 143 of SIGTERM.
-        over: Whether they do nothing any more.
+        code: Exit code, 128 plus the number of the signal, as in shells: 130 for Ctrl-C, 143 for SIGTERM.
+        over: Whether signals are ignored from now on.
     """
 
     def __init__(self):
@@ -82,7 +83,7 @@ class Interrupts:
         self._before = {}
         if threading.current_thread() is threading.main_thread():
             own = {signal.SIGINT: (signal.default_int_handler, leave), signal.SIGTERM: (signal.SIG_DFL, leave)}
-            for number, replaced in own.items():  # whoever has another handler, or ignores them, knows why
+            for number, replaced in own.items():  # leave other handlers, and signals that are ignored, alone
                 if signal.getsignal(number) in replaced:
                     self._before[number] = signal.signal(number, self._interrupt)
         self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
@@ -110,17 +111,17 @@ class Interrupts:
 
 
 def leave(number, _frame):
-    """Ends the process at once, without a traceback; nobody knows what an import makes of an exception."""
-    with suppress(Exception):  # it may have come in the middle of another flush
+    """Ends the process at once, without a traceback, because an import may swallow an exception."""
+    with suppress(Exception):  # the signal may have come in the middle of another flush
         sys.stdout.flush()
     os.write(2, b"warpcloth: interrupted\n")
     os._exit(128 + number)
 
 
 def leave_while_loading():
-    """Makes interrupts end the command while its modules load, which takes a second, and once it has said its last word.
+    """Makes interrupts end the command while its modules load, which takes a second, and after its last message.
 
-    Processes that it starts to measure in end without a word.
+    The processes that it starts for measurements end silently.
     """
     if threading.current_thread() is not threading.main_thread():
         return

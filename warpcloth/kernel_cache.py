@@ -1,4 +1,4 @@
-"""Warp's cache of compiled kernels: what is broken there is compiled again, and a cache that takes nothing is said."""
+"""Repairs Warp's cache of compiled kernels: broken files are compiled again, and a cache that cannot be written is an error."""
 
 import errno
 import os
@@ -6,15 +6,15 @@ import shutil
 import tempfile
 from functools import wraps
 
-_ROOM = 2**22  # bytes that the source and the binary of a kernel have to find
+_ROOM = 2**22  # free bytes that the source and the binary of a kernel need
 
 
 def mend():
-    """Has Warp look after its cache where it loads kernels, of any module.
+    """Makes Warp repair its cache when it loads a module.
 
-    A process that was killed, or a disk that was full, may leave a binary or its description cut, which Warp then fails to load
-    each time: here the files of the module are removed, and it is compiled once more. Without room for a binary LLVM ends the
-    process: here that is an error, before.
+    A killed process or a full disk may leave a truncated binary or description, which Warp then fails to load every time. In
+    that case the files of the module are removed and it is compiled once more. LLVM ends the process if there is no room for a
+    binary; this is checked first and raised as an error.
     """
     import warp as wp
 
@@ -37,11 +37,11 @@ def _mended(load):
             return load(module, device, block_dim, *arguments, **options)
         try:
             loaded = load(module, device, block_dim, *arguments, **options)
-            # A binary may be whole for the linker, and lack what it should have; CUDA notices that itself.
+            # The linker may accept a binary that lacks a kernel; CUDA notices that itself.
             if device.is_cpu and any(loaded.get_kernel_hooks(kernel).forward is None for kernel in list(loaded.kernel_names)):
                 raise RuntimeError(f"{folder}: a kernel is not there")
             return loaded
-        except Exception:  # of many kinds; if it was not for these files it comes again
+        except Exception:  # many kinds; if these files are not the cause it is raised again
             refuse_full(os.path.dirname(folder))
             shutil.rmtree(folder, ignore_errors=True)
             module.execs.pop(key, None)
@@ -52,10 +52,10 @@ def _mended(load):
 
 
 def refuse_full(cache):
-    """Refuses a folder that takes no binary.
+    """Refuses a folder that has no room for a binary.
 
     Raises:
-        OSError: It is full or cannot be written.
+        OSError: The folder is full or cannot be written.
     """
     try:
         with tempfile.TemporaryFile(dir=cache) as file:
@@ -65,6 +65,6 @@ def refuse_full(cache):
 
 
 def described(error, cache):
-    """The error of a cache, with what it is."""
+    """Returns the error of a cache, with a name for its folder."""
     where = f"{cache}, where Warp keeps compiled kernels (WARP_CACHE_PATH names another folder)"
     return OSError(error.errno or errno.EIO, error.strerror or str(error), where)

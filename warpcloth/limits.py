@@ -1,16 +1,16 @@
-"""Sizes that no machine takes, refused before anything runs: what memory or a disk has no room for, and counts without end."""
+"""Refuses, before anything runs, sizes that exceed the free memory or disk, and counts that would never end."""
 
 import os
 import shutil
 
-# Steps of a frame, iterations of a step, copies: at a microsecond each, the least that any takes, more are minutes or hours.
+# Most steps of a frame, iterations of a step, and copies. Each takes a microsecond at least, so more take minutes or hours.
 MOST = 10_000_000
-# Frames: their numbers are time codes of a stage, see `usd.values.MOST_TIME_CODE`.
+# Most frames, since their numbers are time codes of a stage, see `usd.values.MOST_TIME_CODE`.
 MOST_FRAMES = 1_000_000_000
 
 
 def available_memory():
-    """Bytes that this process can still be given, as the kernel of Linux and its control group say; None where nobody says."""
+    """Returns the bytes that this process can still allocate, from the Linux kernel and the control group; None if unknown."""
     found = []
     for path, key in (
         ("/proc/meminfo", "MemAvailable:"),
@@ -21,7 +21,7 @@ def available_memory():
             with open(path) as file:
                 words = next(line.removeprefix(key).split() for line in file if line.startswith(key))
             found.append(int(words[0]) * (1024 if key else 1))
-        except (OSError, StopIteration, ValueError):  # not Linux, or no limit, which is the word "max"
+        except (OSError, StopIteration, ValueError):  # not Linux, or the word "max", which means no limit
             found.append(None)
     free, limit, used = found
     rooms = [free] if limit is None or used is None else [free, limit - used]
@@ -29,14 +29,14 @@ def available_memory():
 
 
 def refuse_memory(what, size):
-    """Refuses what takes more memory than there is.
+    """Refuses an option that takes more memory than is free.
 
     Args:
-        what: What it is, as the start of a sentence: "frames is 1000000000".
-        size: Bytes.
+        what: The option and its value, as the start of a sentence: "frames is 1000000000".
+        size: Bytes that it takes.
 
     Raises:
-        ValueError: There are fewer.
+        ValueError: Fewer bytes are free.
     """
     room = available_memory()
     if room is not None and size > room:
@@ -46,10 +46,10 @@ def refuse_memory(what, size):
 
 
 def refuse_disk(what, size, folder):
-    """Refuses what takes more room than the disk of a folder has, which must exist.
+    """Refuses an option that takes more space than is free on the disk of a folder, which must exist.
 
     Raises:
-        ValueError: There is less.
+        ValueError: Less space is free.
     """
     room = shutil.disk_usage(folder).free
     if size > room:
@@ -60,7 +60,7 @@ def refuse_disk(what, size, folder):
 
 
 def shown_bytes(size):
-    """A size in a unit of its own: 1.5 GB."""
+    """Formats a size with a suitable unit, such as 1.5 GB."""
     size, units = float(size), ["bytes", "kB", "MB", "GB", "TB"]
     while size >= 1000.0 and len(units) > 1:
         size /= 1000.0
