@@ -273,7 +273,7 @@ TOO_LARGE = [
     (lambda path: run(frames=10**12), "frames is 10+; it must be 1,000,000,000 or less"),
     (
         lambda path: run(frames=10**9, copies=100),
-        "frames is 1,000,000,000, which takes 60 TB of memory; it must fit in the .* that are free",
+        "frames is 1,000,000,000 of 100 copies, which takes 60 TB of memory; it must fit in the .* that are free",
     ),
     (
         lambda path: run(300, output=path / "out.usdc", frames=10**9),
@@ -283,6 +283,10 @@ TOO_LARGE = [
     (lambda path: wc.Mesh.grid(10**400, 3), "nx = 10+...0+: must be a whole number of vertices, at least 2 and at most"),
     (lambda path: wc.Mesh.grid(3, 3, size=10**400), "size = 10+...0+: must be a finite positive length"),
     (lambda path: wc.Mesh.chain(2**31 - 1), "n = 2147483647, which takes 189 GB of memory"),
+    (lambda path: run(copies="2"), "copies is '2'; it must be a whole number of 1 or more"),
+    (lambda path: run(copies=None), "copies is None; it must be a whole number of 1 or more"),
+    (lambda path: run(dtype="double"), "dtype is 'double'; it must be one of 'float32', 'float64'"),
+    (lambda path: run(dtype=[1]), r"dtype is \[1\]; it must be one of 'float32', 'float64'"),
     (lambda path: run(device=[]), r"device is \[\]; on this machine there are cpu"),
 ]
 

@@ -9,11 +9,12 @@ import numpy as np
 import warp as wp
 
 from .balance import GAIN, STRETCHED, Balance
-from .checks import whole
+from .checks import choice, whole
 from .frames import frames_of, state_of
 from .interrupts import recording
 from .limits import MOST_FRAMES, refuse_disk, refuse_memory
 from .lines import lines_of
+from .model import DTYPES
 from .ordering import order_of_run
 from .status import Result, Status, sentence
 from .turns import in_turn
@@ -100,6 +101,8 @@ def simulate(
     """
     frames = scene.frames if frames is None else frames
     whole("frames", frames, 1, MOST_FRAMES)
+    whole("copies", copies, 1)
+    choice("dtype", dtype, tuple(DTYPES))
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
     # First, for it refuses a wrong output before anything compiles.
@@ -132,9 +135,10 @@ def simulate(
 
 def _refuse_size(frames, scene, dtype, copies, output):
     """Refuses more frames than memory, or the disk of an output, has room for: positions and velocities at least."""
-    what, numbers = f"frames is {frames:,}", 6 * len(scene.mesh.points) * (int(frames) + 1)
+    of = f" of {copies:,} copies" if copies > 1 else ""
+    what, numbers = f"frames is {frames:,}{of}", 6 * len(scene.mesh.points) * (int(frames) + 1)
     if output is None:
-        refuse_memory(what, np.dtype(dtype).itemsize * copies * numbers)
+        refuse_memory(what, np.dtype(dtype).itemsize * int(copies) * numbers)
     else:
         refuse_disk(what, 4 * numbers, os.path.dirname(os.path.realpath(output)))
 
