@@ -576,7 +576,7 @@ BAD_FILES = [
     ("row.off", "OFF\n4 2 0\n" + ROWS[:-3], ValueError, "line 8: face 1 has 3 numbers, must have 4"),
     ("counts.off", "OFF\n4 -2 0\n" + ROWS, ValueError, "line 2: must be the numbers of vertices, faces"),
     ("open.off", "OFF\n40 1 0\n" + "0 0 0\n" * 40 + "3 0 2 1", ValueError, "line 43: ends in 1 without a line break"),
-    ("nothing.off", "OFF\n", ValueError, "has no line of the numbers of vertices and faces"),
+    ("nothing.off", "OFF\n", ValueError, "has no line with the numbers of vertices and faces"),
     ("short.ply", HEAD.replace("face 2", "face 3") + ROWS, ValueError, "line 16: the file ends before face 2 of the 3"),
     ("row.ply", HEAD + ROWS[:-3], ValueError, "line 15: face 1 has 3 numbers, must have 4"),
     ("list.ply", HEAD + ROWS.replace("3 0", "-3 0"), ValueError, "line 14: face 0 has a list of -3"),

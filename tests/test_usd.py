@@ -1015,7 +1015,7 @@ def test_a_folder_without_locks_warns(tmp_path, monkeypatch):
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr("warpcloth.outputs._lock", refuse)
-    with pytest.warns(UserWarning, match=r"out\.usdc: its folder takes no locks; keep other runs away from it"):
+    with pytest.warns(UserWarning, match=r"out\.usdc: its folder does not support locks; do not start another run to it"):
         write(tmp_path / "out.usdc", Mesh.grid(4, 4))
     assert len(FrameSequence(tmp_path / "out.usdc")) == FRAMES
 

@@ -18,10 +18,11 @@ def gathered(model, elements, damped=False, rows=True):
 
     Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
     than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and what the element has
-    beside it at hand, unless the rest state is set, by element, in each step. A stiffness that all pairs of a copy share is one
-    number a vertex, so that a copy has the bits of a model of its own. Of a quadratic energy that is not damped the
-    incidences are the rows of its matrix, if ``rows`` allows it: these take a third of the time, but what one vertex rounds no
-    other takes back, and in float32 that noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as elements.
+    beside it at hand, unless the rest state is set, by element, in each step. A stiffness that all pairs of a copy share is
+    stored once per vertex, so that a copy gets the same bits as a model of its own. For a quadratic energy without damping the
+    incidences are the rows of its matrix, if ``rows`` allows it. Rows take a third of the time, but their rounding errors do
+    not cancel between vertices: in float32 this noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as
+    with elements.
     """
     part = Part(elements.term, damped, shared=0 in elements.stiffness.strides)
     arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}

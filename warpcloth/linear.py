@@ -9,7 +9,7 @@ import warp as wp
 from .capture import Mirror, on_host
 from .kernels import linear
 
-# Unknowns of which all eigenvalues are found at once.
+# Most unknowns for which all eigenvalues are computed at once.
 SMALL = 100
 
 
@@ -126,7 +126,7 @@ class Factorised:
         return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
     def lowest_eigenvalue(self, copy=0):
-        """The lowest eigenvalue of a copy's matrix without its pinned vertices [N/m]; see :func:`lowest_eigenvalue`."""
+        """Finds the lowest eigenvalue of a copy's matrix without its pinned vertices [N/m], see :func:`lowest_eigenvalue`."""
         matrix = self.matrices[copy]
         matrix.data[:] = self.values.read()[self.starts[copy] : self.starts[copy + 1]]
         n = self.model.per_copy
@@ -160,17 +160,17 @@ class Factorised:
 
 
 def lowest_eigenvalue(matrix):
-    """The lowest eigenvalue of a sparse symmetric matrix, by Lanczos iterations with the inverse of A + σ.
+    """Finds the lowest eigenvalue of a sparse symmetric matrix, by Lanczos iterations with the inverse of A + σ.
 
-    σ is raised from 1000 ε times the largest entry of the diagonal, tenfold each time, until A + σ has no negative pivot: then
-    no eigenvalue lies below −σ, the lowest is the nearest to it, and few iterations find it (Ericsson and Ruhe 1980).
+    σ starts at 1000 ε times the largest entry of the diagonal and grows tenfold until A + σ has no negative pivot. Then no
+    eigenvalue lies below −σ, the lowest is the nearest to −σ, and few iterations find it (Ericsson and Ruhe 1980).
 
     Args:
         matrix: A, scipy (n, n).
 
     Returns:
-        float: As exact as about 1e-10 (λ + σ), σ at most 10 |λ| or 1000 ε times the largest entry. Infinite where n is 0, NaN
-            where an entry is not finite.
+        float: Accurate to about 1e-10 (λ + σ), where σ is at most 10 |λ| or 1000 ε times the largest entry. Infinite if n is 0,
+            NaN if an entry is not finite.
     """
     from scipy.sparse import identity
     from scipy.sparse.linalg import LinearOperator, eigsh, splu

@@ -1,22 +1,23 @@
-"""Lines that show what the triangles of a mesh do not: strings and bars, which terms hold between vertices of no triangle."""
+"""Finds the lines to draw for strings and bars: pairs of vertices that a term joins and that are not edges of a triangle."""
 
 import numpy as np
 
-# Thickness of springs and of rigid bodies, in mean lengths of the edges of the mesh.
+# Thickness of springs and of rigid bodies, relative to the mean edge length of the mesh.
 _SPRING, _BODY = 0.05, 0.15
 
 
 def lines_of(scene):
-    """Pairs of vertices that a term joins, one of them at least without a triangle.
+    """Finds the pairs of vertices that a term joins, at least one of them without a triangle.
 
-    Those of a spring are its own, those of a rigid body the shortest tree over its vertices without a triangle. A mesh of edges
-    alone shows all of its vertices already.
+    A spring has its own pairs. A rigid body has the shortest tree over its vertices without a triangle. A mesh of edges alone
+    shows all of its vertices already.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
 
     Returns:
-        dict: Pairs (E, 2) and a thickness [m] by label of the term; of terms of one label all pairs, as thick as the thickest.
+        dict: Pairs (E, 2) and a thickness [m] by label of the term. Terms with one label share their pairs and the largest
+            thickness.
     """
     mesh = scene.mesh
     lines = {}
@@ -42,7 +43,7 @@ def lines_of(scene):
 
 
 def _tree(points, vertices):
-    """Pairs (k−1, 2) of vertices (k,) that join them all, of the least length in sum."""
+    """Finds the minimum spanning tree of vertices (k,), as pairs (k−1, 2)."""
     from scipy.sparse.csgraph import minimum_spanning_tree
 
     if len(vertices) < 2:

@@ -18,7 +18,7 @@ ENDINGS = {
     ".glb": {},
     ".gltf": {},
 }
-# trimesh logs the tracebacks of what it stumbles over, which Python prints where nobody has asked for a log.
+# trimesh logs the tracebacks of its errors, which Python prints unless a log is configured.
 _QUIET = logging.NullHandler()
 # STL has no shared vertices at all; glTF stores a vertex once for every normal and texture coordinate that it has.
 WELDED = (".stl", ".glb", ".gltf")
@@ -90,8 +90,8 @@ def read_arrays(path, name=None):
     logging.getLogger("trimesh").addHandler(_QUIET)
     try:
         scene = trimesh.load_scene(path, process=False, maintain_order=True, **ENDINGS[ending])
-    except ModuleNotFoundError:  # of what would guess the encoding of a text
-        raise ValueError(f"{path}: cannot be read as {ending}, it is no UTF-8") from None
+    except ModuleNotFoundError:  # the module that would guess the encoding of a text
+        raise ValueError(f"{path}: cannot be read as {ending}, it is not UTF-8") from None
     except Exception as error:  # the readers raise whatever a broken file makes them stumble over
         raise ValueError(f"{path}: cannot be read as {ending}, {type(error).__name__}: {error}") from error
     found = {node: scene.graph[node] for node in scene.graph.nodes_geometry}
@@ -108,11 +108,11 @@ def read_arrays(path, name=None):
 
 
 def _check_ply(path, data):
-    """Refuses an ASCII .ply file whose lines are not those that its header says: trimesh would read another mesh."""
+    """Refuses an ASCII .ply file whose lines do not match its header, because trimesh would read a different mesh."""
     head, end, body = data.partition(b"end_header")
     words = [line.split() for line in head.decode("latin-1").splitlines()]
     if ["format", "ascii"] not in [line[:2] for line in words]:
-        return  # of a binary file trimesh counts the bytes
+        return  # trimesh checks the size of a binary file itself
     if not end:
         raise ValueError(f"{path}: its header has no end_header, the file may be cut")
     elements = []
@@ -124,7 +124,7 @@ def _check_ply(path, data):
         elif line[:1] == ["property"] and elements:
             elements[-1][2].append(line[1] == "list" if len(line) > 1 else False)
     vertices = next((count for name, count, _ in elements if name == "vertex"), 0)
-    lines = body.decode("latin-1").splitlines()[1:]  # what is left of the last line of the header
+    lines = body.decode("latin-1").splitlines()[1:]  # the first entry is the rest of the header's last line
     first, row = len(words) + 2, 0
     for name, count, lists in elements:
         for index in range(count):
@@ -145,14 +145,14 @@ def _check_ply(path, data):
 
 
 def _check_off(path, data):
-    """Refuses an .off file whose lines are not those that its header says: trimesh would read another mesh."""
+    """Refuses an .off file whose lines do not match its header, because trimesh would read a different mesh."""
     lines = enumerate(data.decode("latin-1").splitlines(), start=1)
     lines = [(number, words) for number, line in lines if (words := line.partition("#")[0].split())]
     if lines and lines[0][1][0].endswith("OFF"):
         lines[0][1].pop(0)
         lines = lines if lines[0][1] else lines[1:]
     if not lines:
-        raise ValueError(f"{path}: has no line of the numbers of vertices and faces")
+        raise ValueError(f"{path}: has no line with the numbers of vertices and faces")
     (number, counts), *rows = lines
     if len(counts) < 2 or not all(count.isdecimal() for count in counts[:2]):
         raise ValueError(f"{path}, line {number}: must be the numbers of vertices, faces and edges, each 0 or more")
@@ -180,10 +180,10 @@ _PLURAL = {"vertex": "vertices", "face": "faces"}
 
 
 def _refuse_open_end(where, data, line, most):
-    """Refuses a file without a line break at its end whose last number could have gone on, as an index below ``most``."""
+    """Refuses a file that ends in a number without a line break, if more digits could make an index below ``most``."""
     last = line.split()[-1:] or [""]
     if data[-1:] not in b"\r\n" and not (last[0].isdecimal() and (int(last[0]) == 0 or 10 * int(last[0]) >= most)):
-        raise ValueError(f"{where}: ends in {last[0]} without a line break, so that the file may be cut; end the line with one")
+        raise ValueError(f"{where}: ends in {last[0]} without a line break, so the file may be cut; end the line with one")
 
 
 def _arrays(path, geometry, transform, drop_unused):

@@ -14,7 +14,7 @@ from .selection import select
 STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 UP_AXES = ("Y", "Z")
 _MOST_VERTICES = 2**31 - 1  # indices are int32
-# What building a grid takes at least: float64 positions and texture coordinates, int64 corners of two triangles.
+# Least memory to build a grid: float64 positions and texture coordinates, int64 corners of two triangles.
 _BYTES_OF_A_VERTEX = 24 + 16 + 48
 
 
@@ -32,7 +32,7 @@ class Mesh:
             each row has its smaller index first, and rows are in lexicographic order. Of an edge mesh: as given.
         texture_coordinates: One st pair for each vertex (n, 2), float64, or None.
         grid_shape: (nx, ny) if vertex i + nx·j is column i, row j of a grid of four-sided cells, or None.
-        up_axis: "Y" or "Z", which gravity and files follow; None where nobody says, which they take for "Y".
+        up_axis: "Y" or "Z", which gravity and files follow; None if unknown, which they take as "Y".
 
     Raises:
         ValueError: An array has the wrong shape or type, is empty, or has an element (named by its index) that is not

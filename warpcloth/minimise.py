@@ -148,17 +148,18 @@ class Minimiser:
             self._solve()
 
     def curves_down(self, tolerance):
-        """Whether the unchanged Hessian at d = 0 has a negative eigenvalue in some copy that balance to ``tolerance`` resolves.
+        """Whether the unchanged Hessian at d = 0 of some copy has a negative eigenvalue that ``tolerance`` does not explain.
 
-        A force of ``tolerance`` times the scale and the mass of the cloth may be left, and with it a compression of that force
-        over an edge [N/m]. A sheet without bending stiffness has no other resistance against a move out of its plane.
+        Balance to ``tolerance`` may leave a force of ``tolerance`` times the scale and the mass of the cloth. That force can
+        compress an edge, which adds the force divided by the edge length [N/m] to the Hessian. A sheet without bending
+        stiffness has no other resistance to motion out of its plane.
         """
         self._assemble_raw()
         unresolved = tolerance * float((self.scale * self.model.mass.numpy().reshape(self.model.copies, -1).sum(axis=1)).max())
         return Factorised(self.hessian).curves_down(unresolved / self.edge)
 
     def lowest_eigenvalue(self):
-        """The lowest eigenvalue of the unchanged Hessian at d = 0 over the free vertices of the first copy [N/m]."""
+        """Finds the lowest eigenvalue of the unchanged Hessian at d = 0 over the free vertices of the first copy [N/m]."""
         self._assemble_raw()
         return Factorised(self.hessian).lowest_eigenvalue()
 
@@ -175,7 +176,7 @@ class Minimiser:
         self._policy.write(before)
 
     def start(self):
-        """d = 0, with what follows from it."""
+        """Sets d = 0 and everything that depends on it."""
         self._start()
 
     # What the segments record.

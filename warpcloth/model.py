@@ -112,14 +112,14 @@ class DeviceElements:
         return len(self.stencil)
 
     def stiffness_of_copies(self, model):
-        """The stiffness (B,) that all elements of a copy share, of each copy; None where elements of a copy differ."""
+        """Returns the stiffness (B,) that all elements of each copy share, or None if the elements of a copy differ."""
         # Colours put elements of all copies in one order; all vertices of an element are in one copy.
         by_copy = np.argsort(self.stencil.numpy()[:, 0] // model.per_copy, kind="stable")
         values = self.stiffness.numpy()[by_copy].reshape(model.copies, -1)
         return values[:, 0] if values.size and (values == values[:, :1]).all() else None
 
     def with_unit_stiffness(self):
-        """The same elements with a stiffness of 1, or 0 where it is 0."""
+        """Returns these elements with a stiffness of 1, or 0 where it is 0."""
         stiffness = self.stiffness.numpy()
         array = wp.array((stiffness > 0.0).astype(stiffness.dtype), device=self.stiffness.device)
         return replace(self, stiffness=array, hard=False)

@@ -10,10 +10,10 @@ from .rotation import point_sets
 
 _RULE = 'must be "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, or a set for each'
 _SHARE = 2.0  # per cent
-# Points whose spread across a line is at most this part of that along it lie on it: what they are wrong by across, they turn by
-# a hundred times.
+# Points lie on a line if their spread across it is at most this fraction of the spread along it. An error across the line
+# then turns the set a hundred times as far.
 _LINE = 0.01
-# Of the nearest points so many are looked at for all vertices at once: only on very uneven meshes do more lie on a line.
+# Number of nearest points that are checked for all vertices at once; more lie on a line only on very uneven meshes.
 _FEW = 8
 
 
@@ -27,8 +27,8 @@ def neighbourhoods(mesh, chosen):
     Args:
         mesh: The :class:`warpcloth.Mesh`.
         chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, which is
-            "nearest" too; or sets of vertices, (n, k) or n lists. Where a share of the vertices is fewer than three, or all on
-            one line, it takes the fewest nearest that determine a rotation, and warns.
+            "nearest" too; or sets of vertices, (n, k) or n lists. If a share of the vertices is fewer than three, or all of
+            them are on one line, the fewest nearest vertices that determine a rotation are taken, with a warning.
 
     Returns:
         tuple: offsets (n + 1,) and members, int32: those of vertex i are members[offsets[i]:offsets[i + 1]].
@@ -100,10 +100,10 @@ def _nearest(mesh, used, chosen):
 
 
 def _sets(tree, k, widen):
-    """The k nearest of each point of a tree; with ``widen`` more of them, until they determine a rotation.
+    """Finds the k nearest points of each point of a tree; with ``widen``, as many as it takes to determine a rotation.
 
     Returns:
-        tuple: How many they are (n,), and all of them one set after another, each in order of index.
+        tuple: The size of each set (n,), and all sets one after another, each in order of index.
     """
     points, n = tree.data, tree.n
     most = min(max(k, _FEW), n) if widen else k
@@ -113,7 +113,7 @@ def _sets(tree, k, widen):
         part, least, most = todo.pop()
         near = tree.query(points[part], k=most)[1]
         size = np.full(len(part), 0 if widen else k)
-        for count in range(least, most + 1):  # ends after few: three or four points are on a line seldom
+        for count in range(least, most + 1):  # ends soon: three or four points are seldom on a line
             unknown = np.flatnonzero(size == 0)
             if not len(unknown):
                 break

@@ -32,11 +32,12 @@ def check_apart(outputs, inputs=()):
 class Output:
     """A file that is written under another name, and renamed at `close`, so that a failure leaves an earlier result whole.
 
-    As a context it closes, also where the user interrupts, with what there is; other errors leave nothing of it.
+    As a context manager it closes the file at the end, and with the rows so far if the user interrupts; other errors discard
+    it.
 
     Attributes:
         path: The file, once it is closed.
-        finished: Whether it is.
+        finished: Whether it is closed.
     """
 
     def __init__(self, path, mode, **options):
@@ -96,16 +97,16 @@ class Output:
 
 
 class Lock:
-    """Keeps other writers away from an output: a file beside it, `.<name>.lock`, which the system frees when its process ends.
+    """Locks an output against other writers by a file `.<name>.lock` beside it, which is unlocked when its process ends.
 
-    So a process that was killed leaves a file that holds nobody up, and that the next writer removes when it is done. Folders
-    of a network are locked for all their machines where the file system does that.
+    A killed process leaves a file that blocks nobody and that the next writer removes when it is done. In network folders the
+    lock holds for all machines if the file system supports that.
 
     Args:
         output: Path of the output.
 
     Raises:
-        BlockingIOError: Another writer has it, of this process or of another one.
+        BlockingIOError: Another writer, in this or another process, has the lock.
 
     Warns:
         UserWarning: The file system of the folder has no locks.
@@ -117,7 +118,7 @@ class Lock:
         while True:
             try:
                 file = open(self._path, "a+", encoding="utf-8")
-            except PermissionError:  # that of another user, who may have left it; if there is none the folder is another's
+            except PermissionError:  # the file of another user; if there is no file, the folder cannot be written
                 file = open(self._path, encoding="utf-8")
             try:
                 _lock(file)
@@ -127,24 +128,24 @@ class Lock:
                     holder = file.read(200).strip()
                 file.close()
                 if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
-                    warnings.warn(f"{output}: its folder takes no locks; keep other runs away from it", stacklevel=5)
+                    warnings.warn(f"{output}: its folder does not support locks; do not start another run to it", stacklevel=5)
                     return
                 raise BlockingIOError(
                     f"{output}: is being written by {holder or 'another run'}; wait until it ends, or give another output"
                 ) from None
-            # Or the writer before has removed the file between, and the next one would make another.
+            # Otherwise the last writer has removed this file in the meantime, and the next one would make another.
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(file.fileno()), os.stat(self._path)):
                     break
             file.close()
         self._file = file
-        with contextlib.suppress(OSError):  # of a full disk; it is for the message alone
+        with contextlib.suppress(OSError):  # a full disk; the text is only for the message
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}")
             file.flush()
 
     def release(self):
-        """Lets others write; once is enough. In a process that was forked from the writer's it does nothing."""
+        """Lets others write. Further calls do nothing, nor do calls in a process that was forked from the writer's."""
         if self._file is None or self._process != os.getpid():
             return
         with contextlib.suppress(OSError):
@@ -158,7 +159,7 @@ def _lock(file):
     if sys.platform == "win32":
         import msvcrt
 
-        file.seek(2**20)  # beyond what is read, for nobody else could read what is locked
+        file.seek(2**20)  # beyond the text, because others cannot read locked bytes
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
     else:
         import fcntl

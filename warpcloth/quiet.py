@@ -1,4 +1,4 @@
-"""Warp without its greeting, its lines on modules and its native line about a missing CUDA driver, unless asked for."""
+"""Silences Warp's greeting, its lines on modules and its native line about a missing CUDA driver, unless they are asked for."""
 
 import os
 import sys
@@ -10,7 +10,7 @@ from .kernel_cache import described
 
 
 def leave_out_news():
-    """Leaves Warp at warnings where its log level is still its own default; a level that is set later, or was before, holds."""
+    """Sets Warp's log level to warnings if it is still Warp's default; a level that the user sets, before or later, is kept."""
     import warp as wp
 
     if wp.config.log_level == wp.LOG_INFO:
@@ -18,7 +18,7 @@ def leave_out_news():
 
 
 def find_device(name):
-    """The Warp device of a name, Warp being initialised by :func:`initialise_warp`.
+    """Returns the Warp device of a name, after :func:`initialise_warp`.
 
     Raises:
         ValueError: This machine has no such device.
@@ -28,14 +28,14 @@ def find_device(name):
     initialise_warp()
     try:
         return wp.get_device(name)
-    except (TypeError, ValueError, RuntimeError):  # of what is no name, or the name of none
+    except (TypeError, ValueError, RuntimeError):  # not a name, or the name of no device
         there = ", ".join(device.alias for device in wp.get_devices())
         raise ValueError(f"device is {shown(name)}; on this machine there are {there}") from None
 
 
 @cache
 def initialise_warp():
-    """Initialises Warp; that there is no driver is no news where only a CPU is asked for.
+    """Initialises Warp, without its line about a missing driver if only the CPU is asked for.
 
     Raises:
         OSError: The folder of compiled kernels cannot be made.

@@ -88,11 +88,11 @@ def write_report(
             about the value of what is undeformed where there is one.
         curves: Whether stage and pictures show the principal directions, as long as their stretches.
         single_file: Whether the stage is one file, see :class:`warpcloth.usd.AnimationWriter`.
-        up_axis: "Y" or "Z", of what does not say its own.
+        up_axis: "Y" or "Z", for inputs that do not say theirs.
         progress: Function called with (row, rows) after each, or None.
         view: The :class:`warpcloth.chart.View` of the stills, if not its default; its up axis is that of the animation.
-        both_sides: Whether stills show the cloth from straight behind too, see :func:`warpcloth.chart.draw`.
-        colormap: Name of a colour map of matplotlib, if not that which :class:`warpcloth.chart.Scale` has by itself.
+        both_sides: Whether stills show the cloth from the opposite side too, see :func:`warpcloth.chart.draw`.
+        colormap: Name of a colour map of matplotlib, if not the default of :class:`warpcloth.chart.Scale`.
 
     Returns:
         :class:`Report`.
@@ -170,7 +170,7 @@ def write_report(
 
 @contextmanager
 def _interruptible(report, rows, opened):
-    """Says at an interrupt which of the writers that were opened have the rows until then in a file."""
+    """At an interrupt, says which of the opened writers have saved the rows so far in a file."""
     try:
         yield
     except KeyboardInterrupt:

@@ -44,7 +44,7 @@ class Scene:
         velocities: How they start, (n, 3) [m/s]; at rest if not given. What they say of pinned vertices does not matter.
         terms: The energies, see :mod:`warpcloth.terms`.
         pins: :class:`Pins`, or vertices or a selection of fixed ones.
-        gravity: Acceleration (3,) [m/s²]; if not given 9.81 down the up axis of the mesh, which is y where it has none.
+        gravity: Acceleration (3,) [m/s²]; by default 9.81 down the up axis of the mesh, or down y if it has none.
         duration: [s], a whole number of frames.
         fps: Frames per second.
         name: For reports and files.
@@ -139,7 +139,7 @@ class Scene:
 
     @property
     def up_axis(self):
-        """The axis that gravity is along, "Y" or "Z"; that of the mesh without gravity."""
+        """The axis along which gravity acts, "Y" or "Z"; without gravity the up axis of the mesh."""
         if not self.gravity[1:].any():
             return self.mesh.up_axis or "Y"
         return "Z" if abs(self.gravity[2]) > abs(self.gravity[1]) else "Y"

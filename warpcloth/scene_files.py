@@ -35,7 +35,7 @@ class SceneSource:
         path: The file.
         function: Called with ``parameters`` by name, returns a :class:`warpcloth.Scene`.
         parameters: Of the function, as `inspect.Parameter` by name.
-        pins: A selection of vertices that stand still where they start, in place of the pins of the scene; or None.
+        pins: A selection of vertices that stand still and replace the pins of the scene, or None.
     """
 
     path: Path
@@ -60,10 +60,11 @@ class SceneSource:
         return values
 
     def scene(self, values):
-        """The scene for the values of the parameters.
+        """Builds the scene for the values of the parameters.
 
         Raises:
-            ValueError: The function raises, with its file and line, or returns no scene; or ``pins`` selects no vertex.
+            ValueError: The function raises (the message has its file and line) or returns no scene, or ``pins`` selects no
+                vertex.
         """
         if self.path.suffix in STAGES:
             scene = self.function(**values)
@@ -78,10 +79,10 @@ class SceneSource:
 
 
 def some_vertices(option, selection, mesh):
-    """The vertices that an option selects.
+    """Returns the vertices that an option selects.
 
     Raises:
-        ValueError: There are none, or the selection does not follow the grammar.
+        ValueError: It selects none, or does not follow the grammar of selections.
     """
     vertices = mesh.select(selection)
     if not len(vertices):
@@ -138,7 +139,7 @@ def _python_source(path, pins):
 
 
 def parameters_of(function):
-    """The `inspect.Parameter` by name of a function, or of a record of options."""
+    """Returns the `inspect.Parameter` of each parameter of a function, or of a record of options, by name."""
     by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     found = inspect.signature(function, eval_str=True).parameters
     return {name: parameter for name, parameter in found.items() if parameter.kind in by_name}
@@ -191,7 +192,7 @@ def list_scenes(folder):
     for path in sorted(folder.glob("*.py")):
         try:
             tree = ast.parse(path.read_bytes())
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # the last two of what is nested too deep
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # the last two from too deep nesting
             listed.append(Listed(path.stem, f"cannot be read: {error}"))
             continue
         function = next((n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "scene"), None)
@@ -306,7 +307,7 @@ def _kinds(annotation):
 
 
 def kinds_of_parameter(parameter):
-    """Types of which a parameter takes a value: those of its annotation, else that of its default."""
+    """Returns the types that a parameter takes: those of its annotation, or else that of its default."""
     if parameter.annotation is not parameter.empty:
         return _kinds(parameter.annotation)
     if parameter.default is None or parameter.default is parameter.empty:

@@ -9,8 +9,8 @@ from .checks import shown
 # Points often come from float32 files, and 0.1 from a text: nearer than this share of the mesh's size is equal.
 _EQUAL = 1e-6
 
-_DEEPEST = 100  # brackets in brackets: each takes three calls of Python
-_EXCERPT = 60  # characters of a long text before and after what is wrong
+_DEEPEST = 100  # nested brackets, each of which takes three Python calls
+_EXCERPT = 60  # characters of a long text that are shown before and after an error
 
 _TOKEN = re.compile(
     r"(?P<space>\s+)|(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),:])"
@@ -113,7 +113,7 @@ class _Reader:
         kind, word, column = self.tokens[self.position]
         if kind != "number":
             self.expected("a whole number" if whole else "a number")
-        # Python turns no more than some thousand digits into a number, and no index has more than a float is sure of.
+        # Python converts only a few thousand digits to a number, and no index needs more than a float represents exactly.
         if whole and not (word.isdecimal() and least <= float(word) <= most):
             self.fail(column, f"found {shown(word)[1:-1]}, expected a whole number from {least} to {most}")
         if not whole and not np.isfinite(float(word)):

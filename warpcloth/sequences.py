@@ -54,7 +54,7 @@ class Sequence:
         precision: Type of the numbers that the input has, which says how coarsely they are rounded.
         declared: Whether the input says the rest shape; else `mesh` has the points of the first frame.
         files: Paths of the files that frames are read from.
-        up_axis: "Y" or "Z"; None where the input does not say.
+        up_axis: "Y" or "Z"; None if the input does not say.
 
     Raises:
         ValueError: The mesh has no triangles.
@@ -274,7 +274,7 @@ def _open_npz(path, fps):
 
 @contextmanager
 def _numpy_reads():
-    """Has one kind of error where NumPy reads a file: it raises what a broken header or archive makes it stumble over."""
+    """Turns all errors of NumPy while it reads a file into one kind; a broken header or archive raises many."""
     try:
         yield
     except ValueError:

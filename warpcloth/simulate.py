@@ -36,8 +36,8 @@ class Animation:
         status: :class:`warpcloth.status.Status`.
         timings: ``compile`` (building the model and binding the solver, with compiling what was not in the cache),
             ``factorise`` (constant matrices, a part of it) and ``frames`` (a list) [s].
-        worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame; of B > 1 copies one for each, (B,), over its good
-            frames.
+        worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame; with B > 1 copies one value per copy, (B,), over
+            its good frames.
         output: Path of the USD file, or None.
     """
 
@@ -95,8 +95,8 @@ def simulate(
 
     Raises:
         BlockingIOError: If another process, or thread, is writing ``output``.
-        Interrupted: If the user interrupts, a KeyboardInterrupt; it says which frames are in ``output``.
-        OSError: If a file cannot be written; it says the same.
+        Interrupted: A KeyboardInterrupt, if the user interrupts; the message says which frames are in ``output``.
+        OSError: If a file cannot be written; the message also says which frames are in ``output``.
         ValueError: If an argument breaks a rule, or the scene's stage has changed and no longer fits the frames.
     """
     frames = scene.frames if frames is None else frames
@@ -134,7 +134,7 @@ def simulate(
 
 
 def _refuse_size(frames, scene, dtype, copies, output):
-    """Refuses more frames than memory, or the disk of an output, has room for: positions and velocities at least."""
+    """Refuses frames whose positions and velocities exceed the free memory or, with an output, the free disk."""
     of = f" of {copies:,} copies" if copies > 1 else ""
     what, numbers = f"frames is {frames:,}{of}", 6 * len(scene.mesh.points) * (int(frames) + 1)
     if output is None:
@@ -157,27 +157,27 @@ def _ahead(model, output):
 
 
 def of_copies(values):
-    """A number for each copy, (B,), and of one copy a float."""
+    """Returns one value per copy, (B,), or a float if there is one copy."""
     return np.array(values) if len(values) > 1 else float(values[0])
 
 
 class Watch:
     """Tells a copy that has diverged from one that is merely fast, from frames alone and for every solver.
 
-    Diverged is what is not finite, a step of the solver that says so, what has gained energy that nothing put in, and an edge
-    so long that no energy of the run suffices for it; see :mod:`warpcloth.balance`.
+    A run has diverged if a value is not finite, a step of the solver says so, the energy has grown beyond what its sources put
+    in, or an edge is longer than the energy of the run allows; see :mod:`warpcloth.balance`.
 
     Frames come in the order of the scene.
 
     Args:
         model: The :class:`warpcloth.model.Model`.
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
-        stretched: Strain of an edge from which its energy is asked for.
+        stretched: Strain of an edge above which its energy is checked.
 
     Attributes:
         good: The last good frame of each copy (B,).
         alive: Whether a copy is still good (B,).
-        growth: Largest energy of motion and height in a good frame, over what the sources can have put in (B,).
+        growth: Largest energy of motion and height in a good frame, divided by what the sources can have put in, (B,).
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
     """
 
@@ -224,7 +224,7 @@ class Watch:
         return bool(self.alive.any())
 
     def _strain(self, points):
-        """Largest |l/L − 1| of an edge of each copy, of points (B, n, 3); NaN of copies that are no longer good."""
+        """Largest |l/L − 1| of an edge of each copy, for points (B, n, 3); NaN for copies that are no longer good."""
         squares = np.zeros((int(self.alive.sum()), len(self.rest)))
         with np.errstate(over="ignore", invalid="ignore"):
             for column in np.moveaxis(points[self.alive], -1, 0):  # a fifteenth of the time of rows of three
@@ -235,7 +235,7 @@ class Watch:
         return found
 
     def status(self, results, residual, solver):
-        """The :class:`Status` of a run with a solver, whose copies ended with these."""
+        """Returns the :class:`Status` of a run with a solver from the results of its copies."""
         results = [Result.DIVERGED if copy in self.messages else result for copy, result in enumerate(results)]
         result = max(results, key=list(Result).index)
         kind, measure, unit = solver.residual_on(self.model), None, None

@@ -26,7 +26,7 @@ class Result(Enum):
 
 UNBALANCED = "largest unbalanced acceleration of a vertex"
 
-# For what a result can be used that is not good without more ado, and not bad.
+# How a result can be used that is neither clearly good nor bad.
 _NEAR = "usable if this is near enough to the solution"
 
 
@@ -34,9 +34,9 @@ class Residual(NamedTuple):
     """The quantity that a solver reports as its residual; each record of options names its own as ``residual``.
 
     Attributes:
-        measure: What is measured; of a run it is the largest of any step.
+        measure: Name of the quantity; a run reports its largest value in any step.
         weightless: Its unit in a scene without gravity.
-        unit: Its unit in one with gravity.
+        unit: Its unit in a scene with gravity.
     """
 
     measure: str
@@ -50,11 +50,11 @@ class Status(NamedTuple):
     Attributes:
         result: The worst of any step and copy.
         frame: The last frame in which a copy is good.
-        residual: The largest residual of any step; of B > 1 copies one for each, (B,). 0 of methods that have none.
+        residual: The largest residual of any step; with B > 1 copies one per copy, (B,). 0 for methods without a residual.
         message: One sentence: how it ended, whether the result can be used, and the residual with its unit and tolerance.
         good: The last good frame of each copy, (B,).
-        measure: What the residual measures, or None of methods that have none.
-        unit: The unit of the residual, of several copies that of the worst; or None.
+        measure: The quantity that the residual measures, or None for methods without a residual.
+        unit: The unit of the residual, with several copies that of the worst; or None.
     """
 
     result: Result
@@ -72,17 +72,17 @@ class Status(NamedTuple):
 
 
 def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None, use=None):
-    """How a run ended, whether its result can be used, and the residual with its unit and what it was compared with.
+    """Says how a run ended, whether its result can be used, and the residual with its unit and tolerance.
 
     Args:
         result: The worst :class:`Result` of any step.
         dtype: The precision, ``"float32"`` or ``"float64"``.
         residual: The largest residual.
-        measure: What it measures, or None of methods that have none.
+        measure: The quantity that it measures, or None for methods without a residual.
         unit: Its unit.
-        tolerance: What it was compared with, or None of methods that iterate without looking.
-        copy: The copy whose residual it is, or None of one copy.
-        use: What the result can be used for, if not what it is of a run in time.
+        tolerance: The tolerance it was compared with, or None for methods that do not check it.
+        copy: The copy whose residual it is, or None if there is one copy.
+        use: How the result can be used, if that differs from a run in time.
     """
     use = use or {
         Result.COMPLETED: "usable" if measure is None else _NEAR,
@@ -99,5 +99,5 @@ def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=No
 
 
 def digits(value):
-    """Two digits of a number, written out where that is short."""
+    """Formats a number with two digits, without an exponent if that is short."""
     return f"{float(f'{value:.2g}'):.0f}" if 100.0 <= value < 1e6 else f"{value:.2g}"

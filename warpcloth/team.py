@@ -137,7 +137,7 @@ class Team:
     def _guard(self, function):
         """What the function raises, or None."""
         try:
-            with TURN.shared():  # of the thread that called run
+            with TURN.shared():  # the turn of the thread that called run
                 function()
         except BaseException as error:
             self._meeting.numpy()[kernels.ABANDONED] = 1

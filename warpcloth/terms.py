@@ -140,9 +140,9 @@ class Spring(_Damped):
         pairs: Which vertices: ``"edges"`` of the mesh; of a grid ``"structural"`` (along rows and columns), ``"shear"``
             (both diagonals of each cell), ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge);
             several of these in a tuple, where a pair that belongs to more than one kind is one spring; or own pairs (E, 2).
-            Arrays of the other fields have a value for each row: of own pairs as given, of ``"edges"`` (and of
-            ``"structural"`` without a grid) in the order of ``mesh.edges``, which of an edge mesh is that in which its edges
-            were given, of all other kinds and of several in lexicographic order, the smaller index first.
+            Arrays of the other fields have one value per pair. Own pairs keep their order. ``"edges"`` (and ``"structural"``
+            without a grid) have the order of ``mesh.edges``, which for an edge mesh is the order in which its edges were given.
+            All other kinds, and several kinds together, are in lexicographic order, the smaller index first.
         stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
         rest_lengths: L [m], one or (E,), if not those of the mesh.
         damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.
@@ -271,7 +271,7 @@ class QuadraticBending(_Damped):
         stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh. A grid with one diagonal a
             cell is 3 times as stiff where it curves along its diagonals, as stiff where it folds about them or curves along
             its rows, and 0.75 times 15° off the rows away from them; one with alternating diagonals is 1 to 1.5 times.
-            Poisson's ratio of the equilateral mesh is −1/3, and the others are no isotropic plates.
+            The equilateral mesh has a Poisson's ratio of −1/3; the other meshes are not isotropic plates.
         damping: β [N·m·s], of the rate of ‖y‖, which for a small angle θ is |e|·|θ|.
         name: To tell two terms of one kind apart.
     """

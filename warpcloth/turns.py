@@ -1,11 +1,11 @@
-"""Threads of one process take turns with Warp, which guards little of what all of them share.
+"""Makes the threads of one process take turns with Warp, which does not protect its shared state.
 
-The graph that is being recorded, the modules that are loaded and the overloads of kernels are of the whole process: threads
-that bind or step side by side get wrong arrays, or end the process. So all that records, launches or allocates here waits for
-its turn: building a model, binding, each step or frame, each solve of :class:`warpcloth.Arap`, each measure of a frame,
-:func:`warpcloth.equilibrium`, :func:`warpcloth.svd` and the like. Of several calls of :func:`warpcloth.simulate` the frames
-alternate; nobody waits for what is done between frames, such as writing a file or ``progress``. A thread that has its turn may
-take it again. What another library of the same process does with Warp does not wait.
+The graph that is being recorded, the loaded modules and the overloads of kernels belong to the whole process. Threads that bind
+or step at the same time get wrong arrays, or end the process. So every call that records, launches or allocates waits for its
+turn: building a model, binding, each step or frame, each solve of :class:`warpcloth.Arap`, each measure of a frame,
+:func:`warpcloth.equilibrium`, :func:`warpcloth.svd` and the like. Several calls of :func:`warpcloth.simulate` alternate frame
+by frame; work between frames, such as writing a file or ``progress``, does not wait. A thread that has the turn may take it
+again. Other libraries that use Warp in the same process do not take turns.
 """
 
 import os
@@ -34,7 +34,7 @@ class _Turn:
 
     @contextmanager
     def shared(self):
-        """Lets this thread work within the turn of another one, which waits for it."""
+        """Lets this thread work within the turn of another thread, which waits for it."""
         self._here.shared = True
         try:
             yield
@@ -43,12 +43,12 @@ class _Turn:
 
 
 TURN = _Turn()
-if hasattr(os, "register_at_fork"):  # a child has this thread alone, and would wait for ever for the turn of another
+if hasattr(os, "register_at_fork"):  # a child process has only this thread, and would wait forever for another
     os.register_at_fork(before=TURN.__enter__, after_in_parent=TURN.__exit__, after_in_child=TURN.__exit__)
 
 
 def in_turn(function):
-    """The function, called when it is its thread's turn."""
+    """Wraps a function so that it waits for its thread's turn."""
 
     @wraps(function)
     def waiting(*args, **kwargs):
@@ -59,7 +59,7 @@ def in_turn(function):
 
 
 def methods_in_turn(kind, *names):
-    """Makes the methods of these names that a class has of its own wait for their turn."""
+    """Makes those of the named methods that a class itself defines wait for their turn."""
     for name in names:
         if name in vars(kind):
             setattr(kind, name, in_turn(vars(kind)[name]))
