@@ -1087,7 +1087,7 @@ def test_a_source_that_changes_and_fits_is_said(tmp_path, ending):
     source = artist_stage(tmp_path / "artist.usda", Mesh.grid(5, 4))
     mesh = read_mesh(source)
     with (
-        pytest.warns(UserWarning, match=r"artist\.usda: has changed during the run; the frames are of what it was before"),
+        pytest.warns(UserWarning, match=r"artist\.usda: has changed during the run; the frames belong to its earlier version"),
         AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, source=source, chunk=CHUNK) as writer,
     ):
         for frame in range(FRAMES):

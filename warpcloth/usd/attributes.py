@@ -54,7 +54,7 @@ class Attribute:
 
     @property
     def infinite(self):
-        """Whether it need not be finite: a term says itself what it takes, and USD says −inf for the gravity of the earth."""
+        """Whether it may be infinite: each term checks its own values, and USD uses −inf for the gravity of the earth."""
         return self.field.startswith("terms.") or self.field == "(gravity magnitude)"
 
 
@@ -161,7 +161,7 @@ class Values:
 
 
 def _kind(type_name):
-    """What a type holds, whatever its precision: text, numbers or nothing known, one or several, how many components."""
+    """Describes a type without its precision: text, numbers or unknown, one or several, and the number of components."""
     default = type_name.scalarType.defaultValue
     return default is None, isinstance(default, str), type_name.isArray, np.shape(default)
 

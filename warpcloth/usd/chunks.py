@@ -21,7 +21,7 @@ from .stage import METADATA_KEY, followed, identity
 from .values import refuse_path, sentences
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
-_COMPLETE = "complete"  # a file in the folder of a run that has all of its frames, until it is packed
+_COMPLETE = "complete"  # marks the folder of a run that has all of its frames and is not packed yet
 
 
 class ChunkWriter:
@@ -37,19 +37,18 @@ class ChunkWriter:
 
     Every file is written under another name, complete, and then renamed; the root is replaced after each chunk. So a
     process killed at any moment leaves a result that opens, with at most one chunk of frames missing, and the result of
-    an earlier run stays whole until the first chunk of this one stands, or for .usdz the whole of it. Files are not forced
-    to the disk (fsync): a killed process loses nothing by that, a power failure may lose the newest chunks. Memory holds
-    one chunk. The folder belongs to the file: move them together, or make one file of them with `close(single_file=True)`.
-    An output has one writer at a time, of all processes; another one is refused.
+    an earlier run stays whole until the first chunk of this run is written, or for .usdz the whole package. Files are not
+    forced to the disk (fsync): a killed process loses nothing by that, a power failure may lose the newest chunks. Memory
+    holds one chunk. The folder belongs to the file: move them together, or make one file of them with
+    `close(single_file=True)`. Only one writer at a time, in all processes, has an output; another one is refused.
 
-    An interrupt (Ctrl-C) waits for a chunk, and for `close`, to be finished; a second one does not. What a run left in the
-    folder is removed by the next one to the same output, but for what that reads, and for a .usdz that had all of its frames
-    and was not packed.
+    An interrupt (Ctrl-C) waits until a chunk, or `close`, is finished; a second one does not. A run removes what earlier runs
+    to the same output left in the folder, except files that it reads and the complete frames of a .usdz that was not packed.
 
     Attributes:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
         frames: Number of frames appended.
-        kept: Number of those that are in the file.
+        kept: Number of appended frames that are in the file.
     """
 
     # Of all sampled prims: name of their set of value clips; a set in a source below with the same name is not seen.
@@ -86,7 +85,7 @@ class ChunkWriter:
         self._closed = False
 
     def _put_on(self, rest, targets, root_metadata, metadata, source=None, files=(), refit=None):
-        """Says what the samples are put on, and takes the output for this writer.
+        """Sets the layer that the samples are put on, and locks the output for this writer.
 
         Args:
             rest: Layer of all that is not sampled; it has the sampled attributes without samples.
@@ -109,7 +108,7 @@ class ChunkWriter:
         self._root_metadata = {**root_metadata, "customLayerData": facts}
         self._files, self._refit = {file: identity(file) for file in files}, refit
         self._lock = Lock(self._output)
-        weakref.finalize(self, self._lock.release)  # where nobody closes
+        weakref.finalize(self, self._lock.release)  # in case nobody closes the writer
 
     def __enter__(self):
         return self
@@ -144,11 +143,11 @@ class ChunkWriter:
                 always is one.
 
         Raises:
-            OSError: A file could not be written; the chunks that stand stay.
-            ValueError: The source has changed meanwhile and no longer fits the frames, which stay in chunks.
+            OSError: A file could not be written; the finished chunks stay.
+            ValueError: The source has changed in the meantime and no longer fits the frames, which stay in chunks.
 
         Warns:
-            UserWarning: The source has changed, but fits; or there are frames of an earlier run that was not packed.
+            UserWarning: The source has changed but still fits, or there are frames of an earlier run that was not packed.
         """
         if self._closed:
             return
@@ -169,18 +168,18 @@ class ChunkWriter:
             self._lock.release()
 
     def _keep_chunks(self):
-        """Gives chunks that stand a root in their folder, where the output cannot be written."""
+        """Writes a root layer into the folder of the chunks if the output cannot be written."""
         if self._closed or not (self._run / "rest.usdc").exists():
             return
         before, self.path = self.path, str(self._run / "animation.usdc")
         try:
             (self._run / _COMPLETE).touch()
             self._write_chunk()
-        except OSError:  # a full disk takes nothing anywhere
+        except OSError:  # a full disk: the folder cannot be written either
             self.path = before
 
     def _check_source(self):
-        """Notices where the files of the source are no longer those that were read."""
+        """Checks whether the files of the source have changed since they were read."""
         changed = [file for file, before in self._files.items() if identity(file) != before]
         if not changed:
             return
@@ -192,7 +191,7 @@ class ChunkWriter:
         except (OSError, ValueError) as error:
             now = f"has changed during the run and no longer fits ({error})"
             raise ValueError(f"{changed[0]}: {now}; {self.saved()}") from None
-        warnings.warn(f"{changed[0]}: has changed during the run; the frames are of what it was before", stacklevel=4)
+        warnings.warn(f"{changed[0]}: has changed during the run; the frames belong to its earlier version", stacklevel=4)
 
     def _append(self, time, samples):
         """Adds a frame: at a time code values by path of attribute; every `chunk` frames they are written."""
@@ -247,7 +246,7 @@ class ChunkWriter:
     def _write_pending(self):
         if not self._chunks:
             self._start_run()
-        elif not self._chunks[-1][1].exists():  # USD would make the folder again, and a file without the frames before
+        elif not self._chunks[-1][1].exists():  # USD would make the folder again, and the file would lack the earlier frames
             self.kept, last = 0, self.frames - len(self._pending) - 1
             raise FileNotFoundError(f"{self._run}: has been removed during the run, with frames 0 to {last}")
         layer = self._declared(Sdf.Layer.CreateAnonymous(".usdc"))
@@ -321,7 +320,7 @@ class ChunkWriter:
                     stacklevel=5,
                 )
             else:
-                shutil.rmtree(folder, ignore_errors=True)  # a file that another process has open is worth no run
+                shutil.rmtree(folder, ignore_errors=True)  # a file that another process has open is no reason to fail
 
     def _write_single_file(self):
         contents = Contents(self._run)
@@ -344,7 +343,7 @@ class ChunkWriter:
         self.path = str(self._output)
         (self._run / _COMPLETE).unlink(missing_ok=True)
         shutil.rmtree(self._run)
-        with suppress(OSError):  # it may have gone, or be in use, by a run to another ending
+        with suppress(OSError):  # it may be gone, or in use by a run to an output with another ending
             if self._packed:
                 self._remove_other_runs()
             self._folder.rmdir()
@@ -422,5 +421,5 @@ def _export(layer, file, meant=None):
 
 
 def _writing(path):
-    """Has what pxr says of a file that cannot be written raised as one sentence."""
+    """Raises pxr's errors about a file that cannot be written as one sentence."""
     return sentences(path, OSError, "could not be written: ")

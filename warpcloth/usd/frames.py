@@ -183,7 +183,7 @@ class FrameSequence:
 
     @contextmanager
     def _located(self):
-        """Says in an error whose attribute is wrong."""
+        """Adds the path of the prim to an error about an attribute."""
         try:
             yield
         except ValueError as error:

@@ -73,7 +73,7 @@ def define_lines(layer, mesh, lines):
     Args:
         layer: Of `scene_layer`.
         mesh: The `Mesh`.
-        lines: Pairs (E, 2) and a thickness [m] by name; a prim has the name as far as letters, digits and _ go.
+        lines: Pairs (E, 2) and a thickness [m] by name. The name of the prim keeps only letters, digits and _.
 
     Returns:
         list: The `Target` of each, to be sampled with all vertices of the mesh.
@@ -95,7 +95,7 @@ def define_lines(layer, mesh, lines):
 
 
 def _define_curves(stage, path, paths, width):
-    """Linear curves along paths of vertices; where curves meet they each have a point for the vertex."""
+    """Makes linear curves along paths of vertices; where curves meet, each has a point for the vertex."""
     width = float(np.float32(width))
     curves = UsdGeom.BasisCurves.Define(stage, path)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
@@ -340,7 +340,7 @@ def flatten(base_paths, describe, named):
     Args:
         base_paths: Files of the layers, strongest first.
         describe: Function that writes the root's metadata on a layer.
-        named: Function that gives the path of a file (a texture) in the layer, from its path before and the stage.
+        named: Function of the path of a file (such as a texture) and the stage, which returns the path in the layer.
 
     Returns:
         Sdf.Layer: Anonymous.
@@ -357,7 +357,7 @@ def flatten(base_paths, describe, named):
 
 
 def named_from(folder):
-    """For `flatten` the paths of files as a layer in a folder names them; those that are not there stay."""
+    """Returns a function for `flatten` that makes paths of files relative to a folder; paths to missing files stay."""
     return lambda path, _: relative_path(path, folder) if os.path.isabs(path) and os.path.exists(path) else path
 
 

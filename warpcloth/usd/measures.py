@@ -66,7 +66,7 @@ class MeasureWriter(ChunkWriter):
             directions: "vertex" or "uniform" by name of each set of segments, or None.
             source: The `StageMesh` that was measured, or None.
             fps: Frames per second, also time codes per second; a source has its own.
-            up_axis: "Y" or "Z", that of the mesh where not given; a source has its own.
+            up_axis: "Y" or "Z", by default that of the mesh; a source has its own.
             chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
             metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers, texts or dicts
                 of such.

@@ -1,4 +1,4 @@
-"""The modules of pxr, loaded at once: an interrupt waits, for pxr would swallow it and go on with half of them."""
+"""Loads the modules of pxr with interrupts held back, because pxr would swallow one and go on with half of its modules."""
 
 import math
 

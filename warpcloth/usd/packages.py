@@ -1,4 +1,4 @@
-"""Packages, .usdz: one file of a layer and of what it shows, with nothing else of the machine in it."""
+"""Writes packages (.usdz): one file with a layer and the files that it refers to, and nothing else from the machine."""
 
 import glob
 import os
@@ -12,25 +12,26 @@ _TILES = "<UDIM>"
 
 
 class Contents:
-    """The files that a layer refers to, and what they are called in a package.
+    """The files that a layer refers to, with their names in a package.
 
-    A stage can name any file of the machine, and who packs it need not know: only what lies in the folders of its layers, or
-    below them, is packed. `UsdUtils.CreateNewUsdzPackage` would pack all.
+    A stage can name any file on the machine without the user knowing. Only files in or below the folders of its layers are
+    packed; `UsdUtils.CreateNewUsdzPackage` would pack all of them.
     """
 
     def __init__(self, folder):
         """Starts with nothing.
 
         Args:
-            folder: A folder for files that come out of packages.
+            folder: A folder for files that are extracted from packages.
         """
         self._folder, self._names = folder, {}
 
     def named(self, path, stage):
-        """The path of a file in the package; or, with a warning, as it was where it is not packed, and "" of none.
+        """Returns the path of a file in the package. With a warning, a file that is not packed keeps its path, a missing one
+        gets "".
 
         Args:
-            path: As a flattened layer has it.
+            path: Path of the file in the flattened layer.
             stage: The stage that was flattened.
         """
         files, origins = self._files(path)
@@ -49,7 +50,7 @@ class Contents:
         return f"{os.path.dirname(self._names[files[0]])}/{os.path.basename(path.removesuffix(']'))}"
 
     def _files(self, path):
-        """The files that a path stands for: one, or the tiles of a texture, or none; and these or the package of one."""
+        """Finds the files of a path (one, the tiles of a texture, or none), and their origins: themselves or a package."""
         if _TILES in path:
             head, tail = map(glob.escape, path.split(_TILES, 1))
             files = sorted(glob.glob(f"{head}[0-9][0-9][0-9][0-9]{tail}"))
@@ -62,16 +63,16 @@ class Contents:
         try:
             with zipfile.ZipFile(package) as archive:
                 return [archive.extract(member, os.path.join(self._folder, "unpacked"))], [package]
-        except (OSError, KeyError, zipfile.BadZipFile):  # of a package in a package
+        except (OSError, KeyError, zipfile.BadZipFile):  # a package in a package
             return [], []
 
     def write(self, layer, package, meant):
-        """Writes a package of a layer's file and all that was named.
+        """Writes a package of a layer and all files that were named.
 
         Args:
-            layer: The file.
+            layer: The file of the layer.
             package: The file to write.
-            meant: The path that it is for, for the error.
+            meant: The final path of the package, for the error message.
 
         Raises:
             OSError: It could not be written.
@@ -84,7 +85,7 @@ class Contents:
 
 
 def _folders(stage):
-    """Real paths of the folders that the layers of a stage lie in."""
+    """Returns the real paths of the folders of a stage's layers."""
     return {os.path.dirname(os.path.realpath(layer.realPath)) for layer in stage.GetUsedLayers() if layer.realPath}
 
 
@@ -94,7 +95,7 @@ def _is_below(file, folders):
 
 
 def _as_authored(path, stage):
-    """The path as a layer of a stage has it: flattening makes it absolute."""
+    """Returns the path as a layer of the stage has it, because flattening makes it absolute."""
     for layer in stage.GetUsedLayers():
         if layer.realPath:
             for authored in chain(*UsdUtils.ExtractExternalReferences(layer.realPath)):
@@ -104,7 +105,7 @@ def _as_authored(path, stage):
 
 
 def _is_whole(package):
-    """Whether all of a package is on the disk: pxr does not notice one that is full."""
+    """Whether the package is complete on the disk; pxr does not notice a full disk."""
     try:
         with zipfile.ZipFile(package) as archive:
             return archive.testzip() is None

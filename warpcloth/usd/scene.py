@@ -209,7 +209,7 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
             keyframes = np.array([points[vertices] for points in _frames(animated, surroundings, frames, fps)])
             keyframes = None if (keyframes == keyframes[0]).all() else keyframes
     if own is not None:
-        # Those of a scene that was written have a sample for each frame, beyond the last frame too.
+        # Pins of a scene that was written have a sample for each frame, even after the last frame.
         most = max(frames, len(own[1].GetTimeSamples()) - 1)
         keyframes = list(_samples(own[1], surroundings, most, fps))
         wrong = [len(places) for places in keyframes if len(places) != len(vertices)]

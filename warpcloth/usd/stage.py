@@ -98,9 +98,9 @@ def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is no USD stage or has units, rates or times that are none, has no mesh or several, the prim is
-            missing or no mesh or refers to a file that is missing, its transform is animated or cannot be inverted, its
-            topology changes, or its points and topology make no valid `Mesh`.
+        ValueError: The file is not a USD stage, has invalid units, rates or times, or has no mesh or several; the prim is
+            missing, is not a mesh or refers to a missing file; its transform is animated or cannot be inverted, its topology
+            changes, or its points and topology do not make a valid `Mesh`.
     """
     with sentences(path):
         return _stage_mesh(open_stage(path), path, prim, kind, time)
@@ -119,7 +119,7 @@ def _stage_mesh(stage, path, prim, kind, time):
             _refuse_moving_topology(found)
         if found.IsA(UsdGeom.Mesh):
             corners, triangles = _corners(found, len(points))
-            if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # the sign alone, for the rest may overflow
+            if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # only the sign, because the determinant may overflow
                 triangles = triangles[:, ::-1]
             at_vertices, at_corners = _texture_coordinates(found, len(points), corners)
             corner_coordinates = None if at_corners is None else at_corners[triangles]
@@ -157,7 +157,7 @@ def followed(path):
 
 
 def identity(path):
-    """What differs between a file and any that takes its place; None where there is none."""
+    """Returns a value that changes when the file is replaced; None if there is no file."""
     try:
         status = os.stat(path)
     except OSError:
@@ -355,10 +355,10 @@ def topology(attribute, time=None):
 
 
 def refuse_change(name, now, fixed, code):
-    """Refuses an integer array that is not at a time code what it was before.
+    """Refuses an integer array that has changed at a time code.
 
     Raises:
-        ValueError: It has another length, or where it first differs.
+        ValueError: Its length or an entry differs; the message names the first such entry.
     """
     if len(now) != len(fixed):
         raise ValueError(f"{len(now)} {name} at time code {code:g}, must stay {len(fixed)}")
@@ -403,10 +403,10 @@ def _corners(prim, count):
 
 
 def triangles_of_faces(prim):
-    """Number of triangles (F,) that each face of a Mesh prim is cut into; of a hole none, for there is no cloth.
+    """Returns the number of triangles (F,) that each face of a Mesh prim is cut into; a hole has none.
 
     Raises:
-        ValueError: A hole is no face.
+        ValueError: The index of a hole is not that of a face.
     """
     mesh = UsdGeom.Mesh(prim)
     triangles = topology(mesh.GetFaceVertexCountsAttr()) - 2
@@ -440,7 +440,7 @@ def _texture_coordinates(prim, count, corners):
     if not (primvar and primvar.HasValue()):
         return None, None
     st = np.array(primvar.ComputeFlattened())
-    st = st.astype(np.float64) if st.dtype.kind in "iuf" else st  # of another type it is no (count, 2) below
+    st = st.astype(np.float64) if st.dtype.kind in "iuf" else st  # with another type the check for (count, 2) below fails
     interpolation = primvar.GetInterpolation()
     if interpolation in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and st.shape == (count, 2):
         return st, None

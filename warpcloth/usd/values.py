@@ -1,4 +1,4 @@
-"""Values of a stage, each read with a check: what is wrong is refused by its name before it reaches any arithmetic."""
+"""Reads values of a stage with checks, so that a wrong value is refused by its name before any arithmetic uses it."""
 
 import os
 import textwrap
@@ -12,11 +12,11 @@ from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from ..checks import shown
 
-# Beyond it neighbouring time codes, which are float64, are more than 1e-7 apart, and frames cannot be told by them.
+# Beyond it neighbouring time codes, which are float64, are more than 1e-7 apart and cannot tell frames apart.
 MOST_TIME_CODE = 1e9
-# Frames and time codes in a second: from one in eleven days to one a microsecond.
+# Range of frames and time codes per second: from one in eleven days to one per microsecond.
 _RATES = (1e-6, 1e6)
-# Metres and kilograms in a unit: a light year is 1e16 m.
+# Range of metres and kilograms per unit: a light year is 1e16 m.
 _UNITS = (1e-18, 1e18)
 
 _listening = False
@@ -24,24 +24,24 @@ _listening = False
 
 @contextmanager
 def sentences(path, raised=ValueError, what=""):
-    """Has what pxr says of a file in one sentence each: its errors ``raised``, its warnings as those of Python.
+    """Turns what pxr says about a file into sentences: errors are raised, and warnings become Python warnings.
 
     Args:
         path: The file.
-        raised: The type of the error.
-        what: What it says before the words of pxr.
+        raised: Type of the exception.
+        what: Text before the words of pxr.
 
     Raises:
-        ValueError: pxr has met an error; or of the type that is given.
+        ValueError: pxr has reported an error; ``raised`` gives another type.
     """
     global _listening
-    heard = None if _listening else UsdUtils.CoalescingDiagnosticDelegate()  # each listener is told everything
+    heard = None if _listening else UsdUtils.CoalescingDiagnosticDelegate()  # nested delegates would all get every message
     _listening = True
     try:
         yield
     except Tf.ErrorException as error:
         raise raised(f"{path}: {what}{reason_of(error)}") from None
-    except UnicodeDecodeError:  # of a name or text that pxr hands over
+    except UnicodeDecodeError:  # from a name or text that pxr returns
         raise raised(f"{path}: {what}it holds text that is no valid UTF-8") from None
     finally:
         if heard:
@@ -53,7 +53,7 @@ def sentences(path, raised=ValueError, what=""):
 
 
 def reason_of(error):
-    """What an error of pxr says first."""
+    """Returns the first sentence of a pxr error."""
     first = error.args[0] if error.args else error
     return _plain(getattr(first, "commentary", str(first)))
 
@@ -67,7 +67,7 @@ def refuse_path(path):
     """Refuses a path that no layer can refer to.
 
     Raises:
-        ValueError: It has control characters, such as a line break, or is no UTF-8.
+        ValueError: It has control characters, such as a line break, or is not UTF-8.
     """
     text = os.fspath(path)
     if any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
@@ -102,7 +102,7 @@ def check_stage(stage, path):
 
 
 def check_composed(prim, path):
-    """Refuses a prim that is not whole, for what it or a prim above it refers to is missing.
+    """Refuses a prim that is incomplete because a file that it or a prim above it refers to is missing.
 
     Raises:
         ValueError: pxr could not compose it.
@@ -118,13 +118,13 @@ def _refuse_outside(where, name, value, least, most):
 
 
 def value_of(attribute, time=None):
-    """The value of an attribute at a time code, or at the default time; None where there is none.
+    """Returns the value of an attribute at a time code, or at the default time; None if it has none.
 
     Raises:
-        ValueError: The file is broken there, or holds a type that Python has not.
+        ValueError: The file is broken there, or holds a type that Python does not have.
     """
     try:
-        with redirect_stderr(StringIO()):  # pxr prints by itself what it cannot turn into a value of Python
+        with redirect_stderr(StringIO()):  # pxr prints a value that it cannot convert to Python
             return attribute.Get(Usd.TimeCode.Default() if time is None else time)
     except UnicodeDecodeError:
         raise ValueError(f"{attribute.GetName()} is no valid UTF-8") from None
@@ -133,10 +133,10 @@ def value_of(attribute, time=None):
 
 
 def token_of(attribute, allowed):
-    """One of the words that an attribute may have.
+    """Returns the value of an attribute that takes one of some words.
 
     Raises:
-        ValueError: It has another.
+        ValueError: It has another value.
     """
     value = value_of(attribute)
     if value not in allowed:
@@ -145,17 +145,17 @@ def token_of(attribute, allowed):
 
 
 def array_of(attribute, components=(), whole=False, time=None):
-    """The rows of an array attribute (count, *components), int32 if they are to be whole, else as they are; None without any.
+    """Returns the rows of an array attribute (count, *components), as int32 if ``whole``; None if it has no value.
 
     Raises:
-        ValueError: They are of another type or shape, or cannot be read.
+        ValueError: The rows have another type or shape, or cannot be read.
     """
     value = value_of(attribute, time)
     return None if value is None else rows_of(attribute.GetName(), value, components, whole)
 
 
 def rows_of(name, value, components=(), whole=False):
-    """The same of a value."""
+    """Returns the rows of a value, with the checks of :func:`array_of`."""
     rows = np.array(value)
     if rows.dtype.kind not in ("iu" if whole else "iuf") or rows.shape[1:] != components or rows.ndim != 1 + len(components):
         kind = "whole numbers" if whole else f"rows of {components[0]} numbers" if components else "numbers"
@@ -164,10 +164,10 @@ def rows_of(name, value, components=(), whole=False):
 
 
 def refuse_outside(name, numbers, count, what):
-    """Refuses a number that is no index of ``count`` things.
+    """Refuses numbers that are not indices from 0 to ``count`` − 1.
 
     Raises:
-        ValueError: The first such.
+        ValueError: One is out of range; the message names the first.
     """
     wrong = (numbers < 0) | (numbers >= count)
     if wrong.any():
@@ -176,10 +176,10 @@ def refuse_outside(name, numbers, count, what):
 
 
 def refuse_unknown(name, values, where="", infinite=False):
-    """Refuses numbers that are not finite, or only those that are NaN.
+    """Refuses numbers that are not finite, or with ``infinite`` only NaN.
 
     Raises:
-        ValueError: The first such.
+        ValueError: There is one; the message names the first.
     """
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     for place in np.argwhere(wrong)[:1].tolist():
@@ -188,10 +188,10 @@ def refuse_unknown(name, values, where="", infinite=False):
 
 
 def time_codes_of(attribute):
-    """Time codes of the samples of an attribute, a list.
+    """Lists the time codes of the samples of an attribute.
 
     Raises:
-        ValueError: One is too far out to be told from its neighbours.
+        ValueError: A time code is too large to be told from its neighbours.
     """
     codes = attribute.GetTimeSamples()
     for code in codes:

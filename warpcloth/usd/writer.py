@@ -52,13 +52,13 @@ class AnimationWriter(ChunkWriter):
             source: A stage to write a layer over, or None.
             prim: Of a source: path or name of the prim. Without: name of the prim under /World, "Cloth" if None.
             pins: Vertex indices by name, written as GeomSubsets in the family "pins". A source has its own.
-            up_axis: "Y" or "Z", that of the mesh where not given; a source has its own.
+            up_axis: "Y" or "Z", by default that of the mesh; a source has its own.
             chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
             metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers or texts.
             primvars: Interpolation of each primvar that `append` will be given, by name: "vertex", a value for each
                 vertex, or "uniform", one for each triangle.
-            lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth, such as
-                `lines.lines_of` finds them in a scene. With a source none.
+            lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth;
+                `lines.lines_of` finds those of a scene. Not allowed with a source.
 
         Raises:
             FileNotFoundError: The output's folder or the source does not exist.
