@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from warpcloth.mesh import Surface
 from warpcloth.neighbourhoods import neighbourhoods
 
 ROOT = Path(__file__).parents[1]
@@ -103,6 +104,11 @@ WRONG = "ring 3-ring nearest:k=2 nearest:k=99 nearest:k=3.5 nearest:k= nearest:r
 def test_refused(chosen):
     with pytest.raises(ValueError, match="neighbour"):
         neighbourhoods(SHEET, chosen)
+
+
+def test_nowhere_is_nowhere_near():
+    with pytest.raises(ValueError, match="no vertex with a triangle is at a finite position"):
+        neighbourhoods(Surface(np.full((3, 3), np.nan), [[0, 1, 2]]), "nearest:radius=0.2")
 
 
 STUDY = run_path(str(ROOT / "benchmarks" / "neighbourhoods.py"))

@@ -104,6 +104,9 @@ def test_a_run_without_output_writes_the_name_of_the_scene_and_replaces_nothing(
     )
     assert (tmp_path / "hanging.usdc").read_bytes() == written
     assert main([*command, "-o", "hanging.usdc"]) == 0
+    (tmp_path / "hanging.usdc").unlink()
+    assert main([*command, "-o", ""]) == 2  # of a variable of a shell that is not set
+    assert "must end with one of" in capfd.readouterr().err and not (tmp_path / "hanging.usdc").exists()
 
 
 def test_a_prim_is_named_by_an_option(tmp_path, capfd, monkeypatch):

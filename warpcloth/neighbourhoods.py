@@ -73,6 +73,8 @@ def _nearest(mesh, used, chosen):
         value = np.nan
     if not (np.isfinite(value) and value > 0.0) or (kind == "k" and value % 1) or (kind == "share" and value > 100.0):
         raise ValueError(f"neighbourhood = {shown(chosen)}: {_RULE}")
+    if not len(points):
+        raise ValueError(f"neighbourhood = {shown(chosen)}: no vertex with a triangle is at a finite position, one must be")
     tree = cKDTree(points)
     if kind == "radius":
         # One vertex after another: together they may be more than memory holds as Python's lists.

@@ -30,7 +30,7 @@ def run(arguments):
 
     source, values, scene = named_scene(arguments)
     frames = scene.frames if arguments.frames is None else arguments.frames
-    arguments.output = arguments.output or _own_output(scene)
+    arguments.output = _own_output(scene) if arguments.output is None else arguments.output
     check_writable(arguments.output)
     device = find_device(arguments.device)
     if arguments.tolerance is not None or arguments.budget is not None:

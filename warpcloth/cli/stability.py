@@ -21,9 +21,10 @@ Axes: {", ".join(AXES)}.
 Stiffness and mass-ratio are factors of what the scene has, compression is 1 − l/L of the start, resolution a parameter n, links
 or elements of the scene. A method is NAME or NAME:option=value,option=value. All cells are compared over the same time
 of motion; runs of large steps go on for --steps, to show whether they diverge, and those of small ones cost the most. Diverged
-is what gets ten times as fast as start, gravity and time allow; inaccurate is what ends further than --accuracy, over vertices
-and frames and over the size of the cloth, from Newton's method with BDF2 and a quarter of the step, in float64, by more than
-that is known to; unsure is what that cannot tell. Rows that are measured are kept, and not measured again.
+is what has three times the energy that the start, falling and moving pins can have put in; inaccurate is what ends further
+than --accuracy, over vertices and frames and over the size of the cloth, from Newton's method with BDF2 and a quarter of the
+step, in float64, by more than that is known to; unsure is what that cannot tell. Rows that are measured are kept, and not
+measured again.
 
   warpcloth chart stability hanging -p n=8 --x stiffness --y dt -o map.png
   warpcloth chart stability net -p n=12 stiffness=inf --x resolution --y relaxation --solvers pbd:sweep=jacobi -o jacobi.png
