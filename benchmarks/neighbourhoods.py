@@ -1,12 +1,12 @@
-"""How far F and D of neighbourhoods are from those of a known motion, by their size and the noise of the points.
+"""Measures the errors of F and D of neighbourhoods in a known motion, against their size and the noise of the points.
 
     python benchmarks/neighbourhoods.py [--n 33] [--seeds 3] [--waves 2]
 
-An irregular flat sheet of n² vertices and 1 m is stretched, sheared and bent in waves that travel, so that F and D of its
-tangent plane are known everywhere. Two frames, 1/60 s apart, have normal noise of a part of the mean edge in each coordinate.
-Prints a line for each kind of neighbourhood: its vertices on average, and RMS errors of F [%] and of D over the RMS of D [%],
-for each noise over vertices at least 0.2 m from the outline, and without noise over those nearer to it; of triangles by their
-centroids.
+Travelling waves stretch, shear and bend an irregular flat sheet of n² vertices and 1 m, so F and D of its tangent plane are
+known everywhere. Two frames, 1/60 s apart, have normal noise of a fraction of the mean edge in each coordinate. The script
+prints a line for each kind of neighbourhood: its mean number of vertices, the RMS error of F [%], and the RMS error of D
+divided by the RMS of D [%]. Each noise is measured over the vertices at least 0.2 m from the outline; the last columns are the
+vertices nearer to it, without noise. Triangles are placed by their centroids.
 """
 
 import argparse
@@ -23,21 +23,22 @@ DT = 1.0 / 60.0  # [s]
 
 
 def sheet(n):
-    """Delaunay triangles of n² points of the plane y = 0, moved at random by up to 0.3 of their distance within."""
+    """Triangulates n² points of the plane y = 0 (Delaunay); inner points are moved at random by up to 0.3 of the spacing."""
     line = np.linspace(0.0, 1.0, n)
     uv = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     inner = ((uv > 0.0) & (uv < 1.0)).all(axis=1)
     uv[inner] += np.random.default_rng(0).uniform(-0.3, 0.3, (inner.sum(), 2)) / (n - 1)
     triangles = Delaunay(uv).simplices[:, ::-1]
     a, b = (uv[triangles[:, k]] - uv[triangles[:, 0]] for k in (1, 2))
-    whole = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-3 / n**2  # the outline is a line but for rounding
-    return wc.Mesh(np.stack([uv[:, 0], np.zeros(n * n), uv[:, 1]], axis=1), triangles[whole])
+    whole = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-3 / n**2  # drop slivers that rounding makes along the straight
+    outline return wc.Mesh(np.stack([uv[:, 0],
+    np.zeros(n * n), uv[:, 1]], axis=1), triangles[whole])
 
 
 def motion(points, t, waves):
-    """Positions of material points at a time, and their gradients ∂x/∂X and ∂x/∂Z, (n, 3) and (n, 3, 2)."""
+    """Returns the positions of material points at a time, and their gradients ∂x/∂X and ∂x/∂Z, (n, 3) and (n, 3, 2)."""
     X, _, Z = points.T
-    k, rate = 2.0 * np.pi * waves, 2.0 * np.pi  # waves a metre, one a second
+    k, rate = 2.0 * np.pi * waves, 2.0 * np.pi  # waves per metre, one per second
     parts = [(0.10, (1.0, 0.4), 0), (0.06, (-0.5, 1.0), 2), (0.10, (0.7, 0.7), 1)]  # size, direction and axis of motion
     x, F = points.copy(), np.zeros((len(X), 3, 2))
     F[:, 0, 0] = F[:, 2, 1] = 1.0
@@ -49,7 +50,7 @@ def motion(points, t, waves):
 
 
 def known(points, t, waves):
-    """F (n, 3, 2) at t + Δt/2 and at t + Δt, and D (n, 3, 3) in the tangent plane midway."""
+    """Returns F (n, 3, 2) at a time, and D (n, 3, 3) in the tangent plane then."""
     small = 1e-5
     F, (before, after) = motion(points, t, waves)[1], (motion(points, t + s, waves)[1] for s in (-small, small))
     rate = (after - before) / (2.0 * small)
@@ -61,7 +62,7 @@ def known(points, t, waves):
 
 
 def errors(mesh, kind, noise, seed, waves):
-    """Vertices on average, and RMS errors of F and of D over that of D, (2,) within and (2,) near the outline."""
+    """Returns the mean number of vertices, and the RMS errors of F and D, relative for D, (2,) inside and (2,) near the outline."""
     edge, rng = mesh.edge_lengths.mean(), np.random.default_rng(seed)
     frames = [motion(mesh.points, t, waves)[0] for t in (0.0, DT)]
     frames = [x + noise * edge * rng.normal(size=x.shape) for x in frames]
@@ -86,14 +87,14 @@ def errors(mesh, kind, noise, seed, waves):
 
 
 def members(mesh, kind):
-    """Vertices of a neighbourhood on average."""
+    """Returns the mean number of vertices of a neighbourhood."""
     from warpcloth.neighbourhoods import neighbourhoods
 
     return len(neighbourhoods(mesh, kind)[1]) / len(mesh.points)
 
 
 def table(n=33, seeds=3, waves=2.0):
-    """Rows of a kind, its vertices, and errors of F and D [%]: for each noise the RMS of the seeds, then near the outline."""
+    """Returns rows of kind, vertices, and errors of F and D [%]: for each noise the RMS over seeds, then near the outline."""
     mesh, rows = sheet(n), []
     for kind in KINDS:
         cells = []

@@ -46,7 +46,7 @@ def draw(axes, mesh, seen, values, colours):
 
 
 def finish(figure, axes, colours, norm, ticks, label, extend="neither"):
-    """Equal scales, no axes, and a bar of the colours with ticks."""
+    """Sets equal scales, hides the axes, and adds a colour bar with ticks."""
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.axis("off")
@@ -60,12 +60,12 @@ def finish(figure, axes, colours, norm, ticks, label, extend="neither"):
 
 
 def picture_hanging(moments=(0.0, 0.25, 0.4, 0.5, 0.75, 1.0, 1.25), least=1e-4):
-    """The hanging cloth side by side at some moments [s], coloured by strain from ``least`` to the largest of the whole run."""
+    """Draws the hanging cloth at some times [s] side by side, coloured by strain from ``least`` to the largest of the run."""
     scene = hanging.scene(n=64, duration=1.25)
     animation = wc.simulate(scene, wc.Newton(dt=1 / 240))
     assert animation.status.ok, animation.status
     most = max(strain(scene.mesh, np.asarray(points, dtype=float)).max() for points in animation.points)
-    norm = LogNorm(100.0 * least, 100.0 * most)  # what is pinned is strained a hundred times as much as the rest
+    norm = LogNorm(100.0 * least, 100.0 * most)  # the strain at the pins is a hundred times that of the rest
     figure, axes = plt.subplots(figsize=(11.0, 2.6))
     left = 0.0
     for time in moments:

@@ -18,8 +18,8 @@ class Part(NamedTuple):
     Attributes:
         term: The :class:`.term.Term`.
         damped: Whether it has damping, taken at x + h v about the state x, see :class:`.term.Dissipation`.
-        shared: Whether all elements share one stiffness; of gathered pairs that are not damped, whether those of a vertex do,
-            and ``stiffness`` is then one number a vertex.
+        shared: Whether all elements share one stiffness. For gathered pairs without damping, whether all pairs of a vertex do;
+            ``stiffness`` then has one value per vertex.
         pairs: Slots of a vertex, for gathering, as first and as second of a pair, where incidences name the other vertex and
             have a rest state of their own, slot by slot; None where they name elements.
         rows: Slots of a vertex, for gathering, where incidences name the other vertices of a row of the matrix of a quadratic

@@ -1,8 +1,8 @@
 """A strip clamped at one end that bends under its own weight, Γ = ρgL³/D (Romero et al. 2021), on an equilateral mesh.
 
-Length runs along x. Of no width it is one row of triangles, which bends with 1 − ν² = 8/9 of D, for Poisson's ratio ν of both
-bending energies is −1/3; otherwise rows of edges lie across it. L counts from amid the pins, half an element from x = 0 (to
-the mean end of a single row).
+The length runs along x. With a width of 0 it is one row of triangles, which bends with 1 − ν² = 8/9 of D, because the Poisson's
+ratio ν of both bending energies is −1/3; otherwise rows of edges lie across it. L is measured from the middle of the pins, half
+an element from x = 0 (to the mean end of a single row).
 """
 
 import numpy as np

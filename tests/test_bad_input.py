@@ -368,10 +368,10 @@ def test_gaps_without_end(tmp_path):
         (["info", "memory.py"], "memory.py, line 2: MemoryError"),
         (
             ["run", "later.py", "-o", "o.usdc"],
-            "there is not enough memory, a smaller mesh, fewer copies or frames take less: 16",
+            "there is not enough memory; a smaller mesh, fewer copies or fewer frames take less: 16",
         ),
         (["run", "disk.py", "-o", "o.usdc"], "a file could not be read or written: No space left on device"),
-        (["run", "deep.py", "-o", "o.usdc"], "something is nested too deep to be read"),
+        (["run", "deep.py", "-o", "o.usdc"], "the input is nested too deeply to be read"),
     ],
 )
 def test_one_line_at_the_command_line(tmp_path, monkeypatch, capfd, arguments, line):

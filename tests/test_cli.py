@@ -77,9 +77,9 @@ def scene():
 # argv, with {} for a folder of SCENE_FILES, and a part of the line that it gives.
 WRONG_USES = [
     ("run", "the following arguments are required: SCENE; see warpcloth run --help"),
-    ("run {}/good.py -p label=a/b", "the scene is called 'a/b', which is no name for a file; give one with -o"),
-    ("run {}/good.py -p label=..", "the scene is called '..', which is no name for a file; give one with -o"),
-    ("run {}/good.py -o {}/o.usdc --prim Cloth", "good.py is no stage; leave it out"),
+    ("run {}/good.py -p label=a/b", "the scene is called 'a/b', which cannot be the name of a file; give one with -o"),
+    ("run {}/good.py -p label=..", "the scene is called '..', which cannot be the name of a file; give one with -o"),
+    ("run {}/good.py -o {}/o.usdc --prim Cloth", "good.py is not a stage; leave it out"),
     ("run hanging -o {}/o.usdc --pins", "argument --pins: expected one argument"),
     ("info hanging --pins nowhere", "'nowhere'"),
     ("info hanging --pins x==7", "--pins 'x==7' names no vertex; the mesh reaches from (0, 0, 0) to (1, 0, 1)"),

@@ -82,14 +82,14 @@ def test_parameters_are_listed_of_a_known_scene_a_file_and_a_stage(tmp_path, cap
     assert listed(capfd, "run", str(tmp_path / "two.usda"), "-p", "help")["prim"]["allowed"] == "a text, or none"
     (tmp_path / "none.py").write_text("def scene():\n    return 3\n", encoding="utf-8")
     assert main(["choose", str(tmp_path / "none.py"), "-p", "help"]) == 0
-    assert "takes none" in capfd.readouterr().out
+    assert "it has none" in capfd.readouterr().out
 
 
 def test_both_lists_at_once_and_no_run(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["run", "hanging", "--solver", "pbd", "-s", "help", "-p", "help"]) == 0
     out = capfd.readouterr().out
-    assert "-s of pbd: Position based dynamics" in out and "dt or substeps is given" in out and "-p of " in out
+    assert "-s of pbd: Position based dynamics" in out and "give dt or substeps" in out and "-p of " in out
     assert not list(tmp_path.iterdir())
 
 
@@ -100,7 +100,7 @@ def test_a_run_without_output_writes_the_name_of_the_scene_and_replaces_nothing(
     written = (tmp_path / "hanging.usdc").read_bytes()
     assert main(command) == 2
     assert capfd.readouterr().err == (
-        "warpcloth: hanging.usdc is there already, and without -o nothing is replaced; give -o hanging.usdc to replace it\n"
+        "warpcloth: hanging.usdc exists already, and without -o nothing is replaced; give -o hanging.usdc to replace it\n"
     )
     assert (tmp_path / "hanging.usdc").read_bytes() == written
     assert main([*command, "-o", "hanging.usdc"]) == 0

@@ -638,7 +638,7 @@ def test_a_map_is_drawn(tmp_path, monkeypatch):
     texts = {text.get_text() for text in kept[0].legends[0].get_texts()}
     named = {"stable", "inaccurate: off by more than 1 % of the size", "stalled", "stable or inaccurate, not known", "refused"}
     named |= {"slow", "diverged at once", "diverged in the end", "2/ω_max: largest stable step about the rest shape"}
-    assert texts == named | {f"{KNOWN}: beyond, it is known less well"}
+    assert texts == named | {f"{KNOWN}: beyond, the reference is less accurate"}
     assert [label.get_text() for label in axes.get_xticklabels()] == ["0.001", "0.01", "0.1", "1"]
     assert "iterations 3" in kept[0]._suptitle.get_text() and axes.get_title() == "newton"
     for ending in ("svg", "pdf"):

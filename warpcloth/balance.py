@@ -1,13 +1,13 @@
-"""The balance of energy of a run: what a cloth has against what its sources can have put into it.
+"""Compares the energy of a cloth with the energy that its sources can have put in.
 
-A cloth is judged by its kinetic energy and its height, which are never more than all of its energy. Elastic energy is left out:
-sweeps that end too early store a huge ½kx² without exploding, and strain is judged apart.
+A cloth is judged by its kinetic energy and its height, whose sum never exceeds its total energy. Elastic energy is left out,
+because sweeps that end too early store a huge ½kx² without exploding; strain is judged separately.
 
-Symplectic Euler has its velocities half a step before its positions. Of x″ = −ω²x it keeps v² + ω²x² − hω²xv, and near its
-limit ωh = 2 this is far below v², at ωh = 1.995 up to 199 times. With the velocity at the time of the position,
-u = v − ½hω²x, the same is u² + ω²x²(1 − ω²h²/4), so that below the limit u² never exceeds it: u is judged, not v.
+Symplectic Euler has its velocities half a step before its positions. For x″ = −ω²x it conserves v² + ω²x² − hω²xv, which near
+the limit ωh = 2 is far below v², by a factor of up to 199 at ωh = 1.995. With the velocity at the time of the position,
+u = v − ½hω²x, the conserved quantity is u² + ω²x²(1 − ω²h²/4). Below the limit u² never exceeds it, so u is judged and not v.
 
-What puts energy in is a :class:`Source`. A new kind of them is an entry of :data:`SOURCES`.
+A :class:`Source` puts energy in. A new kind of source is an entry of :data:`SOURCES`.
 """
 
 from functools import cached_property
@@ -18,19 +18,19 @@ import warp as wp
 from .operators import Energy, Gradient, Sums
 from .turns import TURN
 
-# A run has diverged when it has this many times the energy that its sources can have put in. What holds has up to 1.4 times
-# that with unconverged or large steps and 1.3 times with sweeps averaged by vertex; single hierarchical sweeps, 16 a frame,
-# give 1.9 times on a hanging cloth and 2.9 times on a hard flag that is swung by 120°. What explodes passes every bound.
+# A run has diverged when it has this many times the energy that its sources can have put in. Stable runs reach up to 1.4 times
+# with unconverged or large steps and 1.3 times with sweeps averaged by vertex. Single hierarchical sweeps, 16 a frame, reach
+# 1.9 times on a hanging cloth and 2.9 times on a hard flag that is swung by 120°. Runs that explode pass every bound.
 GAIN = 3.0
-# A run has diverged when an edge has this strain and the energy for it was not there. The fewest sweeps that hold a cloth give
-# up to 6.4 (one a step of 1/60 s, averaged by vertex); a cloth that falls as if nothing held it passes 10 soon.
+# A run has diverged when an edge has this strain and the run does not have the energy for it. The fewest sweeps that hold a
+# cloth give up to 6.4 (one a step of 1/60 s, averaged by vertex); a cloth that falls as if nothing held it soon passes 10.
 STRETCHED = 10.0
-# More patches of pins than these are taken for one, whose pins move within it.
+# More patches of pins than this are treated as one patch, whose pins move within it.
 _PATCHES = 32
 
 
 class Elastic:
-    """U of the soft terms of a model, ∂U/∂x, and gaps; kernels and scratch are made when first needed."""
+    """Evaluates U and ∂U/∂x of the soft terms of a model, and gaps; kernels and scratch are allocated on first use."""
 
     def __init__(self, model):
         self.model = model
@@ -54,7 +54,7 @@ class Elastic:
         return self._value(self._energy, x) if self.soft else np.zeros(self.model.copies)
 
     def gaps(self, x, terms):
-        """½Σ gap² of the constraints of terms, which is their energy with a stiffness of 1, (B,)."""
+        """Computes ½Σ gap² of the constraints of terms, which is their energy with a stiffness of 1, (B,)."""
         unit = tuple(elements.with_unit_stiffness() for elements in terms)
         return self._value(Energy(self.model, self._sums, terms=unit), x) if unit else np.zeros(self.model.copies)
 
@@ -65,7 +65,7 @@ class Elastic:
         return self.model.in_scene_order(gradient.numpy()).astype(np.float64)
 
     def put(self, points):
-        """Points (B·n, 3) in the order of the scene as the model has them, on its device."""
+        """Puts points (B·n, 3) from the order of the scene into that of the model, on its device."""
         model = self.model
         if model.order is not None:
             points = points.reshape(model.copies, -1, 3)[:, model.order]
@@ -78,38 +78,38 @@ class Elastic:
 
 
 class Source:
-    """What puts energy into a cloth. All its numbers are upper bounds.
+    """A source of energy for a cloth. All its numbers are upper bounds.
 
     Attributes:
-        name: For sentences.
+        name: Its name in messages.
     """
 
     name = "a source"
 
     def energy(self, frame, speed):
-        """What it has put in until a frame, (B,) [J]; frames are asked for once each, in order from 1.
+        """Energy that it has put in up to a frame, (B,) [J]; called once for each frame, in order from 1.
 
         Args:
             frame: Number of the frame.
-            speed: Largest RMS speed of each copy in any frame before, and what falling adds in one frame, (B,) [m/s].
+            speed: Largest RMS speed of each copy in any earlier frame plus what falling adds in one frame, (B,) [m/s].
         """
         return 0.0
 
     def speed(self, frame):
-        """Speed by which it carries along all that it moves, in a frame [m/s]: energy is that of the motion beside it."""
+        """Speed at which it carries the whole cloth along in a frame [m/s]; energy is counted relative to that motion."""
         return 0.0
 
     def stored(self, frame):
-        """What it has put in beside, (B,) [J]; costly, and only asked for where all else does not suffice."""
+        """Further energy that it has put in, (B,) [J]; costly, so called only if everything else is not enough."""
         return 0.0
 
 
 class Start(Source):
-    """Motion and elastic energy at the start.
+    """Kinetic and elastic energy at the start.
 
-    Of hard constraints it is the energy of closing their gaps in a step: N of them, with gaps in a row, move what hangs on them
-    by up to Σ gap ≤ √(N Σ gap²), at twice the speed that hₑ gives with midpoint or a relaxation of 2. Of solvers whose sweeps
-    ``closes`` soft constraints as well, these count likewise.
+    Hard constraints count with the energy of closing their gaps in one step. N of them in a row move what hangs on them by up
+    to Σ gap ≤ √(N Σ gap²), and midpoint or a relaxation of 2 doubles the speed that hₑ gives. Soft constraints count in the
+    same way for solvers whose sweeps may close them too (``closes``).
     """
 
     name = "the start"
@@ -129,10 +129,10 @@ class Start(Source):
 class Pins(Source):
     """Pins that keyframes move.
 
-    Pins that are joined by edges are a patch. Where a patch moves as a rigid body, the cloth could move with it, and beside
-    that motion it keeps its energy: a change δ of the speed of the patch, over the whole cloth, adds at most ½δ² + δ·speed to
-    the energy of a mass, and nothing else does but lifting. What patches store by moving against one another costs at most as
-    much as to deform the start with them, each vertex by the mean of their motions with weights 1/distance².
+    Pins that are joined by edges form a patch. If a patch moves as a rigid body, the cloth can move with it and keep its energy
+    relative to that motion. A change δ of the patch's speed, taken over the whole cloth, adds at most ½δ² + δ·speed per unit
+    mass, and apart from that only lifting adds energy. Patches that move against one another store at most the energy of
+    deforming the start with them, each vertex by the mean of their motions with weights 1/distance².
     """
 
     name = "moving pins"
@@ -227,24 +227,24 @@ def _moving(balance, stepper):
     return Pins(balance, stepper) if moves else None
 
 
-# Functions of (balance, stepper), each of which gives a source, or None for a scene that has none of its kind.
+# Functions of (balance, stepper), each of which returns a source, or None if the scene has none of its kind.
 SOURCES = [Start, _moving]
 
 
 class Balance:
     """Compares the energy of each copy, frame by frame, with what the sources of the scene can have put in.
 
-    Energies are counted from the lowest height that a copy has had, so that falling is no source of its own.
+    Energies are counted from the lowest height that a copy has had, so falling is not a separate source.
 
     Args:
         model: The :class:`warpcloth.model.Model`.
         stepper: The :class:`warpcloth.solvers.solver.Stepper` of a solver that is bound to it.
 
     Attributes:
-        mass, total: Of the free vertices (B, n) and of all of them (B,) [kg].
+        mass, total: Masses of the free vertices (B, n) and their sum (B,) [kg].
         elastic: :class:`Elastic` of the model.
         sources: The sources of the scene.
-        has, given: What each copy has, and can have been given, in the frame that was asked for last, (B,) [J].
+        has, given: Energy that each copy has, and that it can have been given, in the last frame that was checked, (B,) [J].
     """
 
     def __init__(self, model, stepper):
@@ -258,7 +258,7 @@ class Balance:
         self._gravity = model.gravity.numpy().astype(np.float64)
         self._moment, self._lowest, self._fastest = self._moments(points), np.zeros(model.copies), np.zeros(model.copies)
         self.elastic = Elastic(model)
-        # Rounding of positions gives a velocity of at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up as a walk does.
+        # Rounding of positions gives a velocity of at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
         farthest = np.abs(points).reshape(model.copies, -1).max(axis=1)
         rounded = 4.0 * np.finfo(model.numpy_dtype).eps * farthest
         self._rounding = 0.5 * self.total * (rounded / self._h) ** 2
@@ -272,7 +272,7 @@ class Balance:
         return 0.5 * (self.mass * squares).sum(axis=1)
 
     def gains(self, frame, points, velocities):
-        """What each copy has over what it can have been given, (B,).
+        """Divides the energy of each copy by what it can have been given, (B,).
 
         Args:
             frame: Number of the frame; they come in order from 1.
@@ -305,7 +305,7 @@ class Balance:
         return self._gravity.any(axis=1)
 
     def sentence(self, copy):
-        """What a copy has gained by the last frame."""
+        """Says how much energy a copy has gained by the last frame."""
         names = [source.name for source in self.sources] + ["falling"] * bool(self.weighs[copy])
         names = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
         return (
@@ -314,7 +314,7 @@ class Balance:
         )
 
     def suffices(self, copy, points, stretch):
-        """Whether what a copy can have been given by the last frame suffices for an edge ``stretch`` m too long."""
+        """Whether the energy that a copy can have been given by the last frame allows an edge ``stretch`` m too long."""
         with TURN:
             x = self.elastic.put(points)
             energy, gaps = self.elastic.energy(x)[copy], self.elastic.gaps(x, self.elastic.hard)[copy]
@@ -333,7 +333,7 @@ class Balance:
         return -((self._moments(points) - self._moment) * self._gravity).sum(axis=1)
 
     def _at_positions(self, points, velocities):
-        """Velocities half a kick later, when the positions are these."""
+        """Velocities at the time of the positions, half a kick later."""
         mass, shape = self.mass[..., None], (*self.mass.shape, 3)
         forces = mass * self._gravity[:, None] - self.elastic.gradient(self.elastic.put(points)).reshape(shape)
         kicks = np.divide(forces, mass, out=np.zeros(shape), where=mass > 0.0)

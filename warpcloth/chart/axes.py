@@ -9,7 +9,7 @@ from ..checks import number, whole
 from ..solvers import Explicit
 from .tasks import Setup
 
-# Frames of what is compared, about: a frame has as many steps as that takes.
+# Approximate number of frames that are compared; a frame has as many steps as that needs.
 FRAMES = 64
 # Noise of the start, over the median edge: what is unstable grows out of it, a hundredfold in energy while springs are linear.
 NOISE = 1e-6
@@ -68,13 +68,13 @@ FIXED = {"dt": 1 / 60}
 
 
 def scene_at(ref, values, steps, duration=None):
-    """The scene of a cell: frames of a step or more each, and a start with noise.
+    """Returns the scene of a cell, with frames of one step or more and noise at the start.
 
     Args:
         ref: :class:`warpcloth.chart.tasks.SceneRef`.
-        values: By name of the axis; ``dt`` among them.
-        steps: Number of steps at least, rounded up to whole frames.
-        duration: Time of motion at least [s], for which :data:`FRAMES` are meant; that of ``steps`` if not given.
+        values: Values by name of the axis, ``dt`` among them.
+        steps: Least number of steps, rounded up to whole frames.
+        duration: Least time of motion [s], which has about :data:`FRAMES` frames; by default that of ``steps``.
 
     Raises:
         ValueError: The scene cannot have such a value.
@@ -100,7 +100,7 @@ def scene_at(ref, values, steps, duration=None):
 
 
 def steps_in(duration, dt):
-    """The fewest steps that last a duration, 1 or more; what rounding adds counts for nothing."""
+    """Returns the fewest steps that last a duration, at least 1, ignoring rounding."""
     return max(math.ceil(duration / dt * (1.0 - 1e-9)), 1)
 
 

@@ -29,7 +29,7 @@ class Scale:
         high: Value at the upper end.
         neutral: Value in the middle of a diverging map, about which the ends are moved apart until they are symmetric. None
             is a sequential map.
-        colormap: Name of a map of matplotlib, if not `DIVERGING` with a neutral value and `SEQUENTIAL` without.
+        colormap: Name of a colour map of matplotlib; by default `DIVERGING` with a neutral value, `SEQUENTIAL` without.
 
     Raises:
         ValueError: A value is not finite, low is not below high, or matplotlib has no such map.
@@ -130,11 +130,11 @@ def to_linear(colours):
 
 
 def check_colormap(name):
-    """Refuses what is no colour map of matplotlib.
+    """Refuses a name that is not a colour map of matplotlib.
 
     Raises:
         ImportError: matplotlib is not installed.
-        ValueError: Naming maps that look alike, or some that it has.
+        ValueError: There is no such map; the message suggests similar names, or some that exist.
     """
     require_matplotlib()
     from difflib import get_close_matches

@@ -18,7 +18,7 @@ _STYLES = {
     "constrained-dynamics": ("tab:green", "p"),
 }
 _DASHES = ("-", "--", ":", "-.")
-_WIDTH, _LINES = 46, 48  # of the texts beside a picture
+_WIDTH, _LINES = 46, 48  # characters and lines of the texts beside a picture
 _SMALL, _TEXT = 8.5, 10.0  # sizes of letters [pt]
 # Of a motion, with what is written along them.
 _ERRORS = {
@@ -28,11 +28,11 @@ _ERRORS = {
 
 
 def plot_time(path, found):
-    """Draws the error of each setting over its time with the quartiles of that, and names each line at its end.
+    """Draws the error of each setting over its time, with the quartiles of the time, and names each line at its end.
 
-    Two panels have the error of positions and the 99th percentile of the error of strains. In each those that nothing beats by
-    more than times spread are joined and numbered, with their names beside it. What has no error is named with the reason; the
-    error of the reference solution is a line, and no point below means anything.
+    Two panels show the error of positions and the 99th percentile of the error of strains. In each panel the settings that no
+    other beats by more than the spread of times are joined and numbered, with their names beside the panel. Settings without an
+    error are named with the reason. The error of the reference solution is a line; points below it mean nothing.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -165,10 +165,10 @@ def _missing(head, found):
 
 
 def _name_ends(figure, axes, ends):
-    """Writes beside the end of each line what it is, in its colour, as near as none is over another or outside.
+    """Writes the name of each line beside its end, in its colour, as near as possible without overlaps and inside the panel.
 
     Args:
-        figure: Of the axes, which are otherwise finished.
+        figure: Figure of the axes, which are otherwise finished.
         axes: A panel.
         ends: (x, y, text, colour) of each line.
     """
@@ -177,7 +177,7 @@ def _name_ends(figure, axes, ends):
     low, high = axes.get_xlim()
     axes.set_xlim(low, high * (high / low) ** 0.3)  # room for names
     number_axis(axes.xaxis)
-    figure.draw_without_rendering()  # sizes are known then
+    figure.draw_without_rendering()  # so that sizes are known
     style, taken = {"fontsize": _SMALL, "va": "center", "path_effects": [withStroke(linewidth=2.5, foreground="white")]}, []
     for x, y, text, colour in sorted(ends, key=lambda end: -end[1]):
         note = axes.annotate(
@@ -220,7 +220,7 @@ def _figure(path, texts):
 
 
 def _finish(figure, axes, notes, title, texts, found):
-    """Title with the machine, legend, and the texts below it."""
+    """Adds the title with the machine, the legend, and the texts below it."""
     known = {}
     for each in axes:
         number_axis(each.xaxis)

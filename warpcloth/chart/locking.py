@@ -9,10 +9,10 @@ Apart from it each net has its own bending stiffness, the error of its pattern, 
 cantilever shows while its membrane is soft. Divided by it, what is left is locking, and falls with h⁴. Regular nets lock there
 too, though less: their curvature varies, and their sides curl.
 
-How far a net can give way depends on the freedom that its stiff edges leave (:mod:`warpcloth.freedom`): rows and columns alone
-leave more than one degree of freedom a vertex, all edges of triangles 3 + those of the boundary, however fine they are, and a
-grid with both diagonals none but rigid motion. With so little left a net bends only if it is regular and bent along its own
-lines.
+How far a net can give way depends on the degrees of freedom that its stiff edges leave (:mod:`warpcloth.freedom`). Rows and
+columns alone leave more than one per vertex. All edges of triangles leave 3 plus the number of boundary edges, however fine the
+mesh is. A grid with both diagonals leaves only rigid motion. With so little freedom a net bends only if it is regular and bent
+along its own lines.
 
 Springs alone end in no shape: what is left has no stiffness, and slides on along its wrinkles.
 """
@@ -49,7 +49,7 @@ _LET_GO = (("equilateral", 0.0), ("jittered", 0.0), ("jittered", 20.0), ("jitter
 SOFT, STIFF = 1e4, 1e8
 _DECADES = {8: range(4, 11), 16: range(4, 10)}
 _CANTILEVERS = [(pattern, n) for pattern in ("equilateral", "jittered") for n in (6, 8, 12, 16, 24)] + [("alternating", 8)]
-# Nets of springs whose freedom is counted and that are rolled up while all but rigid, K/D = 1e9, by what holds.
+# Nets of springs by the edges that hold; their freedom is counted, and they are rolled up while almost rigid, K/D = 1e9.
 _HOLDING = {"rows and columns": "diagonal", "edges": "equilateral", "edges, jittered": "jittered", "both diagonals": "diagonal"}
 _COUNTED = (5, 9, 17, 33, 65)  # vertices a side
 _TURNED = (0.0, 15.0, 30.0, 45.0)  # [°]
@@ -191,10 +191,11 @@ def relaxed(pattern, elements, moduli, device):
 
 
 def _at_rest(flat, pairs, K, device):
-    """The scene of a flat mesh whose hinges are at rest when rolled up and whose springs when flat, and its rest shape."""
+    """Builds a flat mesh whose hinges are at rest when rolled up and whose springs are at rest when flat, and its rest
+    shape."""
     rolled = Mesh(rolled_up(flat.points, CURVATURE), flat.triangles)
-    lengths = np.linalg.norm(flat.points[pairs[:, 1]] - flat.points[pairs[:, 0]], axis=1)
-    terms = [
+    lengths = np.linalg.norm(flat.points[pairs[:, 1]]
+    - flat.points[pairs[:, 0]], axis=1) terms = [
         Spring(pairs=pairs, stiffness=np.sqrt(0.75) * K * D, rest_lengths=lengths),
         DihedralBending(stiffness=D),
     ]
@@ -203,10 +204,10 @@ def _at_rest(flat, pairs, K, device):
 
 
 def held(holding, mesh):
-    """Pairs of vertices (E, 2) of a net that hold their distance, one of `_HOLDING`."""
+    """Returns the pairs of vertices (E, 2) that hold their distance in a net of `_HOLDING`."""
     if holding.startswith("edges"):
         return mesh.edges
-    # Of right triangles, the longest side of which is the diagonal of a cell.
+    # The longest side of a right triangle is the diagonal of a cell.
     diagonal = mesh.edge_lengths > 1.2 * mesh.edge_lengths.min()
     if holding == "rows and columns":
         return mesh.edges[~diagonal]
@@ -216,7 +217,7 @@ def held(holding, mesh):
 
 
 def counted(holding, n):
-    """What the springs of a square net of n² vertices leave free, or of a jittered one as large."""
+    """Counts the degrees of freedom that the springs of a square net of n² vertices leave, or of a jittered one as large."""
     pattern = _HOLDING[holding]
     mesh = strip(pattern, 0.0, 1.0 / (n - 1)).mesh if pattern == "jittered" else Mesh.grid(n, n, pattern=pattern)
     return [point("freedom", holding, len(mesh.boundary_edges), _left(mesh, held(holding, mesh)))]
@@ -227,7 +228,7 @@ def _left(mesh, pairs):
 
 
 def nearly_rigid(holding, degrees, device):
-    """The part of its curvature that a net of very stiff springs keeps at rest, by the freedom that they leave."""
+    """Measures the part of its curvature that a net of very stiff springs keeps at rest, by the freedom that they leave."""
     flat = strip(_HOLDING[holding], np.radians(degrees), 1.0 / 8).mesh
     pairs = held(holding, flat)
     scene, rest = _at_rest(flat, pairs, _ALL_BUT_RIGID, device)

@@ -42,7 +42,7 @@ def name(device="cpu"):
 
 
 def in_words(facts):
-    """The device of :func:`machine`, of a CPU its name and cores, and the version of Warp, as a title has them."""
+    """Formats the device of :func:`machine` (for a CPU its name and cores) and the version of Warp for a title."""
     device = facts["device"] if facts["device"] != "cpu" else f"{facts['processor']}, {facts['cores']} cores"
     return f"{device}, Warp {facts['warp']}"
 

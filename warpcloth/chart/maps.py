@@ -21,7 +21,7 @@ _PLAIN = {
     "refused": (1.0, 1.0, 1.0),
 }
 _EARLY, _LATE = np.array([0.42, 0.02, 0.11]), np.array([0.87, 0.47, 0.40])
-# Of each rule, with what it says; black where beyond it a run diverges.
+# Line style and label of each rule; lines are black if runs diverge beyond them.
 _STYLES = {
     "2/ω_max": ("-", "largest stable step about the rest shape"),
     "2/√(2 Σk/m)": ("--", "stable in any motion"),
@@ -30,9 +30,9 @@ _STYLES = {
     "Gauss–Seidel, |z| = 1": ((0, (4, 1, 1, 1, 1, 1)), "sweeps in their order overshoot beyond"),
     "h² = m/(k(L/l − 1))": ("-", "beyond, a step has several minima"),
     "1 + Σk h²/m iterations": ("--", "needed across stiff springs"),
-    "a ring an iteration": ("-.", "pins are not felt everywhere beyond"),
+    "a ring an iteration": ("-.", "beyond, the pins do not reach every vertex"),
     "r = 1/(2hω)": ((0, (5, 1)), "the weight that converges fastest"),
-    KNOWN: ((0, (1, 2)), "beyond, it is known less well"),
+    KNOWN: ((0, (1, 2)), "beyond, the reference is less accurate"),
 }
 # Of what is stable or inaccurate.
 _UNSURE = {"facecolor": _PLAIN["stable"], "edgecolor": _PLAIN["inaccurate"], "hatch": "///", "linewidth": 0.0}
@@ -97,7 +97,7 @@ def _places(name, values):
 
 
 def _ticks(name, values, at):
-    """Where numbers stand along an axis, and their texts: powers of ten where there are some, else a few of the values."""
+    """Returns the ticks of an axis and their labels: powers of ten if there are some, else a few of the values."""
     if AXES[name].logarithmic and at[-1] - at[0] >= 1.0:
         powers = np.arange(math.ceil(at[0] - 1e-6), at[-1] + 1e-6)
         powers = powers[:: math.ceil(len(powers) / _TICKS)]
@@ -174,7 +174,8 @@ def _legend(figure, shown, verdicts, accuracy):
 
 
 def write_table(path, survey, cells):
-    """A line for each cell: method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules, reason.
+    """Writes a line for each cell: method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules,
+    reason.
 
     The last column is the machine, if known.
 

@@ -113,7 +113,7 @@ def _draw(axes, panel, rows):
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter("{x:g}")
             if high > 10.0 * low:
-                axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))  # more would run into one another
+                axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))  # more labels would overlap
     axes.tick_params(which="both", colors=GREY, labelsize=8)
     axes.grid(True, which="major", linewidth=0.3, color="0.85")
     axes.spines[["top", "right"]].set_visible(False)

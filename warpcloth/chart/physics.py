@@ -11,8 +11,8 @@
 Bending is calibrated on equilateral nets; on others what is wrong stays as the mesh is refined (:func:`strips.rolled`). What
 makes a cantilever something else than the elastica:
 
-- One row of triangles, or any strip much narrower than long, bends with 1 − ν² = 8/9 of D, as Poisson's ratio ν of both
-  energies is −1/3 (:func:`strips.plate`): it is the elastica of 9Γ/8. This one is twice as wide as it is long.
+- One row of triangles, or any strip much narrower than long, bends with 1 − ν² = 8/9 of D, because the Poisson's ratio ν of
+  both energies is −1/3 (:func:`strips.plate`): it is the elastica of 9Γ/8. This strip is twice as wide as it is long.
 - Its sides curl as those of a narrow strip do, as far in as its membrane lets them: `sides` is what that takes of D, and the
   error cannot be much less. The stiffer the membrane the smaller it is.
 - A stiff membrane locks: the mesh cannot bend without stretching, and an irregular one does so most, by κ²h²/24 a triangle,
@@ -223,11 +223,11 @@ def _cantilever(settle, bending, net, gamma, stretching, width):
 
 
 def side_loss(gamma, stretching, width):
-    """Part of D that the free sides of a wide cantilever take, an estimate for small Γ.
+    """Estimates the part of D that the free sides of a wide cantilever take, for small Γ.
 
-    Free of moment, a side of a plate of curvature κ curls within a width of 1/α, α⁴ = Kκ²/4D, and saves ν²Dκ²/2α a length
-    (Lamb 1891, *On the flexure of a flat elastic spring*); here ν = −1/3, and κ = Γu²/2 makes the tip sink that much more. A
-    narrow strip loses ν² of D.
+    A side of a plate with curvature κ has no moment. It curls within a width of 1/α, α⁴ = Kκ²/4D, and saves ν²Dκ²/2α per length
+    (Lamb 1891, *On the flexure of a flat elastic spring*). Here ν = −1/3, and with κ = Γu²/2 the tip sinks further by that
+    much. A narrow strip loses ν² of D.
     """
     saved = 2.0 / 9.0 / width * (4.0 / stretching) ** 0.25
     return float(min(saved * 8.0 / (3.0 * np.sqrt(2.0 * gamma)), 1.0 / 9.0))

@@ -39,7 +39,7 @@ def draw(
             points if it is None or without a window.
         directions: Segments to draw on the cloth, as a dictionary from names to (centres (E, 3) [m], vectors (E, 3) [m] from
             end to end); the first are black, the second white, the third grey. Those that are not finite are left out.
-        both_sides: Whether the cloth is also seen from straight behind, in a second panel; each says from where it is seen.
+        both_sides: Whether a second panel shows the cloth from the opposite side; each panel then has its view as a title.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -69,7 +69,7 @@ def draw(
 
 
 def _paint_cloth(axes, view, points, triangles, colours, on, directions):
-    """Draws the triangles and directions as they are seen; how many triangles have a corner that is not finite."""
+    """Draws the triangles and directions in a view; returns how many triangles have a corner that is not finite."""
     corners = view.project(points)[triangles]
     placed = np.isfinite(corners).all(axis=(1, 2))
     outlines, colours = (_whole if on == "triangle" else _thirds)(corners[placed], colours[placed])
@@ -143,9 +143,9 @@ def _segments(view, directions):
 
 
 def _layout(window, title, count=1):
-    """A figure, ``count`` axes as large as the window, and axes for the bar; they depend on nothing but the window.
+    """Creates a figure, ``count`` axes as large as the window, and axes for the colour bar; they depend only on the window.
 
-    Panels that are higher than wide stand side by side, others one above another.
+    Panels that are taller than wide are side by side, others one above the other.
     """
     from matplotlib.figure import Figure
 

@@ -18,8 +18,8 @@ from ..turns import in_turn
 DIVERGES = ("2/ω_max", "2/√(2 Σk/m)", "forward Euler", "ω λ_max = 2", "Gauss–Seidel, |z| = 1")
 # Not of a method: how far the reference of a map is known, over the accuracy that is asked for.
 KNOWN = "error of the reference = accuracy"
-# What the fastest mode of a net has gained in energy when the whole net, which starts as noise, has gained what counts as
-# diverged (:data:`warpcloth.balance.GAIN`): 7 to 16 times, measured in runs of 40 to 400 steps.
+# Growth in energy of the fastest mode of a net when the whole net, which starts as noise, has grown enough to count as diverged
+# (:data:`warpcloth.balance.GAIN`). Measured in runs of 40 to 400 steps it is 7 to 16 times.
 GROWTH = 10.0
 # Factors z of a step, complex, where sweeps multiply x̃ by q: Euler z² − 2qz + q = 0, midpoint z² − 2(2q − 1)z + 1 = 0, BDF2
 # z² = r(4z − 1)/3 with r = q ± √(q² − q).
@@ -28,9 +28,9 @@ _STEPS = {
     "midpoint": lambda q: _roots(2.0 * q - 1.0, 1.0),
     "bdf2": lambda q: np.concatenate([_roots(2.0 * r / 3.0, r / 3.0) for r in _roots(q, q)]),
 }
-# The least real q for which |z| ≤ 1.
+# Smallest real q for which |z| ≤ 1.
 _LEAST = {"euler": -1.0 / 3.0, "midpoint": 0.0, "bdf2": -9.0 / 55.0}
-# Springs whose sweeps are solved for their eigenvalues, densely.
+# Most springs for which the eigenvalues of a sweep are computed, by a dense solver.
 _MOST = 1000
 
 
@@ -39,16 +39,16 @@ def rules(scene, record, steps):
 
     - ``2/ω_max``: h over the largest stable step of symplectic Euler about the rest shape; ``2/√(2 Σk/m)``: over that in
       motion, see :func:`warpcloth.solvers.explicit.step_limits`.
-    - ``forward Euler``: by 1 + h²ω² a step its fastest mode has grown by :data:`GROWTH` at the end; none where
-      damping holds it.
+    - ``forward Euler``: the fastest mode grows by 1 + h²ω² a step and has grown by :data:`GROWTH` at the end; no line if
+      damping stops it.
     - ``h² = m/(k(L/l − 1))``: hₑ √−λ with λ the least eigenvalue of M⁻¹∂²U/∂x² at the start and hₑ the effective step of the
       integrator, beyond which what a step minimises is not convex (Choi and Ko 2002).
     - ``ω λ_max = 2``: of Jacobi sweeps over springs, averaged or not, see :func:`largest_relaxation`.
-    - ``Gauss–Seidel, |z| = 1``: of sweeps in their order, beyond which energy grows by :data:`GROWTH` in the steps of the run,
-      see :func:`largest_ordered`.
+    - ``Gauss–Seidel, |z| = 1``: for sweeps in their own order; beyond it energy grows by :data:`GROWTH` in the steps of the
+      run, see :func:`largest_ordered`.
     - ``1 + Σk h²/m iterations``: those that projections need across springs, for accelerated ones the root.
-    - ``r = 1/(2hω)``: the weight of ADMM over the least that :func:`warpcloth.solvers.admm.best_weights` gives an element, the
-      stiffest: above it stalls, below it oscillates.
+    - ``r = 1/(2hω)``: the weight of ADMM divided by the smallest that :func:`warpcloth.solvers.admm.best_weights` gives, that
+      of the stiffest element. A larger weight stalls, a smaller one oscillates.
     - ``a ring an iteration``: how many edges lie between pins and the furthest vertex, over the sweeps.
 
     Args:
@@ -146,22 +146,22 @@ def largest_relaxation(scene, he, record):
 
 
 def largest_ordered(scene, he, record, steps):
-    """The largest relaxation ω with which Gauss–Seidel sweeps over springs about the rest shape hold for so many steps.
+    """Finds the largest relaxation ω at which Gauss–Seidel sweeps over springs, about the rest shape, are stable for a run.
 
-    A sweep solves (D/ω + L)Δλ = −(Jx̃ + Aλ), with A = JWJᵀ + α̃ of XPBD, JWJᵀ of PBD, D the diagonal of JWJᵀ + α̃, α̃ = 1/(khₑ²),
-    and L what of JWJᵀ comes before an element in the order of the sweep; x = x̃ + WJᵀλ. What n of them multiply x̃ by has complex
-    eigenvalues q, for an order has a direction, and steps multiply by z, see :data:`_STEPS`. It holds while no |z| makes energy
-    grow by :data:`GROWTH` in all steps. A net of structural springs has q = (1 − ω)ⁿ as its least, which is −1/3 for
-    ω = 1 + 3^(−1/n); with more springs complex ones grow before that.
+    A sweep solves (D/ω + L)Δλ = −(Jx̃ + Aλ). A is JWJᵀ + α̃ for XPBD and JWJᵀ for PBD, D is the diagonal of JWJᵀ + α̃,
+    α̃ = 1/(khₑ²), and L is the part of JWJᵀ that comes before an element in the order of the sweep; x = x̃ + WJᵀλ. The matrix by
+    which n sweeps multiply x̃ has complex eigenvalues q, because the order makes it unsymmetric. Steps multiply by z, see
+    :data:`_STEPS`. A run is stable while no |z| makes the energy grow by :data:`GROWTH` in all steps. In a net of structural
+    springs the smallest q is (1 − ω)ⁿ, which is −1/3 for ω = 1 + 3^(−1/n); with more springs complex q grow before that.
 
     Args:
-        scene: Of springs alone, without damping.
+        scene: A scene of springs alone, without damping.
         he: Effective step hₑ [s].
         record: :class:`warpcloth.PBD` or :class:`warpcloth.XPBD` with a Gauss–Seidel sweep.
-        steps: Length of the run.
+        steps: Number of steps of the run.
 
     Returns:
-        float: ω; None where twice 1 + 3^(−1/n) still holds, or of more than :data:`_MOST` springs, which take long.
+        float: ω; None if twice 1 + 3^(−1/n) is still stable, or for more than :data:`_MOST` springs, which take too long.
     """
     pairs, mobility, compliance = _springs(scene, he, _turns(scene, record))
     if len(pairs) > _MOST:
@@ -176,9 +176,9 @@ def largest_ordered(scene, he, record, steps):
     )
 
 
-@lru_cache(256)  # cells along the relaxation have one limit, and so have those of a hard net at all steps
+@lru_cache(256)  # cells that differ in relaxation share a limit, and so do those of a hard net at all steps
 def _largest_ordered(J, count, diagonal, compliance, n, integrator, to_and_fro, steps):
-    """:func:`largest_ordered` of JW^½ (E, 3N), D (E,) and α̃ (E,), each as bytes."""
+    """Implements :func:`largest_ordered` with JW^½ (E, 3N), D (E,) and α̃ (E,), each as bytes."""
     from scipy.linalg import solve_triangular
 
     J, diagonal, compliance = np.frombuffer(J).reshape(count, -1), np.frombuffer(diagonal), np.frombuffer(compliance)
@@ -194,7 +194,7 @@ def _largest_ordered(J, count, diagonal, compliance, n, integrator, to_and_fro, 
         q = np.linalg.eigvals(np.eye(B.shape[1]) + B.T @ moves).astype(complex)
         return abs(_STEPS[integrator](q)).max() > GROWTH ** (0.5 / steps)
 
-    # Not all that lies beyond the first ω that grows must grow.
+    # Beyond the first unstable ω there may be stable ones again.
     trials = np.linspace(0.0, 2.0 * (1.0 + 3.0 ** (-1.0 / n)), 41)[1:] * (diagonal / np.diag(J @ J.T)).min()
     first = next((k for k, omega in enumerate(trials) if grows(omega)), None)
     if first is None:
@@ -207,7 +207,7 @@ def _largest_ordered(J, count, diagonal, compliance, n, integrator, to_and_fro, 
 
 
 def _springs(scene, he, turns=None):
-    """Of springs that can move something: vertices (E, 2), GWGᵀ (E,) and α̃ (E,), in the order of ``turns`` if given."""
+    """Returns, for springs with a free vertex, vertices (E, 2), GWGᵀ (E,) and α̃ (E,), in the order of ``turns`` if given."""
     pairs = [term.stencil(scene.mesh) for term in scene.terms]
     stiffness = np.concatenate([np.broadcast_to(t.stiffness, len(p)) for t, p in zip(scene.terms, pairs, strict=True)])
     pairs = np.concatenate(pairs)
@@ -219,7 +219,7 @@ def _springs(scene, he, turns=None):
 
 
 def _turns(scene, record):
-    """The order in which a Gauss–Seidel sweep takes springs: term by term as declared, by colour in each if so asked."""
+    """Returns the order in which a Gauss–Seidel sweep takes springs: term by term as declared, and by colour if coloured."""
     found, first, free = [], 0, _inverse_masses(scene) > 0.0
     for pairs in (term.stencil(scene.mesh) for term in scene.terms):
         order = np.argsort(colours(pairs, free), kind="stable") if record.sweep == "coloured" else np.arange(len(pairs))
@@ -229,7 +229,7 @@ def _turns(scene, record):
 
 
 def _directions(scene, pairs):
-    """J at the rest shape (E, 3N), sparse: of each spring its direction at one end, and the opposite at the other."""
+    """Assembles J at the rest shape (E, 3N), sparse: a spring's direction at one end, and the opposite at the other."""
     from scipy.sparse import csr_array
 
     points = scene.mesh.points
@@ -241,13 +241,13 @@ def _directions(scene, pairs):
 
 
 def _range(J):
-    """An orthonormal basis of the range of Jᵀ (3N, rank): of the moves that springs notice."""
+    """Returns an orthonormal basis of the range of Jᵀ (3N, rank), the moves that change the length of springs."""
     _, values, vectors = np.linalg.svd(J, full_matrices=False)
     return vectors[values > 1e-9 * values[0]].T
 
 
 def _roots(half, product):
-    """Both z of z² − 2·half·z + product = 0, complex."""
+    """Solves z² − 2·half·z + product = 0 for both z, complex."""
     root = np.sqrt(half * half - product + 0j)
     return np.stack([half + root, half - root])
 

@@ -19,8 +19,8 @@ from .tasks import SceneRef, Setup, task
 VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
 # RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
 ACCURACY = 0.01
-# Steps of the reference in one of the map, but in all no more than so many, or as many as frames; a run of half as many says
-# how well it is known.
+# Steps of the reference per step of the map, and the most steps that it takes in all (or as many as frames). A run with half as
+# many steps gives the error of the reference.
 _FINER, _MOST = 4, 2000
 _FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
 
@@ -32,11 +32,11 @@ class Trial:
     Attributes:
         points: (frames+1, B, n, 3) [m].
         good: The last good frame of each copy (B,).
-        growth: Largest energy of motion and height in a good frame, over what the start, falling and rounding can have given
-            (B,), see :class:`warpcloth.balance.Balance`.
-        reasons: A sentence for each copy, "" if nothing is to be said.
+        growth: Largest energy of motion and height in a good frame, divided by what the start, falling and rounding can have
+            put in, (B,), see :class:`warpcloth.balance.Balance`.
+        reasons: A sentence for each copy, or "".
         results: :class:`warpcloth.status.Result` of each copy.
-        steps_per_frame: Steps a frame.
+        steps_per_frame: Steps per frame.
     """
 
     points: np.ndarray
@@ -52,10 +52,10 @@ class Slow(Exception):
 
 
 def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", limit=60.0):
-    """Runs a scene as `simulate` does, and calls the same runs diverged but for strain, which the reference tells.
+    """Runs a scene as `simulate` does, with its criterion for divergence except strain, which the reference covers.
 
     Raises:
-        Slow: After ``limit`` seconds, looked at each frame.
+        Slow: The run took more than ``limit`` seconds, which is checked at each frame.
         ValueError: The solver refuses the scene.
     """
     began = time.perf_counter()
@@ -104,17 +104,18 @@ def measure(
         setups: Dictionaries of :class:`warpcloth.chart.tasks.Setup`.
         fixed: Values by axis that all cells share; ``dt`` is among them or ``axis``.
         axis: The axis along which they differ.
-        values: Of that axis.
-        steps: The fewest steps of a run, however long they take: what diverges shows it in so many.
+        values: Values of that axis.
+        steps: The fewest steps of a run, however long they take, so that runs that diverge show it.
         accuracy: RMS distance to the reference, over vertices and frames and over the size of the cloth, that is inaccurate.
         device: Of the run.
         dtype: Of the run; the reference has float64.
         limit: Seconds for each run.
-        reference: Whether to compare with Newton, BDF2, of a quarter of the step, or where that takes more than 2000 steps with
-            as many. Where that refuses the scene there is none.
-        digests: Of the scene, see :func:`warpcloth.chart.digest.scene_digest`: a scene that was changed has another key.
-        duration: Time of motion that is compared with the reference, and run at least, the same for all cells [s]; that of
-            ``steps`` if not given.
+        reference: Whether to compare with Newton and BDF2 at a quarter of the step, or in 2000 steps if that takes more. If
+            Newton refuses the scene there is no reference.
+        digests: Digests of the scene, see :func:`warpcloth.chart.digest.scene_digest`: a scene that was changed has another
+            key.
+        duration: Time of motion that is compared with the reference, the same for all cells [s]; runs last at least as long. By
+            default that of ``steps``.
 
     Returns:
         list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS` ("stalled": a step ended in
@@ -130,7 +131,7 @@ def measure(
         groups = [[value] for value in values]
     rows, answer, length = [[] for _ in setups], None, (steps, duration)
     for nth, group in enumerate(groups):
-        if reference and (nth == 0 or axis not in OPTIONS):  # of no option of a method
+        if reference and (nth == 0 or axis not in OPTIONS):  # the axis is not an option of the method
             answer = _reference(ref, fixed, axis, group, length, device, limit)
         for row, setup in zip(rows, setups, strict=True):
             try:
@@ -183,7 +184,10 @@ def _reference(ref, fixed, axis, group, length, device, limit):
 
 
 def _apart(first, other, copy):
-    """RMS distance of a copy in two runs, over vertices, the frames of the second and the size; None where one did not end."""
+    """Returns the RMS distance of a copy in two runs, over vertices and frames of the second, divided by the size of the cloth.
+
+    None if one of the runs did not end.
+    """
     frames = len(other.points)
     if min(each.good[copy] for each in (first, other)) < frames - 1:
         return None
@@ -241,7 +245,7 @@ class Survey:
         x, y: Names of the two axes, of :data:`warpcloth.chart.axes.AXES`.
         xs, ys: Their values.
         fixed: Values of other axes.
-        steps, duration: Of :func:`measure`; without a duration half of that of the scene.
+        steps, duration: As in :func:`measure`; the default duration is half of the scene's.
 
     Raises:
         ValueError: The axes are not two, or unknown, or a method has a step of its own.

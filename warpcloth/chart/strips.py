@@ -75,10 +75,10 @@ def strip(pattern, angle, spacing, length=1.0, width=1.0):
 
 
 def rolled(pattern, angle):
-    """Stiffness over D of a net that is rolled to a cylinder, however fine it is.
+    """Computes the stiffness, divided by D, of a net that is rolled to a cylinder, however fine it is.
 
-    With c, s of the angle the curvature has the parts c², s² and cs in the net's own axes.
-    At rest a sheet may find a softer shape: one that also twists, or whose two kinds of vertices of "alternating" part.
+    With c and s the cosine and sine of the angle, the curvature has the components c², s² and cs in the net's own axes. At rest
+    a sheet may find a softer shape: one that also twists, or in which the two kinds of vertices of "alternating" separate.
     """
     c, s = np.cos(angle), np.sin(angle)
     curvature = np.array([c * c, s * s, c * s])
@@ -86,11 +86,11 @@ def rolled(pattern, angle):
 
 
 def plate(pattern):
-    """C (3, 3) of a net whose vertices lie on a surface of curvature κ = (κ₁₁, κ₂₂, κ₁₂): ½D κᵀCκ an area, however fine.
+    """Returns C (3, 3) of a net on a surface of curvature κ = (κ₁₁, κ₂₂, κ₁₂), with energy ½D κᵀCκ per area, however fine.
 
-    C is the sum of the squares of what the hinges measure, of which these are the rows. An equilateral net's hinge along e
-    measures κₙₙ − ⅓κₑₑ, and its three directions make 4/3 tr κ² − 1/3 (tr κ)²: a plate whose Poisson's ratio is −1/3. The
-    other nets are no isotropic plates.
+    C is AᵀA, where each row of A is the curvature that a kind of hinge measures. In an equilateral net the hinge along e
+    measures κₙₙ − ⅓κₑₑ, and the three directions add up to 4/3 tr κ² − 1/3 (tr κ)²: a plate with a Poisson's ratio of −1/3. The
+    other nets are not isotropic plates.
     """
     choice("pattern", pattern, PATTERNS[:3])
     rows = {

@@ -23,8 +23,8 @@ class SceneRef:
 
     Attributes:
         name: A known name, a .py file or a USD stage.
-        parameters: Of its function, by name; texts are converted, so that "inf" is a number too, which JSON has not.
-        pins: A selection in place of its pins, see :class:`warpcloth.scene_files.SceneSource`; or None.
+        parameters: Parameters of its function by name. Texts are converted, so "inf", which JSON lacks, is a number too.
+        pins: A selection that replaces its pins, see :class:`warpcloth.scene_files.SceneSource`; or None.
     """
 
     name: str

@@ -63,7 +63,7 @@ class View:
         return replace(self, window=(left, right, bottom, top))
 
     def opposite(self):
-        """The view from straight behind, of the same window."""
+        """Returns the view from the opposite side, with the same window."""
         azimuth = (self.azimuth + 360.0) % 360.0 - 180.0
         window = self.window and (-self.window[1], -self.window[0], *self.window[2:])
         return replace(self, azimuth=azimuth, elevation=-self.elevation, window=window)

@@ -217,13 +217,13 @@ def cheapest(rows, floor=0.0):
 
 
 def front(rows, floor=0.0, name="error"):
-    """Places of the rows that no other beats in both time and error by more than times spread, the fastest first.
+    """Returns the indices of the rows that no other beats in time and error by more than the spread of times, fastest first.
 
-    A row whose error another leaves behind in a time that may as well be its own, within the quartiles of both, is not on it.
+    A row is left out if another has a smaller error and its time is no longer, within the quartiles of both.
 
     Args:
         rows: Of :func:`time_diagram`.
-        floor: Error of the reference: what is below it is as good as any other there.
+        floor: Error of the reference; errors below it count as equal.
         name: The error, "error" or "strain_error".
     """
     places = [i for i, row in enumerate(rows) if row["status"] == "ok" and row[name] is not None]
@@ -239,7 +239,7 @@ def front(rows, floor=0.0, name="error"):
 
 
 def spread(row):
-    """The quartiles of what a second of motion takes, (low, high) [ms]; both its median where they are not known."""
+    """Returns the quartiles of the time for a second of motion, (low, high) [ms]; both are the median if they are unknown."""
     if not row.get("spread"):
         return row["ms_per_second"], row["ms_per_second"]
     return tuple(each * row["ms_per_second"] / row["ms"] for each in row["spread"])

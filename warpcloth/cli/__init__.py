@@ -2,9 +2,9 @@
 animations, charts and benchmarks methods.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
-saved), 2 wrong use (one line on stderr); as shells have it 130 interrupted by Ctrl-C and 143 by SIGTERM (a line says what is
-saved). Any other error ends with 2 and one line as well, for most come of what a scene file declares; with ``--debug`` the
-traceback stands above the line.
+saved), 2 wrong use (one line on stderr), 130 interrupted by Ctrl-C and 143 by SIGTERM, as in shells (a line says what is
+saved). Any other error ends with 2 and one line as well, because most come from a scene file; ``--debug`` prints the traceback
+above the line.
 """
 
 import argparse
@@ -31,7 +31,7 @@ def main(argv=None):
     """
     with warnings.catch_warnings(), contextlib.redirect_stdout(Printable(sys.stdout)), Interrupts() as interrupts:
         warnings.showwarning = show_warning
-        # NumPy's words on a number that is not finite: whoever meets one says so by name, or it was to be expected.
+        # NumPy's warnings about numbers that are not finite: the code reports such numbers by name, or expects them.
         warnings.filterwarnings("ignore", ".* encountered in ", RuntimeWarning)
         debug = False
         try:
@@ -52,7 +52,7 @@ def main(argv=None):
             interrupts.over = True
             return say(str(interrupted) or "interrupted", interrupts.code)
         except (Exception, SystemExit) as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):  # Python makes another error of one that comes in a new class
+            if isinstance(error.__cause__, KeyboardInterrupt):  # raised while a class was created
                 interrupts.over = True
                 return say("interrupted", interrupts.code)
             if debug:
@@ -67,9 +67,9 @@ def _sentence(error, debug):
             return error
         return f"{error.filename or 'a file could not be read or written'}: {error.strerror}"
     if isinstance(error, MemoryError):
-        return f"there is not enough memory, a smaller mesh, fewer copies or frames take less: {error}".removesuffix(": ")
+        return f"there is not enough memory; a smaller mesh, fewer copies or fewer frames take less: {error}".removesuffix(": ")
     if isinstance(error, RecursionError):
-        return f"something is nested too deep to be read: {error}"
+        return f"the input is nested too deeply to be read: {error}"
     if isinstance(error, ImportError) and error.name is None:  # a sentence about an extra, no module that broke
         return error
     if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError):
@@ -119,10 +119,10 @@ def _parser():
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
         for option, metavar, text in (("-s", "option=value", "of the solver"), ("-p", "parameter=value", "of the scene")):
-            text = f"{text}; {option} help lists them"
+            text = f"{text}; '{option} help' lists them"
             sub.add_argument(option, nargs="+", action="extend", default=[], metavar=metavar, help=text)
-        sub.add_argument("--prim", help="path or name of the prim of a stage with several")
-        sub.add_argument("--pins", metavar="SELECTION", help="vertices that stand still where they start, for the scene's pins")
+        sub.add_argument("--prim", help="path or name of the cloth's prim, for a stage with several meshes")
+        sub.add_argument("--pins", metavar="SELECTION", help="vertices that stand still; replaces the scene's pins")
     info.add_argument("--advise", action="store_true", help="say which terms, precision and resolution matter, by trying")
     info.add_argument("--tolerance", metavar="SHARE", help="of --advise: a change that does not matter, 1%% where not given")
     info.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try, 30 where not given")
@@ -140,7 +140,7 @@ def _parser():
         sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
     for sub in (runs, deforms):
         text = "the .usd, .usda, .usdc or .usdz file to write"
-        text += "" if sub is deforms else "; where not given NAME.usdc, of the scene's name, which must not be there"
+        text += "" if sub is deforms else "; by default NAME.usdc, where NAME is the scene's, which must not exist yet"
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
     for sub in (runs, deforms, analyzes):
         sub.add_argument("--single-file", action="store_true", help="one file in the end, with no folder of frames beside it")

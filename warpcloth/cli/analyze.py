@@ -59,20 +59,20 @@ def add_arguments(parser):
         metavar=("LOW", "HIGH"),
         help="of the colours; else of all frames, without the last 1 %%",
     )
-    add("--up-axis", choices=UP_AXES, help="of what does not say its own; Y where not given")
+    add("--up-axis", choices=UP_AXES, help="up axis of an input that does not say its own (default: Y)")
     add("--curves", action="store_true", help="show the principal directions as curves")
     add("--csv", metavar="FILE", help="a table: percentiles of every frame, the worst element and its place")
     add("--report", metavar="FILE", help="the same and what is left out, as JSON")
     add("--npz", metavar="FILE", help="the measures themselves, (frames, elements, …)")
     add("--plot", metavar="FILE", help="percentiles over time, .png, .svg or .pdf")
     add("--still", metavar="FILE", help="pictures, .png; the number of the frame is put before the ending")
-    add("--azimuth", type=float, metavar="DEGREES", help="of the viewer of --still about the vertical, -38 where not given")
-    add("--elevation", type=float, metavar="DEGREES", help="of the viewer of --still above the horizontal, 24 where not given")
-    add("--both-sides", action="store_true", help="show the cloth from straight behind too in each --still")
+    add("--azimuth", type=float, metavar="DEGREES", help="azimuth of the viewer in --still (default: -38)")
+    add("--elevation", type=float, metavar="DEGREES", help="elevation of the viewer in --still (default: 24)")
+    add("--both-sides", action="store_true", help="show the cloth from the opposite side too in each --still")
     add(
         "--colormap",
         metavar="NAME",
-        help="a colour map of matplotlib, such as cividis; where not given viridis, or coolwarm about what is undeformed",
+        help="a colour map of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
     )
     add("--still-frames", type=float, nargs="+", metavar="FRAME", help="of which frames; of the last where not given")
 
@@ -203,11 +203,11 @@ def _stills(arguments, analyzer):
 
 
 def _view(arguments):
-    """The view of the pictures, or None without any."""
+    """Returns the view of the stills, or None without stills."""
     given = {name: value for name in ("azimuth", "elevation") if (value := getattr(arguments, name)) is not None}
     if arguments.still is None:
         for name in (*given, *(["both-sides"] if arguments.both_sides else [])):
-            raise ValueError(f"--{name} is given without --still, the name of the pictures")
+            raise ValueError(f"--{name} is given without --still, which writes the pictures")
         if arguments.colormap is not None and arguments.output is None:
             raise ValueError("--colormap is given without --still and -o, which have colours")
         return None

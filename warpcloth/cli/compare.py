@@ -15,9 +15,9 @@ _SHOWN = 8  # frames or exclusions of each that the summary names
 
 EPILOG = """\
 A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames that
-both have at one time are compared, and the others are said. With the same triangles vertices are compared, and stretches, each
-against its own rest shape, which of a folder or an .npz file is the first frame where no --rest-a or --rest-b says another;
-with other triangles the surfaces alone. Where one is Y up and the other Z up, B is turned to the axis of A.
+both have at one time are compared, and the others are listed. If the triangles are the same, vertices are compared, and
+stretches relative to each rest shape; otherwise only the surfaces are. The rest shape of a folder or an .npz file is its first
+frame, unless --rest-a or --rest-b gives another. If one is Y up and the other Z up, B is turned to the axis of A.
 
   warpcloth compare hanging.usdc frames --fps-b 24 --rest-b rest.obj --csv apart.csv
 """
@@ -33,7 +33,7 @@ def add_arguments(parser):
         parser.add_argument(f"--fps-{name}", type=float, metavar="FPS", help=f"frames per second of {of} alone")
         parser.add_argument(f"--up-axis-{name}", choices=UP_AXES, help=f"up axis of {of} alone")
     parser.add_argument("--fps", type=float, help="frames per second of both, if they do not say")
-    parser.add_argument("--up-axis", choices=UP_AXES, help="up axis of both, if not those that they say")
+    parser.add_argument("--up-axis", choices=UP_AXES, help="up axis of both, which overrides their own")
     parser.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not all")
     parser.add_argument("--csv", metavar="FILE", help="write a line for each frame")
     parser.add_argument("--plot", metavar="FILE", help=f"draw the distances over time, as {', '.join(PICTURES)}")
@@ -186,7 +186,7 @@ def _summary(facts, found):
     up_a, up_b = facts["up_axes"]
     if up_a and up_b and up_a != up_b:
         lines.append(f"  up axis       A is {up_a} up and B {up_b} up; B was turned to {up_a} up")
-        lines.append("                (--up-axis takes both as they are)")
+        lines.append("                (with --up-axis both are taken as they are)")
     for of, labels in zip("AB", facts["unmatched"], strict=True):
         if labels:
             few = ", ".join(f"{label:g}" for label in labels[:_SHOWN]) + (", …" if len(labels) > _SHOWN else "")

@@ -243,7 +243,7 @@ def _handles(mesh, fixes, moves, frames):
 
 
 def _refuse_size(frames, mesh, handles):
-    """Refuses more frames than memory has room for: the places of the handles, and of each frame points and angles."""
+    """Refuses frames that exceed the free memory: positions of the handles, and points and angles of each frame."""
     refuse_memory(f"frames is {frames:,}", 8 * frames * (3 * handles + 4 * len(mesh.points)))
 
 

@@ -1,4 +1,4 @@
-"""Options of solvers and parameters of scenes: listed by ``-s help`` and ``-p help``, and completed by a shell."""
+"""Lists options of solvers and parameters of scenes for ``-s help`` and ``-p help``, and completes them in a shell."""
 
 import os
 import warnings
@@ -11,12 +11,12 @@ _HELP = "help"
 
 
 def asks_for_help(arguments):
-    """Whether ``-s`` or ``-p`` is to list what it takes."""
+    """Whether ``-s`` or ``-p`` asks for help."""
     return any(_HELP in (getattr(arguments, key, None) or ()) for key in "sp")
 
 
 def show_help(arguments):
-    """Lists what ``-s`` takes of the solver, and ``-p`` of the scene, where either says help."""
+    """Lists the options of the solver for ``-s help`` and the parameters of the scene for ``-p help``."""
     found = {}
     if _HELP in getattr(arguments, "s", ()):
         found["options"] = _of_solver(getattr(arguments, "solver", None))
@@ -32,7 +32,7 @@ def _of_solver(name):
     name = name or "newton"
     record = SOLVERS[name]
     found = _listed(f"-s of {name}", record.__doc__, record, scene_files.parameters_of(record))
-    return found | {"note": "dt or substeps is given, not both; where neither is, a step is chosen"}
+    return found | {"note": "give dt or substeps, not both; without either a step is chosen"}
 
 
 def _of_scene(name):
@@ -64,7 +64,7 @@ def _text(found):
     lines = [found["of"] + (f": {found['meaning']}" if found["meaning"] else "")]
     rows = [(row["name"], _default(row), row["allowed"]) for row in found["rows"]]
     if not rows:
-        return "\n".join([*lines, "  takes none"])
+        return "\n".join([*lines, "  it has none"])
     widths = [max(map(len, columns)) for columns in zip(*rows, strict=True)]
     lines += [f"  {name:<{widths[0]}}  {default:<{widths[1]}}  {allowed}" for name, default, allowed in rows]
     return "\n".join([*lines, *([found["note"]] if "note" in found else [])])
@@ -75,14 +75,14 @@ def _default(row):
 
 
 class _Refused:
-    """A value that no option takes; one of words is asked with a text, so that it names those."""
+    """A value that no option takes; options that take words are probed with a text instead, so that the refusal lists them."""
 
 
 def _allowed(call, name, parameter):
-    """What a solver's record or the function of a scene says of a value that it refuses; else what its type takes."""
+    """Returns the allowed values: from the error for a value that the solver or scene refuses, or else from the type."""
     kinds = scene_files.kinds_of_parameter(parameter)
     refused = "?" if str in kinds else _Refused()
-    for more in ({}, {"substeps": 1}):  # a record wants a step before it looks at the rest
+    for more in ({}, {"substeps": 1}):  # a record checks the step before the rest
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -97,7 +97,7 @@ def _allowed(call, name, parameter):
 
 
 def complete(parser):
-    """Completes a command line for a shell that asks by argcomplete, and ends there; otherwise does nothing."""
+    """Completes a command line and exits if a shell asks for it by argcomplete; otherwise does nothing."""
     if "_ARGCOMPLETE" not in os.environ:
         return
     import argcomplete
@@ -134,7 +134,7 @@ def _scene_words(prefix, parsed_args, **_):
 
 
 def _words(prefix, found):
-    """``name=`` of each, or where a name stands already ``name=value`` of each word that it takes."""
+    """Completes ``name=`` for each name, or ``name=value`` for each allowed word once the name is typed."""
     name, sign, _value = prefix.partition("=")
     if not sign:
         return [f"{row['name']}=" for row in found["rows"]] + [_HELP]

@@ -81,16 +81,16 @@ def run(arguments):
 
 
 def _own_output(scene):
-    """The file that a run writes where none is named: the scene's name in the current folder, if nothing is there.
+    """Returns the default output of a run: a file with the scene's name in the current folder.
 
     Raises:
-        ValueError: There is, or the name is none that a file can have.
+        ValueError: The file exists already, or the name cannot be that of a file.
     """
     if scene.name != os.path.basename(scene.name) or not scene.name.isprintable() or scene.name.strip(". ") == "":
-        raise ValueError(f"the scene is called {scene.name!r}, which is no name for a file; give one with -o")
+        raise ValueError(f"the scene is called {scene.name!r}, which cannot be the name of a file; give one with -o")
     output = f"{scene.name}.usdc"
     if os.path.lexists(output):
-        raise ValueError(f"{output} is there already, and without -o nothing is replaced; give -o {output} to replace it")
+        raise ValueError(f"{output} exists already, and without -o nothing is replaced; give -o {output} to replace it")
     return output
 
 
@@ -199,9 +199,9 @@ def named_scene(arguments):
     """(source, values of its parameters, scene) that the arguments name."""
     source = scene_files.find_source(arguments.scene, getattr(arguments, "pins", None))
     prim = getattr(arguments, "prim", None)
-    if prim is not None:  # of a stage a parameter like others, which measurements in other processes are given too
+    if prim is not None:  # a parameter of a stage like others, so measurements in other processes get it too
         if source.path.suffix not in scene_files.STAGES:
-            raise ValueError(f"--prim is given, and {arguments.scene} is no stage; leave it out")
+            raise ValueError(f"--prim is given, but {arguments.scene} is not a stage; leave it out")
         arguments.p, arguments.prim = [*arguments.p, f"prim={prim}"], None
     values = source.values(scene_files.assignments(arguments.p))
     return source, values, source.scene(values)

@@ -19,12 +19,12 @@ _COUNT = 9
 EPILOG = f"""\
 Axes: {", ".join(AXES)}.
 Stiffness and mass-ratio are factors of what the scene has, compression is 1 − l/L of the start, resolution a parameter n, links
-or elements of the scene. A method is NAME or NAME:option=value,option=value. All cells are compared over the same time
-of motion; runs of large steps go on for --steps, to show whether they diverge, and those of small ones cost the most. Diverged
-is what has three times the energy that the start, falling and moving pins can have put in; inaccurate is what ends further
-than --accuracy, over vertices and frames and over the size of the cloth, from Newton's method with BDF2 and a quarter of the
-step, in float64, by more than that is known to; unsure is what that cannot tell. Rows that are measured are kept, and not
-measured again.
+or elements of the scene. A method is NAME or NAME:option=value,option=value. All cells are compared over the same time of
+motion. Runs with large steps go on for --steps, to show whether they diverge; small steps cost the most. A run is diverged if
+it has three times the energy that its start, falling and moving pins can have put in. It is inaccurate if it is further than
+--accuracy, RMS over vertices and frames and over the size of the cloth, from Newton's method with BDF2 and a quarter of the
+step, in float64, by more than the error of that reference. It is unsure if the reference cannot tell. Rows that are measured
+are kept, and not measured again.
 
   warpcloth chart stability hanging -p n=8 --x stiffness --y dt -o map.png
   warpcloth chart stability net -p n=12 stiffness=inf --x resolution --y relaxation --solvers pbd:sweep=jacobi -o jacobi.png
@@ -43,9 +43,9 @@ def add_arguments(parser):
     parser.add_argument("--at", nargs="+", action="extend", default=[], metavar="axis=value", help="of other axes; dt=1/60")
     parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), metavar="METHOD", help="the methods, all if not given")
     parser.add_argument(
-        "--duration", type=float, metavar="SECONDS", help="time of motion compared, half of the scene's if not given"
+        "--duration", type=float, metavar="SECONDS", help="time of motion that is compared (default: half of the scene's)"
     )
-    parser.add_argument("--steps", type=int, default=120, metavar="N", help="fewest steps of each run, 120 if not given")
+    parser.add_argument("--steps", type=int, default=120, metavar="N", help="fewest steps of each run (default: 120)")
     parser.add_argument(
         "--accuracy", type=float, default=ACCURACY, metavar="SHARE", help=f"{ACCURACY:g} if not given, 0 for none"
     )

@@ -17,7 +17,7 @@ from ..checks import whole
 from ..interrupts import Interrupted
 from ..outputs import Output, check_apart
 
-# Categories of Unicode: control, format (which turns the direction of a text too), halves of a code, ends of lines.
+# Unicode categories that are escaped: control, format (which can reverse the direction of text), surrogates, ends of lines.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
@@ -186,10 +186,11 @@ class Progress:
 
     @contextlib.contextmanager
     def of(self, output):
-        """Closes the bar, however the block ends; an interrupt once it is closed says where the frames are.
+        """Closes the bar, however the block ends; an interrupt after the last frame says where the frames are.
 
         Raises:
-            Interrupted: The user did, then or before the first frame; between them whoever makes the frames says the rest.
+            Interrupted: The user interrupted before the first frame or after the last one; in between, the writer of the frames
+                raises it.
         """
         try:
             yield
@@ -233,14 +234,14 @@ def say(message, code):
 
 
 def printable(text):
-    """A text with escapes in place of what steers a terminal or cannot be written, which a name in a file may have."""
+    """Escapes characters that control a terminal or cannot be written; a name from a file may contain them."""
     if text.isprintable():
         return text
     return "".join(c if c in "\n\t" or unicodedata.category(c) not in _STEERING else repr(c)[1:-1] for c in text)
 
 
 class Printable:
-    """A stream that is written as :func:`printable` has it."""
+    """A stream that escapes its text by :func:`printable`."""
 
     def __init__(self, stream):
         self._stream = stream

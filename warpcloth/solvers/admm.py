@@ -15,8 +15,8 @@ from ..operators import Sums, constant_blocks, constant_matrices
 from ..status import Residual, Result
 from .solver import ImplicitStep, Stepper, refuse_cells, refuse_hard
 
-# n times the least r for n iterations: a small weight needs many, and what a step leaves unfinished becomes a velocity of the
-# next one, which midpoint keeps and Euler damps.
+# n times the smallest r for n iterations. A small weight needs many iterations, and what a step leaves unfinished becomes a
+# velocity in the next one, which midpoint keeps and Euler damps.
 _FLOORS = {"euler": 2.0, "bdf2": 4.0, "midpoint": 20.0}
 
 
@@ -32,10 +32,11 @@ class ADMM(ImplicitStep):
     :class:`warpcloth.ProjectiveDynamics` and the x(t+h) of :class:`warpcloth.Newton`. Only WD counts: iterates stay the same
     when D is scaled and W inversely.
 
-    Too large a weight stalls, too small a one oscillates. Of a mode of s = h²ω² an iteration leaves
-    (1 + r²s)/((1 + rs)(1 + r)), least for r = 1/√s. So ``"auto"`` is r = 1/(2hₑω) for each element, ω² its largest eigenvalue
-    of M⁻¹ s k A DᵀD by itself, for in a net all together are about twice as fast. Measured, iterations of one step until 1e-4
-    of the way from x̃ is left, beside those of the best of 17 weights for all elements, from 1e-3 to 10:
+    Too large a weight stalls, too small a one oscillates. An iteration multiplies the error of a mode with s = h²ω² by
+    (1 + r²s)/((1 + rs)(1 + r)), which is smallest for r = 1/√s. So ``"auto"`` is r = 1/(2hₑω) for each element, where ω² is the
+    largest eigenvalue of M⁻¹ s k A DᵀD of the element by itself; the factor 2 is there because a whole net is about twice as
+    fast. The table has the measured iterations of one step until 1e-4 of the way from x̃ is left, beside those of the best of 17
+    weights shared by all elements, from 1e-3 to 10:
 
     =============================  =======  =======  =======
     hanging of 8 × 8, 1/240 s      "auto"   best     r = 1
@@ -54,10 +55,11 @@ class ADMM(ImplicitStep):
     chain, straight                37       1        1
     =============================  =======  =======  =======
 
-    Of n iterations a small weight leaves cloth soft, and the next step makes a velocity of what is unfinished. Therefore
-    ``"auto"`` is no less than c/n, at most 1, c = 2 for Euler, 4 for BDF2 and 20 for midpoint, which keeps most. So ``hanging``
-    of 1e5 N/m and a cantilever, over 2 to 100 iterations a step, err less than with r = 1 and stay whole, where a weight of
-    0.03 tears them. Energies that are concave somewhere, hinges above all, need not converge with a small one.
+    With few iterations a small weight leaves the cloth soft, and the next step turns what is unfinished into a velocity.
+    Therefore, with n iterations, ``"auto"`` is at least c/n, and at most 1, where c is 2 for Euler, 4 for BDF2 and 20 for
+    midpoint, which keeps most of that velocity. With this bound ``hanging`` at 1e5 N/m and a cantilever have a smaller error
+    than with r = 1 over 2 to 100 iterations a step, and do not tear, as they do with a weight of 0.03. Energies that are
+    concave somewhere, hinges above all, need not converge with a small weight.
 
     ``residual`` is the larger of the primal and the dual residual, and both are accelerations over gravity's (in m/s² without
     any), the largest of any vertex: of the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before) over the masses. The first is
@@ -67,8 +69,8 @@ class ADMM(ImplicitStep):
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
         iterations: The most iterations a step.
-        tolerance: Of both residuals.
-        weight: r = W²/(kA) > 0 of all elements, or ``"auto"``.
+        tolerance: Tolerance of both residuals.
+        weight: r = W²/(kA) > 0 for all elements, or ``"auto"``.
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -170,7 +172,7 @@ class ADMMStepper(Stepper):
             self.results[copy] = before.worse(now)
 
     def _ratio_of(self, elements):
-        """r of each element, an array (E,)."""
+        """Returns r of each element, an array (E,)."""
         model, weight = self.model, self.options.weight
         if weight != "auto":
             return model.constant(weight, elements.count)
@@ -212,7 +214,7 @@ class ADMMStepper(Stepper):
 
 
 def best_weights(model, elements, he):
-    """r = 1/(2hₑω) of each element (E,), ω² its largest eigenvalue of M⁻¹ s k A DᵀD by itself; 1 where nothing of it moves.
+    """Computes r = 1/(2hₑω) of each element (E,), ω² its largest eigenvalue of M⁻¹ s k A DᵀD by itself; 1 if it cannot move.
 
     Args:
         model: The :class:`warpcloth.model.Model`.
@@ -226,7 +228,7 @@ def best_weights(model, elements, he):
 
 
 def _curvatures(model, elements):
-    """What r counts in, for each element: 1 of a squared distance, else the curvature s of its energy at rest."""
+    """Computes the unit of r for each element: 1 for a squared distance, else the curvature s of its energy at rest."""
     if elements.term.project is not None:
         return model.constant(1.0, elements.count)
     scale = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
@@ -234,12 +236,12 @@ def _curvatures(model, elements):
     kernel = model.kernel(kernels.stiffness_scale, elements.term, model.dtype)
     model.launch(kernel, elements.count, [*elements.arguments, rest_shape], [scale])
     found = scale.numpy()
-    # A hinge that has no normal at rest has no curvature there, and would weigh nothing.
+    # A hinge without a normal at rest has no curvature there, and its weight would be 0.
     found = np.where(found > 0.0, found, found.max() or 1.0)
     return model.array(found, model.dtype)
 
 
 def _weighed(elements, factor):
-    """The elements with k times a factor (E,)."""
+    """Returns the elements with k multiplied by a factor (E,)."""
     stiffness = elements.stiffness.numpy() * factor
     return replace(elements, stiffness=wp.array(stiffness, dtype=elements.stiffness.dtype, device=elements.stiffness.device))

@@ -35,8 +35,8 @@ class Step:
         dt: Step [s]; 1/(fps·dt) must be a whole number.
         substeps: Steps a frame.
         ordered: Whether the result depends on the order of elements by more than rounding.
-        staggered: Whether velocities are those of half a step before the positions.
-        closes: Whether a step may close a gap whatever the stiffness.
+        staggered: Whether velocities belong to a time half a step before that of the positions.
+        closes: Whether a step may close a gap regardless of the stiffness.
         residual: The :class:`warpcloth.status.Residual` that its steps report, or None.
 
     Raises:
@@ -54,7 +54,7 @@ class Step:
     substeps: int | None = None
 
     def residual_on(self, model):
-        """The residual that its steps report on a model, where that depends on the terms."""
+        """Returns the residual that its steps report on a model, which may depend on the terms."""
         return self.residual
 
     @property
