@@ -3,10 +3,10 @@
     python benchmarks/neighbourhoods.py [--n 33] [--seeds 3] [--waves 2]
 
 Travelling waves stretch, shear and bend an irregular flat sheet of n² vertices and 1 m, so F and D of its tangent plane are
-known everywhere. Two frames, 1/60 s apart, have normal noise of a fraction of the mean edge in each coordinate. The script
-prints a line for each kind of neighbourhood: its mean number of vertices, the RMS error of F [%], and the RMS error of D
-divided by the RMS of D [%]. Each noise is measured over the vertices at least 0.2 m from the outline; the last columns are the
-vertices nearer to it, without noise. Triangles are placed by their centroids.
+known everywhere. Two frames, 1/60 s apart, have normal noise of a fraction of the mean edge in each coordinate. The script prints
+a line for each kind of neighbourhood: its mean number of vertices, the RMS error of F [%], and the RMS error of D divided by the
+RMS of D [%]. Each noise is measured over the vertices at least 0.2 m from the outline; the last columns are the vertices nearer
+to it, without noise. Triangles count by their centroids.
 """
 
 import argparse
@@ -30,9 +30,8 @@ def sheet(n):
     uv[inner] += np.random.default_rng(0).uniform(-0.3, 0.3, (inner.sum(), 2)) / (n - 1)
     triangles = Delaunay(uv).simplices[:, ::-1]
     a, b = (uv[triangles[:, k]] - uv[triangles[:, 0]] for k in (1, 2))
-    whole = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-3 / n**2  # drop slivers that rounding makes along the straight
-    outline return wc.Mesh(np.stack([uv[:, 0],
-    np.zeros(n * n), uv[:, 1]], axis=1), triangles[whole])
+    whole = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-3 / n**2  # no slivers from rounding along the outline
+    return wc.Mesh(np.stack([uv[:, 0], np.zeros(n * n), uv[:, 1]], axis=1), triangles[whole])
 
 
 def motion(points, t, waves):
@@ -62,7 +61,7 @@ def known(points, t, waves):
 
 
 def errors(mesh, kind, noise, seed, waves):
-    """Returns the mean number of vertices, and the RMS errors of F and D, relative for D, (2,) inside and (2,) near the outline."""
+    """Returns the mean number of vertices, and RMS errors of F and (relative) D, (2,) inside and (2,) near the outline."""
     edge, rng = mesh.edge_lengths.mean(), np.random.default_rng(seed)
     frames = [motion(mesh.points, t, waves)[0] for t in (0.0, DT)]
     frames = [x + noise * edge * rng.normal(size=x.shape) for x in frames]

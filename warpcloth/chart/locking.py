@@ -191,11 +191,10 @@ def relaxed(pattern, elements, moduli, device):
 
 
 def _at_rest(flat, pairs, K, device):
-    """Builds a flat mesh whose hinges are at rest when rolled up and whose springs are at rest when flat, and its rest
-    shape."""
+    """Builds a flat mesh with hinges at rest when rolled up and springs at rest when flat, and its rest shape."""
     rolled = Mesh(rolled_up(flat.points, CURVATURE), flat.triangles)
-    lengths = np.linalg.norm(flat.points[pairs[:, 1]]
-    - flat.points[pairs[:, 0]], axis=1) terms = [
+    lengths = np.linalg.norm(flat.points[pairs[:, 1]] - flat.points[pairs[:, 0]], axis=1)
+    terms = [
         Spring(pairs=pairs, stiffness=np.sqrt(0.75) * K * D, rest_lengths=lengths),
         DihedralBending(stiffness=D),
     ]

@@ -174,10 +174,10 @@ def _legend(figure, shown, verdicts, accuracy):
 
 
 def write_table(path, survey, cells):
-    """Writes a line for each cell: method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules,
-    reason.
+    """Writes a line for each cell of the maps.
 
-    The last column is the machine, if known.
+    Its columns are method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules and reason, and last
+    the machine, if known.
 
     Raises:
         FileNotFoundError: The folder does not exist.
