@@ -3,10 +3,10 @@
     python benchmarks/neighbourhoods.py [--n 33] [--seeds 3] [--waves 2]
 
 Travelling waves stretch, shear and bend an irregular flat sheet of n² vertices and 1 m, so F and D of its tangent plane are
-known everywhere. Two frames, 1/60 s apart, have normal noise of a fraction of the mean edge in each coordinate. The script prints
-a line for each kind of neighbourhood: its mean number of vertices, the RMS error of F [%], and the RMS error of D divided by the
-RMS of D [%]. Each noise is measured over the vertices at least 0.2 m from the outline; the last columns are the vertices nearer
-to it, without noise. Triangles count by their centroids.
+known everywhere. Two frames, 1/60 s apart, have normal noise of a fraction of the mean edge in each coordinate. The script
+prints a line for each kind of neighbourhood: its mean number of vertices, the RMS error of F [%], and the RMS error of D
+divided by the RMS of D [%]. Each noise is measured over the vertices at least 0.2 m from the outline; the last columns are the
+vertices nearer to it, without noise. Triangles count by their centroids.
 """
 
 import argparse

@@ -176,8 +176,8 @@ def _legend(figure, shown, verdicts, accuracy):
 def write_table(path, survey, cells):
     """Writes a line for each cell of the maps.
 
-    Its columns are method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules and reason, and last
-    the machine, if known.
+    Its columns are method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules and reason, and
+    last the machine, if known.
 
     Raises:
         FileNotFoundError: The folder does not exist.
