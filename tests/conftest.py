@@ -14,7 +14,7 @@ def device(request):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Leaves out what is slow, and on another device than the CPU also what does not run there or takes long there."""
+    """Skips slow tests, and on a device other than the CPU also tests that do not run there or take long there."""
     if config.option.markexpr:
         return
     elsewhere = config.getoption("--device") != "cpu"

@@ -1,4 +1,4 @@
-"""Input that is wrong: refused in one sentence that says what, where and what is allowed, before anything runs."""
+"""Wrong input is refused, before anything runs, in one sentence that says what is wrong, where, and what is allowed."""
 
 import os
 import re
@@ -204,7 +204,7 @@ def test_a_crate_that_is_cut(tmp_path, capfd, left):
 
 
 def test_a_value_that_python_has_not(tmp_path):
-    """A crate may hold any type where an attribute says another, and pxr then raises what it likes."""
+    """A crate may hold a different type than its attribute declares, and pxr then raises errors of any kind."""
 
     class Broken:
         def GetName(self):
@@ -395,7 +395,7 @@ def test_one_line_at_the_command_line(tmp_path, monkeypatch, capfd, arguments, l
 
 
 def test_names_do_not_steer_the_terminal(tmp_path, capfd):
-    """A stage whose name, attribute and type hold escape sequences: they are shown as such."""
+    """Escape sequences in the name, an attribute and a type of a stage are printed escaped."""
     named = STAGE.replace(
         "double warpcloth:density", 'string warpcloth:name = "a\\x1b[31mred\\x07\\u202e"\n    double warpcloth:density'
     )
@@ -411,7 +411,7 @@ def test_names_do_not_steer_the_terminal(tmp_path, capfd):
 
 @pytest.mark.parametrize("ending", ["usda", "usdc", "usdz"])
 def test_a_full_disk_at_the_last_file_loses_nothing(tmp_path, ending):
-    """A limit on the size of a file stands for the disk: chunks are below it, the one file of all frames is not."""
+    """A limit on file size stands in for a full disk: chunks are below it, the merged file is not."""
     mesh = wc.Mesh.grid(8, 8)
     frames = np.random.default_rng(0).normal(size=(40, 64, 3)).astype(np.float32)
     writer = AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, chunk=5)
@@ -430,7 +430,7 @@ def test_a_full_disk_at_the_last_file_loses_nothing(tmp_path, ending):
 
 @pytest.mark.parametrize("kept", [0.5, 0.99])
 def test_a_package_that_is_cut_is_not_taken_for_whole(tmp_path, monkeypatch, kept):
-    """pxr does not notice a disk that is full while it packs: what it leaves is read before the frames are removed."""
+    """pxr does not notice that the disk is full while it packs, so the package is read before the frames are removed."""
 
     def is_whole(package):
         os.truncate(package, int(kept * os.path.getsize(package)))
@@ -503,12 +503,12 @@ def test_a_package_holds_no_file_from_elsewhere(tmp_path):
         assert {name.rpartition("/")[2] for name in archive.namelist()[1:]} == {"a.png", "t.png"}
 
 
-# --- a cache of kernels that is broken
+# --- a broken cache of kernels
 
 
 @pytest.fixture
 def kernel(tmp_path, monkeypatch):
-    """A kernel whose compiled files are in a folder of its own; and how to have them loaded again."""
+    """Returns a kernel with its own folder of compiled files, and a function that loads them again."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def double(x: wp.array(dtype=float)):

@@ -1,4 +1,4 @@
-"""The balance of energy: what gains what nothing put in is named, and nothing else is."""
+"""A run that gains energy which no source put in is named, and no other run is."""
 
 from dataclasses import asdict, replace
 
@@ -55,7 +55,7 @@ BLOWN_UP = {
 
 @pytest.mark.parametrize("name", BLOWN_UP)
 def test_what_gains_energy_is_named(name, device):
-    """They ended as completed, with strains of 464 and 5530 %, at 10 m/s from noise of 1e-6 m, and with 2640 %."""
+    """Without the balance these runs completed, with strains of 464 and 5530 %, at 10 m/s from noise of 1e-6 m, and 2640 %."""
     make, solver, said = BLOWN_UP[name]
     animation = wc.simulate(make(), solver, device=device)
     assert not animation.status.ok and said in animation.status.message
@@ -168,7 +168,7 @@ def test_what_pins_stretch_may_turn_into_motion(device):
 
 
 def test_each_copy_has_a_balance_of_its_own(device):
-    """Of three copies that differ in stiffness the one that no step is short enough for is named."""
+    """Among three copies that differ in stiffness, the one whose step is too long is named."""
     declared = noisy(hanging.scene(n=6, stiffness=10.0), 1e-3)
     vary = {"Spring.stiffness": [10.0, 1e4, 50.0]}
     solver = wc.Explicit(substeps=16, above_limit="allow")
@@ -178,7 +178,7 @@ def test_each_copy_has_a_balance_of_its_own(device):
 
 
 def test_a_source_of_a_new_kind_counts(device, monkeypatch):
-    """What carries a mass along in a solver of its own says so by an entry of SOURCES."""
+    """A new solver that carries a mass along declares its source by an entry of SOURCES."""
 
     class Wind(balance.Source):
         name = "wind"

@@ -583,7 +583,7 @@ def test_an_interrupt_finishes_the_file_and_says_what_is_in_it(moment, ending, n
 @pytest.mark.parametrize("ending", ["usdc", "usdz"])
 @pytest.mark.parametrize("moment", ["its root", "the last chunk", "one file", "removing"])
 def test_a_second_interrupt_comes_at_once_and_loses_nothing(moment, ending, tmp_path, capfd, monkeypatch):
-    """The file that is named has what is said, whatever was made of it, and stays when the same command runs again."""
+    """The file in the message has the frames that it names, and stays when the same command runs again."""
     target, attribute, call, _ = MOMENTS[moment]
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as patched:
@@ -642,7 +642,7 @@ sys.meta_path.insert(0, Finder())
     ],
 )
 def test_an_interrupt_while_modules_load_is_one_line(module, how, name, more, tmp_path):
-    """Those of pxr are loaded when a stage is first written or read."""
+    """The modules of pxr are loaded when a stage is first written or read."""
     (tmp_path / "sitecustomize.py").write_text(SITE.format(module, name))
     (tmp_path / "warpcloth").write_text("import sys\nfrom warpcloth.cli import main\nsys.exit(main())\n")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
@@ -662,7 +662,7 @@ def test_an_interrupt_that_python_makes_another_error_of_is_one(capfd, monkeypat
 
 
 def test_an_output_that_another_process_writes_is_refused(tmp_path, capfd):
-    """In one line and at once; a file that a lock left behind, of a process that is gone, is no lock."""
+    """The refusal is one line and comes at once; the lock file of a process that is gone does not lock."""
     output, left = tmp_path / "out.usdc", tmp_path / ".out.usdc.lock"
     left.write_text("process 1 on nowhere")
     assert run(capfd, "run", *SMALL, "--frames", 2, "-o", output)[0] == 0

@@ -1,4 +1,4 @@
-"""What hard and stiff edges leave free: ranks against closed forms and dense decompositions, and what `info` says of them."""
+"""Tests the degrees of freedom that hard and stiff edges leave, against closed forms and dense decompositions, and `info`."""
 
 import json
 
@@ -41,7 +41,7 @@ NETS = {
 @pytest.mark.parametrize("n", [6, 12, pytest.param(128, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NETS)
 def test_ranks(name, n):
-    """By the closed form, and where that is no matter of seconds by the singular values of J in another general position."""
+    """Matches the closed form, and for small meshes the rank from singular values of J in another general position."""
     mesh, pairs, left = NETS[name](n)
     pairs = mesh.springs(pairs) if isinstance(pairs, str) else pairs
     rank = rank_of(pairs, np.ones(len(mesh.points), dtype=bool))
@@ -58,7 +58,7 @@ def test_ranks(name, n):
 @pytest.mark.parametrize(("pins", "rigid"), [([], 6), ([0], 3), ([0, 5], 1), ([0, 5, 30], 0)])
 @pytest.mark.parametrize("kind", ["edges", ("structural", "shear")])
 def test_pins_take_coordinates_and_rigid_motion(kind, pins, rigid):
-    """A disc of triangles keeps what is no rigid motion, less what pins fix between them: with three their distances."""
+    """A disc of triangles keeps its freedom beyond rigid motion, less what pins fix between them."""
     n = 6
     scene = wc.Scene(wc.Mesh.grid(n, n), density=0.1, pins=pins, terms=[wc.Spring(pairs=kind, stiffness=np.inf)])
     found = freedom(scene)

@@ -1,4 +1,4 @@
-"""Input that Hypothesis makes of what is right: each is taken, or refused in one sentence that begins with its file."""
+"""Input that Hypothesis makes by changing valid input is accepted, or refused in one sentence that begins with its file."""
 
 import io
 import re
@@ -50,7 +50,7 @@ TYPES = ["int", "int[]", "float[]", "double", "double3[]", "string", "token[]", 
 
 
 def generated(count, thorough):
-    """A test of so many inputs, and marked slow of many more; the same ones each time."""
+    """Makes a test with a given number of inputs, and one marked slow with many more; the inputs are the same each time."""
 
     def decorate(test):
         def run(examples, *arguments):
@@ -88,7 +88,7 @@ def edited(draw, texts, words=WORDS):
 
 @st.composite
 def damaged(draw, contents):
-    """Bytes that are cut, or have a few others in them."""
+    """Generates bytes that are truncated or have a few other bytes in them."""
     data = bytearray(draw(st.sampled_from(contents)))
     for _ in range(draw(st.integers(0, 3))):
         place = draw(st.integers(0, max(len(data) - 1, 0)))
@@ -99,7 +99,7 @@ def damaged(draw, contents):
 
 
 def refused_in_a_sentence(path, read, *arguments):
-    """Whether a reader refuses a file, which it does in a sentence."""
+    """Whether a reader refuses a file; checks that it does so in one sentence."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         warnings.simplefilter("ignore", UserWarning)

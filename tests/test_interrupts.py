@@ -1,4 +1,4 @@
-"""Interrupts wait for what is being finished, once; who ignores them, or has a handler of his own, keeps it."""
+"""An interrupt waits once for work that is being finished; handlers of the user, and ignored signals, stay as they are."""
 
 import signal
 import sys

@@ -53,7 +53,7 @@ def test_nearest(chosen, k):
 
 @pytest.mark.parametrize("cells", [2, 3, 6, 9])
 def test_a_share_of_few_vertices_determines_rotations(cells, device):
-    """Below 101 vertices 2 % are one or two: it takes the nearest three, or more where these are on a line, and says so."""
+    """Below 101 vertices 2 % are one or two: the nearest three, or more if on a line, are taken with a warning."""
     mesh = wc.Mesh.grid(cells + 1, cells + 1)
     n, points = len(mesh.points), mesh.points
     with pytest.warns(
@@ -115,7 +115,7 @@ STUDY = run_path(str(ROOT / "benchmarks" / "neighbourhoods.py"))
 
 
 def test_the_study_of_neighbourhoods():
-    """The table of docs/measures.md, as it is printed: to half of its last digit, and what other rounding may add."""
+    """Checks the table of docs/measures.md to half of its last digit, plus what other rounding may add."""
     text = (ROOT / "docs" / "measures.md").read_text(encoding="utf-8")
     rows = {line.split("|")[1].strip(" `"): line.split("|")[2:-1] for line in text.splitlines() if line.startswith("| `")}
     for kind, *numbers in STUDY["table"]():

@@ -1,4 +1,4 @@
-"""What a user of the command line finds without the documentation: lists of options, completion, and names for files."""
+"""Tests help that the command line itself gives: lists of options, completion, and default names of files."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Python says no more than the command line does, unless it is asked to; what is printed of results is short."""
+"""Python prints no more than the command line, unless it is asked to, and results have a short repr."""
 
 import subprocess
 import sys

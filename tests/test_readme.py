@@ -103,7 +103,7 @@ def test_every_command_is_one(command):
 
 @pytest.mark.parametrize("path", [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))], ids=str)
 def test_what_is_to_be_installed_is_there(path):
-    """From a checkout, for warpcloth is on no index."""
+    """Extras are installed from a checkout, because warpcloth is on no index."""
     text = path.read_text(encoding="utf-8")
     assert "warpcloth[" not in text
     for given in re.findall(r"pip install ([^`&#\n]*)", text):
@@ -128,7 +128,7 @@ find = PathFinder.find_spec
 absent = {!r}
 PathFinder.find_spec = lambda name, *more: None if name.partition(".")[0] in absent else find(name, *more)
 """
-# Modules of packages that are called otherwise.
+# Modules whose names differ from those of their packages.
 MODULES = {"libigl": "igl", "pillow": "PIL"}
 # The two commands are what .ci/run does, word for word; a cluster needs more than one machine, see test_cluster.
 SECTIONS = [

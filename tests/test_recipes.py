@@ -1,4 +1,4 @@
-"""What common recipes get wrong: the figures of docs/recipes.md, each computed beside the right one."""
+"""Computes the wrong figure of each recipe in docs/recipes.md, beside the right one."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "recipes.md").read_text(encoding="u
 
 
 def absolute_cotangents():
-    """Interpolation of a linear function over a net of long triangles: the largest error over its range [%]."""
+    """Interpolates a linear function over a net of long triangles; the largest error divided by its range [%]."""
     mesh = flat(17)
     mesh = wc.Mesh((mesh.points @ TILT) * [3.0, 1.0, 1.0], mesh.triangles)
     values, n, errors = mesh.points[:, 0] + mesh.points[:, 1], len(mesh.points), []
@@ -97,7 +97,7 @@ def rate_of_shear():
 
 
 def transposed_inverse():
-    """How wide the square of 1 m of `hanging` is after a step that it is at rest in, solved by (M/h² + Σ kGᵀG)ᵀ and ⁻¹ [m]."""
+    """The width of the 1 m square of `hanging` after a step at rest, solved by (M/h² + Σ kGᵀG)ᵀ and ⁻¹ [m]."""
     scene = hanging.scene(n=8)
     model = scene.build(dtype="float64")
     (A,) = constant_matrices(model, 240.0**2)
@@ -117,12 +117,12 @@ RECIPES = {
 }
 
 
-# What rounding decides depends on the processor, by a few parts in a hundred.
+# Figures that rounding decides differ between processors by a few per cent.
 ROUNDED = {"eigenvalues": 0.1, "digits": 0.1}
 
 
 def row(name):
-    """What the page says of a recipe: what it gives and what is right."""
+    """Reads the figures of a recipe from the page: what it gives and what is right."""
     (cells,) = (line.split("|")[1:-1] for line in PAGE.splitlines() if line.startswith(f"| `{name}` |"))
     return [float(cell.split()[0]) for cell in cells[-2:]]
 

@@ -1,4 +1,4 @@
-"""Threads of one process that simulate, deform and measure at once: each waits for its turn and gets its own result."""
+"""Threads of one process simulate, deform and measure at once: each waits for its turn and gets its own result."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +25,7 @@ def pins():
     return wc.Pins(np.arange(4), keyframes=np.stack([MESH.points[:4], MESH.points[:4] + 0.1]))
 
 
-# What uses Warp, as (what is made beforehand, what is called with that).
+# Uses of Warp, as (function that prepares the arguments, function that is called with them).
 CALLS = {
     "build": (lambda: None, lambda _: scene().build().positions.numpy()),
     "bind": (lambda: scene().build(), lambda model: wc.Newton(substeps=1).bind(model).state.x.numpy()),
@@ -51,7 +51,7 @@ CALLS = {
 
 @pytest.mark.parametrize("name", CALLS)
 def test_all_that_uses_warp_waits_until_a_graph_is_recorded(name, device):
-    """Beside a recording it would be recorded in part, or end the process."""
+    """Without turns, a call beside a recording would be recorded in part, or end the process."""
     prepare, call = CALLS[name]
     prepared, ended, model = prepare(), threading.Event(), scene().build(device=device)
     vectors = model.vectors()

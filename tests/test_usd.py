@@ -941,7 +941,7 @@ def test_a_reader_finds_a_whole_file_at_any_moment(tmp_path, monkeypatch, ending
 
 
 def test_an_output_has_one_writer_at_a_time(tmp_path):
-    """Of two threads that begin together one is refused or comes later; both endings beside each other go on."""
+    """If two threads begin together, one is refused or starts later; outputs that differ in their ending do not conflict."""
     mesh, output = Mesh.grid(4, 4), tmp_path / "out.usdc"
 
     def run(sign):
@@ -1021,7 +1021,7 @@ def test_a_folder_without_locks_warns(tmp_path, monkeypatch):
 
 
 def spoil(folder, act):
-    """Does to a source, or to what stands of an output, what nobody should do during a run."""
+    """Changes a source, or the files of an output, during a run."""
     stage, output = folder / "artist.usda", folder / "out.usdc"
     if act == "delete":
         stage.unlink()
@@ -1052,7 +1052,7 @@ def spoil(folder, act):
     ],
 )
 def test_what_changes_during_a_run_is_noticed(tmp_path, act, ending, single_file, message, kept):
-    """In one sentence, which says where the frames are; no later run removes them."""
+    """The error is one sentence that says where the frames are, and no later run removes them."""
     source = artist_stage(tmp_path / "artist.usda", Mesh.grid(5, 4))
     original, mesh, output = Path(source).read_text(), read_mesh(source), tmp_path / f"out.{ending}"
     writer = AnimationWriter(output, mesh, 24, source=source, chunk=CHUNK)
@@ -1098,7 +1098,7 @@ def test_a_source_that_changes_and_fits_is_said(tmp_path, ending):
 
 @pytest.mark.parametrize("cut", [False, True], ids=["ended", "cut-short"])
 def test_a_run_that_was_cut_short_is_recovered_under_its_own_name(tmp_path, cut):
-    """What is read is not removed, not by what is made of it and not where that is cut short in its turn."""
+    """Files that a run reads are not removed, neither by that run nor after it is cut short itself."""
     mesh, output = Mesh.grid(5, 4), tmp_path / "out.usdz"
     writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
     for frame in range(2 * CHUNK):

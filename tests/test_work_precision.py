@@ -275,7 +275,7 @@ def test_below_the_error_of_the_reference_nothing_is_better():
 
 
 def test_a_lead_within_the_spread_is_none():
-    """Of two settings as quick, for all that is known, the one of less error is on the front; so in strains by themselves."""
+    """If two settings are equally fast within the spread, only the one with the smaller error is kept; strains count apart."""
     rows = [
         {"status": "ok", "ms_per_second": 60.0 * ms, "ms": ms, "spread": [ms - off, ms + off], "error": a, "strain_error": b}
         for ms, off, a, b in ((1.0, 0.3, 4.0, 1.0), (1.2, 0.3, 2.0, 3.0), (2.0, 0.1, 1.0, 2.0), (2.3, 0.1, 0.5, 0.1))
