@@ -122,7 +122,7 @@ def test_info_counts_and_warns(capfd, monkeypatch):
     assert "hard or stiff edges" not in out and not warned
     out, (warned,) = info("hanging", "-p", "n=5", "stiffness=inf")
     assert "hard or stiff edges: 72, of rank 68 in 69 coordinates; 1 degrees of freedom are left, 1 of them rigid motion" in out
-    assert warned.startswith("warpcloth: warning: 72 hard or stiff edges leave nothing to bend once the cloth is not flat; ")
+    assert warned.startswith("warpcloth: warning: 72 hard or stiff edges leave no freedom to bend once the cloth is not flat; ")
     out, warned = info("hanging", "-p", "n=5", "stiffness=inf", "--json")
     assert json.loads(out)["freedom"]["locked"] is True and len(warned) == 1
     out, warned = info("cantilever", "-p", "elements=8", "stretching=1e9", "width=0.5", "--json")

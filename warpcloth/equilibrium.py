@@ -90,7 +90,7 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     residual, began = descent.residual, result.value
     if result is Result.ROUNDED and residual <= tolerance:
         result = Result.CONVERGED
-    # A sheet that nothing has moved leaves its weight, but for an ulp. Without gravity a start at rest leaves its own rounding.
+    # A sheet that has not moved leaves its whole weight, up to an ulp. Without gravity a start at rest leaves its own rounding.
     elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity[0] > 0.0:
         result, began = Result.STALLED, f"rounding hides the rest shape in {dtype}"
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan

@@ -90,13 +90,13 @@ class Interrupts:
         return self
 
     def __exit__(self, *error):
-        self.over = True  # or one that comes in the next line would be lost for whoever is told
+        self.over = True  # set first, so that a signal from here on is ignored
         sys.unraisablehook = self._hook
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def _unraisable(self, unraisable):
-        """Lets an interrupt that came in a destructor, where Python drops it, come again in a moment."""
+        """Raises an interrupt again that came in a destructor, where Python drops it."""
         if not issubclass(unraisable.exc_type, KeyboardInterrupt):
             self._hook(unraisable)
         elif not self.over:

@@ -96,7 +96,7 @@ def _own_output(scene):
 
 def _summary(facts):
     threads, measured = facts["threads"], facts["residual_measure"] is not None
-    residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none: the method has none"
+    residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none, the method does not compute one"
     return "\n".join(
         [
             f"{facts['scene']}: {facts['message']}",
@@ -149,8 +149,8 @@ def info(arguments):
     if free.locked:
         leave = "are so many that they may leave" if free.counted else "leave"
         warnings.warn(
-            f"{free.edges:,} hard or stiff edges {leave} nothing to bend once the cloth is not flat; make them softer, or hold "
-            "the edges of triangles alone, which leaves 3 + boundary edges",
+            f"{free.edges:,} hard or stiff edges {leave} no freedom to bend once the cloth is not flat; make them softer, or "
+            "hold only the edges of triangles, which leaves 3 + boundary edges degrees of freedom",
             stacklevel=2,
         )
     print(as_json(facts) if arguments.json else f"{scene}\n{_info_text(facts)}")

@@ -316,7 +316,7 @@ class ChunkWriter:
             if (folder / _COMPLETE).exists():
                 warnings.warn(
                     f"{folder / 'animation.usdc'}: has all frames of an earlier run that was not packed, and is kept; "
-                    "remove its folder once nobody needs them",
+                    "remove its folder if nobody needs them",
                     stacklevel=5,
                 )
             else:

@@ -59,7 +59,7 @@ def reason_of(error):
 
 
 def _plain(text):
-    """Without the line breaks of pxr and the address of the stage in memory, and not longer than anyone reads."""
+    """Shortens a text of pxr, without its line breaks and the address of the stage in memory."""
     return textwrap.shorten(text.partition(" (instantiating stage on")[0], 500, placeholder=" …")
 
 
@@ -82,7 +82,7 @@ def check_stage(stage, path):
     """
     for error in stage.GetCompositionErrors():
         if type(error).__name__ == "ErrorInvalidSublayerPath":
-            raise ValueError(f"{path}: {_plain(str(error))} It must be there, for it may say something of the cloth")
+            raise ValueError(f"{path}: {_plain(str(error))} It must be there, because it may hold a part of the cloth")
     units = {
         "metersPerUnit": UsdGeom.GetStageMetersPerUnit(stage),
         "kilogramsPerUnit": UsdPhysics.GetStageKilogramsPerUnit(stage),
