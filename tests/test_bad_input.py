@@ -139,6 +139,8 @@ WRONG_STAGES = [  # the text, what stands in place of a part of it, the sentence
         r"prim /Cloth: GeomSubset pins: indices\[1\] = 99, must be a point, 0 to 3",
     ),
     (STAGE, "indices = [0, 1]", "indices = [-1, 0]", r"GeomSubset pins: indices\[0\] = -1, must be a point"),
+    (STAGE, 'elementType = "point"', 'elementType = "face"', "GeomSubset pins: elementType is 'face', must be"),
+    (STAGE, "indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [1]}", "1 GeomSubset pins: indices at time code 2, must"),
     (STAGE, "double warpcloth:density = 0.15", "double warpcloth:density = nan", "warpcloth:density is nan, must be finite"),
     (STAGE, "(0, -9.81, 0)", "(0, -inf, 0)", r"warpcloth:gravity\[1\] is -inf, must be finite"),
     (STAGE, "stiffness = 1000", "stiffness = nan", "warpcloth:terms:threads:stiffness is nan, must be a number"),
@@ -240,6 +242,13 @@ def test_a_missing_layer_elsewhere_is_a_warning(tmp_path, capfd):
     with pytest.warns(UserWarning, match="^[^\n]*cloth.usda: In </Set>: Could not open asset @gone.usda@[^\n]*$"):
         read_scene(tmp_path / "cloth.usda")
     assert capfd.readouterr().err == ""
+
+
+def test_pins_may_stand_at_a_time_sample_alone(tmp_path):
+    """The schema has an empty fallback for indices, which is not what the file says."""
+    path = tmp_path / "cloth.usda"
+    path.write_text(STAGE.replace("indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [0, 1]}"))
+    assert read_scene(path).pins.vertices.tolist() == [0, 1]
 
 
 def test_holes_are_no_cloth(tmp_path):

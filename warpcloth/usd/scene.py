@@ -15,7 +15,7 @@ from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
 from .chunks import export
 from .layers import scene_layer
 from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
-from .values import array_of, refuse_unknown, sentences, time_codes_of
+from .values import array_of, refuse_unknown, sentences, shown, time_codes_of
 
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none
 
@@ -193,7 +193,12 @@ def _term(values, key):
 
 def _pinned(cloth, surroundings):
     """Sorted vertices of all GeomSubsets of points in the family "pins"."""
-    subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(cloth), UsdGeom.Tokens.point, "pins")
+    subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(cloth), familyName="pins")
+    for subset in subsets:
+        kind = subset.GetElementTypeAttr().Get()
+        if kind != UsdGeom.Tokens.point:  # that of faces is the default
+            name = subset.GetPrim().GetName()
+            raise ValueError(f"GeomSubset {name}: elementType is {shown(str(kind))}, must be 'point' for pins")
     pins = [surroundings.pins[subset.GetPrim().GetName()] for subset in subsets]
     return np.unique(np.concatenate([np.empty(0, np.int32), *pins]))
 

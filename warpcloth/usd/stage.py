@@ -349,7 +349,7 @@ def topology(attribute, time=None):
         ValueError: It holds no whole numbers, or cannot be read.
     """
     found = array_of(attribute, whole=True, time=time)
-    if found is None and time is None:
+    if time is None and (found is None or len(found) == 0):  # where the schema has a fallback it is empty
         found = array_of(attribute, whole=True, time=Usd.TimeCode.EarliestTime())
     return np.array([], dtype=np.int32) if found is None else found
 
@@ -456,8 +456,11 @@ def _pins(prim, point_vertices, count):
     pins = {}
     for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
         if subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.point:
-            points = topology(subset.GetIndicesAttr())
-            refuse_outside(f"GeomSubset {subset.GetPrim().GetName()}: indices", points, count, "point")
+            indices, name = subset.GetIndicesAttr(), f"GeomSubset {subset.GetPrim().GetName()}: indices"
+            points = topology(indices)
+            for code in time_codes_of(indices):
+                refuse_change(name, topology(indices, code), points, code)
+            refuse_outside(name, points, count, "point")
             vertices = points if point_vertices is None else point_vertices[points]
             pins[subset.GetPrim().GetName()] = np.unique(vertices)
     return pins
