@@ -573,6 +573,8 @@ BAD_FILES = [
     ("range.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", ValueError, "cannot be read as .off"),
     ("short.off", "# a square\nOFF\n\n4 3 0\n" + ROWS, ValueError, "line 10: the file ends after 2 of the 3 faces"),
     ("points.off", "OFF 40 2 0\n" + ROWS, ValueError, "line 7: the file ends after 6 of the 40 vertices"),
+    ("long.off", "OFF\n4 1 0\n" + ROWS, ValueError, "line 8: the file goes on after all vertices and faces that its header"),
+    ("long.ply", HEAD.replace("face 2", "face 1") + ROWS, ValueError, "line 15: the file goes on after all"),
     ("row.off", "OFF\n4 2 0\n" + ROWS[:-3], ValueError, "line 8: face 1 has 3 numbers, must have 4"),
     ("counts.off", "OFF\n4 -2 0\n" + ROWS, ValueError, "line 2: must be the numbers of vertices, faces"),
     ("open.off", "OFF\n40 1 0\n" + "0 0 0\n" * 40 + "3 0 2 1", ValueError, "line 43: ends in 1 without a line break"),

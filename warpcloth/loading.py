@@ -142,6 +142,7 @@ def _check_ply(path, data):
             row += 1
         if row == len(lines) and count:
             _refuse_open_end(f"{path}, line {first + row - 1}", data, lines[-1], vertices if any(lists) else np.inf)
+    _refuse_more(path, next((first + row + index for index, line in enumerate(lines[row:]) if line.strip()), None))
 
 
 def _check_off(path, data):
@@ -171,8 +172,15 @@ def _check_off(path, data):
             raise ValueError(
                 f"{path}, line {last}: the file ends after {len(rows_of)} of the {count} {_PLURAL[name]} that its header says"
             )
-    if len(rows) == vertices + faces and rows and len(rows[-1][1]) <= needed:
+    _refuse_more(path, next((number for number, _ in rows[vertices + faces :]), None))
+    if rows and len(rows[-1][1]) <= needed:
         _refuse_open_end(f"{path}, line {rows[-1][0]}", data, rows[-1][1][-1], vertices if faces else np.inf)
+
+
+def _refuse_more(path, line):
+    """Refuses a file with a line, None for no such, after all that its header counts."""
+    if line is not None:
+        raise ValueError(f"{path}, line {line}: the file goes on after all vertices and faces that its header says")
 
 
 _COUNTED = {".ply": _check_ply, ".off": _check_off}
