@@ -120,8 +120,12 @@ class _Descent:
         """Settles without inertia, with proximal steps in between where that does not go on; the last result."""
         while True:
             result = self._settle(0.0, load, self.iterations)
-            while result is Result.ROUNDED and self.moved > NEAR and self.used < self.iterations:
-                result = self._settle(0.0, load, self.iterations)  # a long d rounds much; from here it is short
+            least, found = (np.inf, np.inf), (self.moved, self.unbalanced)
+            # A long d rounds much; from here it is short, unless a move costs nothing and rounding makes one.
+            while result is Result.ROUNDED and self.moved > NEAR and self.used < self.iterations and _halved(found, least):
+                least = tuple(map(min, found, least))
+                result = self._settle(0.0, load, self.iterations)
+                found = self.moved, self.unbalanced
             if result in SETTLED or result is Result.DIVERGED or self.used >= self.iterations:
                 return result
             for _ in range(8):
@@ -147,6 +151,11 @@ class _Descent:
         self.moved = np.abs(correction).max(initial=0.0) / self.size
         self.base.assign(self.base.numpy() + correction)
         return result
+
+
+def _halved(found, least):
+    """Whether some number is at most half of the least that it was."""
+    return any(one <= 0.5 * before for one, before in zip(found, least, strict=True))
 
 
 def _move_pins(pins, base, part):
