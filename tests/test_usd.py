@@ -1010,6 +1010,15 @@ def test_a_writer_of_another_process_is_waited_for_until_it_is_killed(tmp_path):
     assert not (tmp_path / ".out.usdc.lock").exists()
 
 
+def test_a_link_in_place_of_a_lock_is_not_written_through(tmp_path):
+    """Anybody may leave one in a shared folder; the file that it stands for was emptied."""
+    (tmp_path / "precious").write_text("text")
+    (tmp_path / ".out.usdc.lock").symlink_to("precious")
+    with pytest.raises(OSError, match=r"\.out\.usdc\.lock"):
+        AnimationWriter(tmp_path / "out.usdc", Mesh.grid(2, 2), 24.0)
+    assert (tmp_path / "precious").read_text() == "text"
+
+
 def test_a_folder_without_locks_warns(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(errno.ENOLCK, "No locks available")

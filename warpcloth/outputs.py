@@ -117,9 +117,9 @@ class Lock:
         self._file, self._process = None, os.getpid()
         while True:
             try:
-                file = open(self._path, "a+", encoding="utf-8")
+                file = open(self._path, "a+", encoding="utf-8", opener=_open_itself)
             except PermissionError:  # the file of another user; if there is no file, the folder cannot be written
-                file = open(self._path, encoding="utf-8")
+                file = open(self._path, encoding="utf-8", opener=_open_itself)
             try:
                 _lock(file)
             except OSError as error:
@@ -152,6 +152,11 @@ class Lock:
             os.remove(self._path)
         self._file.close()
         self._file = None
+
+
+def _open_itself(path, flags):
+    """Opens a file that is no link, since what is written would replace the text of the file that a link stands for."""
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def _lock(file):
