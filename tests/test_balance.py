@@ -146,6 +146,7 @@ PATHS = {
 }
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("solver", ["explicit", "newton", "pbd", "xpbd"])
 @pytest.mark.parametrize("name", PATHS)
 def test_pins_may_put_energy_in(name, solver, device):

@@ -203,6 +203,7 @@ def test_chain_of_hard_links(linear, device):
     assert x[-1, 1] < -0.3, "it has swung"
 
 
+@pytest.mark.host
 def test_a_hard_pendulum_is_of_first_order(device):
     """Against θ″ = −(g/l) sin θ; and with m(x − x̃) = Jᵀλ the string's pull is along the string where the step ends."""
     from scipy.integrate import solve_ivp

@@ -46,6 +46,7 @@ def test_table_of_the_elastica(gamma):
     assert aspect(gamma) == pytest.approx(ASPECT[gamma], rel=1e-7)
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("bending", ["quadratic", "dihedral"])
 @pytest.mark.parametrize("gamma", GAMMAS)
 def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
@@ -176,7 +177,7 @@ def test_a_sheet_too_stiff_to_move_is_no_rest_shape(device):
         sheet = wc.Scene(mesh, density=density, terms=[wc.Spring(stiffness=1e18)], pins=[0, 4])
         rest = wc.equilibrium(sheet, device=device)
         assert rest.status.result not in SETTLED and not rest.stable, rest.status
-        assert rest.status.residual == pytest.approx(1.0)
+        assert rest.status.residual > 1.0 - 1e-6  # and what lengths are rounded by times the stiffness, which is 0 on the CPU
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

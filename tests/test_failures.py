@@ -530,6 +530,7 @@ def test_07_rate_of_admm_on_one_spring(r, device):
         assert np.abs(moves[:, 1, axis] / error - expected).max() < 20 * (error + EPS / error)
 
 
+@pytest.mark.host
 def test_07_weights_that_are_too_large_stall_and_too_small_oscillate(device):
     """Iterations of a swinging cloth to 1e-6 of gravity: fewest for W² = 0.03 k, of stiff threads far below k.
 
@@ -560,6 +561,7 @@ SPLIT = {
 }
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("name", SPLIT)
 def test_07_the_weight_by_itself_is_near_the_best(name, device):
     """r = 1/(2hω) brings a step to 1e-4 of its way in 1.3 times the iterations of the best of 11 weights, and often fewer."""
@@ -577,6 +579,7 @@ def test_07_the_weight_by_itself_is_near_the_best(name, device):
     assert counts["auto"] < 500 and counts["auto"] <= 1.3 * min(counts[weight] for weight in counts if weight != "auto") + 2
 
 
+@pytest.mark.host
 @pytest.mark.parametrize(
     ("integrator", "substeps", "iterations"), [("euler", 8, 5), ("bdf2", 8, 5), ("midpoint", 16, 2), ("midpoint", 8, 20)]
 )

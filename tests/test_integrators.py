@@ -77,6 +77,7 @@ def test_order_on_an_oscillator(name, integrator, device):
     assert slopes(steps, errors)[-1] == pytest.approx(1 if integrator == "euler" else 2, abs=0.15)
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("omega_h", [0.1, 1.0, 10.0])
 @each_integrator
 @each_solver
@@ -166,7 +167,7 @@ def true_end(damping):
     return state
 
 
-@pytest.mark.parametrize("damping", [0.0, 2.0])
+@pytest.mark.parametrize("damping", [0.0, pytest.param(2.0, marks=pytest.mark.host)])
 @each_integrator
 @each_solver
 def test_order_on_a_net_whose_pins_move(name, integrator, damping, device):

@@ -103,7 +103,10 @@ CONVERGED = {"none": 20_000, "chebyshev": 3_000, "anderson": 1_500, "l-bfgs": 2_
 CONVERGED |= {"matrix-free": 20_000, "matrix-free l-bfgs": 3_000}
 
 
-@pytest.mark.parametrize("name", METHODS)
+SHORT = ("l-bfgs", "matrix-free l-bfgs", "admm, light")  # runs on a device, which waits for the host in each iteration
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in SHORT else pytest.mark.host) for name in METHODS])
 def test_the_fixed_point_is_implicit_euler(name, device):
     """All energies are squared distances here, so that every method ends where Newton does."""
     declared = swinging(8)
@@ -118,6 +121,7 @@ def test_the_fixed_point_is_implicit_euler(name, device):
     assert stepper.results == [Result.ITERATIONS_USED_UP] and stepper.residual[0] > 1e-3
 
 
+@pytest.mark.host
 def test_the_objective_never_rises(device):
     declared = swinging(8)
     h = 1 / declared.fps
@@ -403,6 +407,7 @@ LOCAL = {
 }
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("name", LOCAL)
 def test_admm_solves_local_problems_by_newton(name, device):
     """Energies that are no squared distance: after three steps of a thrown cloth ADMM is where Newton is."""
@@ -457,6 +462,7 @@ def test_a_hinge_without_curvature_at_rest_counts(device):
         assert np.abs(x - opened).max() > 1e-4
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_admm_takes_a_crushed_membrane(dtype, device):
     """From all vertices but the pins on a line, and in one place: no NaN, and the cloth comes back to its size."""

@@ -122,6 +122,7 @@ def test_energy_over_twenty_seconds(device):
     assert drift < 0.01
 
 
+@pytest.mark.host
 @pytest.mark.parametrize(
     ("declared", "frames", "bound"),
     [

@@ -223,7 +223,7 @@ def test_steps_above_gershgorins_bound_warn(device):
         wc.Explicit(substeps=1).bind(scene.build(device=device))
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.host)])
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_sheet_at_rest_stays_there(name, dtype, device):
     """Its rest shape, one pinned vertex, no gravity: it does not move in a second, and does not spin about the pin."""
@@ -239,7 +239,8 @@ def test_a_sheet_at_rest_stays_there(name, dtype, device):
     inertia -= np.einsum("n,ni,nj->ij", mass, arms, arms)
     # Forces are made of rounding: a step moves a place of size 1 by up to ε, to and fro or, at worst, as in a random walk.
     assert np.abs(x - scene.mesh.points).max() < 2.0 * np.sqrt(600) * eps
-    assert np.linalg.norm(np.linalg.solve(inertia, L)) < 0.1 * eps / stepper.h
+    # A random walk of the velocity ends √3 times as fast as it is in the mean: of a vertex 0.5 m off that moves by that much.
+    assert np.linalg.norm(np.linalg.solve(inertia, L)) * 600 * stepper.h * 0.5 < np.sqrt(3.0) * 2.0 * np.sqrt(600) * eps
 
 
 VARIED = {

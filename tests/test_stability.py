@@ -25,6 +25,8 @@ from warpcloth.cli.stability import _survey
 from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
 
+pytestmark = pytest.mark.host
+
 DOCS = Path(__file__).parents[1] / "docs" / "stability.md"
 HANGING = SceneRef("hanging", {"n": 5})
 DECADES = tuple(10.0**e for e in range(-4, 5))  # times 1e3 N/m
@@ -256,7 +258,6 @@ IMPLICIT = [Setup("newton", {"hessian": "clamp"}), Setup("newton"), Setup("proje
 OTHERS = [Setup(name) for name in ("explicit", "xpbd", "pbd", "admm", "hierarchical-pbd")]
 
 
-@pytest.mark.host
 def test_implicit_euler_never_diverges(device):
     """8 decades of stiffness, 0.1 to 1e7 N/m, and the ends of 4 of the step; the others diverge where a rule says so."""
     cells = mapped(
@@ -336,7 +337,6 @@ def test_the_cost_of_a_cell_is_bounded(dt, steps, run, reference, device, monkey
 # --- Failures as maps show them; docs/stability.md says which.
 
 
-@pytest.mark.host
 def test_02_a_raw_hessian_stalls_in_compression(device):
     """Newton with the raw Hessian, factorised, stalls beyond h² = m/(k(L/l − 1)) and nowhere before; clamped it never does."""
     soft = SceneRef("hanging", {"n": 5, "stiffness": 10.0})

@@ -1185,9 +1185,9 @@ def test_sums_of_splitting_gather_what_they_scatter(term, dtype, device):
         model = model_of(rest_mesh(), None, [term.name], dtype, each, pins=[0, 7], copies=2)
         elements = model.terms[0]
         random, matrix = np.random.default_rng(10), wp.types.matrix((term.rows, 3), model.dtype)
-        scale = model.array(random.uniform(0.5, 2.0, elements.count), model.dtype)
+        ratio, scale = (model.array(random.uniform(0.5, 2.0, elements.count), model.dtype) for _ in range(2))
         values = (model.array(random.normal(size=(elements.count, term.rows, 3)), matrix) for _ in range(3))
-        given = [*elements.arguments, 0.7, scale, *values]
+        given = [*elements.arguments, ratio, scale, *values]
         out = [model.vectors() for _ in range(3)]
         for array in out:
             array.fill_(model.vec3(1.0, 2.0, 3.0))
