@@ -159,6 +159,14 @@ def test_limits_of_gauss_seidel_in_its_order(kind, solver, options, iterations, 
     assert found == pytest.approx(limit, rel=0.01)
 
 
+@pytest.mark.parametrize(("stiffness", "pins"), [(0.0, ()), (1.0, "all")], ids=["no stiffness", "all pinned"])
+@pytest.mark.parametrize("sweep", ["sequential", "coloured", "jacobi", "vertex-averaged"])
+def test_a_net_that_no_spring_moves_has_no_limit(stiffness, pins, sweep):
+    declared = replace(net("shear", 4, stiffness).load(), pins=pins)
+    ratios = rules(declared, wc.PBD(substeps=1, iterations=1, sweep=sweep), 100)
+    assert "Gauss–Seidel, |z| = 1" not in ratios and ratios.get("ω λ_max = 2", 0.0) == 0.0
+
+
 def test_an_order_moves_the_limit_of_gauss_seidel():
     """With shear springs one sweep in one order for all holds for ω < 1.07, by colour up to 1.36; structural ones for 4/3."""
     limits = {

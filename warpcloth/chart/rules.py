@@ -128,6 +128,8 @@ def largest_relaxation(scene, he, record):
     from scipy.sparse import diags_array
 
     (pairs, mobility, compliance), inverse = _springs(scene, he), _inverse_masses(scene)
+    if not len(pairs):
+        return np.inf
     J = _directions(scene, pairs)
     factor = _share(mobility, compliance, record) / mobility
     counts = np.bincount(np.concatenate([term.stencil(scene.mesh) for term in scene.terms]).ravel(), minlength=len(inverse))
@@ -161,10 +163,11 @@ def largest_ordered(scene, he, record, steps):
         steps: Number of steps of the run.
 
     Returns:
-        float: ω; None if twice 1 + 3^(−1/n) is still stable, or for more than :data:`_MOST` springs, which take too long.
+        float: ω; None if twice 1 + 3^(−1/n) is still stable, if no spring moves anything, or for more than :data:`_MOST` springs,
+            which take too long.
     """
     pairs, mobility, compliance = _springs(scene, he, _turns(scene, record))
-    if len(pairs) > _MOST:
+    if not 0 < len(pairs) <= _MOST:
         return None
     J = (_directions(scene, pairs) * np.repeat(np.sqrt(_inverse_masses(scene)), 3)).toarray()
     share = _share(mobility, compliance, record)
