@@ -163,8 +163,8 @@ def largest_ordered(scene, he, record, steps):
         steps: Number of steps of the run.
 
     Returns:
-        float: ω; None if twice 1 + 3^(−1/n) is still stable, if no spring moves anything, or for more than :data:`_MOST` springs,
-            which take too long.
+        float: ω; None if twice 1 + 3^(−1/n) is still stable, if no spring moves anything, or for more than :data:`_MOST`
+            springs, which take too long.
     """
     pairs, mobility, compliance = _springs(scene, he, _turns(scene, record))
     if not 0 < len(pairs) <= _MOST:
