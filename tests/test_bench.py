@@ -256,7 +256,7 @@ def rows_until(stop, error):
     [
         (2, KeyboardInterrupt(), "interrupted after 2 of 3 rows, which are printed", 130),
         (0, KeyboardInterrupt(), "interrupted before the first row; nothing was measured", 130),
-        (2, MemoryError(), "MemoryError", 2),
+        (2, MemoryError(), "not enough memory", 2),
     ],
 )
 def test_what_ends_early_keeps_the_rows(stop, error, said, code, folder, monkeypatch, capsys):

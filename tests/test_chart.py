@@ -326,7 +326,7 @@ def test_what_is_missing_is_named(monkeypatch):
         lambda: plot_percentiles("a.png", summaries(GROWING)),
         lambda: draw("a.png", SQUARE, HALVES, [0.0, 1.0], Scale(0.0, 1.0)),
     ):
-        with pytest.raises(ImportError, match=r"need matplotlib: pip install 'warpcloth\[chart\]'"):
+        with pytest.raises(ImportError, match=r"need matplotlib: pip install -e '.\[chart\]' in the checkout"):
             need()
 
 
