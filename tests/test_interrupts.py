@@ -5,9 +5,13 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
+import warp as wp
+from scipy.sparse import eye_array
 
 from warpcloth.interrupts import Interrupted, Interrupts, deferred, recording
+from warpcloth.linear import CholeskyFactor
 
 
 def test_the_first_interrupt_waits_and_a_second_one_does_not():
@@ -96,3 +100,19 @@ def test_an_interrupt_says_what_was_recorded():
         with pytest.raises(Interrupted, match=f"^interrupted {when}; they are here$"), recording(recorder, 9):
             raise KeyboardInterrupt
         assert recorder.closed
+
+
+def test_an_interrupt_in_a_factorisation_is_one(monkeypatch):
+    """Where cholespy asks an array for its memory an interrupt became "incompatible function arguments"."""
+    factor = CholeskyFactor(eye_array(2, format="csr"), wp.get_device("cpu"), wp.float64)
+
+    class Solver:
+        def solve(self, b, x):
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                raise TypeError("incompatible function arguments") from None
+
+    monkeypatch.setattr(factor, "solver", Solver())
+    with pytest.raises(KeyboardInterrupt):
+        factor.solve(np.ones(2), np.zeros(2))

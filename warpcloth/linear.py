@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from .capture import Mirror, on_host
+from .interrupts import deferred
 from .kernels import linear
 
 # Most unknowns for which all eigenvalues are computed at once.
@@ -276,7 +277,8 @@ class CholeskyFactor:
         solver = {wp.float32: cholespy.CholeskySolverF, wp.float64: cholespy.CholeskySolverD}[dtype]
         try:
             start = time.perf_counter()
-            self.solver = solver(columns.shape[0], *compressed, cholespy.MatrixType.CSC)
+            with deferred():
+                self.solver = solver(columns.shape[0], *compressed, cholespy.MatrixType.CSC)
             self.seconds = time.perf_counter() - start
         except ValueError:
             raise ValueError(_INDEFINITE) from None
@@ -285,7 +287,8 @@ class CholeskyFactor:
         """x = A⁻¹ b; both (n,) vectors or (n, k) numbers. NaN in b is NaN in x."""
         on_host(self.device, "a sparse factorisation")
         wp.synchronize_device(self.device)  # on CUDA cholespy has a stream of its own
-        self.solver.solve(b, x)
+        with deferred():  # while it looks at arrays, cholespy makes a TypeError of an interrupt
+            self.solver.solve(b, x)
         wp.synchronize_device(self.device)
 
 
