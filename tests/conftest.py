@@ -1,6 +1,13 @@
 """Options of the test run: the device, and the tests that are left out unless -m says otherwise."""
 
+import signal
+
 import pytest
+
+
+def pytest_configure():
+    """A shell ignores Ctrl-C in what it runs in the background, and what the tests start would inherit that."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser):

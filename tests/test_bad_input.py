@@ -108,6 +108,13 @@ WRONG_STAGES = [  # the text, what stands in place of a part of it, the sentence
     (STAGE, "framesPerSecond = 24", "framesPerSecond = inf", "framesPerSecond is inf, must be"),
     (STAGE, "startTimeCode = 0", "startTimeCode = -1e18", r"startTimeCode is -1e\+18, must be a number of -1e\+09 to 1e\+09"),
     (STAGE, "endTimeCode = 3", "endTimeCode = inf", "endTimeCode is inf, must be a number of"),
+    (STAGE, "endTimeCode = 3", "endTimeCode = -3", "endTimeCode is -3, must be at least startTimeCode, which is 0"),
+    (
+        STAGE,
+        "double warpcloth:density = 0.15",
+        "double warpcloth:density.timeSamples = { 0: 0.15, 3: 0.3 }",
+        "prim /Cloth: warpcloth:density changes over time, must have one value",
+    ),
     (STAGE, "3: [(0, 0.1", "1e15: [(0, 0.1", r"prim /Cloth: points has a sample at time code 1e\+15, must be at -1e\+09"),
     (
         STAGE,

@@ -234,7 +234,8 @@ SOURCES = [Start, _moving]
 class Balance:
     """Compares the energy of each copy, frame by frame, with what the sources of the scene can have put in.
 
-    Energies are counted from the lowest height that a copy has had, so falling is not a separate source.
+    Energies are counted from the lowest height that a copy has had, so falling is not a separate source. A cloth that no pin
+    and no attachment holds is judged by its motion relative to its centre of mass, to which gravity adds nothing.
 
     Args:
         model: The :class:`warpcloth.model.Model`.
@@ -255,21 +256,24 @@ class Balance:
         points, mass, inverse = (model.in_scene_order(array.numpy()).astype(np.float64) for array in arrays)
         self.mass = np.where(inverse > 0.0, mass, 0.0).reshape(model.copies, -1)
         self.total = self.mass.sum(axis=1)
+        # A term of one vertex that is in no cell holds it where it is in space.
+        held = any(elements.term.vertices == 1 and not elements.cells for elements in model.terms)
+        self._free = not (held or len(model.scene.pins.vertices))
         self._gravity = model.gravity.numpy().astype(np.float64)
         self._moment, self._lowest, self._fastest = self._moments(points), np.zeros(model.copies), np.zeros(model.copies)
+        self._rounding = np.zeros(model.copies)
         self.elastic = Elastic(model)
         # Rounding of positions gives a velocity of at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
-        farthest = np.abs(points).reshape(model.copies, -1).max(axis=1)
-        rounded = 4.0 * np.finfo(model.numpy_dtype).eps * farthest
-        self._rounding = 0.5 * self.total * (rounded / self._h) ** 2
-        self._rounded_height = self.total * np.linalg.norm(self._gravity, axis=1) * rounded
+        self._note_farthest(points)
         found = (make(self, stepper) for make in SOURCES)
         self.sources = [source for source in found if source is not None]
 
     def kinetic(self, velocities):
-        """½Σ m v² of each copy [J]."""
-        squares = np.einsum("ij,ij->i", velocities, velocities).reshape(self.mass.shape)
-        return 0.5 * (self.mass * squares).sum(axis=1)
+        """½Σ m v² of each copy [J], of a free cloth relative to its centre of mass."""
+        velocities = velocities.reshape(*self.mass.shape, 3)
+        if self._free:
+            velocities = velocities - (self._moments(velocities) / self.total[:, None])[:, None]
+        return 0.5 * (self.mass * np.einsum("bij,bij->bi", velocities, velocities)).sum(axis=1)
 
     def gains(self, frame, points, velocities):
         """Divides the energy of each copy by what it can have been given, (B,).
@@ -282,6 +286,8 @@ class Balance:
         with np.errstate(all="ignore"):
             points, velocities = points.astype(np.float64, copy=False), velocities.astype(np.float64, copy=False)
             kinetic, height = self.kinetic(velocities), self._height(points)
+            if self._free:
+                self._note_farthest(points)
             self._lowest = np.fmin(self._lowest, height)
             per_frame = 1.0 / self.model.scene.fps
             speed = self._fastest + np.linalg.norm(self._gravity, axis=1) * per_frame
@@ -306,7 +312,7 @@ class Balance:
 
     def sentence(self, copy):
         """Says how much energy a copy has gained by the last frame."""
-        names = [source.name for source in self.sources] + ["falling"] * bool(self.weighs[copy])
+        names = [source.name for source in self.sources] + ["falling"] * bool(self.weighs[copy] and not self._free)
         names = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
         return (
             f"it has gained energy, {self.has[copy]:.3g} J of motion and height, of which {names} can have put in no more "
@@ -325,11 +331,20 @@ class Balance:
         self.has, self.given = beside + height - self._lowest, given
         return np.where(self.has > 0.0, self.has / self.given, np.where(self.has <= 0.0, 0.0, np.nan))
 
+    def _note_farthest(self, points):
+        """Bounds the energy that rounding adds in a step, and the height that it changes, by the farthest of the points."""
+        farthest = np.abs(points).reshape(self.model.copies, -1).max(axis=1)
+        rounded = 4.0 * np.finfo(self.model.numpy_dtype).eps * farthest
+        self._rounding = np.fmax(0.5 * self.total * (rounded / self._h) ** 2, self._rounding)
+        self._rounded_height = self.total * np.linalg.norm(self._gravity, axis=1) * rounded
+
     def _moments(self, points):
         return np.einsum("bi,bij->bj", self.mass, points.reshape(*self.mass.shape, 3))
 
     def _height(self, points):
-        """Potential energy of gravity since the start [J]."""
+        """Potential energy of gravity since the start [J], without which a free cloth is judged."""
+        if self._free:
+            return np.zeros(self.model.copies)
         return -((self._moments(points) - self._moment) * self._gravity).sum(axis=1)
 
     def _at_positions(self, points, velocities):

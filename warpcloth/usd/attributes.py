@@ -145,6 +145,8 @@ class Values:
             value = value_of(attribute, Usd.TimeCode.EarliestTime())
             if value is None:
                 raise ValueError(f"{attribute.GetName()} is blocked at its first time sample, must have a value")
+            if row.name.startswith("warpcloth:") and attribute.ValueMightBeTimeVarying():
+                raise ValueError(f"{attribute.GetName()} changes over time, must have one value")
             if isinstance(value, str):
                 return value
             if isinstance(value, (Vt.TokenArray, Vt.StringArray)):

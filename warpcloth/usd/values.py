@@ -78,7 +78,8 @@ def check_stage(stage, path):
     """Refuses units, rates and times that no stage can have.
 
     Raises:
-        ValueError: One is not finite, or not above 0; the up axis is neither Y nor Z; a layer below is missing.
+        ValueError: One is not finite, or not above 0; the up axis is neither Y nor Z; a layer below is missing; the end is
+            before the start.
     """
     for error in stage.GetCompositionErrors():
         if type(error).__name__ == "ErrorInvalidSublayerPath":
@@ -99,6 +100,9 @@ def check_stage(stage, path):
             _refuse_outside(where, name, rate, *_RATES)
         for name in ("startTimeCode", "endTimeCode"):
             _refuse_outside(where, name, getattr(layer, name), -MOST_TIME_CODE, MOST_TIME_CODE)
+    if stage.HasAuthoredTimeCodeRange() and stage.GetEndTimeCode() < stage.GetStartTimeCode():
+        end, start = stage.GetEndTimeCode(), stage.GetStartTimeCode()
+        raise ValueError(f"{path}: endTimeCode is {end:g}, must be at least startTimeCode, which is {start:g}")
 
 
 def check_composed(prim, path):
