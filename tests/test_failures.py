@@ -689,7 +689,8 @@ def test_08_forces_have_noise(device):
         assert noise < 8.0 and (noise > 0.1 or dtype == "float64")
 
 
-# Seconds of a fall where ten take too long; test_..._for_ten_seconds has them all.
+# Seconds of a fall where ten take too long; test_..._for_ten_seconds has all but one, which differs from Newton with conjugate
+# gradients in its linear solves alone.
 COSTLY = {
     "newton factorised": 0.1,
     "newton midpoint": 0.5,
@@ -739,7 +740,7 @@ def test_08_rounding_of_a_fall(name, device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", COSTLY)
+@pytest.mark.parametrize("name", [name for name in COSTLY if name != "newton factorised"])
 def test_08_rounding_of_a_fall_for_ten_seconds(name, device):
     check_fall(name, 10.0, device)
 
