@@ -37,7 +37,7 @@ def measure(path, setup, device, frames):
     """Seconds of three analyses of the first frames, and the most memory in MiB."""
     options = {"measures": "all", "device": device, **SETUPS[setup]}
     if options["measures"] == "still":
-        from warpcloth.measures import MEASURES
+        from warpcloth.analysis.measures import MEASURES
 
         options["measures"] = [name for name, found in MEASURES["triangle"].items() if not found.rate]
     sequence = wc.open_sequence(path)

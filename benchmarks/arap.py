@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 
 import warpcloth as wc
-from warpcloth.linear import constant_factor
+from warpcloth.numerics.linear import constant_factor
 
 
 def twisted(mesh, handles, angle=2.0 * np.pi / 3.0):

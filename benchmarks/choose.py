@@ -13,10 +13,10 @@ import argparse
 import statistics
 import sys
 
-from warpcloth.chart import trajectory
-from warpcloth.chart.choose import choose
-from warpcloth.chart.sweep import Store, sweep
-from warpcloth.chart.tasks import SceneRef, task
+from warpcloth.lab import trajectory
+from warpcloth.lab.campaign import Store, sweep
+from warpcloth.lab.choosing import choose
+from warpcloth.lab.measurements import SceneRef, task
 
 TOLERANCE = 0.01
 NEAR = 3.0  # times the pick, up to which it is measured again

@@ -87,7 +87,7 @@ def errors(mesh, kind, noise, seed, waves):
 
 def members(mesh, kind):
     """Returns the mean number of vertices of a neighbourhood."""
-    from warpcloth.neighbourhoods import neighbourhoods
+    from warpcloth.analysis.neighbourhoods import neighbourhoods
 
     return len(neighbourhoods(mesh, kind)[1]) / len(mesh.points)
 

@@ -11,10 +11,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
 import warpcloth as wc
-from warpcloth.chart import elastica
-from warpcloth.chart.picture import paint
-from warpcloth.chart.view import View, brightness
-from warpcloth.reports import write_report
+from warpcloth.cli.reports import write_report
+from warpcloth.lab import elastica
+from warpcloth.picture.picture import paint
+from warpcloth.picture.view import View, brightness
 from warpcloth.scenes import bar_twist, bunny, cantilever, hanging, mobile
 
 DOCS = Path(__file__).parent

@@ -14,7 +14,7 @@ import warp as wp
 
 from .assemble import types
 from .clusters import fit
-from .constrain import ROUNDINGS, first_row
+from .constraint_rows import ROUNDINGS, first_row
 from .rotation import epsilon
 
 

@@ -1,7 +1,7 @@
 """Factories of the kernels that move vertices through time: predict, finish, pins.
 
 A pinned vertex has inverse mass 0. Fixed pins stay; moved ones take the place that their keyframes give. hₑ is the effective
-step of an implicit integrator, see :mod:`warpcloth.integrators`.
+step of an implicit integrator, see :mod:`warpcloth.numerics.integrators`.
 """
 
 from functools import cache
@@ -39,7 +39,7 @@ def predict(dtype):
 def start_bdf2(dtype):
     """Kernel over vertices: move ← x₀ − x₋₁ = h(v₁ − 7/4(v₂ − v₁)), v₋₁ ← v₀ − 3/2(v₁ − v₀), where v₋₁ has v₁ before.
 
-    v₁ and v₂ are those of two steps of implicit Euler of hₑ = 2h/3; see :class:`warpcloth.integrators.BDF2`.
+    v₁ and v₂ are those of two steps of implicit Euler of hₑ = 2h/3; see :class:`warpcloth.numerics.integrators.BDF2`.
     """
     vec3, _ = types(dtype)
 

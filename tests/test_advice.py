@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.advice import advise
 from warpcloth.cli import main
+from warpcloth.lab.advice import advise
 from warpcloth.scenes import hanging
 
 NEWTON = wc.Newton(substeps=8, integrator="bdf2")

@@ -17,8 +17,8 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
 import warpcloth as wc
-from warpcloth import arap as module
-from warpcloth import linear
+from warpcloth.deformation import arap as module
+from warpcloth.numerics import linear
 
 EPS = np.finfo(np.float64).eps
 CELLS = [("spokes", name) for name in ("cotangent", "clamped", "intrinsic", "uniform")] + [("spokes_and_rims", "cotangent")]

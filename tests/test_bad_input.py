@@ -13,10 +13,10 @@ import warp as wp
 from pxr import Sdf, Usd
 
 import warpcloth as wc
-from warpcloth import limits
+from warpcloth.base import limits
+from warpcloth.base.quiet import initialise_warp
 from warpcloth.cli import main
 from warpcloth.cli.terminal import printable
-from warpcloth.quiet import initialise_warp
 from warpcloth.usd import AnimationWriter, FrameSequence, MeasureWriter, packages, read_scene
 from warpcloth.usd.values import value_of
 

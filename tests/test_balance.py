@@ -8,13 +8,13 @@ import test_scenes
 import warp as wp
 
 import warpcloth as wc
-from warpcloth import balance
-from warpcloth.chart.stability import measure
-from warpcloth.chart.tasks import SceneRef, Setup
 from warpcloth.cli import main
-from warpcloth.operators import Energy, Sums
+from warpcloth.core.operators import Energy, Sums
+from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.stability import measure
+from warpcloth.run import balance
+from warpcloth.run.simulate import Watch
 from warpcloth.scenes import flag, hanging, net
-from warpcloth.simulate import Watch
 
 PAIR = test_scenes.PAIR
 SMALL = test_scenes.SMALL | {"mobile": {"n": 5}, "net": {"n": 6}}

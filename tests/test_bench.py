@@ -11,15 +11,15 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from warpcloth.bench import benchmarks
-from warpcloth.bench.bandwidth import measure as bandwidth
-from warpcloth.bench.benchmarks import Benchmark, Run, standard
-from warpcloth.bench.counts import compulsory_bytes, elements_of, launches_of
-from warpcloth.bench.measure import measure
-from warpcloth.bench.results import exponent, growth, ratios, write_csv
-from warpcloth.capture import Segment
-from warpcloth.chart.tasks import SceneRef, Setup
 from warpcloth.cli import main
+from warpcloth.core.capture import Segment
+from warpcloth.lab import benchmarks
+from warpcloth.lab.bandwidth import measure as bandwidth
+from warpcloth.lab.benchmarks import Benchmark, Run, standard
+from warpcloth.lab.counts import compulsory_bytes, elements_of, launches_of
+from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.results import exponent, growth, ratios, write_csv
+from warpcloth.lab.timing import measure
 from warpcloth.scenes import hanging
 from warpcloth.solvers import SOLVERS
 

@@ -12,10 +12,11 @@ import pytest
 from matplotlib.image import imread
 
 import warpcloth as wc
-from warpcloth.chart import Scale, View, colour, draw, plot_percentiles, range_over
-from warpcloth.chart.colour import EXCLUDED
-from warpcloth.chart.figures import save
-from warpcloth.chart.view import brightness
+from warpcloth.chart import Scale, View, draw, plot_percentiles, range_over
+from warpcloth.picture import colour
+from warpcloth.picture.colour import EXCLUDED
+from warpcloth.picture.figures import save
+from warpcloth.picture.view import brightness
 
 FRONT = View(azimuth=0.0, elevation=0.0)
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])

@@ -7,11 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from warpcloth.chart import cotangents, isometry, locking, rank
-from warpcloth.chart.failures import COLUMNS, FAILURES, failure_chart, plot_failure, write_csv
-from warpcloth.chart.panels import point
-from warpcloth.chart.sweep import Store
+from warpcloth.chart.failures import plot_failure
 from warpcloth.cli import main
+from warpcloth.lab import cotangents, isometry, locking, rank
+from warpcloth.lab.campaign import Store
+from warpcloth.lab.failures import COLUMNS, FAILURES, failure_chart, write_csv
+from warpcloth.lab.panels import point
 
 pytestmark = pytest.mark.host
 EPS = np.finfo(np.float64).eps
@@ -277,7 +278,7 @@ def test_a_point_without_a_value_is_left_out_and_said(charts, tmp_path, capsys, 
     lost = {**charts["rank"], "rows": [*charts["rank"]["rows"], point("turn", "on a line", 9.0, None, "too slow")]}
     lost["rows"][-1] |= {"law": None, "expected": None}
     plot_failure(tmp_path / "a.png", lost)
-    monkeypatch.setattr("warpcloth.chart.failures.failure_chart", lambda *a, **k: lost)
+    monkeypatch.setattr("warpcloth.lab.failures.failure_chart", lambda *a, **k: lost)
     assert main(["chart", "failure", "rank"]) == 0
     out = capsys.readouterr().out
     assert "no value      on a line, 9: too slow" in out and "turn          58 points, 57 of them off their law by" in out

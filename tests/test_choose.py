@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from warpcloth.chart import trajectory
-from warpcloth.chart.choose import Measured, choose, climb, ladders, pick
-from warpcloth.chart.sweep import Store
-from warpcloth.chart.tasks import SceneRef, Setup
 from warpcloth.cli import main
 from warpcloth.cli.choose import command_line
+from warpcloth.lab import trajectory
+from warpcloth.lab.campaign import Store
+from warpcloth.lab.choosing import Measured, choose, climb, ladders, pick
+from warpcloth.lab.measurements import SceneRef, Setup
 
 # hanging, 64 × 64 vertices: error and ms a frame, with quartiles, of ladders from coarse to fine.
 TABLE = {
@@ -188,7 +188,7 @@ def test_an_interruption_says_what_is_kept(tmp_path, monkeypatch, capsys):
         yield
 
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
-    monkeypatch.setattr("warpcloth.chart.choose.sweep", interrupted)
+    monkeypatch.setattr("warpcloth.lab.choosing.sweep", interrupted)
     assert main("choose chain -p links=3 --frames 3 --tolerance 5% --solvers pbd".split()) == 130
     assert "settings that are measured are kept" in capsys.readouterr().err
 

@@ -17,10 +17,10 @@ import pytest
 
 import warpcloth.cli.run
 import warpcloth.usd
-from warpcloth import scene_files
+from warpcloth.base.outputs import Lock
 from warpcloth.cli import main
-from warpcloth.outputs import Lock
-from warpcloth.scene import Scene
+from warpcloth.run import scene_files
+from warpcloth.scene.scene import Scene
 from warpcloth.solvers import explicit
 from warpcloth.usd import FrameSequence, chunks
 
@@ -604,7 +604,7 @@ def test_a_second_interrupt_comes_at_once_and_loses_nothing(moment, ending, tmp_
 
 def test_interrupts_in_the_frames_before_and_after_them(tmp_path, capfd, monkeypatch):
     """Before the first frame nothing is left; in frames one ends the run and a second one leaves it in chunks."""
-    output, watch = tmp_path / "out.usdz", sys.modules["warpcloth.simulate"].Watch
+    output, watch = tmp_path / "out.usdz", sys.modules["warpcloth.run.simulate"].Watch
     with monkeypatch.context() as patched:
         interrupt_in(patched, watch, "__init__", signal.SIGINT)
         found = run(capfd, "run", *SMALL, "-o", output)
@@ -634,10 +634,10 @@ sys.meta_path.insert(0, Finder())
 @pytest.mark.parametrize(
     ("module", "how", "name", "more"),
     [
-        ("warpcloth.rotation", ["-m", "warpcloth"], "SIGINT", ""),
-        ("warpcloth.rotation", ["-m", "warpcloth.cli"], "SIGTERM", ""),
-        ("warpcloth.rotation", ["warpcloth"], "SIGINT", ""),
-        ("warpcloth.rotation", ["warpcloth"], "SIGTERM", ""),
+        ("warpcloth.numerics.rotation", ["-m", "warpcloth"], "SIGINT", ""),
+        ("warpcloth.numerics.rotation", ["-m", "warpcloth.cli"], "SIGTERM", ""),
+        ("warpcloth.numerics.rotation", ["warpcloth"], "SIGINT", ""),
+        ("warpcloth.numerics.rotation", ["warpcloth"], "SIGTERM", ""),
         ("pxr.UsdGeom", ["-m", "warpcloth"], "SIGINT", " before the first frame; nothing was saved"),
     ],
 )

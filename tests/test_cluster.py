@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 
-from warpcloth.chart import cluster as clusters
-from warpcloth.chart.cluster import Cluster, connect
-from warpcloth.chart.digest import scene_digest
-from warpcloth.chart.sweep import Store, kept, sweep
-from warpcloth.chart.tasks import SceneRef, source_digest, task
-from warpcloth.chart.work_precision import time_diagram
 from warpcloth.cli import main
-from warpcloth.scene_files import find_source
+from warpcloth.lab import cluster as clusters
+from warpcloth.lab.campaign import Store, kept, sweep
+from warpcloth.lab.cluster import Cluster, connect
+from warpcloth.lab.digest import scene_digest, source_digest
+from warpcloth.lab.measurements import SceneRef, task
+from warpcloth.lab.work_precision import time_diagram
+from warpcloth.run.scene_files import find_source
 from warpcloth.scenes import hanging
 from warpcloth.usd import write_scene
 

@@ -11,12 +11,12 @@ from test_solvers import allocations
 from usd_validation import validate
 
 import warpcloth as wc
-from warpcloth.constraints import Constraints
-from warpcloth.lines import lines_of
-from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.status import Result
+from warpcloth.numerics.constraints import Constraints
+from warpcloth.run.lines import lines_of
 from warpcloth.scenes import bar_twist, chain, hanging, mobile
 from warpcloth.solvers.explicit import step_limits
-from warpcloth.status import Result
 from warpcloth.usd import FrameSequence
 
 EPS = np.finfo(np.float64).eps

@@ -8,10 +8,10 @@ import pytest
 import trimesh
 
 import warpcloth as wc
+from warpcloth.analysis.distances import surface_distances
 from warpcloth.cli import main
-from warpcloth.distances import surface_distances
-from warpcloth.mesh import Surface
-from warpcloth.sequences import Sequence, as_sequence
+from warpcloth.mesh.mesh import Surface
+from warpcloth.mesh.sequences import Sequence, as_sequence
 from warpcloth.usd import AnimationWriter
 
 UP = np.array([0.0, 1.0, 0.0])

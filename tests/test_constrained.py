@@ -9,9 +9,9 @@ import warp as wp
 from test_projection import PAIR, hanging_mass, scene, swinging
 
 import warpcloth as wc
+from warpcloth.core.operators import Gradient
+from warpcloth.core.status import Result
 from warpcloth.kernels.terms import CATALOGUE, DIHEDRAL_BENDING, SPRING
-from warpcloth.operators import Gradient
-from warpcloth.status import Result
 
 EPS = np.finfo(np.float64).eps
 SAFEGUARDS = ("geometric-stiffness", "line-search")

@@ -8,8 +8,8 @@ import warp as wp
 from nets import net
 
 import warpcloth as wc
-from warpcloth.damping import Past, damped_terms, dissipations
-from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.model.damping import Past, damped_terms, dissipations
 from warpcloth.solvers.explicit import step_limits
 
 EPS = np.finfo(np.float64).eps

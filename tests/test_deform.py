@@ -13,7 +13,7 @@ from usd_validation import validate
 
 import warpcloth as wc
 import warpcloth.cli.deform
-from warpcloth.deform import rotation_angles
+from warpcloth.deformation.deform import rotation_angles
 from warpcloth.scenes import bar_twist
 from warpcloth.usd import FrameSequence, read_mesh
 

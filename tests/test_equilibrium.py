@@ -8,10 +8,10 @@ import pytest
 import scipy.sparse
 
 import warpcloth as wc
-from warpcloth.chart.elastica import aspect
-from warpcloth.equilibrium import SETTLED
-from warpcloth.linear import lowest_eigenvalue
-from warpcloth.status import digits
+from warpcloth.core.status import digits
+from warpcloth.lab.elastica import aspect
+from warpcloth.numerics.linear import lowest_eigenvalue
+from warpcloth.run.equilibrium import SETTLED
 
 # H/W of the tip for Γ, to 8 digits.
 ASPECT = {
@@ -194,7 +194,7 @@ def test_what_is_at_rest_without_weight_is_settled(dtype, device):
 
 def test_a_saddle_that_is_not_left_is_reported(device, monkeypatch):
     """What no nudge moves away from is in balance, and said to be no more."""
-    monkeypatch.setattr("warpcloth.minimise.Minimiser.curves_down", lambda self, tolerance: True)
+    monkeypatch.setattr("warpcloth.numerics.minimise.Minimiser.curves_down", lambda self, tolerance: True)
     rest = wc.equilibrium(scene("chain", links=3), device=device)
     assert rest.status.result.name == "SADDLE"
 
@@ -255,7 +255,7 @@ def test_stability_of_a_mass_on_a_strut(share, stable, device, monkeypatch):
         terms=[wc.Spring(stiffness=k), wc.Attachment(vertices=[1], stiffness=head, targets=[[0.0, length, 0.0]])],
         pins=[0],
     )
-    monkeypatch.setattr(import_module("warpcloth.equilibrium"), "_nudge", lambda model: 0.0)
+    monkeypatch.setattr(import_module("warpcloth.run.equilibrium"), "_nudge", lambda model: 0.0)
     rest = wc.equilibrium(strut, device=device)
     assert rest.points[1] == pytest.approx([0.0, length, 0.0], abs=1e-9)
     assert rest.lowest_eigenvalue == pytest.approx(head - m * 9.81 / length, rel=1e-6)

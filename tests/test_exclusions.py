@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.measures import MEASURES, scalars
-from warpcloth.mesh import Surface
-from warpcloth.sequences import as_sequence
+from warpcloth.analysis.measures import MEASURES, scalars
+from warpcloth.mesh.mesh import Surface
+from warpcloth.mesh.sequences import as_sequence
 
 MATERIAL = wc.NeoHookeanMembrane(stiffness=1e3, poisson_ratio=0.3)
 ALL = {

@@ -25,11 +25,11 @@ from test_solvers import SOLVERS as STEPPING
 from test_terms import EQUILATERAL, bending_density
 
 import warpcloth as wc
+from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.status import Result
 from warpcloth.kernels.terms import SPRING
-from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.numerics.sweeps import SWEEPS, Sweep
 from warpcloth.solvers.explicit import step_limits
-from warpcloth.status import Result
-from warpcloth.sweeps import SWEEPS, Sweep
 
 EPS = np.finfo(np.float64).eps
 

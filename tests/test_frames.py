@@ -10,8 +10,8 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from warpcloth.frames import frames_of, state_of
-from warpcloth.ordering import near_order
+from warpcloth.mesh.ordering import near_order
+from warpcloth.run.frames import frames_of, state_of
 from warpcloth.scenes import hanging
 from warpcloth.usd import FrameSequence, chunks
 
@@ -32,7 +32,7 @@ def threads():
 
 def look_ahead(monkeypatch, frames):
     """Lets runs compute so many frames ahead, on the CPU too."""
-    module = sys.modules["warpcloth.simulate"]
+    module = sys.modules["warpcloth.run.simulate"]
     monkeypatch.setattr(module, "frames_of", lambda stepper, count, _ahead: frames_of(stepper, count, frames))
 
 
@@ -191,7 +191,7 @@ def test_an_interrupt_keeps_the_frames_until_then(frame, tmp_path, device, monke
 @pytest.mark.parametrize(("output", "cores", "expected"), [(None, 2, 0), ("out.usdc", 2, 1), ("out.usdc", 1, 0)])
 def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_path, device, monkeypatch):
     """On CUDA frames are computed ahead in any case."""
-    asked, module = [], sys.modules["warpcloth.simulate"]
+    asked, module = [], sys.modules["warpcloth.run.simulate"]
     monkeypatch.setattr(module.os, "sched_getaffinity", lambda _process: set(range(cores)), raising=False)
     monkeypatch.setattr(
         module, "frames_of", lambda stepper, count, ahead: asked.append(ahead) or frames_of(stepper, count, ahead)
@@ -208,4 +208,4 @@ def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_
 def test_frames_ahead_leave_memory_to_others(count, free, expected):
     """A GiB of frames of 24 bytes a vertex, or a quarter of what the device has free; two where not even these fit."""
     model = SimpleNamespace(device=SimpleNamespace(is_cuda=True, free_memory=free), count=count, vec3=wp.vec3)
-    assert sys.modules["warpcloth.simulate"]._ahead(model, None) == expected
+    assert sys.modules["warpcloth.run.simulate"]._ahead(model, None) == expected

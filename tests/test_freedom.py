@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 import warpcloth as wc
-from warpcloth import freedom as module
-from warpcloth.chart.strips import strip
 from warpcloth.cli import main
-from warpcloth.freedom import freedom, rank_of
+from warpcloth.lab.strips import strip
+from warpcloth.scene import freedom as module
+from warpcloth.scene.freedom import freedom, rank_of
 from warpcloth.scenes import cantilever, hanging
 
 

@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 import warpcloth as wc
-from warpcloth.hierarchy import levels
+from warpcloth.numerics.hierarchy import levels
 from warpcloth.scenes import chain
 
 EPS = np.finfo(np.float64).eps

@@ -10,8 +10,8 @@ import pytest
 import warp as wp
 from scipy.sparse import eye_array
 
-from warpcloth.interrupts import Interrupted, Interrupts, deferred, recording
-from warpcloth.linear import CholeskyFactor
+from warpcloth.base.interrupts import Interrupted, Interrupts, deferred, recording
+from warpcloth.numerics.linear import CholeskyFactor
 
 
 def test_the_first_interrupt_waits_and_a_second_one_does_not():

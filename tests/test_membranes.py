@@ -6,8 +6,8 @@ import warp as wp
 from test_terms import DENSITIES, FEW, eps, every_dtype, material_of, random_rotation
 
 import warpcloth as wc
-from warpcloth.equilibrium import SETTLED
-from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.run.equilibrium import SETTLED
 from warpcloth.solvers.explicit import step_limits
 
 STIFFNESS = 50.0

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from warpcloth.mesh import Mesh
+from warpcloth.mesh.mesh import Mesh
 
 PATTERNS = ("diagonal", "alternating", "equilateral")
 # Coordinates are products of a few factors near 1, so they are exact to a few rounding errors.

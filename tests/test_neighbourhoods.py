@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.mesh import Surface
-from warpcloth.neighbourhoods import neighbourhoods
+from warpcloth.analysis.neighbourhoods import neighbourhoods
+from warpcloth.mesh.mesh import Surface
 
 ROOT = Path(__file__).parents[1]
 GRID = wc.Mesh.grid(7, 6, size=(1.0, 0.9), pattern="alternating")

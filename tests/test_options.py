@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warpcloth import scene_files
 from warpcloth.cli import main
+from warpcloth.run import scene_files
 from warpcloth.solvers import SOLVERS
 from warpcloth.usd import FrameSequence
 
@@ -142,7 +142,7 @@ def test_pins_replace_those_of_the_scene_and_stand_still(tmp_path, capfd, monkey
 def test_a_choice_is_made_for_the_pins_that_are_run(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
-    from warpcloth.chart import choose
+    from warpcloth.lab import choosing as choose
 
     seen = []
 

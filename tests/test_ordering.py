@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth import ordering, scene_files
-from warpcloth.balance import Balance
-from warpcloth.bench.measure import measure
-from warpcloth.chart.tasks import SceneRef, Setup
 from warpcloth.cli import main
-from warpcloth.ordering import near_order, order_of_run, spread
+from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.timing import measure
+from warpcloth.mesh import ordering
+from warpcloth.mesh.ordering import near_order, order_of_run, spread
+from warpcloth.run import scene_files
+from warpcloth.run.balance import Balance
 from warpcloth.scenes import flag, hanging
 from warpcloth.solvers.explicit import step_limits
 from warpcloth.usd import FrameSequence

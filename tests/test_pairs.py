@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warpcloth.pairs import Pair, pairs_of
+from warpcloth.analysis.frame_pairs import Pair, pairs_of
 
 LABELS = np.array([1, 2, 3, 5, 6, 7])  # 4 is missing
 

@@ -10,16 +10,17 @@ from test_damping import damping_forces
 from test_solvers import SOLVERS, allocations, square
 
 import warpcloth as wc
-from warpcloth import blocks, incidences, jacobi, passes, sweeps
-from warpcloth.blocks import in_blocks
-from warpcloth.damping import Past, damped_terms
-from warpcloth.incidences import gathered
-from warpcloth.jacobi import Scatter
-from warpcloth.operators import Gradient
-from warpcloth.passes import Gather, Sweep
+from warpcloth.core.operators import Gradient
+from warpcloth.core.status import Result
+from warpcloth.fast import blocks, incidences, jacobi, passes
+from warpcloth.fast.blocks import in_blocks
+from warpcloth.fast.incidences import gathered
+from warpcloth.fast.jacobi import Scatter
+from warpcloth.fast.passes import Gather, Sweep
+from warpcloth.model.damping import Past, damped_terms
+from warpcloth.numerics import sweeps
 from warpcloth.solvers import explicit, solver
 from warpcloth.solvers.explicit import step_limits
-from warpcloth.status import Result
 
 MESH = wc.Mesh.grid(7, 5, pattern="alternating")
 N = len(MESH.points)

@@ -11,15 +11,16 @@ from scipy.sparse.linalg import splu
 from scipy.special import jv
 
 import warpcloth as wc
-from warpcloth.chart import closed_forms, physics
+from warpcloth.chart import closed_forms
 from warpcloth.chart.closed_forms import plot_physics
-from warpcloth.chart.elastica import aspect, gamma_of
-from warpcloth.chart.physics import bending_density, measure, side_loss
-from warpcloth.chart.strips import PATTERNS, inner_shares, plate, rolled, strip
-from warpcloth.chart.sweep import Store, sweep
-from warpcloth.chart.tasks import task
+from warpcloth.core.operators import Gradient, Hessian
 from warpcloth.kernels.term import HessianPolicy
-from warpcloth.operators import Gradient, Hessian
+from warpcloth.lab import physics
+from warpcloth.lab.campaign import Store, sweep
+from warpcloth.lab.elastica import aspect, gamma_of
+from warpcloth.lab.measurements import task
+from warpcloth.lab.physics import bending_density, measure, side_loss
+from warpcloth.lab.strips import PATTERNS, inner_shares, plate, rolled, strip
 
 ANGLES = (0.0, 13.0, 30.0, 45.0, -15.0, -45.0)
 BENDING = ("dihedral", "quadratic")

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial import Delaunay
 
 import warpcloth as wc
+from warpcloth.core.operators import Gradient
 from warpcloth.kernels.terms import SPRING
-from warpcloth.operators import Gradient
-from warpcloth.sweeps import Sweep, colours
+from warpcloth.numerics.sweeps import Sweep, colours
 
 EPS = np.finfo(np.float64).eps
 

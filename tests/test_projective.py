@@ -8,13 +8,13 @@ import warp as wp
 from test_projection import swinging
 
 import warpcloth as wc
-from warpcloth import linear
-from warpcloth.acceleration import LBFGS, Anderson, Chebyshev
+from warpcloth.core.operators import Energy, Gradient, Hessian, Sums, constant_matrices
+from warpcloth.core.status import Result, digits
 from warpcloth.kernels import accelerate
-from warpcloth.linear import CopyFactors
-from warpcloth.operators import Energy, Gradient, Hessian, Sums, constant_matrices
+from warpcloth.numerics import linear
+from warpcloth.numerics.acceleration import LBFGS, Anderson, Chebyshev
+from warpcloth.numerics.linear import CopyFactors
 from warpcloth.solvers.projective_dynamics import ACCELERATIONS
-from warpcloth.status import Result, digits
 
 EPS = np.finfo(np.float64).eps
 METHODS = {

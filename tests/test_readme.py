@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from warpcloth.analysis.measures import MEASURES
 from warpcloth.cli import _parser
-from warpcloth.measures import MEASURES
 from warpcloth.solvers import SOLVERS
-from warpcloth.terms import TERMS
+from warpcloth.terms.terms import TERMS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -9,8 +9,8 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
 import warpcloth as wc
-from warpcloth.arap import _half_cotangents
-from warpcloth.operators import constant_matrices
+from warpcloth.core.operators import constant_matrices
+from warpcloth.deformation.arap import _half_cotangents
 from warpcloth.scenes import hanging
 
 PAGE = (Path(__file__).parents[1] / "docs" / "recipes.md").read_text(encoding="utf-8")

@@ -12,13 +12,13 @@ import warp as wp
 from scipy.integrate import solve_ivp
 
 import warpcloth as wc
-from warpcloth.chart import reference as module
-from warpcloth.chart import trajectory
-from warpcloth.chart.digest import scene_digest
-from warpcloth.chart.reference import Reference, cloth_size, position_error, reference, strain_error
-from warpcloth.chart.tasks import SceneRef
-from warpcloth.chart.trajectory import measure
 from warpcloth.kernels.terms import SPRING
+from warpcloth.lab import reference as module
+from warpcloth.lab import trajectory
+from warpcloth.lab.digest import scene_digest
+from warpcloth.lab.measurements import SceneRef
+from warpcloth.lab.reference import Reference, cloth_size, position_error, reference, strain_error
+from warpcloth.lab.trajectory import measure
 
 # Soft enough to be smooth in steps of 1/16 frame: ωh at most 0.1.
 CHAIN = SceneRef("chain", {"links": 5, "stiffness": 20.0})

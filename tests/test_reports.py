@@ -12,11 +12,11 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from usd_validation import validate
 
 import warpcloth as wc
+from warpcloth.analysis.measures import scalars
 from warpcloth.chart import Scale
-from warpcloth.chart.colour import table
 from warpcloth.cli import main
-from warpcloth.measures import scalars
-from warpcloth.reports import camel, scalar_names, write_report
+from warpcloth.cli.reports import camel, scalar_names, write_report
+from warpcloth.picture.colour import table
 from warpcloth.scenes import hanging
 from warpcloth.usd import AnimationWriter, FrameSequence
 
@@ -367,7 +367,7 @@ def test_a_failure_on_the_way_leaves_earlier_results(cloth, tmp_path, monkeypatc
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     sequence = wc.open_sequence(cloth)
     broken = replace(sequence, read=lambda frame: sequence.read(frame) if frame < 4 else 1 / 0)
-    monkeypatch.setattr("warpcloth.sequences.open_sequence", lambda *_: broken)
+    monkeypatch.setattr("warpcloth.mesh.sequences.open_sequence", lambda *_: broken)
     assert main(["analyze", str(cloth), *outputs]) == 2
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -384,7 +384,7 @@ def test_an_interruption_keeps_rows_and_without_any_what_was_there(frame, kept, 
             raise KeyboardInterrupt
         return sequence.read(place)
 
-    monkeypatch.setattr("warpcloth.sequences.open_sequence", lambda *_: replace(sequence, read=read))
+    monkeypatch.setattr("warpcloth.mesh.sequences.open_sequence", lambda *_: replace(sequence, read=read))
     capsys.readouterr()
     assert main(["analyze", str(cloth), "--reference", "previous", *outputs]) == 130
     saved = "nothing was saved" if kept else f"they are in {', '.join(outputs[1::2])}"

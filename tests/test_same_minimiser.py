@@ -11,7 +11,7 @@ import pytest
 from test_projection import after_one_step, swinging
 
 import warpcloth as wc
-from warpcloth.operators import Gradient
+from warpcloth.core.operators import Gradient
 from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.projective_dynamics import ACCELERATIONS
 

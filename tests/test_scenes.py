@@ -9,10 +9,10 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from warpcloth.operators import Energy, Gradient, Sums
+from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.status import Result, digits, sentence
 from warpcloth.solvers import SOLVERS as RECORDS
 from warpcloth.solvers.explicit import step_limits
-from warpcloth.status import Result, digits, sentence
 
 
 def scene(name, **parameters):

@@ -9,9 +9,9 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 import warpcloth as wc
-from warpcloth.mesh import Mesh, Surface
+from warpcloth.mesh.mesh import Mesh, Surface
+from warpcloth.mesh.sequences import as_sequence, open_sequence
 from warpcloth.scenes import chain, hanging
-from warpcloth.sequences import as_sequence, open_sequence
 from warpcloth.usd import AnimationWriter, FrameSequence, read_mesh
 
 EPS32, EPS = np.finfo(np.float32).eps, np.finfo(np.float64).eps

@@ -12,12 +12,12 @@ import warp as wp
 from nets import net
 
 import warpcloth as wc
-from warpcloth.capture import Segment, on_host
-from warpcloth.constraints import Constraints
-from warpcloth.operators import Hessian, RowSums, Sums
+from warpcloth.core.capture import Segment, on_host
+from warpcloth.core.operators import Hessian, RowSums, Sums
+from warpcloth.core.status import Result
+from warpcloth.numerics.constraints import Constraints
 from warpcloth.solvers import explicit
 from warpcloth.solvers.explicit import limit_in_motion, step_limits
-from warpcloth.status import Result
 
 EPS = np.finfo(np.float64).eps
 SOLVERS = {

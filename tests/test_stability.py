@@ -12,16 +12,25 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.chart import machine, stability
-from warpcloth.chart.axes import AXES, FIXED, applied, record_at, scene_at, vary
-from warpcloth.chart.failures import FAILURES
 from warpcloth.chart.maps import _PLAIN, plot_maps, write_table
-from warpcloth.chart.rules import DIVERGES, GROWTH, KNOWN, concave_rate, largest_ordered, largest_relaxation, rings, rules
-from warpcloth.chart.stability import Survey, boundary, measure
-from warpcloth.chart.sweep import Store, sweep
-from warpcloth.chart.tasks import SceneRef, Setup
 from warpcloth.cli import _parser, main
 from warpcloth.cli.stability import _survey
+from warpcloth.lab import machine, stability
+from warpcloth.lab.axes import AXES, FIXED, applied, record_at, scene_at, vary
+from warpcloth.lab.campaign import Store, sweep
+from warpcloth.lab.failures import FAILURES
+from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.stability import Survey, boundary, measure
+from warpcloth.lab.stability_limits import (
+    DIVERGES,
+    GROWTH,
+    KNOWN,
+    concave_rate,
+    largest_ordered,
+    largest_relaxation,
+    rings,
+    rules,
+)
 from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
 

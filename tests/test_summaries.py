@@ -10,8 +10,8 @@ from dataclasses import astuple, dataclass
 import numpy as np
 import pytest
 
-from warpcloth.stacks import NpzWriter
-from warpcloth.summaries import PERCENTILES, CsvWriter, JsonWriter, Summary, summarise
+from warpcloth.analysis.stacks import NpzWriter
+from warpcloth.analysis.summaries import PERCENTILES, CsvWriter, JsonWriter, Summary, summarise
 
 EPS = np.finfo(np.float64).eps
 INF, NAN = math.inf, math.nan

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.chart import tasks as listed
-from warpcloth.chart.machine import machine, name
-from warpcloth.chart.sweep import Store, cache_folder, sweep
-from warpcloth.chart.tasks import SceneRef, Setup, Task, run, source_digest, task
+from warpcloth.lab import measurements as listed
+from warpcloth.lab.campaign import Store, cache_folder, sweep
+from warpcloth.lab.digest import source_digest
+from warpcloth.lab.machine import machine, name
+from warpcloth.lab.measurements import SceneRef, Setup, Task, run, task
 
 
 def square(x, folder=None):
@@ -198,8 +199,8 @@ def test_other_code_is_refused_and_the_machine_kept(tmp_path):
 
 SCRIPT = """
 import os, sys, time
-from warpcloth.chart.sweep import sweep
-from warpcloth.chart.tasks import task
+from warpcloth.lab.campaign import sweep
+from warpcloth.lab.measurements import task
 
 def wait(folder):
     open(os.path.join(folder, str(os.getpid())), "w").close()
@@ -258,7 +259,7 @@ def test_keys_are_of_what_is_measured_and_of_the_code(monkeypatch):
     assert one.key == Task(one.function, dict(one.arguments)).key
     assert one.key != replace(one, arguments={"x": 2}).key
     before = one.key
-    monkeypatch.setattr("warpcloth.chart.tasks.source_digest", lambda: "another")
+    monkeypatch.setattr("warpcloth.lab.measurements.source_digest", lambda: "another")
     assert one.key != before and len(source_digest()) == 16
 
 
@@ -267,7 +268,7 @@ def test_times_of_another_machine_are_not_found(changed, monkeypatch):
     """A folder of caches may be shared, and what computes may be replaced."""
     one, facts = task(square, x=1, device="cpu"), machine()
     before = one.key
-    monkeypatch.setattr("warpcloth.chart.machine.machine", lambda device: facts | {changed: "another"})
+    monkeypatch.setattr("warpcloth.lab.machine.machine", lambda device: facts | {changed: "another"})
     listed._machine.cache_clear()
     after = one.key
     listed._machine.cache_clear()

@@ -11,14 +11,17 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from warpcloth import quadratic
-from warpcloth.incidences import chain, gathered
-from warpcloth.kernels import assemble, constrain, gather, project, splitting
+from warpcloth.core.operators import Energy, Gradient, Hessian, Sums
+from warpcloth.fast import quadratic
+from warpcloth.fast.incidences import chain, gathered
+from warpcloth.kernels import admm as splitting
+from warpcloth.kernels import assemble, project
+from warpcloth.kernels import constraint_rows as constrain
 from warpcloth.kernels import terms as energies
 from warpcloth.kernels.elements import chain_of
+from warpcloth.kernels.fast import gather
 from warpcloth.kernels.term import HessianPolicy, Term
-from warpcloth.model import DTYPES
-from warpcloth.operators import Energy, Gradient, Hessian, Sums
+from warpcloth.model.model import DTYPES
 
 RAW, CLAMP, ABSOLUTE = HessianPolicy
 # Elements by themselves; cells are in test_clusters.py.

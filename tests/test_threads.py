@@ -16,10 +16,10 @@ from test_passes import SPRINGS, TERMS, declared
 from test_solvers import SOLVERS, allocations, square
 
 import warpcloth as wc
-from warpcloth.capture import Segment
 from warpcloth.cli import main
+from warpcloth.core.capture import Segment
+from warpcloth.core.thread_pool import Team
 from warpcloth.solvers import solver as solvers
-from warpcloth.team import Team
 
 pytestmark = pytest.mark.filterwarnings("ignore:threads is . on . cores")
 VARY = {"Spring.stiffness": [50.0, 80.0, 100.0], "gravity": [[0.0, -9.8, 0.0], [0.0, -5.0, 1.0], [2.0, -3.0, 0.0]]}

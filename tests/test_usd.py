@@ -21,9 +21,9 @@ import warp.examples
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from usd_validation import validate
 
-from warpcloth.analysis import Analyzer
-from warpcloth.mesh import Mesh
-from warpcloth.reports import write_report
+from warpcloth.analysis.analysis import Analyzer
+from warpcloth.cli.reports import write_report
+from warpcloth.mesh.mesh import Mesh
 from warpcloth.usd import AnimationWriter, FrameSequence, chunks, read_mesh, read_stage_mesh
 
 EPS = np.finfo(np.float32).eps
@@ -1023,7 +1023,7 @@ def test_a_folder_without_locks_warns(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr("warpcloth.outputs._lock", refuse)
+    monkeypatch.setattr("warpcloth.base.outputs._lock", refuse)
     with pytest.warns(UserWarning, match=r"out\.usdc: its folder does not support locks; do not start another run to it"):
         write(tmp_path / "out.usdc", Mesh.grid(4, 4))
     assert len(FrameSequence(tmp_path / "out.usdc")) == FRAMES

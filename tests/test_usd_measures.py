@@ -28,7 +28,7 @@ from test_usd import (
 )
 from usd_validation import validate
 
-from warpcloth.mesh import Mesh, Surface
+from warpcloth.mesh.mesh import Mesh, Surface
 from warpcloth.usd import FrameSequence, MeasureWriter, read_mesh, read_stage_mesh
 from warpcloth.usd.chunks import export
 

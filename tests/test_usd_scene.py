@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from usd_validation import validate
 
 import warpcloth as wc
-from warpcloth.terms import TERMS
+from warpcloth.terms.terms import TERMS
 from warpcloth.usd import read_scene, read_stage_mesh, write_scene
 from warpcloth.usd.attributes import ATTRIBUTES
 

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.chart import convergence, fronts, machine, spectrum, work_precision
-from warpcloth.chart.convergence import OneStep
-from warpcloth.chart.digest import scene_digest
-from warpcloth.chart.setups import RUNS, STEPS, label, setups_of_runs, setups_of_steps
-from warpcloth.chart.sweep import Store
-from warpcloth.chart.tasks import SceneRef, Setup
-from warpcloth.chart.work_precision import (
+from warpcloth.chart import pareto as fronts
+from warpcloth.cli import main
+from warpcloth.lab import convergence, machine, spectrum, work_precision
+from warpcloth.lab.campaign import Store
+from warpcloth.lab.convergence import OneStep
+from warpcloth.lab.digest import scene_digest
+from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.setups import RUNS, STEPS, label, setups_of_runs, setups_of_steps
+from warpcloth.lab.work_precision import (
     cheapest,
     front,
     left_out,
@@ -27,7 +29,6 @@ from warpcloth.chart.work_precision import (
     time_diagram,
     write_csv,
 )
-from warpcloth.cli import main
 from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
 

@@ -1,24 +1,25 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD."""
 
-from . import interrupts as interrupts  # first: it handles interrupts while the other modules load, which takes a second
+from .base import interrupts as interrupts  # first: it handles interrupts while the other modules load, which takes a second
 
 # isort: split
-from . import checks, ordering
-from .analysis import Analyzer, analyze
-from .arap import Arap
-from .compare import Comparison, compare
-from .deform import Deformation, deform
-from .equilibrium import Equilibrium, equilibrium
-from .kernel_cache import mend
-from .mesh import Mesh
-from .quiet import leave_out_news
-from .rotation import kabsch, polar, svd
-from .samples import Analysis
-from .scene import Pins, Scene
-from .sequences import Sequence, as_sequence, open_sequence
-from .simulate import Animation, simulate
+from .analysis.analysis import Analyzer, analyze
+from .analysis.compare import Comparison, compare
+from .analysis.samples import Analysis
+from .base import checks
+from .base.kernel_cache import mend
+from .base.quiet import leave_out_news
+from .deformation.arap import Arap
+from .deformation.deform import Deformation, deform
+from .mesh import ordering
+from .mesh.mesh import Mesh
+from .mesh.sequences import Sequence, as_sequence, open_sequence
+from .numerics.rotation import kabsch, polar, svd
+from .run.equilibrium import Equilibrium, equilibrium
+from .run.simulate import Animation, simulate
+from .scene.scene import Pins, Scene
 from .solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
-from .terms import (
+from .terms.terms import (
     Attachment,
     CorotatedMembrane,
     DihedralBending,

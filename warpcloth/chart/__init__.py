@@ -1,9 +1,9 @@
 """Colours, pictures and plots of measured cloth. Nothing else here imports matplotlib, the extra "chart"."""
 
-from .colour import Scale, range_over
+from ..picture.colour import Scale, range_over
+from ..picture.picture import draw
+from ..picture.view import View
 from .distances import plot_distances
 from .percentiles import plot_percentiles
-from .picture import draw
-from .view import View
 
 __all__ = ["Scale", "View", "draw", "plot_distances", "plot_percentiles", "range_over"]

@@ -2,7 +2,7 @@
 
 import math
 
-from .figures import GREY, PICTURES, check_path, number_axis, save
+from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
 
 _MARKS = "os^Dv"
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from .figures import PICTURES, check_path, save
+from ..picture.figures import PICTURES, check_path, save
 
 
 def plot_distances(path, found, names):

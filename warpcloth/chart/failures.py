@@ -1,50 +1,7 @@
-"""Where terms, weights and fits fail, each failure as measured points beside the laws that explain them.
+"""Charts of failures."""
 
-A chart is a module with a `TITLE`, `PANELS`, what is drawn, and `tasks`, what measures it: each task returns points,
-dictionaries with ``panel``, ``series``, ``x``, ``value`` (None where there is none) and ``reason``.
-"""
-
-import csv
-
-from ..checks import choice
-from ..outputs import TEXT, Output
-from . import cotangents, isometry, locking, rank, slivers
-from .machine import machine
+from ..lab.failures import FAILURES
 from .panels import plot_panels
-from .sweep import kept, sweep
-
-FAILURES = {"locking": locking, "isometry": isometry, "slivers": slivers, "cotangents": cotangents, "rank": rank}
-COLUMNS = ("panel", "series", "x", "value", "law", "expected", "reason", "machine")
-
-
-def failure_chart(name, device="cpu", **run):
-    """Measures what a failure does.
-
-    Args:
-        name: One of `FAILURES`.
-        device: A Warp device.
-        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
-
-    Returns:
-        dict: JSON values; in ``rows`` the points, with the ``law`` that a series follows and what that ``expected``.
-
-    Raises:
-        ValueError: There is no such failure.
-    """
-    choice("failure", name, tuple(FAILURES))
-    tasks = FAILURES[name].tasks(str(device))
-    run = run if "store" in run else {"store": kept("failures", run.get("executor")), **run}
-    results = {task.key: points for task, points in sweep(tasks, **run)}
-    panels = {panel.key: panel for panel in FAILURES[name].PANELS}
-    rows = []
-    for done, point in [(task, point) for task in tasks for point in results[task.key]]:
-        panel = panels[point["panel"]]
-        law = panel.follows.get(point["series"])
-        expected = float(panel.laws[law](point["x"])) if law else None
-        rows.append({**point, "law": law, "expected": expected, "machine": run["store"].machine(done)})
-    facts = {"failure": name, "title": FAILURES[name].TITLE, "device": str(device), "seed": 0, "machine": machine(device)}
-    shown = {key: {"title": panel.title, "x": panel.x, "y": panel.y} for key, panel in panels.items()}
-    return {**facts, "panels": shown, "rows": rows}
 
 
 def plot_failure(path, found):
@@ -56,15 +13,3 @@ def plot_failure(path, found):
         ValueError: The path has another ending.
     """
     plot_panels(path, FAILURES[found["failure"]].PANELS, found["rows"], found["title"])
-
-
-def write_csv(path, found):
-    """Writes a line for each point.
-
-    Raises:
-        FileNotFoundError: The folder does not exist.
-    """
-    with Output(path, "x", **TEXT) as output:
-        table = csv.DictWriter(output.file, COLUMNS, lineterminator="\n")
-        table.writeheader()
-        table.writerows(found["rows"])

@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 
-from ..outputs import TEXT, Output
-from .axes import AXES, FRAMES
-from .figures import GREY, PICTURES, check_path, save
-from .rules import DIVERGES, KNOWN
+from ..base.outputs import TEXT, Output
+from ..lab.axes import AXES, FRAMES
+from ..lab.stability_limits import DIVERGES, KNOWN
+from ..picture.figures import GREY, PICTURES, check_path, save
 
 # sRGB. What diverged goes from the dark, at once, to the light, in the last frame; all differ in lightness too, for those who
 # do not see red.
@@ -41,12 +41,13 @@ _SMALL, _TEXT = 9.5, 11.0  # sizes of letters [pt]
 
 
 def plot_maps(path, survey, cells, accuracy=None):
-    """Draws what became of each cell, a panel for each method, and where the rules of :mod:`warpcloth.chart.rules` are 1.
+    """Draws what became of each cell, a panel for each method, and where the rules of :mod:`warpcloth.lab.stability_limits` are
+    1.
 
     Args:
         path: The file, .png, .svg or .pdf.
-        survey: The :class:`warpcloth.chart.stability.Survey`.
-        cells: (setup, y, x) as :meth:`warpcloth.chart.stability.Survey.table` gives them.
+        survey: The :class:`warpcloth.lab.stability.Survey`.
+        cells: (setup, y, x) as :meth:`warpcloth.lab.stability.Survey.table` gives them.
         accuracy: What is inaccurate, to say so, or None.
 
     Raises:

@@ -1,53 +1,13 @@
 """Panels of measured points with laws as lines, of one shape for all charts of failures."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 
-from .figures import GREY, PICTURES, check_path, save
+from ..picture.figures import GREY, PICTURES, check_path, save
 
 _MARKS = "os^DvPX*"
 _COLOURS = ("black", "tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purple", "tab:cyan", "tab:brown")
-
-
-@dataclass(frozen=True)
-class Panel:
-    """What one panel shows.
-
-    Attributes:
-        key: Its name in tables.
-        title: A sentence that says what fails.
-        x: Label of the axis, with its unit.
-        y: The same of the other axis.
-        scales: Of x and of y, "linear" or "log".
-        laws: Functions of x by the label of their line.
-        follows: The law of a series, by label; not all have one.
-        marks: Labels of vertical lines by their x.
-        limits: Ends of y, None to fit.
-    """
-
-    key: str
-    title: str
-    x: str
-    y: str
-    scales: tuple[str, str] = ("linear", "linear")
-    laws: dict[str, Callable] = field(default_factory=dict)
-    follows: dict[str, str] = field(default_factory=dict)
-    marks: dict[float, str] = field(default_factory=dict)
-    limits: tuple[float, float] | None = None
-
-
-def point(panel, series, x, value, reason=""):
-    """A measured point as JSON; ``value`` None where there is none, and then the reason."""
-    return {
-        "panel": panel,
-        "series": series,
-        "x": float(x),
-        "value": None if value is None else float(value),
-        "reason": reason,
-    }
 
 
 def plot_panels(path, panels, rows, title):
@@ -55,8 +15,8 @@ def plot_panels(path, panels, rows, title):
 
     Args:
         path: The file, .png, .svg or .pdf.
-        panels: :class:`Panel` records.
-        rows: Points, see :func:`point`.
+        panels: :class:`warpcloth.lab.panels.Panel` records.
+        rows: Points, see :func:`warpcloth.lab.panels.point`.
         title: Of the whole.
 
     Raises:

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from ..checks import choice
-from .figures import GREY, PICTURES, check_path, save
+from ..base.checks import choice
+from ..picture.figures import GREY, PICTURES, check_path, save
 
 # Columns of the percentiles 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, and the grey of each band.
 _BANDS = ((1, 7, "0.88", "1 to 99 %"), (2, 6, "0.76", "5 to 95 %"), (3, 5, "0.6", "25 to 75 %"))

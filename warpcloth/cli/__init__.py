@@ -15,7 +15,7 @@ import warnings
 
 import numpy as np
 
-from ..interrupts import Interrupts
+from ..base.interrupts import Interrupts
 from . import analyze, bench, chart, choose, compare, deform, options, run
 from .terminal import Printable, say, show_warning
 
@@ -86,7 +86,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser():
-    from ..model import DTYPES
+    from ..model.model import DTYPES
     from ..solvers import SOLVERS
 
     parser = _Parser(prog="warpcloth", description="Cloth simulation, written as USD.", allow_abbrev=False)

@@ -3,14 +3,14 @@
 import contextlib
 from dataclasses import asdict
 
-from .. import scene_files
+from ..run import scene_files
 from .run import solver_setup
 from .terminal import Progress, as_json
 
 
 def advise_on(arguments, source, values, scene, device):
     """Says which terms, precision and resolution matter, by leaving out or changing each."""
-    from ..advice import advise
+    from ..lab.advice import advise
 
     tolerance = 0.01 if arguments.tolerance is None else scene_files.share("tolerance", arguments.tolerance)
     solver = solver_setup(arguments, scene, device).checked

@@ -3,10 +3,10 @@
 import time
 from pathlib import Path
 
-from .. import scene_files
-from ..mesh import UP_AXES
-from ..outputs import check_apart
-from ..quiet import find_device
+from ..base.outputs import check_apart
+from ..base.quiet import find_device
+from ..mesh.mesh import UP_AXES
+from ..run import scene_files
 from .terminal import Progress, as_json, check_writable, frames_folder_of, place
 
 EPILOG = """\
@@ -78,8 +78,8 @@ def add_arguments(parser):
 
 
 def analyze(arguments):
-    from ..measures import MEASURES
-    from ..reports import write_report
+    from ..analysis.measures import MEASURES
+    from .reports import write_report
 
     if arguments.measure == ["help"]:
         print(_listed(MEASURES))
@@ -144,9 +144,9 @@ def analyze(arguments):
 
 
 def _analyzer(arguments):
-    from ..analysis import Analyzer
-    from ..mesh import Surface
-    from ..sequences import open_sequence
+    from ..analysis.analysis import Analyzer
+    from ..mesh.mesh import Surface
+    from ..mesh.sequences import open_sequence
 
     if arguments.input is None:
         raise ValueError("INPUT is missing, what is to be measured; see warpcloth analyze --help")
@@ -173,7 +173,7 @@ def _analyzer(arguments):
 
 
 def _material(arguments):
-    from .. import terms
+    from ..terms import terms
 
     kind = arguments.material
     if arguments.stiffness is None:

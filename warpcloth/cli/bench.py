@@ -2,10 +2,10 @@
 
 from datetime import datetime, timezone
 
-from ..checks import whole
-from ..outputs import Output, check_apart
-from ..quiet import find_device
-from ..scene_files import assignments, options
+from ..base.checks import whole
+from ..base.outputs import Output, check_apart
+from ..base.quiet import find_device
+from ..run.scene_files import assignments, options
 from .run import named_scene, solver_setup
 from .terminal import Interrupted, as_json, check_writable, open_bar, say
 
@@ -65,7 +65,7 @@ def bench(arguments):
         Output(arguments.csv, "x").discard()
         check_writable(arguments.csv)
     device = find_device(arguments.device)
-    from ..bench.benchmarks import Run
+    from ..lab.benchmarks import Run
 
     run = Run(_benchmarks(arguments, device))
     progress = _Rows()
@@ -88,8 +88,8 @@ def _benchmarks(arguments, device):
     Raises:
         ValueError: They do not go together, or one of them is wrong.
     """
-    from ..bench.benchmarks import Benchmark, standard
-    from ..chart.tasks import SceneRef, Setup
+    from ..lab.benchmarks import Benchmark, standard
+    from ..lab.measurements import SceneRef, Setup
     from ..solvers import SOLVERS
 
     given = {
@@ -149,8 +149,8 @@ class _Rows:
 
 def _write(arguments, run, device):
     """Writes and prints what rows there are."""
-    from ..bench.results import growth, write_csv
-    from ..chart.machine import machine
+    from ..lab.machine import machine
+    from ..lab.results import growth, write_csv
 
     if all(row["status"] == "refused" for row in run.rows):
         return
@@ -225,7 +225,7 @@ def _compare(arguments):
     Raises:
         ValueError: A file is none, or the two have no row in common.
     """
-    from ..bench.results import ratios, read
+    from ..lab.results import ratios, read
 
     if arguments.scene:
         raise ValueError("SCENE is given beside --compare, which measures nothing")

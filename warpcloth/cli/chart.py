@@ -4,10 +4,10 @@ import argparse
 import sys
 from collections import Counter
 
-from ..chart.figures import PICTURES
-from ..checks import number, whole
-from ..quiet import find_device
-from ..scene_files import assignments
+from ..base.checks import number, whole
+from ..base.quiet import find_device
+from ..picture.figures import PICTURES
+from ..run.scene_files import assignments
 from . import stability
 from .run import named_scene
 from .terminal import add_dask, as_json, check_outputs, measuring
@@ -66,7 +66,7 @@ def add(charts, name, command, text, epilog):
 
 
 def _add_work_precision(charts):
-    from ..model import DTYPES
+    from ..model.model import DTYPES
     from ..solvers import SOLVERS
 
     sub = add(charts, "work-precision", work_precision, "Error over time, of settings of all solvers.", EPILOG)
@@ -82,14 +82,15 @@ def _add_work_precision(charts):
 
 
 def _add_failure(charts):
-    from ..chart.failures import FAILURES
+    from ..lab.failures import FAILURES
 
     sub = add(charts, "failure", failure, "Chart where terms, weights and fits fail, beside theory.", FAILURE_EPILOG)
     sub.add_argument("failure", metavar="FAILURE", choices=FAILURES, help=", ".join(FAILURES))
 
 
 def failure(arguments):
-    from ..chart.failures import failure_chart, plot_failure, write_csv
+    from ..chart.failures import plot_failure
+    from ..lab.failures import failure_chart, write_csv
 
     check_outputs(arguments)
     device = find_device(arguments.device)
@@ -120,8 +121,8 @@ def _failure_summary(found):
 
 
 def work_precision(arguments):
-    from ..chart.tasks import SceneRef
-    from ..chart.work_precision import write_csv
+    from ..lab.measurements import SceneRef
+    from ..lab.work_precision import write_csv
 
     if arguments.frames is not None:
         whole("frames", arguments.frames, least=1)
@@ -152,8 +153,8 @@ def work_precision(arguments):
 
 def _parts(diagram):
     """What measures a diagram, what draws it and what says the most of it; another diagram is another row."""
-    from ..chart import fronts
-    from ..chart import work_precision as measured
+    from ..chart import pareto as fronts
+    from ..lab import work_precision as measured
 
     return {
         "time": (measured.time_diagram, fronts.plot_time, _time_lines),
@@ -176,7 +177,7 @@ def _physics_lines(found):
 
 
 def _summary(found, lines_of):
-    from ..chart.work_precision import left_out
+    from ..lab.work_precision import left_out
 
     rows, device = found["rows"], found["machine"]["device"]
     counts = {status: sum(row["status"] == status for row in rows) for status in ("ok", "diverged", "slow", "refused")}
@@ -192,7 +193,7 @@ def _summary(found, lines_of):
 
 def _time_lines(found):
     """The settings that nothing beats, and the cheapest of each solver."""
-    from ..chart.work_precision import WITHIN, cheapest
+    from ..lab.work_precision import WITHIN, cheapest
 
     exact, rows = found["reference"], found["rows"]
     lines = [f"  reference     known to {100.0 * exact['error']:.2g} %, {exact['substeps']} steps a frame"]

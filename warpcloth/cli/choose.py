@@ -3,8 +3,8 @@
 import shlex
 import sys
 
-from .. import scene_files
-from ..quiet import find_device
+from ..base.quiet import find_device
+from ..run import scene_files
 from .run import named_scene
 from .terminal import Interrupted, Settings, add_dask, as_json, executing
 
@@ -33,7 +33,7 @@ def add_arguments(parser):
 def choose(arguments):
     device = find_device(arguments.device)
     choice, found, exact, values = chosen(arguments, device)
-    from ..chart.choose import as_json as facts_of
+    from ..lab.choosing import as_json as facts_of
 
     command = None if choice.chosen is None else command_line(arguments, values, choice.chosen.setup)
     facts = {"scene": arguments.scene, "parameters": values, **facts_of(choice, found, exact), "command": command}
@@ -43,8 +43,8 @@ def choose(arguments):
 
 def chosen(arguments, device):
     """The choice for the scene, tolerance and budget of the arguments, all that was measured, reference, and parameters."""
-    from ..chart.choose import choose
-    from ..chart.tasks import SceneRef
+    from ..lab.choosing import choose
+    from ..lab.measurements import SceneRef
 
     _source, values, _scene = named_scene(arguments)
     tolerance = None if arguments.tolerance is None else scene_files.share("tolerance", arguments.tolerance)
@@ -103,7 +103,7 @@ def command_line(arguments, values, setup):
 
 
 def _text(facts, choice, found, exact):
-    from ..chart.choose import percent
+    from ..lab.choosing import percent
 
     measured = f"{facts['scene']}: {len(found)} settings measured over {len(exact.points) - 1} frames"
     lines = [f"{measured}; the reference is known to {percent(exact.error)}"]

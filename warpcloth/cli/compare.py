@@ -4,11 +4,11 @@ import csv
 
 import numpy as np
 
-from ..chart.figures import PICTURES, check_path
-from ..checks import whole
-from ..mesh import UP_AXES
-from ..outputs import TEXT, Output, check_apart
-from ..quiet import find_device
+from ..base.checks import whole
+from ..base.outputs import TEXT, Output, check_apart
+from ..base.quiet import find_device
+from ..mesh.mesh import UP_AXES
+from ..picture.figures import PICTURES, check_path
 from .terminal import Progress, as_json, check_writable
 
 _SHOWN = 8  # frames or exclusions of each that the summary names
@@ -40,7 +40,7 @@ def add_arguments(parser):
 
 
 def compare(arguments):
-    from ..compare import compare, opened
+    from ..analysis.compare import compare, opened
 
     if arguments.frames is not None:
         whole("frames", arguments.frames, least=0)
@@ -80,7 +80,7 @@ def _check_outputs(arguments):
 def _open(arguments, name, opened):
     source, prim, rest, fps = (getattr(arguments, key) for key in (name, f"prim_{name}", f"rest_{name}", f"fps_{name}"))
     if rest is not None:
-        from ..mesh import Surface
+        from ..mesh.mesh import Surface
 
         source = (Surface.load(rest), source)
     return opened(name, source, prim, arguments.fps if fps is None else fps)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import scene_files
-from ..checks import whole
-from ..limits import refuse_memory
-from ..quiet import find_device
+from ..base.checks import whole
+from ..base.limits import refuse_memory
+from ..base.quiet import find_device
+from ..run import scene_files
 from .run import named_scene
 from .terminal import Progress, as_json, check_writable, frames_folder_of, place
 
@@ -111,7 +111,7 @@ def _vector(name, texts):
 
 
 def deform(arguments):
-    from ..deform import deform
+    from ..deformation.deform import deform
 
     name, values, given = _given(arguments)
     frames = len(given["pins"].keyframes) - 1
@@ -168,7 +168,7 @@ def _summary(facts):
 
 def _given(arguments):
     """(name, values of a scene's parameters, arguments of `deform`) that the command line stands for."""
-    from ..scene import Pins
+    from ..scene.scene import Pins
 
     path = Path(arguments.mesh)
     if arguments.frames is not None:
@@ -194,7 +194,7 @@ def _given(arguments):
         stage = read_stage_mesh(arguments.mesh, arguments.prim)
         mesh, fps = stage.mesh, stage.fps or _FPS
     else:
-        from ..mesh import Mesh
+        from ..mesh.mesh import Mesh
 
         stage, mesh, fps = None, Mesh.load(arguments.mesh, arguments.prim), _FPS
     pins = Pins(*_handles(mesh, arguments.fix, arguments.moves, arguments.frames or _FRAMES))

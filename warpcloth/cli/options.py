@@ -4,7 +4,7 @@ import os
 import warnings
 from functools import partial
 
-from .. import scene_files
+from ..run import scene_files
 from .terminal import as_json
 
 _HELP = "help"

@@ -8,10 +8,10 @@ import time
 import warnings
 from dataclasses import asdict, dataclass, replace
 
-from .. import scene_files
-from ..freedom import freedom
-from ..quiet import find_device
-from ..status import digits
+from ..base.quiet import find_device
+from ..core.status import digits
+from ..run import scene_files
+from ..scene.freedom import freedom
 from .terminal import Progress, as_json, check_writable, frames_folder_of, place, say
 
 # A step that all solvers but the explicit ones take well; where no step is given the substeps come nearest to it.
@@ -26,7 +26,7 @@ and below the bound for motion (exact for springs; hinges count as at rest), all
 
 
 def run(arguments):
-    from ..simulate import simulate
+    from ..run.simulate import simulate
 
     source, values, scene = named_scene(arguments)
     frames = scene.frames if arguments.frames is None else arguments.frames
@@ -258,7 +258,7 @@ def solver_setup(arguments, scene, device, limits=False):
         return _Setup(solver, solver, "by default about 1/240 s")
     if step_given and not limits:
         return _Setup(solver, solver)
-    from ..ordering import order_of_run
+    from ..mesh.ordering import order_of_run
     from ..solvers.explicit import fewest_substeps, step_limits
 
     began = time.perf_counter()

@@ -2,15 +2,15 @@
 
 from collections import Counter
 
-from ..chart.axes import AXES, FIXED, SEED
-from ..chart.machine import machine
-from ..chart.stability import ACCURACY, VERDICTS, Survey
-from ..chart.sweep import kept, sweep
-from ..chart.tasks import SceneRef, Setup
-from ..checks import number, whole
-from ..model import DTYPES
-from ..quiet import find_device
-from ..scene_files import assignments, convert, options
+from ..base.checks import number, whole
+from ..base.quiet import find_device
+from ..lab.axes import AXES, FIXED, SEED
+from ..lab.campaign import kept, sweep
+from ..lab.machine import machine
+from ..lab.measurements import SceneRef, Setup
+from ..lab.stability import ACCURACY, VERDICTS, Survey
+from ..model.model import DTYPES
+from ..run.scene_files import assignments, convert, options
 from ..solvers import SOLVERS
 from .terminal import as_json, check_outputs, measuring
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..chart.figures import PICTURES, check_path
-from ..checks import whole
-from ..interrupts import Interrupted
-from ..outputs import Output, check_apart
+from ..base.checks import whole
+from ..base.interrupts import Interrupted
+from ..base.outputs import Output, check_apart
+from ..picture.figures import PICTURES, check_path
 
 # Unicode categories that are escaped: control, format (which can reverse the direction of text), surrogates, ends of lines.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
@@ -97,7 +97,7 @@ def executing(arguments):
         return
     if getattr(arguments, "workers", None) is not None:
         raise ValueError("--workers is of processes of this machine, and --dask of a cluster, which has its own; leave one out")
-    from ..chart.cluster import connect
+    from ..lab.cluster import connect
 
     with connect(arguments.dask) as cluster:
         yield {"executor": cluster}

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from ..capture import Mirror, Segment
-from ..checks import number, whole
-from ..kernels import splitting as kernels
+from ..base.checks import number, whole
+from ..core.capture import Mirror, Segment
+from ..core.operators import Sums, constant_blocks, constant_matrices
+from ..core.status import Residual, Result
+from ..kernels import admm as kernels
 from ..kernels.accelerate import plain_step
 from ..kernels.minimise import add_inertia
-from ..linear import CopyFactors
-from ..operators import Sums, constant_blocks, constant_matrices
-from ..status import Residual, Result
+from ..numerics.linear import CopyFactors
 from .solver import ImplicitStep, Stepper, refuse_cells, refuse_hard
 
 # n times the smallest r for n iterations. A small weight needs many iterations, and what a step leaves unfinished becomes a
@@ -217,7 +217,7 @@ def best_weights(model, elements, he):
     """Computes r = 1/(2hₑω) of each element (E,), ω² its largest eigenvalue of M⁻¹ s k A DᵀD by itself; 1 if it cannot move.
 
     Args:
-        model: The :class:`warpcloth.model.Model`.
+        model: The :class:`warpcloth.model.model.Model`.
         elements: One of its terms.
         he: Effective step hₑ [s].
     """

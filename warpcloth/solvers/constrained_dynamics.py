@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..capture import Mirror, Segment
-from ..checks import choice, number, whole
-from ..constraints import Constraints
-from ..damping import refuse_apart
-from ..kernels import constrain as kernels
-from ..linear import ConjugateGradients, FactorisedRows
-from ..operators import RowSums, Sums
-from ..search import Search
-from ..status import Residual, Result
+from ..base.checks import choice, number, whole
+from ..core.capture import Mirror, Segment
+from ..core.operators import RowSums, Sums
+from ..core.status import Residual, Result
+from ..kernels import constraint_rows as kernels
+from ..model.damping import refuse_apart
+from ..numerics.constraints import Constraints
+from ..numerics.linear import ConjugateGradients, FactorisedRows
+from ..numerics.search import Search
 from .solver import ImplicitStep, Stepper, refuse_hard, require_model
 
 STABILISATIONS = ("none", "geometric-stiffness", "line-search")
@@ -120,7 +120,7 @@ class ConstrainedDynamicsStepper(Stepper):
     """:class:`ConstrainedDynamics` on a model.
 
     Attributes:
-        constraints: The :class:`warpcloth.constraints.Constraints`, with λ of the last step.
+        constraints: The :class:`warpcloth.numerics.constraints.Constraints`, with λ of the last step.
         correction: x − x̃ of the last step, (N,) [m].
         iterations: Iterations of the last step.
     """

@@ -7,12 +7,12 @@ from hashlib import sha256
 
 import numpy as np
 
-from ..checks import choice
-from ..damping import Past, dissipations
-from ..operators import Hessian
-from ..passes import Gather, Sweep, is_fine
-from ..ranges import Ranges
-from ..turns import in_turn
+from ..base.checks import choice
+from ..base.turns import in_turn
+from ..core.operators import Hessian
+from ..fast.passes import Gather, Sweep, is_fine
+from ..fast.ranges import Ranges
+from ..model.damping import Past, dissipations
 from .solver import LaunchedStepper, Step, refuse_hard
 
 
@@ -218,8 +218,8 @@ class ExplicitStepper(LaunchedStepper):
     """:class:`Explicit` on a model.
 
     Attributes:
-        passes: The :class:`warpcloth.passes.Sweep` or :class:`warpcloth.passes.Gather` that a step is, or for several threads
-            the :class:`warpcloth.ranges.Ranges`.
+        passes: The :class:`warpcloth.fast.passes.Sweep` or :class:`warpcloth.fast.passes.Gather` that a step is, or for several
+            threads the :class:`warpcloth.fast.ranges.Ranges`.
     """
 
     def __init__(self, options, model):

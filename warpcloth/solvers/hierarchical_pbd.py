@@ -5,11 +5,11 @@ from functools import partial
 
 import warp as wp
 
-from ..checks import number, whole
-from ..damping import Past
-from ..hierarchy import levels, on_device
+from ..base.checks import number, whole
 from ..kernels.hierarchy import follow
-from ..sweeps import Sweep, refuse_unprojectable
+from ..model.damping import Past
+from ..numerics.hierarchy import levels, on_device
+from ..numerics.sweeps import Sweep, refuse_unprojectable
 from .solver import LaunchedStepper, Step, require_model
 
 
@@ -79,8 +79,8 @@ class HierarchicalPBDStepper(LaunchedStepper):
     """:class:`HierarchicalPBD` on a model.
 
     Attributes:
-        levels: The :class:`warpcloth.hierarchy.Level` of each level above the finest, finer ones first.
-        sweep: The :class:`warpcloth.sweeps.Sweep` over all terms, with x − x̃ of the last step.
+        levels: The :class:`warpcloth.numerics.hierarchy.Level` of each level above the finest, finer ones first.
+        sweep: The :class:`warpcloth.numerics.sweeps.Sweep` over all terms, with x − x̃ of the last step.
     """
 
     def __init__(self, options, model):

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..capture import Segment
-from ..checks import choice, number, whole
-from ..minimise import LINEAR, POLICIES, Minimiser
-from ..status import UNBALANCED, Residual
+from ..base.checks import choice, number, whole
+from ..core.capture import Segment
+from ..core.status import UNBALANCED, Residual
+from ..numerics.minimise import LINEAR, POLICIES, Minimiser
 from .solver import ImplicitStep, Stepper, refuse_hard
 
 

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from ..checks import choice, number, whole
-from ..damping import Past
-from ..sweeps import IN_PLACE, SWEEPS, Sweep, refuse_unprojectable
+from ..base.checks import choice, number, whole
+from ..model.damping import Past
+from ..numerics.sweeps import IN_PLACE, SWEEPS, Sweep, refuse_unprojectable
 from .solver import LaunchedStepper, Step, require_model
 
 
@@ -78,7 +78,7 @@ class PBDStepper(LaunchedStepper):
     """:class:`PBD` on a model.
 
     Attributes:
-        sweep: The :class:`warpcloth.sweeps.Sweep`, with x − x̃ of the last step.
+        sweep: The :class:`warpcloth.numerics.sweeps.Sweep`, with x − x̃ of the last step.
     """
 
     def __init__(self, options, model):

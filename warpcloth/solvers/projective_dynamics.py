@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..acceleration import LBFGS, Anderson, Chebyshev
-from ..capture import Mirror, Segment
-from ..checks import choice, number, whole
+from ..base.checks import choice, number, whole
+from ..core.capture import Mirror, Segment
+from ..core.operators import CHUNKS, Energy, Gradient, Sums, constant_matrices
+from ..core.status import UNBALANCED, Residual, Result
 from ..kernels import accelerate as kernels
 from ..kernels.minimise import add_inertia
-from ..linear import CopyFactors, DiagonalScaling
-from ..operators import CHUNKS, Energy, Gradient, Sums, constant_matrices
-from ..status import UNBALANCED, Residual, Result
+from ..numerics.acceleration import LBFGS, Anderson, Chebyshev
+from ..numerics.linear import CopyFactors, DiagonalScaling
 from .solver import ImplicitStep, Stepper, refuse_hard, refuse_without_projection
 
 ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")

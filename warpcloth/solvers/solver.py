@@ -7,17 +7,17 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..capture import Segment
-from ..checks import choice, number, shown, whole
-from ..damping import Past, damped_terms, refuse_apart
-from ..integrators import INTEGRATORS
+from ..base.checks import choice, number, shown, whole
+from ..base.limits import MOST
+from ..base.turns import in_turn, methods_in_turn
+from ..core.capture import Segment
+from ..core.reset import Reset
+from ..core.status import Result
 from ..kernels import step as kernels
-from ..limits import MOST
-from ..model import Model
-from ..reset import Reset
-from ..scene import Scene
-from ..status import Result
-from ..turns import in_turn, methods_in_turn
+from ..model.damping import Past, damped_terms, refuse_apart
+from ..model.model import Model
+from ..numerics.integrators import INTEGRATORS
+from ..scene.scene import Scene
 
 
 class State(NamedTuple):
@@ -37,7 +37,7 @@ class Step:
         ordered: Whether the result depends on the order of elements by more than rounding.
         staggered: Whether velocities belong to a time half a step before that of the positions.
         closes: Whether a step may close a gap regardless of the stiffness.
-        residual: The :class:`warpcloth.status.Residual` that its steps report, or None.
+        residual: The :class:`warpcloth.core.status.Residual` that its steps report, or None.
 
     Raises:
         ValueError: If both or neither are given, or they are not above 0.
@@ -116,7 +116,7 @@ class ImplicitStep(Step):
 
     Attributes:
         dt, substeps: See :class:`Step`.
-        integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, see :mod:`warpcloth.integrators`.
+        integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, see :mod:`warpcloth.numerics.integrators`.
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -138,11 +138,11 @@ class Stepper:
         state: :class:`State`.
         h: Step [s].
         model: The model, its terms damped as a step has it.
-        past: What they know of the state before, see :class:`warpcloth.damping.Past`.
-        integrator: What leads to x̃ and away from the minimiser, see :mod:`warpcloth.integrators`.
+        past: What they know of the state before, see :class:`warpcloth.model.damping.Past`.
+        integrator: What leads to x̃ and away from the minimiser, see :mod:`warpcloth.numerics.integrators`.
         he: Its hₑ [s].
         steps_per_frame: Steps a frame.
-        results: The worst :class:`warpcloth.status.Result` of each copy so far, a list of B.
+        results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 of methods that have none.
         iterations: Iterations of the last step; sweeps of methods that sweep, 1 of methods that do not iterate.
         factorise_seconds: What factorising constant matrices took, once, [s]; 0 of methods that have none.

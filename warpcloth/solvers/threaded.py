@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..reset import Reset
+from ..core.reset import Reset
 from .solver import State, Stepper
 
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..capture import Mirror
-from ..checks import choice, number, whole
-from ..damping import Past
+from ..base.checks import choice, number, whole
+from ..core.capture import Mirror
+from ..core.operators import Gradient, Sums
+from ..core.status import UNBALANCED, Residual, Result
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
-from ..operators import Gradient, Sums
-from ..status import UNBALANCED, Residual, Result
-from ..sweeps import IN_PLACE, Sweep, refuse_unprojectable
+from ..model.damping import Past
+from ..numerics.sweeps import IN_PLACE, Sweep, refuse_unprojectable
 from .solver import ImplicitStep, LaunchedStepper, refuse_hard, require_model
 
 
@@ -104,7 +104,7 @@ class XPBDStepper(LaunchedStepper):
     """:class:`XPBD` on a model.
 
     Attributes:
-        sweep: The :class:`warpcloth.sweeps.Sweep`, with x − x̃ and λ of the last step.
+        sweep: The :class:`warpcloth.numerics.sweeps.Sweep`, with x − x̃ and λ of the last step.
     """
 
     def __init__(self, options, model):

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd
 
-from ..interrupts import deferred
-from ..outputs import Lock
+from ..base.interrupts import deferred
+from ..base.outputs import Lock
 from .layers import flatten, named_from, relative_path
 from .packages import Contents
 from .stage import METADATA_KEY, followed, identity

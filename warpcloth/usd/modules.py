@@ -2,7 +2,7 @@
 
 import math
 
-from ..interrupts import deferred
+from ..base.interrupts import deferred
 
 with deferred(math.inf):
     from pxr import Ar, Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-from ..limits import MOST_FRAMES
-from ..mesh import Mesh
-from ..scene import DOWN, EARTH, Pins, Scene
-from ..terms import TERMS, QuadraticBending, Spring
+from ..base.limits import MOST_FRAMES
+from ..mesh.mesh import Mesh
+from ..scene.scene import DOWN, EARTH, Pins, Scene
+from ..terms.terms import TERMS, QuadraticBending, Spring
 from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
 from .chunks import export
 from .layers import scene_layer

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
-from ..mesh import Mesh
+from ..mesh.mesh import Mesh
 from .values import (
     array_of,
     check_composed,

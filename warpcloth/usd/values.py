@@ -10,7 +10,7 @@ from io import StringIO
 import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from ..checks import shown
+from ..base.checks import shown
 
 # Beyond it neighbouring time codes, which are float64, are more than 1e-7 apart and cannot tell frames apart.
 MOST_TIME_CODE = 1e9

@@ -1,0 +1,303 @@
+"""Factories of what sums over the elements of a vertex in a fixed order, of all terms in one pass: deterministic on a GPU."""
+
+from functools import cache
+
+import warp as wp
+
+from ..assemble import types
+from ..elements import Part, chain_of, elements_of, local_gradient, of_corner
+from ..memory import load, load_shared, store
+from .packed_residual import unpack
+
+
+@cache
+def sum_of_lanes(dtype, lanes: int):
+    """The device function (value) → its sum over the ``lanes`` threads, neighbours in a warp, that take one vertex."""
+    vec3, _ = types(dtype)
+    shuffle = "value.c[{0}] += __shfl_xor_sync(mask, value.c[{0}], n);"
+
+    @wp.func_native(
+        f"const unsigned mask = {(1 << lanes) - 1}u << (threadIdx.x & 31 & ~{lanes - 1}); "
+        f"for (int n = 1; n < {lanes}; n *= 2) {{ {' '.join(shuffle.format(c) for c in range(3))} }} return value;"
+    )
+    def sum_over_lanes(value: vec3) -> vec3: ...
+
+    return sum_over_lanes
+
+
+@cache
+def move_of(dtype, ahead):
+    """The device function (v, i, h) → what xᵢ is moved by: h vᵢ, or of int32 what is packed in vᵢ in units of h."""
+    vec3, _ = types(dtype)
+    if ahead is wp.int32:
+        whole = load(wp.int32)
+
+        @wp.func
+        def unpacked(v: wp.array(dtype=wp.int32), i: int, unit: dtype):
+            return unpack(whole(v, i), unit)
+
+        return unpacked
+    vector = load(vec3)
+
+    @wp.func
+    def scaled(v: wp.array(dtype=vec3), i: int, h: dtype):
+        return h * vector(v, i)
+
+    return scaled
+
+
+@cache
+def gather_term(part: Part, dtype, ahead=None, lanes: int = 1):
+    """The device function (elements, i, lane, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term.
+
+    The first is taken at x, or where :func:`move_of` has moved it if the type of v is given as ``ahead``. Of ``lanes`` threads
+    for a vertex each takes every so manieth element.
+    """
+    if part.rows:
+        return gather_rows(part, dtype, ahead, lanes)
+    if part.pairs:
+        return gather_pairs(part, dtype, ahead, lanes)
+    vec3, _ = types(dtype)
+    v_type = ahead or vec3
+    term = part.term
+    K, damped, shared, padded = wp.constant(term.vertices), part.damped, part.shared, part.padded
+    moved = damped or ahead is not None
+    y_type = wp.types.matrix((term.rows, 3), dtype)
+    (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype, ahead is not None)
+    vector, whole, vertex, number = load(vec3), load(wp.int32), load(wp.int32, 2), load_shared(dtype)
+    moves = move_of(dtype, ahead)
+    rest_of = load(wp.types.vector(term.parameters, dtype))
+
+    @wp.func
+    def total_of(
+        elements: elements_of(part, dtype),
+        i: int,
+        lane: int,
+        count: int,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=v_type),
+        h: dtype,
+    ):
+        total = vec3()
+        beta = dtype(0.0)
+        k = dtype(0.0)
+        if wp.static(shared):
+            k = number(elements.stiffness, 0)
+        slot = whole(elements.offsets, i)
+        left = whole(elements.offsets, i + 1) - slot - lane
+        if wp.static(padded):
+            slot = lane * count + i
+        else:
+            slot += lane
+        while left > 0:
+            code = whole(elements.codes, slot)
+            e = code // K
+            r = rest_of(elements.rest, e)
+            y = y_type()
+            dy = y_type()
+            for corner in range(K):
+                j = vertex(elements.stencil, K * e + corner)
+                y += part_of(r, corner, vector(x, j))
+                if wp.static(moved):
+                    dy += part_of(r, corner, moves(v, j, h))
+            if wp.static(damped):
+                beta = number(elements.damping, e)
+            if wp.static(not shared):
+                k = number(elements.stiffness, e)
+            total += force_of(r, code - K * e, local(k, beta, r, y, dy, h))
+            if wp.static(padded):
+                slot += lanes * count
+            else:
+                slot += lanes
+            left -= lanes
+        return total
+
+    return total_of
+
+
+@cache
+def gather_pairs(part: Part, dtype, ahead, lanes: int):
+    """The same of pairs, without a branch: an empty slot pairs the vertex with itself, where forces are 0 in any direction.
+
+    So all slots are read at once; one after another they take 1.2 times as long (H200, 64² vertices).
+    """
+    vec3, _ = types(dtype)
+    v_type = ahead or vec3
+    term = part.term
+    (firsts, seconds), damped, shared = part.pairs, part.damped, part.shared
+    slots = firsts + seconds
+    apart = shared and not damped
+    ragged, each, firsts, slots = slots % lanes > 0, wp.constant(-(-slots // lanes)), wp.constant(firsts), wp.constant(slots)
+    moved = damped or ahead is not None
+    y_type = wp.types.matrix((term.rows, 3), dtype)
+    (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype, ahead is not None)
+    vector, whole, number, moves = load(vec3), load(wp.int32), load_shared(dtype), move_of(dtype, ahead)
+    rest_of = load(wp.types.vector(term.parameters, dtype))
+
+    @wp.func
+    def total_of(
+        elements: elements_of(part, dtype),
+        i: int,
+        lane: int,
+        count: int,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=v_type),
+        h: dtype,
+    ):
+        total = vec3()
+        beta = dtype(0.0)
+        place = vector(x, i)
+        move = vec3()
+        if wp.static(moved):
+            move = moves(v, i, h)
+        k = dtype(1.0)
+        for n in range(each):
+            s = n * lanes + lane
+            if wp.static(ragged):
+                s = wp.min(s, slots - 1)
+            corner = wp.where(s < firsts, 0, 1)  # of one lane known to the compiler, and so are the weights
+            slot = s * count + i
+            code = whole(elements.codes, slot)
+            if wp.static(ragged):
+                code = wp.where(n * lanes + lane < slots, code, i)
+            r = rest_of(elements.rest, slot)
+            y = part_of(r, corner, place) + part_of(r, 1 - corner, vector(x, code))
+            dy = y_type()
+            if wp.static(moved):
+                dy = part_of(r, corner, move) + part_of(r, 1 - corner, moves(v, code, h))
+            if wp.static(damped):
+                beta = number(elements.damping, slot)
+            if wp.static(not apart):
+                k = number(elements.stiffness, slot)
+            total += force_of(r, corner, local(k, beta, r, y, dy, h))
+        if wp.static(apart):
+            total *= number(elements.stiffness, i)
+        return total
+
+    return total_of
+
+
+@cache
+def gather_rows(part: Part, dtype, ahead, lanes: int):
+    """The same of a quadratic energy by the rows of its matrix Q: ∂U/∂xᵢ = Σⱼ Qᵢⱼ (xⱼ − xᵢ), for rows that add up to 0."""
+    vec3, _ = types(dtype)
+    v_type = ahead or vec3
+    vector, whole, number, moves = load(vec3), load(wp.int32), load(dtype), move_of(dtype, ahead)
+    moved, ragged = ahead is not None, part.rows % lanes > 0
+    each, slots = wp.constant(-(-part.rows // lanes)), wp.constant(part.rows)
+
+    @wp.func
+    def pull_of(
+        elements: elements_of(part, dtype),
+        slot: int,
+        place: vec3,
+        move: vec3,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=v_type),
+        h: dtype,
+    ):
+        j = whole(elements.codes, slot)
+        apart = vector(x, j) - place
+        if wp.static(moved):
+            apart += moves(v, j, h) - move
+        return number(elements.stiffness, slot) * apart
+
+    @wp.func
+    def total_of(
+        elements: elements_of(part, dtype),
+        i: int,
+        lane: int,
+        count: int,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=v_type),
+        h: dtype,
+    ):
+        total = vec3()
+        place = vector(x, i)
+        move = vec3()
+        if wp.static(moved):
+            move = moves(v, i, h)
+        for n in range(each):
+            s = n * lanes + lane
+            if wp.static(ragged):
+                if s < slots:
+                    total += pull_of(elements, s * count + i, place, move, x, v, h)
+            else:
+                total += pull_of(elements, s * count + i, place, move, x, v, h)
+        return total
+
+    return total_of
+
+
+@cache
+def gather_terms(parts: tuple[Part, ...], dtype, ahead=None, lanes: int = 1):
+    """The same of all terms."""
+    vec3, _ = types(dtype)
+    v_type = ahead or vec3
+    chain_type = chain_of(parts, dtype)
+
+    if not parts:
+
+        @wp.func
+        def total_of_nothing(
+            chain: chain_type, i: int, lane: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=v_type), h: dtype
+        ):
+            return vec3()
+
+        return total_of_nothing
+    first, others = gather_term(parts[0], dtype, ahead, lanes), gather_terms(parts[1:], dtype, ahead, lanes)
+
+    @wp.func
+    def total_of(
+        chain: chain_type, i: int, lane: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=v_type), h: dtype
+    ):
+        return first(chain.first, i, lane, count, x, v, h) + others(chain.others, i, lane, count, x, v, h)
+
+    return total_of
+
+
+@cache
+def sum_at_vertices(parts: tuple[Part, ...], dtype, ahead=None, lanes: int = 1):
+    """The device function (thread, chain, N, x, v, h) → that sum of vertex ``thread // lanes``, in all its threads."""
+    vec3, _ = types(dtype)
+    v_type = ahead or vec3
+    total_of = gather_terms(parts, dtype, ahead, lanes)
+    chain_type = chain_of(parts, dtype)
+    if lanes == 1:
+
+        @wp.func
+        def alone(thread: int, chain: chain_type, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=v_type), h: dtype):
+            return total_of(chain, thread, 0, count, x, v, h)
+
+        return alone
+    sum_over = sum_of_lanes(dtype, lanes)
+
+    @wp.func
+    def together(thread: int, chain: chain_type, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=v_type), h: dtype):
+        i = thread // lanes
+        return sum_over(total_of(chain, i, thread - i * lanes, count, x, v, h))
+
+    return together
+
+
+@cache
+def gather_gradient(parts: tuple[Part, ...], dtype, corrected: bool = False, lanes: int = 1):
+    """Kernel over vertices, ``lanes`` threads each: adds ∂U/∂x [N] of all terms, at x or if ``corrected`` at x + d, to out."""
+    vec3, _ = types(dtype)
+    total_of = sum_at_vertices(parts, dtype, vec3 if corrected else None, lanes)
+    vector, put = load(vec3), store(vec3)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather(
+        chain: chain_of(parts, dtype),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        out: wp.array(dtype=vec3),
+    ):
+        thread = wp.tid()
+        total = total_of(thread, chain, x.shape[0], x, d, dtype(1.0))
+        i = thread // lanes
+        if thread == i * lanes:
+            put(out, i, vector(out, i) + total)
+
+    return gather

@@ -1,0 +1,289 @@
+"""Measures of an animated cloth: deformation, strain, rotation and their rates, frame by frame or of all frames at once."""
+
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+
+from ..base.checks import choice, number
+from ..mesh.mesh import same_topology
+from ..mesh.sequences import Sequence, as_sequence, open_sequence
+from ..model.model import DTYPES
+from .frame_pairs import pairs_of
+from .measures import chosen
+from .samples import Analysis, Exclusion, Sample
+from .surfaces import RATES, Neighbourhoods, Triangles, check_material, material_directions
+
+_MOST = 100  # missing frames that have a sentence each
+
+
+def analyze(mesh, frames, dt=None, **options):
+    """Measures an animation.
+
+    With a ``neighbourhood`` of each vertex, else of each triangle: see :data:`warpcloth.analysis.measures.MEASURES` for all
+    measures, or the table in the README. Everything is kept; :class:`Analyzer` gives a row at a time, in memory that does not
+    grow.
+
+    Args:
+        mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape; None for that of the file.
+        frames: Points (F, n, 3) [m], an :class:`warpcloth.Animation`, anything that :func:`warpcloth.open_sequence` opens or
+            returned.
+        dt: Time between frames [s], which rates need; a file or an animation has its own.
+        options: As of :class:`Analyzer`.
+
+    Returns:
+        :class:`Analysis`.
+
+    Raises:
+        ValueError: As :class:`Analyzer`; or a frame is broken.
+    """
+    analyzer = Analyzer(mesh, frames, dt, **options)
+    values = {
+        measure.name: np.empty((len(analyzer.pairs), analyzer.count, *measure.shape), analyzer.dtype)
+        for measure in analyzer.measures
+    }
+    references, labels, times, excluded = [], [], [], []
+    for sample in analyzer:
+        for name, found in sample.values.items():
+            values[name][sample.row] = found
+        references.append(sample.reference)
+        labels.append(sample.frame)
+        times.append(sample.time)
+        excluded += sample.excluded
+    measures = {measure.name: measure for measure in analyzer.measures}
+    return Analysis(analyzer.mesh, analyzer.on, measures, references, np.array(labels), np.array(times), excluded, values)
+
+
+class Analyzer:
+    """Measures of an animation, row by row: ``for sample in Analyzer(mesh, frames): …`` gives a :class:`Sample` for each.
+
+    A row is a frame against its reference. Memory holds three frames, however many there are.
+
+    Args:
+        mesh: As of :func:`analyze`.
+        frames: As there.
+        dt: As there.
+        measures: Names, or "all" that can be had with what is given. Nothing else is computed.
+        reference: "rest", "first", "previous" or the number of a frame, see :func:`warpcloth.analysis.frame_pairs.pairs_of`;
+            instead of it ``pairs`` or ``lag``.
+        pairs: "1:2,1:3", reference and frame.
+        lag: Frames from reference to frame.
+        every: Every k-th frame alone.
+        neighbourhood: None for triangles; of vertices "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m],
+            "nearest:2%" of all vertices, or a set of vertices for each. Fixed by the rest shape.
+        rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt then; "logarithm", exact
+            for a constant L. All need turns below 180° from frame to frame. D is accurate for small turns: if a frame turns by
+            θ, midpoint makes a strain 1/cos²(θ/2) times too large, and logarithm up to θ/sin θ times. The first frame, which
+            has none before it, has no rates.
+        directions: Warp and weft: "st" for the texture coordinates, or a vector (3,) in the rest shape.
+        material: A membrane term for energy and stress, such as :class:`warpcloth.NeoHookeanMembrane`.
+        device: A Warp device.
+        dtype: "float32" or "float64".
+
+    Attributes:
+        mesh, sequence: What is measured.
+        on, count: "triangle" or "vertex", and how many.
+        measures: List of :class:`warpcloth.analysis.measures.Measure`.
+        pairs: List of :class:`warpcloth.analysis.frame_pairs.Pair`.
+
+    Raises:
+        ValueError: An option is none of those above; a measure needs one that is not given; the mesh has no triangles.
+    """
+
+    def __init__(
+        self,
+        mesh,
+        frames,
+        dt=None,
+        measures=("stretch",),
+        reference=None,
+        pairs=None,
+        lag=None,
+        every=1,
+        neighbourhood=None,
+        rates="midpoint",
+        directions=None,
+        material=None,
+        device="cpu",
+        dtype="float64",
+    ):
+        self._given = {name: value for name, value in locals().items() if name != "self"}
+        choice("rates", rates, tuple(RATES))
+        choice("dtype", dtype, tuple(DTYPES))
+        self.sequence = _sequence(mesh, frames, dt)
+        self.mesh = self.sequence.mesh if mesh is None else mesh
+        if not len(self.mesh.triangles):
+            raise ValueError("mesh: is of edges alone, must have triangles, for what is measured is a surface")
+        self.on = "triangle" if neighbourhood is None else "vertex"
+        self.measures = self._chosen(measures, directions, material)
+        self.pairs, self._left_out = pairs_of(self.sequence.labels, reference, pairs, lag, every)
+        self.rates, self.dtype = rates, DTYPES[dtype][1]
+        self._check_times()
+        if self.on == "triangle":
+            if material is not None:
+                check_material(material)
+            seams = self.sequence.stage and self.sequence.stage.corner_coordinates
+            threads = None if directions is None else material_directions(self.mesh, directions, seams)
+            self._elements = Triangles(self.mesh, self.measures, threads, material, device, dtype)
+        else:
+            for name, value in (("directions", directions), ("material", material)):
+                if value is not None:
+                    raise ValueError(f"{name}: is for measures of triangles, must be None with a neighbourhood")
+            self._elements = Neighbourhoods(self.mesh, self.measures, neighbourhood, device, dtype)
+        self.count = self._elements.count
+        self._reference = self._without = None  # what the elements refer to, and which have none in it
+
+    def _chosen(self, names, directions, material):
+        given = {"directions": directions is not None, "material": material is not None}
+        given["rate"] = self.sequence.times is not None
+        found = chosen(names, self.on, [need for need, there in given.items() if there])
+        advice = {
+            "directions": 'directions="st" or a vector',
+            "material": "material=NeoHookeanMembrane(stiffness=1e3, poisson_ratio=0.3) or another membrane",
+            "rate": "dt, the time between frames [s]",
+        }
+        for measure in found:
+            for need in (measure.needs, "rate" if measure.rate else ""):
+                if need and not given[need]:
+                    raise ValueError(f"measures: {measure.name!r} needs {advice[need]}")
+        return found
+
+    def _check_times(self):
+        """Refuses times between frames of which a number of this precision has no reciprocal."""
+        if any(measure.rate for measure in self.measures):
+            times, least = self.sequence.times, np.finfo(self.dtype).tiny
+            rule = f"must be from {least:g} to {1.0 / least:g}, of which {np.dtype(self.dtype)} has the reciprocal"
+            for pair in self.pairs:
+                dt = 1.0 if pair.before is None else abs(times[pair.frame] - times[pair.before])
+                if not least <= dt <= 1.0 / least:
+                    raise ValueError(f"dt: {dt:g} s to frame {self._label(pair.frame):g}, {rule}")
+
+    def of(self, *measures):
+        """The same analysis of other measures."""
+        return Analyzer(**(self._given | {"frames": self.sequence, "dt": None, "measures": measures}))
+
+    @property
+    def areas(self):
+        """Rest areas (E,) of triangles, or lumped ones of vertices [m²]."""
+        return self.mesh.triangle_areas if self.on == "triangle" else self.mesh.vertex_areas
+
+    def places(self, points):
+        """Where the elements are among points (n, 3): the centroids of triangles, or the vertices, (E, 3)."""
+        if self.on == "vertex":
+            return points
+        a, b, c = self.mesh.triangles.T
+        return (points[a] + points[b] + points[c]) / 3.0
+
+    def __len__(self):
+        return len(self.pairs)
+
+    def __iter__(self):
+        elements, sequence = self._elements, self.sequence
+        labels, times = sequence.labels, sequence.times
+        excluded = _missing(sequence.missing)
+        excluded += [_frame(label, reason) for label, reason in self._left_out]
+        rates = ", ".join(measure.name for measure in self.measures if measure.rate)
+        held, seen, referred = {}, set(), set()
+        for row, pair in enumerate(self.pairs):
+            places = {pair.reference, pair.frame} | ({pair.before} if pair.before is not None else set())
+            held = {place: held[place] if place in held else self._read(place) for place in places}
+            for place in places - seen:
+                vertices = np.flatnonzero(held[place].lost_vertices)
+                if len(vertices):
+                    excluded.append(Exclusion(self._label(place), "vertex", vertices, "is not at a finite place"))
+            without = self._refer(held[pair.reference])
+            if pair.reference not in referred:
+                none = np.flatnonzero(without & ~held[pair.reference].lost)
+                if len(none):
+                    excluded.append(Exclusion(self._label(pair.reference), self.on, none, elements.without))
+            seen |= places
+            referred.add(pair.reference)
+            elements.measure(held[pair.frame].points)
+            if rates and pair.before is None:
+                excluded.append(_frame(labels[pair.frame], f"has none before it, and so no {rates}"))
+            elif rates:
+                elements.start(held[pair.before].points)
+                rounding = max(held[place].rounding for place in places)
+                elements.rates(times[pair.frame] - times[pair.before], self.rates, rounding)
+            values = elements.read()
+            known = without | held[pair.reference].lost | held[pair.frame].lost
+            undefined = {}
+            for measure in self.measures:
+                lost = self._exclude(measure, pair, values[measure.name], known, held)
+                if len(lost):
+                    undefined.setdefault((measure.undefined, lost.tobytes()), (lost, []))[1].append(measure.name)
+            for (reason, _), (lost, names) in undefined.items():
+                reason = f"{reason}, so that {', '.join(names)} cannot be said"
+                excluded.append(Exclusion(labels[pair.frame], self.on, lost, reason))
+            time = np.nan if times is None else times[pair.frame]
+            points = held[pair.frame].points
+            yield Sample(row, self._label(pair.reference), labels[pair.frame], pair.frame, time, points, values, excluded)
+            excluded = []
+
+    def _refer(self, held):
+        """Makes the elements refer to a frame, where another iteration may have been since; returns which have none in it."""
+        if self._reference is not held:
+            self._without, self._reference = self._elements.refer(held.points, held.rounding), held
+        return self._without
+
+    def _exclude(self, measure, pair, values, known, held):
+        """Makes what could not be measured NaN in all its numbers; returns elements that are not ``known`` to be so."""
+        if measure.rate:
+            if pair.before is None:
+                values[:] = np.nan
+                return ()
+            known = known | held[pair.before].lost
+        lost = known | ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        values[lost] = np.nan
+        return np.flatnonzero(lost & ~known)
+
+    def _read(self, place):
+        points = self.mesh.points.view() if place is None else self.sequence[place]
+        points.flags.writeable = False  # samples share it with the frames that follow
+        lost = ~np.isfinite(points).all(axis=1)
+        # By the input, and by what computes about one of the points.
+        rounding, found = self.sequence.rounding(points), points[~lost]
+        if len(found):
+            rounding += np.finfo(self.dtype).eps * np.ptp(found, axis=0).max()
+        return _Held(points, rounding, lost, self._elements.touched(lost) if lost.any() else np.zeros(self.count, dtype=bool))
+
+    def _label(self, place):
+        return None if place is None else self.sequence.labels[place]
+
+
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """Points of a frame, what they are rounded by [m], which are not finite (n,), and which elements those touch (E,)."""
+
+    points: np.ndarray
+    rounding: float
+    lost_vertices: np.ndarray
+    lost: np.ndarray
+
+
+def _missing(labels):
+    """Exclusions of frames that are not there; of very many, as one stray file may leave, a single one."""
+    if len(labels) <= _MOST:
+        return [_frame(label, "is missing") for label in labels]
+    return [_frame(labels[0], f"is missing, and so are {len(labels) - 1} more, the last of them {labels[-1]:g}")]
+
+
+def _frame(label, reason):
+    return Exclusion(label, "frame", np.empty(0, dtype=int), reason)
+
+
+def _sequence(mesh, frames, dt):
+    if isinstance(frames, (str, PathLike)):
+        if dt is not None:
+            number("dt", dt, above=0.0)
+        frames = open_sequence(frames, fps=None if dt is None else 1.0 / dt, mesh=mesh)
+    elif not isinstance(frames, Sequence):
+        return as_sequence(mesh, frames, dt)
+    elif dt is not None:
+        raise ValueError("dt: is for arrays and files, must be None with a sequence, which has times or was opened without")
+    if mesh is not None and not same_topology(mesh, frames.mesh):
+        raise ValueError(
+            f"mesh: {len(mesh.points)} vertices and {len(mesh.triangles)} triangles, must be those of the frames, "
+            f"{len(frames.mesh.points)} and {len(frames.mesh.triangles)}, in their order"
+        )
+    return frames

@@ -1,0 +1,291 @@
+"""How far two animated cloths are apart, frame by frame: positions, surfaces and stretches."""
+
+from dataclasses import dataclass, replace
+from os import PathLike
+
+import numpy as np
+
+from ..base.checks import choice, number, shown, whole
+from ..mesh.mesh import UP_AXES, same_topology
+from ..mesh.sequences import Sequence, as_sequence, open_sequence
+from .distances import surface_distances, triangle_areas
+from .measures import MEASURES
+from .samples import Exclusion
+from .surfaces import Triangles
+
+_SAME_TIME = 1e-6  # of the shortest frame
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two sequences of frames, a and b, side by side. Of the pairs of dimension (2,) the first is a's.
+
+    A frame is a pair of frames of one time. Where it could not be compared its numbers are NaN, and ``excluded`` says why.
+    Vertices and triangles of the one are compared with those of the other where the topology is the same; where it is not
+    these arrays are None, and what is left is how far the surfaces are apart.
+
+    Attributes:
+        same_topology: Whether both have the same number of vertices and the same triangles, in the same order.
+        up_axes: The up axes of a and b, "Y" or "Z", or None if the input does not say. If they differ, b was turned to the axis
+            of a.
+        times: Times of the frames (F,) [s].
+        frames: Their indices in a and in b (F, 2).
+        labels: Their numbers as the files have them (F, 2).
+        unmatched: Indices of the frames of a, and of b, that have no partner at their time: two arrays.
+        excluded: What could not be compared of a, and of b: two lists of `analysis.Exclusion`, with numbers of frames as in the
+            file. Triangles that have no area at rest in the one count for the stretches in neither.
+        sizes: Diagonal of the bounding box of a (F,) [m].
+        rms: Root mean square over vertices of ‖aᵢ − bᵢ‖ (F,) [m], or None.
+        largest: The largest of these distances (F,) [m], or None.
+        largest_vertex: The vertex that has it (F,), −1 of what is excluded, or None.
+        surface_mean: Mean distance of a's vertices to the surface of b, and the other way (F, 2) [m]. A vertex counts by the
+            area about it, a third of that of its triangles in the frame; one without triangles is on no surface.
+        surface_rms: Root mean square of the same (F, 2) [m].
+        surface_largest: The largest of the same (F, 2) [m].
+        hausdorff: The larger of the two (F,) [m], the Hausdorff distance as vertices have it. That of the surfaces is no less,
+            but for the rounding of `surface_distances`, and may be more, for they may be further apart between vertices.
+        hausdorff_bound: What it is at most (F,) [m]: hausdorff + l/√3 with the longest side l, for a point of a triangle is
+            within l/√3 of one of its vertices; or ``largest`` where that is less.
+        stretch_rms: Root mean square over triangles of the differences of the principal stretches λ₁ ≥ λ₂, the singular values
+            of the deformation gradient from the own rest shape (F, 2: λ₁, λ₂) [1], or None.
+        stretch_largest: The largest of these differences (F, 2: λ₁, λ₂) [1], or None.
+    """
+
+    same_topology: bool
+    up_axes: tuple
+    times: np.ndarray
+    frames: np.ndarray
+    labels: np.ndarray
+    unmatched: tuple
+    excluded: tuple
+    sizes: np.ndarray
+    surface_mean: np.ndarray
+    surface_rms: np.ndarray
+    surface_largest: np.ndarray
+    hausdorff: np.ndarray
+    hausdorff_bound: np.ndarray
+    rms: np.ndarray | None = None
+    largest: np.ndarray | None = None
+    largest_vertex: np.ndarray | None = None
+    stretch_rms: np.ndarray | None = None
+    stretch_largest: np.ndarray | None = None
+
+    @property
+    def relative_rms(self):
+        """``rms`` by ``sizes`` (F,), NaN where a is a point; None where ``rms`` is."""
+        if self.rms is None:
+            return None
+        return np.divide(self.rms, self.sizes, out=np.full(len(self.rms), np.nan), where=self.sizes > 0.0)
+
+
+def compare(
+    a,
+    b,
+    prim_a=None,
+    prim_b=None,
+    fps=None,
+    fps_a=None,
+    fps_b=None,
+    frames=None,
+    device="cpu",
+    progress=None,
+    up_axis=None,
+    up_axis_a=None,
+    up_axis_b=None,
+):
+    """Compares two animations frame by frame, those frames that both have.
+
+    One frame of each is in memory at a time. Frames belong together by time: where times differ by no more than 1e-6 of the
+    shortest frame. The same frames of the same triangles give zeros.
+
+    Args:
+        a: What `open_sequence` takes or returned, or (mesh, frames): a rest shape, and a path or what `as_sequence` takes.
+        b: The same.
+        prim_a: Prim of a stage with several.
+        prim_b: The same of b.
+        fps: Frames per second of both, where they say nothing or are to have others than they say.
+        fps_a: The same of a alone.
+        fps_b: The same of b alone.
+        frames: Compare only that many frames after the first that both have.
+        device: A Warp device.
+        progress: Function called with (frame, frames) once each frame is compared, ``frames`` being those after the first.
+        up_axis: "Y" or "Z", the up axis of both, which overrides what they say. If one is Y up and the other Z up, b is turned
+            about x by 90° to the axis of a: (x, y, z) of Z up is (x, z, −y) of Y up. An animation that does not say its axis
+            is taken to have that of the other.
+        up_axis_a: The up axis of a alone.
+        up_axis_b: The up axis of b alone.
+
+    Returns:
+        :class:`Comparison`.
+
+    Raises:
+        ValueError: An input is refused or has no times, a frame cannot be read, no two frames have one time, or none of those
+            that do can be compared.
+    """
+    if frames is not None:
+        whole("frames", frames, least=0)
+    a = opened("a", a, prim_a, fps if fps_a is None else fps_a)
+    b = opened("b", b, prim_b, fps if fps_b is None else fps_b)
+    for name, sequence in (("a", a), ("b", b)):
+        if sequence.times is None:
+            where = name if sequence.path is None else sequence.path
+            raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
+    up_axes = tuple(
+        up_axis_of(*given) for given in (("up_axis_a", a, up_axis_a or up_axis), ("up_axis_b", b, up_axis_b or up_axis))
+    )
+    b = _turned(b, *up_axes)
+    pairs = _matching(a, b)
+    unmatched = tuple(np.setdiff1d(np.arange(len(s)), places) for s, places in zip((a, b), pairs.T, strict=True))
+    pairs = pairs if frames is None else pairs[: frames + 1]
+    pair = _Pair(a, b, device)
+    rows = []
+    for frame, places in enumerate(pairs):
+        rows.append(pair.measure(*places))
+        if progress is not None:
+            progress(frame, len(pairs) - 1)
+    if not any(rows):
+        why = next(one for excluded in pair.excluded for one in excluded if one.kind == "vertex")
+        raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
+    labels = np.column_stack([s.labels[places] for s, places in zip((a, b), pairs.T, strict=True)])
+    excluded = tuple(pair.excluded)
+    return Comparison(pair.same, up_axes, a.times[pairs[:, 0]], pairs, labels, unmatched, excluded, **_columns(rows))
+
+
+def opened(name, source, prim=None, fps=None):
+    """The `Sequence` of one of the two, as `compare` takes it; ``name`` is for errors."""
+    if isinstance(source, Sequence):
+        return source
+    if isinstance(source, (str, PathLike)):
+        return open_sequence(source, prim, fps)
+    if not isinstance(source, tuple) or len(source) != 2:
+        raise ValueError(f"{name} is {shown(source)}; it must be a path, a Sequence, or (mesh, frames)")
+    mesh, frames = source
+    if not isinstance(frames, (str, PathLike)):
+        if fps is not None:
+            number("fps", fps, above=0.0)
+        return as_sequence(mesh, frames, dt=None if fps is None else 1.0 / fps)
+    sequence = open_sequence(frames, prim, fps, mesh)
+    if not same_topology(mesh, sequence.mesh):
+        raise ValueError(f"{name}: its mesh is {mesh}, and {frames} has other triangles; it must be the rest shape of these")
+    return replace(sequence, mesh=mesh, declared=True, up_axis=sequence.up_axis or mesh.up_axis)
+
+
+def up_axis_of(name, sequence, given):
+    """Returns the up axis that is given for a sequence, or its own."""
+    if given is not None:
+        choice(name, given, UP_AXES)
+    return given or sequence.up_axis
+
+
+def _turned(b, axis_a, axis_b):
+    """Turns the frames of b to the up axis of a, without rounding; leaves b alone if the axes agree or one is not known."""
+    if axis_a is None or axis_b is None or axis_a == axis_b:
+        return b
+    columns, signs = ([0, 2, 1], [1.0, 1.0, -1.0]) if axis_a == "Y" else ([0, 2, 1], [1.0, -1.0, 1.0])
+    return replace(b, read=lambda frame: b[frame][:, columns] * signs)
+
+
+def _matching(a, b):
+    """Places of the frames of one time (F, 2), F at least 1."""
+    steps = np.concatenate([np.diff(a.times), np.diff(b.times)])
+    near = _SAME_TIME * (steps.min() if len(steps) else 1.0)
+    after = np.searchsorted(b.times, a.times - near).clip(max=len(b) - 1)
+    found = np.abs(b.times[after] - a.times) <= near
+    if not found.any():
+        spans = " and ".join(f"{len(s)} from {s.times[0]:g} to {s.times[-1]:g} s" for s in (a, b))
+        raise ValueError(f"no frame of a has the time of a frame of b; they have {spans}")
+    return np.column_stack([np.flatnonzero(found), after[found]])
+
+
+def _columns(rows):
+    """Arrays by name from a dict for each frame, which is empty where the frame is excluded."""
+    first = next(row for row in rows if row)
+    missing = {name: -1 if name == "largest_vertex" else np.full(np.shape(value), np.nan) for name, value in first.items()}
+    return {name: np.array([row.get(name, missing[name]) for row in rows]) for name in first}
+
+
+class _Pair:
+    """Measures frames of two sequences against each other; collects what is ``excluded`` of each."""
+
+    def __init__(self, a, b, device):
+        self.sequences, self.device = (a, b), device
+        self.triangles = a.mesh.triangles, b.mesh.triangles
+        self.used = [np.unique(triangles) for triangles in self.triangles]
+        self.same = same_topology(a.mesh, b.mesh)
+        self.excluded = [[_whole(label, "is missing") for label in s.missing] for s in (a, b)]
+        if self.same:
+            stretch = [MEASURES["triangle"]["stretch"]]
+            self.elements = [Triangles(s.mesh, stretch, None, None, device, "float64") for s in (a, b)]
+            without = [
+                one.refer(s.mesh.points, s.rounding(s.mesh.points)) for one, s in zip(self.elements, (a, b), strict=True)
+            ]
+            for excluded, lost in zip(self.excluded, without, strict=True):
+                if lost.any():
+                    reason = "no area, so that stretches are not compared"
+                    excluded.append(Exclusion(None, "triangle", np.flatnonzero(lost), reason))
+            self.kept = ~(without[0] | without[1])
+
+    def measure(self, i, j):
+        """Numbers by name of frame i of a and j of b; none where a point is not finite."""
+        points = [sequence[place] for sequence, place in zip(self.sequences, (i, j), strict=True)]
+        labels = [sequence.labels[place] for sequence, place in zip(self.sequences, (i, j), strict=True)]
+        lost = [np.flatnonzero(~np.isfinite(x).all(axis=1)) for x in points]
+        for excluded, label, vertices in zip(self.excluded, labels, lost, strict=True):
+            if len(vertices):
+                excluded.append(
+                    Exclusion(label, "vertex", vertices, "not at a finite place, so that the frame is not compared")
+                )
+        if any(map(len, lost)):
+            return {}
+        row, apart = {"sizes": np.linalg.norm(np.ptp(points[0], axis=0))}, None
+        if self.same:
+            apart = np.linalg.norm(points[0] - points[1], axis=1)
+            row |= {"rms": _rms(apart), "largest": apart.max(), "largest_vertex": apart.argmax()} | self._stretches(points)
+        return row | self._surfaces(points, labels, apart)
+
+    def _stretches(self, points):
+        if not self.kept.any():
+            return {"stretch_rms": np.full(2, np.nan), "stretch_largest": np.full(2, np.nan)}
+        for elements, x in zip(self.elements, points, strict=True):
+            elements.measure(x)
+        one, other = (elements.read()["stretch"][self.kept] for elements in self.elements)
+        apart = np.abs(one - other)
+        return {"stretch_rms": _rms(apart), "stretch_largest": apart.max(axis=0)}
+
+    def _surfaces(self, points, labels, apart):
+        """Distances both ways; ``apart`` are those of vertices to their partners, or None."""
+        mean, rms, largest = np.full((3, 2), np.nan)
+        for k, used in enumerate(self.used):
+            found = surface_distances(points[k][used], points[1 - k], self.triangles[1 - k], self.device)
+            if apart is not None:  # a partner is a point of the other surface
+                found = np.minimum(found, apart[used])
+            largest[k] = found.max()
+            thirds = np.repeat(triangle_areas(points[k], self.triangles[k]) / 3.0, 3)
+            areas = np.bincount(self.triangles[k].ravel(), thirds)[used]
+            if areas.sum() > 0.0:
+                weights = areas / areas.sum()
+                mean[k], rms[k] = weights @ found, np.sqrt(weights @ found**2)
+            else:
+                self.excluded[k].append(_whole(labels[k], "has no area, so that there is no mean over its surface"))
+        hausdorff = largest.max()
+        longest = max(_longest_side(x, triangles) for x, triangles in zip(points, self.triangles, strict=True))
+        bound = hausdorff + longest / np.sqrt(3.0)
+        return {
+            "surface_mean": mean,
+            "surface_rms": rms,
+            "surface_largest": largest,
+            "hausdorff": hausdorff,
+            "hausdorff_bound": bound if apart is None else min(bound, apart[self.used[0]].max()),
+        }
+
+
+def _whole(label, reason):
+    return Exclusion(label, "frame", np.empty(0, dtype=int), reason)
+
+
+def _rms(values):
+    return np.sqrt(np.mean(values**2, axis=0))
+
+
+def _longest_side(x, triangles):
+    return np.linalg.norm(x[triangles] - x[np.roll(triangles, 1, axis=1)], axis=2).max()

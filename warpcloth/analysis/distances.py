@@ -1,0 +1,51 @@
+"""Distances of points to a surface of triangles, in float64, with the search of Warp's `wp.Mesh`."""
+
+import numpy as np
+import warp as wp
+
+from ..base.quiet import find_device
+from ..base.turns import in_turn
+from ..kernels import nearest
+
+# 2·area by the sum of the squared sides: an equilateral triangle has 0.29. Float32 searches ones below by their rounding.
+_FLAT = 1e-3
+
+
+def triangle_areas(x, triangles):
+    """Areas of triangles (T,) [m²] between points x (n, 3) [m]."""
+    a, b, c = (x[corner] for corner in triangles.T)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+@in_turn
+def surface_distances(points, x, triangles, device="cpu"):
+    """Distance of each point to the surface that triangles span, flat ones included.
+
+    Warp searches in float32, about the centre of both and by their size; the distance to the triangle that it finds is then
+    computed in float64. So what is found is never too small, and too large by no more than rounding of the search, about 1e-7
+    of the size, where another triangle is nearer by less than that.
+
+    Args:
+        points: (k, 3) [m], finite.
+        x: Vertices of the surface (n, 3) [m], finite.
+        triangles: (T, 3), at least one.
+        device: A Warp device.
+
+    Returns:
+        np.ndarray: (k,) [m].
+    """
+    low, high = (bound(np.stack([bound(points, axis=0), bound(x, axis=0)]), axis=0) for bound in (np.min, np.max))
+    centre = low + 0.5 * (high - low)
+    # A power of two, which rounds nothing.
+    scale = 2.0 ** np.ceil(np.log2(np.max(high - low) / 2.0 or 1.0))
+    points, x = (points - centre) / scale, (x - centre) / scale
+    sides = x[triangles] - x[np.roll(triangles, 1, axis=1)]
+    flat = 2.0 * triangle_areas(x, triangles) <= _FLAT * np.einsum("tki,tki->t", sides, sides)
+    triangles = np.ascontiguousarray(triangles, dtype=np.int32)
+    with wp.ScopedDevice(find_device(device)):
+        mesh = wp.Mesh(wp.array(x, dtype=wp.vec3), wp.array(triangles.ravel(), dtype=wp.int32))
+        elements = [mesh.id, wp.array(triangles, dtype=wp.vec3i), wp.array(np.flatnonzero(flat), dtype=wp.int32)]
+        state = [wp.array(x, dtype=wp.vec3d), wp.array(points, dtype=wp.vec3d)]
+        out = wp.empty(len(points), dtype=wp.float64)
+        wp.launch(nearest.distances(), len(points), inputs=elements + state, outputs=[out])
+        return out.numpy() * scale

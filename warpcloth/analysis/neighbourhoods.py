@@ -1,0 +1,140 @@
+"""Sets of vertices around each vertex of a mesh: rings of neighbours, or the nearest points."""
+
+import re
+import warnings
+
+import numpy as np
+
+from ..base.checks import shown
+from ..numerics.rotation import point_sets
+
+_RULE = 'must be "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, or a set for each'
+_SHARE = 2.0  # per cent
+# Points lie on a line if their spread across it is at most this fraction of the spread along it. An error across the line
+# then turns the set a hundred times as far.
+_LINE = 0.01
+# Number of nearest points that are checked for all vertices at once; more lie on a line only on very uneven meshes.
+_FEW = 8
+
+
+def neighbourhoods(mesh, chosen):
+    """The neighbourhood of each vertex, itself among them.
+
+    Rings follow edges. Nearest points are those of the rest shape, as the crow flies: of a garment they may belong to a layer
+    that only lies near, and a vertex that is not at a finite place has none. A vertex without a triangle has none, and is in
+    none.
+
+    Args:
+        mesh: The :class:`warpcloth.Mesh`.
+        chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, which is
+            "nearest" too; or sets of vertices, (n, k) or n lists. If a share of the vertices is fewer than three, or all of
+            them are on one line, the fewest nearest vertices that determine a rotation are taken, with a warning.
+
+    Returns:
+        tuple: offsets (n + 1,) and members, int32: those of vertex i are members[offsets[i]:offsets[i + 1]].
+
+    Raises:
+        ValueError: It is none of these.
+    """
+    n = len(mesh.points)
+    used = np.ones(n, dtype=bool)
+    used[mesh.isolated] = False
+    if not isinstance(chosen, str):
+        sizes, members = point_sets(chosen, n)
+        if len(sizes) != n:
+            raise ValueError(f"neighbourhood has {len(sizes)} sets, must be one for each of the {n} vertices")
+        return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32), members.astype(np.int32)
+    ring = re.fullmatch(r"([12])-ring", chosen)
+    return _rings(mesh, used, int(ring[1])) if ring else _nearest(mesh, used, chosen)
+
+
+def _rings(mesh, used, count):
+    from scipy.sparse import coo_array
+
+    n, itself = len(used), np.flatnonzero(used)
+    rows, columns = (np.concatenate(part) for part in ((*mesh.edges.T, itself), (*mesh.edges.T[::-1], itself)))
+    reached = near = coo_array((np.ones(len(rows), dtype=np.int32), (rows, columns)), shape=(n, n)).tocsr()
+    for _ in range(count - 1):
+        reached = reached @ near
+    reached.sort_indices()
+    return reached.indptr.astype(np.int32), reached.indices.astype(np.int32)
+
+
+def _nearest(mesh, used, chosen):
+    from scipy.spatial import cKDTree
+
+    vertices = np.flatnonzero(used & np.isfinite(mesh.points).all(axis=1))
+    points = mesh.points[vertices]
+    found = re.fullmatch(r"nearest(?::(?:(k|radius)=([0-9.eE+-]+)|([0-9.eE+-]+)%))?", chosen)
+    kind, value = (None, None) if not found else (found[1] or "share", found[2] or found[3] or _SHARE)
+    try:
+        value = float(value)
+    except (TypeError, ValueError):
+        value = np.nan
+    if not (np.isfinite(value) and value > 0.0) or (kind == "k" and value % 1) or (kind == "share" and value > 100.0):
+        raise ValueError(f"neighbourhood = {shown(chosen)}: {_RULE}")
+    if not len(points):
+        raise ValueError(f"neighbourhood = {shown(chosen)}: no vertex with a triangle is at a finite position, one must be")
+    tree = cKDTree(points)
+    if kind == "radius":
+        # One vertex after another: together they may be more than memory holds as Python's lists.
+        rows = [np.sort(np.asarray(tree.query_ball_point(point, value), dtype=np.int32)) for point in points]
+        sizes = np.array([len(row) for row in rows])
+        members = np.concatenate(rows)
+    else:
+        k = int(value) if kind == "k" else int(np.ceil(value / 100.0 * len(points)))
+        if (kind == "k" and k < 3) or max(k, 3) > len(points):
+            raise ValueError(
+                f"neighbourhood = {shown(chosen)}: is {k} of the {len(points)} vertices, must be 3 or more and at most all"
+            )
+        sizes, members = _sets(tree, k, widen=kind == "share")
+        if wide := np.count_nonzero(sizes > k):
+            warnings.warn(
+                f"neighbourhood = {shown(chosen)}: {k} of the {len(points)} vertices determine{'s' * (k == 1)} no rotation at "
+                f"{wide} of them; there it takes the fewest nearest that do, {sizes[sizes > k].min()} to {sizes.max()}",
+                stacklevel=2,
+            )
+    if sizes.sum() > np.iinfo(np.int32).max:
+        raise ValueError(f"neighbourhood = {shown(chosen)}: has {sizes.sum()} members in all, must be less than 2³¹")
+    counts = np.zeros(len(used), dtype=np.int64)
+    counts[vertices] = sizes
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), vertices[members].astype(np.int32)
+
+
+def _sets(tree, k, widen):
+    """Finds the k nearest points of each point of a tree; with ``widen``, as many as it takes to determine a rotation.
+
+    Returns:
+        tuple: The size of each set (n,), and all sets one after another, each in order of index.
+    """
+    points, n = tree.data, tree.n
+    most = min(max(k, _FEW), n) if widen else k
+    todo = [(np.arange(start, min(start + 4096, n)), 3, most) for start in range(0, n, 4096)]
+    pieces, sizes = [], np.empty(n, dtype=np.int64)
+    while todo:
+        part, least, most = todo.pop()
+        near = tree.query(points[part], k=most)[1]
+        size = np.full(len(part), 0 if widen else k)
+        for count in range(least, most + 1):  # ends soon: three or four points are seldom on a line
+            unknown = np.flatnonzero(size == 0)
+            if not len(unknown):
+                break
+            size[unknown[~_on_a_line(points[near[unknown, :count]])]] = max(count, k)
+        open_, found = (size == 0) & (most < n), (size > 0) | (most == n)
+        size[size == 0] = n
+        if open_.any():
+            todo.append((part[open_], most + 1, min(2 * most, n)))
+        near = np.where(np.arange(most) < size[:, None], near, n)[found]
+        sizes[part[found]] = size[found]
+        pieces.append((part[found], np.sort(near, axis=1)))
+    ends, members = np.cumsum(sizes), np.empty(sizes.sum(), dtype=np.int32)
+    for part, near in pieces:
+        at = (ends - sizes)[part][:, None] + np.arange(near.shape[1])
+        members[at[near < n]] = near[near < n]
+    return sizes, members
+
+
+def _on_a_line(sets):
+    """Whether the points of each set (m, k, 3) lie on a line."""
+    spread = np.linalg.svd(sets - sets.mean(axis=1, keepdims=True), compute_uv=False)
+    return ~(spread[:, 1] > _LINE * spread[:, 0])

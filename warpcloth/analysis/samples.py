@@ -1,0 +1,98 @@
+"""What an analysis gives: rows of measures, and what could not be measured."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+_SHOWN = 8  # elements that a sentence names
+
+
+@dataclass(frozen=True, eq=False)
+class Exclusion:
+    """What could not be measured.
+
+    Attributes:
+        frame: Number of the frame; None for the rest shape.
+        kind: "triangle", "vertex" or "frame", of which there are no elements.
+        elements: Indices (k,).
+        reason: Why, as the end of a sentence.
+    """
+
+    frame: float | None
+    kind: str
+    elements: np.ndarray
+    reason: str
+
+    def __str__(self):
+        where = "rest shape" if self.frame is None else f"frame {self.frame:g}"
+        if self.kind == "frame":
+            return f"{where} {self.reason}"
+        named = ", ".join(map(str, self.elements[:_SHOWN].tolist())) + (", …" if len(self.elements) > _SHOWN else "")
+        kind = {"triangle": ("triangle", "triangles"), "vertex": ("vertex", "vertices")}[self.kind][len(self.elements) > 1]
+        count = f"{len(self.elements)} " if len(self.elements) > 1 else ""
+        return f"{where}, {count}{kind} {named}: {self.reason}"
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One row of an analysis: a frame measured against its reference.
+
+    Attributes:
+        row: Its place among the rows.
+        reference: Number of the reference frame; None for the rest shape.
+        frame: Number of the frame.
+        place: Place of the frame in its sequence.
+        time: Of the frame [s]; NaN where the sequence has no times.
+        points: (n, 3) [m], read-only.
+        values: Arrays (E, *shape) by name of measure, NaN in what is excluded; the analyzer's next sample overwrites them.
+        excluded: List of :class:`Exclusion` that this row is the first to meet.
+    """
+
+    row: int
+    reference: float | None
+    frame: float
+    place: int
+    time: float
+    points: np.ndarray
+    values: dict
+    excluded: list
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis(Mapping):
+    """Measures of all rows, arrays (rows, E, *shape) by name: ``analysis["stretch"]``.
+
+    Attributes:
+        mesh: The mesh, E of whose triangles or vertices were measured.
+        on: "triangle" or "vertex".
+        measures: What each is, :class:`warpcloth.analysis.measures.Measure` by name.
+        references: Number of each row's reference frame; None for the rest shape.
+        frames: Numbers of the frames (rows,).
+        times: Of the frames (rows,) [s].
+        excluded: What could not be measured, list of :class:`Exclusion`; the values there are NaN.
+        arrays: The arrays.
+    """
+
+    mesh: object
+    on: str
+    measures: dict
+    references: list
+    frames: np.ndarray
+    times: np.ndarray
+    excluded: list
+    arrays: dict = field(repr=False)
+
+    def __getitem__(self, name):
+        return self.arrays[name]
+
+    def __iter__(self):
+        return iter(self.arrays)
+
+    def __len__(self):
+        return len(self.arrays)
+
+    @property
+    def pairs(self):
+        """(reference, frame) of each row, "rest" for the rest shape."""
+        return [("rest" if start is None else start, frame) for start, frame in zip(self.references, self.frames, strict=True)]

@@ -1,0 +1,94 @@
+"""Fields of many rows as arrays of one NPZ file."""
+
+import math
+import shutil
+import tempfile
+import zipfile
+
+import numpy as np
+
+from ..base.outputs import Output
+
+
+class NpzWriter(Output):
+    """Fields of all rows, for ``numpy.load``: (rows, E, *shape) by name, and ``frames``, ``references`` and ``times``.
+
+    The latter are (rows,) float64: labels, NaN for the rest shape, and s. Memory holds them and one row of the fields, which
+    grow in files beside the output and are put together at `close`, without compression. Rows that did not come are left out.
+
+    Attributes:
+        rows: Number of rows appended.
+    """
+
+    def __init__(self, path, rows, fields):
+        """Starts the files.
+
+        Args:
+            path: File to write.
+            rows: The most rows that will come.
+            fields: (shape of a row, dtype) of each field, by name.
+
+        Raises:
+            FileNotFoundError: The folder does not exist.
+            ValueError: The path is a folder or a device, or a field has the name of an array above.
+        """
+        self._heads = {name: np.empty(rows) for name in ("frames", "references", "times")}
+        self._fields = {name: (tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in fields.items()}
+        taken = sorted(self._heads.keys() & self._fields.keys())
+        if taken:
+            raise ValueError(f"field {taken[0]}: the name is taken by the {taken[0]} of the rows; it must be another")
+        self.rows, self._promised = 0, rows
+        super().__init__(path, "xb")
+        self._parts = {name: tempfile.TemporaryFile(dir=self.folder) for name in self._fields}
+
+    def append(self, frame, reference, time, values):
+        """Adds a row.
+
+        Args:
+            frame: Label of the frame.
+            reference: Label of the frame that it is measured against; None is the rest shape.
+            time: Of the frame [s].
+            values: The fields by name, others too; each (E, *shape), of the dtype promised.
+
+        Raises:
+            ValueError: A field differs from what was promised, or there are more rows.
+        """
+        if self.rows == self._promised:
+            raise ValueError(f"{self.path}: {self._promised} rows were promised, and this is one more")
+        arrays = {name: np.asarray(values[name]) for name in self._fields}
+        for name, (shape, dtype) in self._fields.items():
+            found = arrays[name]
+            if (found.shape, found.dtype) != (shape, dtype):
+                raise ValueError(f"field {name} has shape {found.shape} and dtype {found.dtype}; it must be {shape}, {dtype}")
+        for name, array in arrays.items():
+            self._parts[name].write(array.tobytes())
+        for name, head in zip(self._heads, (frame, np.nan if reference is None else reference, time), strict=True):
+            self._heads[name][self.rows] = head
+        self.rows += 1  # last: an interrupted row is none
+
+    def parts(self):
+        return self._parts.values()
+
+    def finish(self):
+        with zipfile.ZipFile(self.file, "w", zipfile.ZIP_STORED) as archive:
+            for name, head in self._heads.items():
+                with _member(archive, name) as member:
+                    np.lib.format.write_array(member, head[: self.rows])
+            for name, (shape, dtype) in self._fields.items():
+                with _member(archive, name) as member, self._parts[name] as part:  # which frees its place on the disk
+                    _copy(part, member, (self.rows, *shape), dtype)
+
+
+def _copy(part, member, shape, dtype):
+    """Copies the rows that are whole, with the header of an array in front."""
+    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(member, header)
+    part.truncate(math.prod(shape) * dtype.itemsize)
+    part.seek(0)
+    shutil.copyfileobj(part, member, 1 << 16)
+
+
+def _member(archive, name):
+    """A file of an archive, larger than 4 GiB if need be, with no date: equal arrays are equal files."""
+    info = zipfile.ZipInfo(f"{name}.npy")
+    return archive.open(info, "w", force_zip64=True)

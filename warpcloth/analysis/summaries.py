@@ -1,0 +1,235 @@
+"""Fields of an analysis in few numbers, and their files: CSV and JSON."""
+
+import csv
+import json
+import math
+import shutil
+import tempfile
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..base.outputs import TEXT, Output
+
+PERCENTILES = (0, 1, 5, 25, 50, 75, 95, 99, 100)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A scalar field of one row of an analysis, over the elements that have a value; NaN is none, infinity is one.
+
+    Attributes:
+        frame: Label of the frame.
+        reference: Label of the frame that it is measured against; None is the rest shape.
+        time: Of the frame [s].
+        name: Of the scalar.
+        unit: Of the scalar.
+        measured: Number of elements with a value.
+        excluded: Number of elements without one.
+        mean: Over elements.
+        area_mean: Σ wᵢvᵢ / Σ wᵢ, w the rest areas.
+        percentiles: (9,) those of `PERCENTILES`, interpolated linearly.
+        smallest: The first element with the smallest value, -1 where none has a value.
+        smallest_at: (x, y, z) of it in this frame [m].
+        largest: As ``smallest``, of the largest value.
+        largest_at: As ``smallest_at``.
+    """
+
+    frame: float
+    reference: float | None
+    time: float
+    name: str
+    unit: str
+    measured: int
+    excluded: int
+    mean: float
+    area_mean: float
+    percentiles: tuple[float, ...]
+    smallest: int
+    smallest_at: tuple[float, float, float]
+    largest: int
+    largest_at: tuple[float, float, float]
+
+
+def summarise(name, unit, values, places, weights, *, frame, reference, time):
+    """The `Summary` of a scalar field.
+
+    Args:
+        name: Of the scalar.
+        unit: Of the scalar.
+        values: (E,), NaN where an element is excluded.
+        places: (E, 3) centroids of triangles or positions of vertices in this frame [m].
+        weights: (E,) rest areas of triangles, or lumped ones of vertices [m²]; those of excluded elements are not read.
+        frame: Label of the frame.
+        reference: Label of the frame that it is measured against; None is the rest shape.
+        time: Of the frame [s].
+
+    Raises:
+        ValueError: A shape is not as above, or the weight of a measured element is negative or not finite.
+    """
+    values, weights, places = np.asarray(values, dtype=np.float64), np.asarray(weights), np.asarray(places)
+    if values.ndim != 1 or weights.shape != values.shape or places.shape != (*values.shape, 3):
+        shapes = f"values {values.shape}, weights {weights.shape} and places {places.shape}"
+        raise ValueError(f"{name}: {shapes} do not go together; they must be (E,), (E,) and (E, 3)")
+    total, elements = len(values), np.flatnonzero(~np.isnan(values))
+    values, weights = values[elements], weights[elements]
+    if not (np.isfinite(weights) & (weights >= 0.0)).all():
+        raise ValueError(f"{name}: the weight of a measured element is negative or not finite; it must be an area")
+    smallest, largest = (int(elements[find(values)]) if len(values) else -1 for find in (np.argmin, np.argmax))
+    with np.errstate(invalid="ignore", over="ignore"):  # ∞ − ∞ has no mean
+        mean = float(values.mean()) if len(values) else math.nan
+    return Summary(
+        frame=frame,
+        reference=reference,
+        time=float(time),
+        name=name,
+        unit=unit,
+        measured=len(values),
+        excluded=total - len(values),
+        mean=mean,
+        area_mean=_weighted_mean(values, weights),
+        percentiles=_percentiles(values),
+        smallest=smallest,
+        smallest_at=_place(places, smallest),
+        largest=largest,
+        largest_at=_place(places, largest),
+    )
+
+
+def _place(places, element):
+    return (math.nan,) * 3 if element < 0 else tuple(places[element].astype(np.float64).tolist())
+
+
+def _weighted_mean(values, weights):
+    total = weights.sum(dtype=np.float64)
+    if not total > 0.0:
+        return math.nan
+    with np.errstate(invalid="ignore", over="ignore"):
+        return float(np.where(weights > 0.0, values, 0.0) @ weights / total)  # 0·∞ is no share
+
+
+def _percentiles(values):
+    """`PERCENTILES` of values without NaN, as NumPy interpolates; next to an infinite value that value."""
+    if not len(values):
+        return (math.nan,) * len(PERCENTILES)
+    ordered = np.sort(values)  # with vector instructions several times as fast as a partition
+    at = np.array(PERCENTILES) / 100 * (len(values) - 1)
+    low, high = ordered[np.floor(at).astype(int)], ordered[np.ceil(at).astype(int)]
+    t = at - np.floor(at)
+    with np.errstate(invalid="ignore", over="ignore"):
+        between = np.where(t < 0.5, low + (high - low) * t, high - (high - low) * (1.0 - t))
+        finite = np.isfinite(low) & np.isfinite(high)
+        return tuple(np.where(finite, between, low + high).tolist())
+
+
+def _label(reference):
+    return "rest" if reference is None else reference
+
+
+class CsvWriter(Output):
+    """A table with a line for each frame and scalar: the columns of `COLUMNS`, in UTF-8.
+
+    Numbers have as many digits as float64 needs; what there is no value for is an empty cell. The scalar is in its ``unit``,
+    ``time`` in s, and the places ``min_x`` to ``max_z`` in m.
+    """
+
+    COLUMNS = (
+        *("frame", "reference", "time", "name", "unit", "measured", "excluded", "mean", "area_mean"),
+        *(f"p{percentile}" for percentile in PERCENTILES),
+        *(f"{end}_{what}" for end in ("min", "max") for what in ("element", "x", "y", "z")),
+    )
+
+    def __init__(self, path):
+        """Starts the table.
+
+        Raises:
+            FileNotFoundError: The folder does not exist.
+            ValueError: The path is a folder or a device.
+        """
+        super().__init__(path, "x", **TEXT)
+        self._table = csv.writer(self.file, lineterminator="\n")
+        self._table.writerow(self.COLUMNS)
+
+    def append(self, summary):
+        """Adds the line of a `Summary`."""
+        s = summary
+        cells = [s.frame, _label(s.reference), s.time, s.name, s.unit, s.measured, s.excluded, s.mean, s.area_mean]
+        cells += [*s.percentiles, s.smallest, *s.smallest_at, s.largest, *s.largest_at]
+        for column in (self.COLUMNS.index("min_element"), self.COLUMNS.index("max_element")):
+            cells[column] = "" if cells[column] < 0 else cells[column]
+        self._table.writerow(["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in cells])
+
+
+class JsonWriter(Output):
+    """One strict JSON object, streamed: ``input``, ``measures``, ``rows``, ``exclusions``, ``facts``.
+
+    What there is no value for is null; infinite numbers, which JSON does not have, are the texts "inf" and "-inf".
+
+    Attributes:
+        facts: What else is said of the analysis, by name; written at `close`.
+    """
+
+    def __init__(self, path, input, measures):
+        """Starts the document.
+
+        Args:
+            path: File to write.
+            input: What was measured: texts and numbers by name.
+            measures: The measures by name, each with ``shape``, ``unit`` and ``neutral``.
+
+        Raises:
+            FileNotFoundError: The folder does not exist.
+            ValueError: The path is a folder or a device.
+        """
+        self.facts = {}
+        shown = {name: {key: getattr(each, key) for key in ("shape", "unit", "neutral")} for name, each in measures.items()}
+        start = f'{{"input": {_json(input)},\n"measures": {_json(shown)},\n"rows": ['
+        super().__init__(path, "x", **TEXT)
+        self.file.write(start)
+        self._exclusions = tempfile.TemporaryFile("w+", dir=self.folder, **TEXT)
+        self._rows_begun = self._exclusions_begun = False
+
+    def append(self, summary):
+        """Adds a `Summary` to the rows."""
+        row = {**vars(summary), "reference": _label(summary.reference)}
+        row["percentiles"] = dict(zip(map(str, PERCENTILES), summary.percentiles, strict=True))
+        for end in ("smallest", "largest"):
+            there = row[end] >= 0
+            row[end], row[f"{end}_at"] = (row[end], row[f"{end}_at"]) if there else (None, None)
+        self.file.write((",\n" if self._rows_begun else "\n") + _json(row))
+        self._rows_begun = True
+
+    def exclude(self, exclusion, frame):
+        """Adds an exclusion, of the frame with the label ``frame``; None is the rest shape."""
+        elements = np.asarray(exclusion.elements)
+        entry = {"frame": _label(frame), "kind": exclusion.kind, "reason": exclusion.reason}
+        entry |= {"count": len(elements), "elements": elements}
+        self._exclusions.write((",\n" if self._exclusions_begun else "\n") + _json(entry))
+        self._exclusions_begun = True
+
+    def parts(self):
+        return (self._exclusions,)
+
+    def finish(self):
+        self.file.write('\n],\n"exclusions": [')
+        with self._exclusions as part:
+            part.seek(0)
+            shutil.copyfileobj(part, self.file)
+        self.file.write(f'\n],\n"facts": {_json(self.facts)}}}\n')
+
+
+def _json(value):
+    return json.dumps(_strict(value), allow_nan=False, ensure_ascii=False)
+
+
+def _strict(value):
+    """``value`` with what JSON does not have as null or a text."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(key): _strict(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)

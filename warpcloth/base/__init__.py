@@ -1,0 +1,1 @@
+"""Checks, files, messages and locks that every other room needs."""

@@ -1,0 +1,232 @@
+"""Pictures of speed against accuracy: settings as points with what nothing beats, and methods as lines towards a minimum."""
+
+import textwrap
+
+from ..lab.machine import in_words
+from ..lab.work_precision import WITHIN, cheapest, front, left_out, spread
+from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
+
+# Each solver has its colour and marker in every picture.
+_STYLES = {
+    "explicit": ("tab:gray", "s"),
+    "newton": ("black", "o"),
+    "projective-dynamics": ("tab:blue", "^"),
+    "admm": ("tab:cyan", "v"),
+    "pbd": ("tab:pink", "D"),
+    "hierarchical-pbd": ("tab:purple", "P"),
+    "xpbd": ("tab:red", "X"),
+    "constrained-dynamics": ("tab:green", "p"),
+}
+_DASHES = ("-", "--", ":", "-.")
+_WIDTH, _LINES = 46, 48  # characters and lines of the texts beside a picture
+_SMALL, _TEXT = 8.5, 10.0  # sizes of letters [pt]
+# Of a motion, with what is written along them.
+_ERRORS = {
+    "error": "error: RMS of all vertices and frames, over the size",
+    "strain_error": "error of strains: 99th percentile of edges and frames",
+}
+
+
+def plot_time(path, found):
+    """Draws the error of each setting over its time, with the quartiles of the time, and names each line at its end.
+
+    Two panels show the error of positions and the 99th percentile of the error of strains. In each panel the settings that no
+    other beats by more than the spread of times are joined and numbered, with their names beside the panel. Settings without an
+    error are named with the reason. The error of the reference solution is a line; points below it mean nothing.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        found: As :func:`warpcloth.lab.work_precision.time_diagram` returns it.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    rows, reference = found["rows"], found["reference"]
+    fronts = {name: front(rows, reference[name], name) for name in _ERRORS}
+    best = sorted(set().union(*fronts.values()), key=lambda i: rows[i]["ms_per_second"])
+    texts = [f"{number}  {rows[i]['label']}" for number, i in enumerate(best, 1)]
+    texts += [
+        "",
+        f"cheapest within {100.0 * WITHIN:g} %:",
+        *(row["label"] for row in cheapest(rows, reference["error"])),
+    ]
+    texts += _missing("not drawn:", found)
+    figure, panels, notes = _figure(path, texts)
+    lines = {}
+    for row in rows:
+        if row["status"] == "ok":
+            lines.setdefault((row["solver"], row["options"].get("integrator", "euler")), []).append(row)
+    ends = {axes: [] for axes in panels}
+    for (solver, integrator), line in lines.items():
+        line.sort(key=lambda row: row["ms_per_second"])
+        colour, marker = _STYLES[solver]
+        for axes, name in zip(panels, _ERRORS, strict=True):
+            x, y = ([row[of] for row in line] for of in ("ms_per_second", name))
+            axes.plot(x, y, color=colour, linewidth=0.7, alpha=0.6)
+            axes.hlines(y, *zip(*map(spread, line), strict=True), color=colour, linewidth=2.5, alpha=0.45)
+            axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none")
+            ends[axes].append((x[-1], y[-1], solver if integrator == "euler" else f"{solver} {integrator}", colour))
+    for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
+        x, y = ([rows[i][of] for i in fronts[name]] for of in ("ms_per_second", name))
+        axes.plot(x, y, color="gold", linewidth=5.0, zorder=0, label="nothing is better in both")
+        for i in fronts[name]:
+            place, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": _TEXT}
+            axes.annotate(str(best.index(i) + 1), place, (-4, -4), textcoords="offset points", **below)
+        axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="quartiles of the times")
+        _floor(axes, reference[name], "error of the reference")
+        axes.set(xlabel="ms for a second of motion", ylabel=text)
+    title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}"
+    _finish(figure, panels, notes, title, texts, found)
+    for axes, of in ends.items():
+        _name_ends(figure, axes, of)
+    save(figure, path)
+
+
+def plot_solver(path, found):
+    """Draws the gap that methods leave of a step over their iterations and over their time, down to what float64 tells.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        found: As :func:`warpcloth.lab.work_precision.solver_diagram` returns it.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    texts = _missing("ended early:", found)
+    figure, panels, notes = _figure(path, texts)
+    seen, floor = {}, max((row["floor"] for row in found["rows"]), default=None)
+    for row in found["rows"]:
+        colour, marker = _STYLES[row["solver"]]
+        style = _DASHES[seen.setdefault(row["solver"], 0) % len(_DASHES)]
+        seen[row["solver"]] += 1
+        if not row["points"]:
+            continue
+        for axes, name in zip(panels, ("iterations", "ms"), strict=True):
+            x, y = ([point[name] for point in row["points"]], [max(point["gap"], floor) for point in row["points"]])
+            axes.plot(x, y, style, marker=marker, color=colour, markersize=3, linewidth=1.0, label=row["label"])
+    for axes, text in zip(panels, ("iterations", "ms of the step"), strict=True):
+        axes.set(xlabel=text)
+        if floor is not None:
+            _floor(axes, floor, "rounding of the objective")
+    panels[0].set_ylabel("gap of the objective, 1 at x̃")
+    step = f"a step of 1/{found['rate']:g} s after {found['frame']} frames"
+    title = f"{found['scene']}, {step}, {found['dtype']}"
+    _finish(figure, panels, notes, title, texts, found)
+    save(figure, path)
+
+
+def plot_spectrum(path, found):
+    """Draws μ over its rank, and beside it errors as points on the lines that the spectrum predicts, each down to its rounding.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        found: As :func:`warpcloth.lab.work_precision.spectrum_diagram` returns it.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    texts = _missing("not drawn:", found)
+    figure, panels, notes = _figure(path, texts)
+    good = [row for row in found["rows"] if row["points"]]
+    for k, row in enumerate(good):
+        mu, colour, points = row["eigenvalues"], f"C{k}", row["points"]
+        panels[0].plot(range(1, len(mu) + 1), mu, color=colour, linewidth=1.2)
+        at, errors = ([point[name] for point in points] for name in ("iterations", "error"))
+        panels[1].plot(
+            at, errors, "o", color=colour, markersize=3, label=f"{row['label']}: max |1 − μ| = {row['contraction']:.4f}"
+        )
+        known = [point for point in points if point["predicted"] is not None]
+        at, errors = ([point[name] for point in known] for name in ("iterations", "predicted"))
+        panels[1].plot(at, errors, color=colour, linewidth=0.8)
+    for k, row in enumerate(good):
+        _floor(panels[1], row["floor"], "rounding of the places", f"C{k}")
+    panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
+    panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
+    title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
+    _finish(figure, panels, notes, title, texts, found)
+    save(figure, path)
+
+
+def _floor(axes, value, label, colour=GREY):
+    """A line below which nothing is known."""
+    axes.axhline(value, color=colour, linestyle="--", linewidth=0.8, label=label)
+
+
+def _missing(head, found):
+    """Lines that say what is left out, and why."""
+    lines = [line for each in left_out(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]
+    return ["", head, *lines] if lines else []
+
+
+def _name_ends(figure, axes, ends):
+    """Writes the name of each line beside its end, in its colour, as near as possible without overlaps and inside the panel.
+
+    Args:
+        figure: Figure of the axes, which are otherwise finished.
+        axes: A panel.
+        ends: (x, y, text, colour) of each line.
+    """
+    from matplotlib.patheffects import withStroke
+
+    low, high = axes.get_xlim()
+    axes.set_xlim(low, high * (high / low) ** 0.3)  # room for names
+    number_axis(axes.xaxis)
+    figure.draw_without_rendering()  # so that sizes are known
+    style, taken = {"fontsize": _SMALL, "va": "center", "path_effects": [withStroke(linewidth=2.5, foreground="white")]}, []
+    for x, y, text, colour in sorted(ends, key=lambda end: -end[1]):
+        note = axes.annotate(
+            text, (x, y), (7, 0), textcoords="offset points", annotation_clip=False, zorder=1.9, color=colour, **style
+        )
+        note.set_in_layout(False)
+        for shift in range(120):
+            for side, up in ((side, up) for up in (-3 * shift, 3 * shift) for side in ("left", "right")):
+                note.set(ha=side)
+                note.xyann = (7 if side == "left" else -7, up)
+                box, around = note.get_window_extent(), axes.bbox
+                inside = around.y0 <= box.y0 and box.y1 <= around.y1 and around.x0 <= box.x0 and box.x1 <= around.x1
+                if inside and not box.count_overlaps(taken):
+                    break
+            else:
+                continue
+            break
+        taken.append(box.padded(2.0))
+
+
+def _figure(path, texts):
+    """A figure with two panels on logarithmic scales, and one for texts."""
+    check_path(path, PICTURES)
+    from matplotlib.figure import Figure
+
+    if len(texts) > _LINES:
+        texts[_LINES:] = [f"… {len(texts) - _LINES} lines more in the table"]
+    height = max(5.4, 0.165 * (len(texts) + 14))
+    figure = Figure(figsize=(13.0, height), layout="constrained")
+    *axes, notes = figure.subplots(1, 3, width_ratios=[1.7, 1.7, 1.0])
+    for each in axes:
+        each.set(xscale="log", yscale="log")
+        each.grid(True, which="major", linewidth=0.3, color="0.8")
+        each.tick_params(which="both", colors=GREY, labelsize=_TEXT)
+        each.xaxis.label.set_size(_TEXT + 1.0)
+        each.yaxis.label.set_size(_TEXT + 1.0)
+        each.spines[["top", "right"]].set_visible(False)
+    notes.axis("off")
+    return figure, axes, notes
+
+
+def _finish(figure, axes, notes, title, texts, found):
+    """Adds the title with the machine, the legend, and the texts below it."""
+    known = {}
+    for each in axes:
+        number_axis(each.xaxis)
+        known.update(zip(*reversed(each.get_legend_handles_labels()), strict=True))
+    notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=_SMALL, borderaxespad=0.0)
+    top = 1.0 - 0.19 * (len(known) + 1) / figure.get_size_inches()[1]
+    notes.text(0.0, top, "\n".join(texts), fontsize=_SMALL, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
+    title = f"{title}, on {in_words(found['machine'])}"
+    figure.suptitle(title, fontsize=_TEXT + 1.0, color=GREY, parse_math=False)

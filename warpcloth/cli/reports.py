@@ -1,0 +1,379 @@
+"""An analysis as files: a USD stage with its measures, tables, arrays, plots and pictures, written row by row."""
+
+import warnings
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..analysis.measures import scalars
+from ..analysis.summaries import CsvWriter, JsonWriter, Summary, summarise
+from ..base.interrupts import Interrupted
+from ..base.outputs import check_apart
+
+# Length of a principal direction of stretch 1 beside the square root of the median area of a triangle.
+_SEGMENT = 0.7
+# Time codes that are nearer than this to the numbers of their frames are these.
+_EVEN = 1e-6
+
+
+@dataclass
+class Extremes:
+    """A scalar over all rows: its :class:`Summary` where it is smallest and where it is largest."""
+
+    smallest: Summary | None = None
+    largest: Summary | None = None
+
+    def add(self, summary):
+        low, high = summary.percentiles[0], summary.percentiles[-1]
+        if self.smallest is None or low < self.smallest.percentiles[0]:
+            self.smallest = summary if summary.measured else self.smallest
+        if self.largest is None or high > self.largest.percentiles[-1]:
+            self.largest = summary if summary.measured else self.largest
+
+
+@dataclass
+class Report:
+    """What :func:`write_report` found.
+
+    Attributes:
+        rows: Number of rows.
+        extremes: :class:`Extremes` by name of scalar.
+        exclusions: Sentences, of the first rows that have any; no more than ``SENTENCES``.
+        excluded: Number of exclusions.
+        coloured: The scalar that is shown as colour, or None.
+        scale: Its low and high, or None.
+    """
+
+    SENTENCES = 20
+
+    rows: int = 0
+    extremes: dict = field(default_factory=dict)
+    exclusions: list = field(default_factory=list)
+    excluded: int = 0
+    coloured: str | None = None
+    scale: tuple[float, float] | None = None
+
+
+def write_report(
+    analyzer,
+    usd=None,
+    csv=None,
+    json=None,
+    npz=None,
+    plot=None,
+    stills=None,
+    colour=None,
+    colour_range=None,
+    curves=False,
+    single_file=False,
+    up_axis=None,
+    progress=None,
+    view=None,
+    both_sides=False,
+    colormap=None,
+):
+    """Measures all rows of an analysis and writes them, in memory that does not grow but for the plot's percentiles.
+
+    Args:
+        analyzer: The :class:`warpcloth.Analyzer`.
+        usd: Path of a stage, a layer over the one that was measured if it was one: each scalar as a primvar, and one as colour.
+        csv: Path of a table with a line for each row and scalar, see :class:`warpcloth.analysis.summaries.CsvWriter`.
+        json: Path of the same as one object, with the exclusions.
+        npz: Path of the measures themselves, (rows, E, *shape).
+        plot: Path of a picture of the percentiles over time, .png, .svg or .pdf.
+        stills: Paths of pictures, .png, by number of the frame.
+        colour: The scalar to show, such as "stretch_1"; the first where not given; "none" for a stage without colours.
+        colour_range: (low, high) of its colours; else from the least first percentile to the largest ninety-ninth of all rows,
+            about the value of what is undeformed where there is one.
+        curves: Whether stage and pictures show the principal directions, as long as their stretches.
+        single_file: Whether the stage is one file, see :class:`warpcloth.usd.AnimationWriter`.
+        up_axis: "Y" or "Z", for inputs that do not say theirs.
+        progress: Function called with (row, rows) after each, or None.
+        view: The :class:`warpcloth.chart.View` of the stills, if not its default; its up axis is that of the animation.
+        both_sides: Whether stills show the cloth from the opposite side too, see :func:`warpcloth.chart.draw`.
+        colormap: Name of a colour map of matplotlib, if not the default of :class:`warpcloth.chart.Scale`.
+
+    Returns:
+        :class:`Report`.
+
+    Raises:
+        ValueError: There is no such scalar or frame, ``curves`` without the measures "stretch" and "directions", a file is
+            given twice or is the input's, or as the writers have it.
+    """
+    listed = {name: measure for measure in analyzer.measures for name in scalar_names(measure)}
+    report = Report(extremes={name: Extremes() for name in listed})
+    _check(analyzer, listed, usd, stills, colour, curves)
+    if colormap is not None:
+        from ..picture.colour import check_colormap
+
+        check_colormap(colormap)
+    _check_pictures(plot, stills)
+    check_apart([usd, csv, json, npz, plot, *(stills or {}).values()], analyzer.sequence.files)
+    if (usd or stills) and colour != "none" and (stills or colour or _can_colour()):
+        report.coloured = colour or next(iter(listed))
+        report.scale = _range(analyzer, report.coloured, listed[report.coloured], colour_range)
+    kept, opened = [], []
+    with _interruptible(report, len(analyzer), opened), ExitStack() as stack:
+        writers = [stack.enter_context(CsvWriter(csv))] if csv else []
+        log = stack.enter_context(JsonWriter(json, _input(analyzer), {m.name: m for m in analyzer.measures})) if json else None
+        writers += [log] if log else []
+        archive = stack.enter_context(_archive(analyzer, npz)) if npz else None
+        opened += filter(None, (*writers, archive))
+        shown = None
+        if usd or stills:
+            looks = view, both_sides, colormap
+            shown = _Shown(analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack)
+            opened += filter(None, [shown.writer])
+        try:
+            for sample in analyzer:
+                values = {}
+                for measure in analyzer.measures:
+                    values |= scalars(measure, sample.values[measure.name])
+                places = analyzer.places(sample.points)
+                about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
+                for name, numbers in values.items():
+                    summary = summarise(name, listed[name].unit, numbers, places, analyzer.areas, **about)
+                    report.extremes[name].add(summary)
+                    if plot:
+                        kept.append(summary)
+                    for writer in writers:
+                        writer.append(summary)
+                for exclusion in sample.excluded:
+                    report.excluded += 1
+                    if len(report.exclusions) < Report.SENTENCES:
+                        report.exclusions.append(str(exclusion))
+                    if log:
+                        log.exclude(exclusion, exclusion.frame)
+                if archive:
+                    archive.append(sample.frame, sample.reference, sample.time, sample.values)
+                if shown:
+                    shown.append(sample, values, places)
+                report.rows += 1
+                if progress:
+                    progress(report.rows, len(analyzer))
+        except KeyboardInterrupt:
+            if not report.rows:  # earlier files are worth more than empty ones
+                for writer in filter(None, (*writers, archive)):
+                    writer.discard()
+            raise
+        if log:
+            log.facts |= {"rows": report.rows, "excluded": report.excluded}
+    if plot:
+        from ..chart import plot_percentiles
+
+        along = "frame" if analyzer.sequence.times is None else "time"
+        with _interruptible(report, len(analyzer), opened):
+            plot_percentiles(plot, kept, along, {name: measure.neutral for name, measure in listed.items()})
+    return report
+
+
+@contextmanager
+def _interruptible(report, rows, opened):
+    """At an interrupt, says which of the opened writers have saved the rows so far in a file."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        tables = ", ".join(writer.path for writer in opened if getattr(writer, "finished", False))
+        said = [f"they are in {tables}"] if tables else []
+        said += [writer.saved() for writer in opened if getattr(writer, "kept", 0)]
+        saved = "; ".join(said) or "nothing was saved"
+        raise Interrupted(f"interrupted after {report.rows} of {rows} frames; {saved}") from None
+
+
+def scalar_names(measure):
+    """Names of the scalars of a measure."""
+    return list(scalars(measure, np.zeros((1, *measure.shape))))
+
+
+def camel(name):
+    """A name as USD has it: ``stretch_1`` is ``stretch1``, ``area_ratio`` is ``areaRatio``."""
+    first, *others = name.split("_")
+    return first + "".join(part[:1].upper() + part[1:] for part in others)
+
+
+def _check(analyzer, listed, usd, stills, colour, curves):
+    if (usd or stills) and not listed:
+        raise ValueError(f"colour: {analyzer.measures[0].name} has no number to be coloured; measure something else too")
+    if colour is not None and colour not in listed and (colour != "none" or stills):
+        raise ValueError(f"colour = {colour!r}: must be one of {', '.join(listed)}" + ("" if stills else ", or none"))
+    names = {measure.name for measure in analyzer.measures}
+    if curves and not {"stretch", "directions"} <= names:
+        raise ValueError("curves: need the measures stretch and directions")
+    frames = [analyzer.sequence.labels[pair.frame] for pair in analyzer.pairs]
+    if usd and len(set(frames)) < len(frames):
+        twice = next(frame for frame in frames if frames.count(frame) > 1)
+        raise ValueError(
+            f"pairs: frame {twice:g} is measured twice, and a stage has one value at a time; write no stage, or one each"
+        )
+    for frame in stills or ():
+        if frame not in frames:
+            raise ValueError(f"stills: frame {frame:g} is not measured; it must be one of {frames[0]:g} to {frames[-1]:g}")
+
+
+def _can_colour():
+    """Whether there are colour maps; without them a stage has its measures all the same."""
+    from ..picture.figures import require_matplotlib
+
+    try:
+        require_matplotlib()
+    except ImportError as error:
+        warnings.warn(f"the stage has no colours: {error}", stacklevel=3)
+        return False
+    return True
+
+
+def _check_pictures(plot, stills):
+    """Refuses pictures that cannot be written, before anything is measured."""
+    if plot or stills:
+        from ..picture.figures import PICTURES, check_path
+
+        if plot:
+            check_path(plot, PICTURES)
+        for path in (stills or {}).values():
+            check_path(path, PICTURES[:1])
+
+
+def _range(analyzer, name, measure, given):
+    """(low, high) of the colours of a scalar."""
+    from ..chart import Scale, range_over
+
+    if given is None:
+        summaries = []
+        for sample in analyzer.of(measure.name):
+            numbers = scalars(measure, sample.values[measure.name])[name]
+            places = np.zeros((len(numbers), 3))
+            about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
+            summaries.append(summarise(name, measure.unit, numbers, places, analyzer.areas, **about))
+        given = range_over(summaries, _neutral(measure))
+    scale = Scale(*given, _neutral(measure))
+    return scale.low, scale.high
+
+
+def _count(analyzer, name):
+    """How many numbers an element has of a measure."""
+    return next(measure.shape[0] for measure in analyzer.measures if measure.name == name)
+
+
+def _rate(sequence):
+    """Numbers of frames a second; 24 where nobody says it."""
+    if sequence.times is None or len(sequence) < 2:
+        return 24.0
+    return float((sequence.labels[-1] - sequence.labels[0]) / (sequence.times[-1] - sequence.times[0]))
+
+
+def _neutral(measure):
+    """Where the scale of a scalar of a measure has its middle; norms begin at 0."""
+    return measure.neutral if len(measure.shape) < 2 else None
+
+
+def _input(analyzer):
+    mesh, sequence = analyzer.mesh, analyzer.sequence
+    facts = {"file": sequence.path, "vertices": len(mesh.points), "triangles": len(mesh.triangles), "frames": len(sequence)}
+    facts |= {"rest_declared": mesh is not sequence.mesh or bool(sequence.declared), "on": analyzer.on, "rates": analyzer.rates}
+    return {name: value for name, value in facts.items() if value is not None}
+
+
+def _archive(analyzer, path):
+    from ..analysis.stacks import NpzWriter
+
+    fields = {measure.name: ((analyzer.count, *measure.shape), analyzer.dtype) for measure in analyzer.measures}
+    return NpzWriter(path, len(analyzer), fields)
+
+
+class _Shown:
+    """What is looked at: a stage and pictures, coloured by one scalar on one scale."""
+
+    def __init__(self, analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack):
+        view, self.both_sides, colormap = looks
+        self.analyzer, self.name, self.curves, self.stills = analyzer, report.coloured, curves, stills or {}
+        self.over, self.scale, metadata = analyzer.sequence.stage is not None, None, {"analysis": _input(analyzer)}
+        if self.name:
+            from ..chart import Scale
+
+            self.unit = listed[self.name].unit
+            self.scale = Scale(*report.scale, _neutral(listed[self.name]), colormap)
+            metadata["legend"] = self.scale.legend(self.name, self.unit)
+        areas = analyzer.mesh.triangle_areas
+        areas = areas[np.isfinite(areas) & (areas > 0.0)]  # others have no segments
+        self.length = _SEGMENT * np.sqrt(np.median(areas)) if len(areas) else 0.0
+        sequence = analyzer.sequence
+        up_axis = sequence.up_axis or up_axis or analyzer.mesh.up_axis or "Y"
+        if self.stills:
+            from ..chart import View
+
+            places = {pair.frame for pair in analyzer.pairs if sequence.labels[pair.frame] in self.stills}
+            view = replace(view or View(), up_axis=up_axis)
+            self.view = view.fit(sequence[place] for place in sorted(places))
+        self.writer, self.rate = None, _rate(sequence)
+        if usd:
+            from ..usd import MeasureWriter
+
+            lost = np.flatnonzero(~np.isfinite(analyzer.mesh.points).all(axis=1))
+            if len(lost) and not self.over:
+                where = "the rest shape" if sequence.declared else f"frame {sequence.labels[0]:g}, which is the rest shape,"
+                raise ValueError(
+                    f"{sequence.path or 'mesh'}: {where} has vertex {lost[0]} in no finite place, and a stage needs all; "
+                    "give another rest shape (--rest), or write no stage"
+                )
+
+            kind = "uniform" if analyzer.on == "triangle" else "vertex"
+            names = [f"principal{k + 1}" for k in range(_count(analyzer, "stretch"))] if curves else []
+            self.writer = MeasureWriter(
+                usd,
+                analyzer.mesh if sequence.stage is None else sequence.mesh,
+                {camel(name): kind for name in listed},
+                coloured=camel(self.name) if self.name else None,
+                directions=dict.fromkeys(names, kind),
+                source=sequence.stage,
+                fps=self.rate,
+                up_axis=up_axis,
+                metadata=metadata,
+            )
+            stack.callback(self.writer.close, single_file=single_file)
+
+    def append(self, sample, values, places):
+        """Adds a row, whose scalars (E,) are ``values``."""
+        segments = self._segments(sample, places) if self.curves else None
+        finite = np.isfinite(sample.points).all()
+        if self.writer and (self.over or finite):  # without a stage below it a frame needs points
+            primvars = {camel(name): _single(numbers) for name, numbers in values.items()}
+            colours = self.scale.linear(values[self.name]) if self.scale else None
+            self.writer.append(self._time_code(sample), primvars, colours, segments, None if self.over else sample.points)
+        if sample.frame in self.stills:
+            from ..chart import draw
+
+            reference = "the rest shape" if sample.reference is None else f"frame {sample.reference:g}"
+            draw(
+                self.stills[sample.frame],
+                sample.points,
+                self.analyzer.mesh.triangles,
+                values[self.name],
+                self.scale,
+                on=self.analyzer.on,
+                title=f"{self.name}, frame {sample.frame:g} against {reference}",
+                unit=self.unit,
+                view=self.view,
+                directions=segments,
+                both_sides=self.both_sides,
+            )
+
+    def _time_code(self, sample):
+        """That of the stage below; without one the number of the frame, or where frames are not even in time what fits it."""
+        sequence = self.analyzer.sequence
+        if self.over or sequence.times is None:
+            return sample.frame
+        code = sequence.labels[0] + self.rate * (sample.time - sequence.times[0])
+        return sample.frame if abs(code - sample.frame) < _EVEN else code
+
+    def _segments(self, sample, places):
+        """Principal directions as long as their stretches, by name: centres and vectors (E, 3) [m]."""
+        stretch, directions = sample.values["stretch"], sample.values["directions"]
+        count = stretch.shape[1]
+        vectors = [self.length * stretch[:, k, None] * directions[:, k] for k in range(count)]
+        return {f"principal{k + 1}": (_single(places), _single(vector)) for k, vector in enumerate(vectors)}
+
+
+def _single(values):
+    """Values of which those are NaN that float32 does not have."""
+    return np.where(np.abs(values) <= np.finfo(np.float32).max, values, np.nan)

@@ -1,0 +1,1 @@
+"""Operators, state and capture that all solvers share."""

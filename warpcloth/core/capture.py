@@ -1,0 +1,87 @@
+"""Graph capture, on the CPU too: a segment of launches is recorded once and replayed."""
+
+import gc
+from contextlib import contextmanager
+
+import warp as wp
+
+from ..base.turns import TURN
+
+
+def on_host(device, what):
+    """Raises if ``device`` is recording: a host call inside a captured segment would see data that nothing has computed.
+
+    Raises:
+        RuntimeError: If a graph is being captured on the device.
+    """
+    if device.is_capturing:
+        raise RuntimeError(f"{what} runs on the host and cannot be part of a captured segment")
+
+
+class Mirror:
+    """A device array and its counterpart on the host, for what the host reads and writes between segments.
+
+    Built once; on the CPU both are one array. Reading and writing then allocate nothing.
+
+    Args:
+        array: The device array.
+    """
+
+    def __init__(self, array):
+        self.array = array
+        self.host = array if array.device.is_cpu else wp.empty_like(array, device="cpu", pinned=True)
+
+    def read(self):
+        """The values as NumPy, valid until the next call or launch.
+
+        Raises:
+            RuntimeError: If a graph is being captured on the device.
+        """
+        on_host(self.array.device, "reading an array")
+        if self.host is not self.array:
+            wp.copy(self.host, self.array)
+            wp.synchronize_stream(self.array.device)
+        return self.host.numpy()
+
+    def write(self, values):
+        """Sets the values from NumPy.
+
+        Raises:
+            RuntimeError: If a graph is being captured on the device.
+        """
+        on_host(self.array.device, "writing an array")
+        self.host.numpy()[...] = values
+        if self.host is not self.array:
+            wp.copy(self.array, self.host)
+            wp.synchronize_stream(self.array.device)  # or the next write would change what is still being copied
+
+
+@contextmanager
+def _uncollected():
+    """No collection of garbage meanwhile: what it frees on CUDA (the factors of cholespy) would break a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+class Segment:
+    """Launches that always run together: recorded when built, replayed by a call, on the CPU and on CUDA.
+
+    Args:
+        device: The Warp device.
+        record: Function that launches.
+    """
+
+    def __init__(self, device, record):
+        self.device = device
+        self.record = record  # the graph has addresses only; what the function refers to must not be freed
+        with TURN, _uncollected(), wp.ScopedCapture(device=device) as capture:
+            record()
+        self.graph = capture.graph
+
+    def __call__(self):
+        wp.capture_launch(self.graph)

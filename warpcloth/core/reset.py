@@ -1,0 +1,104 @@
+"""Copies put back to where they start, between steps."""
+
+import numpy as np
+import warp as wp
+
+from ..base.checks import array, shown
+from ..kernels import step as kernels
+from ..model.precision import cast
+from .capture import Mirror
+from .status import Result
+
+
+class Reset:
+    """Puts copies of a stepper back, see :meth:`warpcloth.solvers.solver.Stepper.reset`.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+    """
+
+    def __init__(self, stepper):
+        self.stepper, self.model = stepper, stepper.model
+        packed = stepper.low is not None and stepper.low.dtype is wp.int32
+        self._kernel = self.model.kernel(kernels.reset, self.model.dtype, self.model.pins is not None, packed)
+        self._buffers = {}  # of what comes from the host, made when first needed
+
+    def __call__(self, mask, positions, velocities):
+        stepper, model, integrator = self.stepper, self.model, self.stepper.integrator
+        if integrator.started[0] is not None and not (positions is None and velocities is None):
+            raise ValueError(
+                "reset takes no positions or velocities with integrator='bdf2', which knows what was before the start of the "
+                "model alone; 'euler' and 'midpoint' take them"
+            )
+        mask, x, v = self.on_device(mask, positions, velocities)
+        x, v = model.positions if x is None else x, model.velocities if v is None else v
+        given = [mask, model.inverse_mass, model.per_copy, model.positions, x, v, *integrator.started]
+        worst = stepper.worst and stepper.worst.array
+        model.launch(self._kernel, model.count, given, [*stepper.state, *integrator.past, stepper.low, stepper.count, worst])
+        if stepper.residual.any() or any(result is not Result.COMPLETED for result in stepper.results):
+            chosen = mask.numpy()
+            stepper.residual = np.where(chosen, 0.0, stepper.residual)
+            stepper.results = [
+                Result.COMPLETED if again else result for result, again in zip(stepper.results, chosen, strict=True)
+            ]
+
+    def on_device(self, mask, positions, velocities):
+        """The mask (B,), and positions and velocities (B·n,) vectors or None, as Warp arrays.
+
+        Raises:
+            ValueError: If one of them breaks a rule.
+        """
+        mask = self._mask(mask)
+        x = None if positions is None else self._places("positions", "m", positions)
+        v = None if velocities is None else self._places("velocities", "m/s", velocities)
+        return mask, x, v
+
+    def _mask(self, mask):
+        """The mask on the device, (B,)."""
+        B = self.model.copies
+        if self._on_device(mask):
+            if mask.dtype is not wp.bool or mask.shape != (B,) or not mask.is_contiguous:
+                raise ValueError(f"mask is {_kind(mask)}; on the device it must be a contiguous array ({B},) of wp.bool")
+            return mask
+        try:
+            values = np.ones(B, dtype=bool) if mask is None else np.asarray(_host(mask))
+        except ValueError:  # rows of different lengths
+            values = np.empty(())
+        if values.dtype != bool or values.shape != (B,):
+            raise ValueError(f"mask is {shown(mask)}; it must be an array ({B},) of truth values, one for each copy")
+        return self._buffered("mask", wp.bool, B, values)
+
+    def _places(self, name, unit, values):
+        """Positions or velocities on the device, (B·n,) vectors."""
+        model = self.model
+        shape = (model.copies, model.per_copy, 3)
+        if self._on_device(values):
+            vectors = wp.types.types_equal(values.dtype, model.vec3)  # as wp.vec3 is, which is another class
+            whole = (*values.shape, 3) if vectors else values.shape if values.dtype is model.dtype else ()
+            if whole not in (shape, (model.count, 3)) or not values.is_contiguous:
+                raise ValueError(
+                    f"{name} is {_kind(values)}; on the device it must be a contiguous array {shape} of {model.dtype.__name__}"
+                )
+            return wp.array(ptr=values.ptr, shape=(model.count,), dtype=model.vec3, device=model.device)
+        values = array(name, _host(values), shape)
+        values = cast(name, unit, values, model.numpy_dtype, lambda copy, i: f"vertex {i} of copy {copy}")
+        return self._buffered(name, model.vec3, model.count, values.reshape(-1, 3))
+
+    def _on_device(self, values):
+        return isinstance(values, wp.array) and values.device == self.model.device
+
+    def _buffered(self, name, dtype, count, values):
+        """The values in an array on the device that is kept."""
+        if name not in self._buffers:
+            self._buffers[name] = Mirror(wp.empty(count, dtype=dtype, device=self.model.device))
+        self._buffers[name].write(values)
+        return self._buffers[name].array
+
+
+def _host(values):
+    return values.numpy() if isinstance(values, wp.array) else values
+
+
+def _kind(values):
+    """What a Warp array is, for the sentence of an error."""
+    return f"an array {values.shape} of {values.dtype.__name__}"

@@ -1,0 +1,377 @@
+"""As-rigid-as-possible deformation: a rest shape follows its handles, every neighbourhood as rigidly as it can."""
+
+import importlib.util
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..base.checks import choice, number, numeric, shown, whole
+from ..base.quiet import find_device
+from ..base.turns import in_turn
+from ..core.capture import Mirror, Segment
+from ..core.operators import CHUNKS
+from ..kernels import arap_cells as cells
+from ..kernels import reduce
+from ..kernels.assemble import types
+from ..mesh.ordering import worthwhile_order
+from ..mesh.selection import distinct_vertices
+from ..model.model import DTYPES
+from ..numerics.linear import constant_factor
+from ..numerics.rotation import kabsch
+
+# A weight below this share of the largest is one of rounding.
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Deformed:
+    """What :meth:`Arap.solve` found.
+
+    Attributes:
+        points: (n, 3) [m]; the handles are at their targets.
+        rotations: (n, 3, 3), R_c of the cell of each vertex, fitted to ``points``.
+        energies: (iterations + 1,) [m²]: of the start and after each iteration, with the rotations fitted to those points.
+        iterations: Iterations made, k.
+        converged: Whether the last one met the tolerance.
+    """
+
+    points: np.ndarray
+    rotations: np.ndarray
+    energies: np.ndarray
+    iterations: int
+    converged: bool
+
+
+class Arap:
+    """As-rigid-as-possible deformation of a mesh by handles, with one rotation R_c for the cell of each vertex c.
+
+    Minimises E(x, R) = Σ_c Σ_(i,j)∈c w ‖(xᵢ − xⱼ) − R_c(Xᵢ − Xⱼ)‖² [m²] over the rotations and, with the handles at their
+    targets, over x. Energies, each with its cells:
+
+    - "spokes": the edges at c (Sorkine & Alexa 2007, *As-rigid-as-possible surface modeling*). Every edge is in two cells.
+    - "spokes_and_rims": all edges of the triangles at c, with the weight that they have in that triangle (Chao, Pinkall,
+      Sanan & Schröder 2010, *A simple geometric model for elastic deformations*). It is Σ_t area ‖∇x − R_c‖² over the
+      triangles at c, so never negative.
+
+    Either step is an exact minimiser, of all R_c by themselves or of all x, so that the energy never rises. The second is
+    L x = b with a constant matrix, which is factorised once. Weights w_ij of edges:
+
+    - "cotangent": ½(cot α + cot β) of the angles opposite the edge; negative where α + β > 180°.
+    - "clamped": the same, negative ones 0. Gives up linear precision: of a flat mesh L x = 0 no longer holds inside.
+    - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges take the place of those of the mesh (Fisher
+      et al. 2007); negative at most on the boundary. Of manifolds that can be oriented. Needs libigl:
+      ``pip install -e '.[intrinsic]'`` in the checkout.
+    - "uniform": 1 for each edge; the only ones for an edge mesh.
+
+    "spokes_and_rims" takes "cotangent" alone.
+
+    Args:
+        mesh: The rest shape, a :class:`warpcloth.Mesh`.
+        handles: Vertices that are moved (h,), each once, or a selection (see :meth:`warpcloth.Mesh.select`), then sorted.
+            Every part of the mesh that hangs together needs one.
+        weights: One of those above.
+        energy: One of those above.
+        device: A Warp device, ``"cpu"`` or ``"cuda:0"``.
+        dtype: ``"float32"`` or ``"float64"``.
+
+    Attributes:
+        handles: (h,) int32, in the order in which :meth:`solve` takes their positions.
+        parts: Number of the part of the mesh that each vertex belongs to (n,): what hangs together by edges with a weight.
+        laplacian: L (n, n), scipy CSR, with L_ij = −w_ij and rows that sum to 0.
+        negative_edges: (k, 2) pairs of vertices with a negative weight. With "spokes" each of them adds a negative energy, so
+            that even a rigid motion may not be a minimum, and there is a warning.
+
+    Raises:
+        ValueError: An argument is none of those above, a vertex is isolated, a part of the mesh has no handle, or the weights
+            leave a matrix that is not definite.
+        ImportError: "intrinsic" without libigl.
+    """
+
+    @in_turn
+    def __init__(self, mesh, handles, weights="cotangent", energy="spokes", device="cpu", dtype="float64"):
+        from scipy.sparse import coo_matrix, diags
+
+        choice("weights", weights, ("cotangent", "clamped", "intrinsic", "uniform"))
+        choice("energy", energy, ("spokes", "spokes_and_rims"))
+        choice("dtype", dtype, tuple(DTYPES))
+        rims = energy == "spokes_and_rims"
+        if rims and weights != "cotangent":
+            raise ValueError(
+                f'weights is {weights!r}; energy = "spokes_and_rims" takes "cotangent", those of each triangle, and is never '
+                'negative; energy = "spokes" takes the others'
+            )
+        if weights != "uniform" and not len(mesh.triangles):
+            raise ValueError(f'weights is {weights!r}, which needs triangles, and this is an edge mesh; use "uniform"')
+        if len(mesh.isolated):
+            raise ValueError(
+                f"vertex {mesh.isolated[0]} is in no triangle and on no edge (isolated vertices of the mesh: "
+                f"{len(mesh.isolated)}); remove such vertices, for nothing says where they go"
+            )
+        self.device, self.dtype = find_device(device), dtype
+        self._scalar, self._numpy = DTYPES[dtype]
+        self.handles = distinct_vertices("handles", handles, mesh)
+        if not len(self.handles):
+            raise ValueError(f"handles is {shown(handles)}, which names no vertex; at least one is needed")
+        self.handles.setflags(write=False)
+        n = len(mesh.points)
+        f = n - len(self.handles)
+
+        pairs, w = _edge_weights(mesh, weights)
+        self.negative_edges = pairs[w < -_ROUNDING * np.abs(w).max(initial=0.0)]
+        if len(self.negative_edges) and not rims:
+            others = "" if weights == "intrinsic" else 'weights = "intrinsic" do inside the mesh, '
+            warnings.warn(
+                f"negative weights: {len(self.negative_edges)}, the most negative {w.min():.3g} of edge "
+                f"{pairs[w.argmin()].tolist()}, so that the energy can be negative and lowest where nothing is rigid; "
+                f'energy = "spokes_and_rims" avoids it, {others}and weights = "clamped" do at the price of linear precision',
+                stacklevel=3,
+            )
+        pairs, w = pairs[w != 0.0], w[w != 0.0]
+        adjacency = coo_matrix((w, pairs.T), shape=(n, n)).tocsr()
+        adjacency = adjacency + adjacency.T
+        self.laplacian = (diags(np.asarray(adjacency.sum(axis=1))[:, 0]) - adjacency).tocsr()
+        self.parts = self._connected(adjacency)
+
+        # The free vertices come first, so that what the system solves for is a slice of every array.
+        near = worthwhile_order(mesh)
+        vertices = np.arange(n) if near is None else near
+        self._order = np.concatenate([vertices[~np.isin(vertices, self.handles)], self.handles])
+        self._place = np.argsort(self._order)
+        system = self.laplacian[self._order[:f]]
+        self._coupling = system[:, self.handles]
+        self._factor = constant_factor(system[:, self._order[:f]], self.device, self._scalar) if f else None
+
+        # Coordinates of about unit size near the origin: nothing is lost to the place or the size of a mesh. A power of two
+        # scales without rounding.
+        self._unit = 2.0 ** np.ceil(np.log2(np.ptp(mesh.points, axis=0).max()))
+        self._rest = (mesh.points - mesh.points[self.handles].mean(axis=0)) / self._unit
+        # The energy of edges that are all strained by 1.
+        self._size = 2.0 * float(np.abs(w) @ (np.diff(self._rest[pairs], axis=1)[:, 0] ** 2).sum(axis=1))
+        # What rounding of coordinates of size 1 makes of the energy.
+        self._rounding = 16.0 * np.finfo(self._numpy).eps ** 2 * np.abs(adjacency).sum()
+
+        vec3, mat33 = types(self._scalar)
+        self._x = Mirror(self._zeros(n, vec3))
+        self._x_free = self._x.array[:f]
+        self._start, self._b = Mirror(self._zeros(f, vec3)), self._zeros(f, vec3)
+        self._rotations = Mirror(self._zeros(n, mat33))
+        self._energy = Mirror(self._zeros(1, wp.float64))
+        self._local = self._record(mesh, pairs, w, rims)
+
+    @in_turn
+    def solve(self, positions, iterations=100, tolerance=1e-6, initial=None):
+        """Moves the handles and lets the rest follow. Reuses the factors and all arrays of earlier calls.
+
+        Args:
+            positions: Targets of the handles (h, 3) [m], in their order.
+            iterations: The most iterations, each of one solve and one fit of rotations.
+            tolerance: It has converged when an iteration lowers the energy by no more than this share of it, or than edges
+                strained by this much have, or by what rounding makes of it; 0 to make all iterations.
+            initial: Points to start from (n, 3) [m], where those of handles do not count. Default: the rest shape, each
+                part of the mesh moved rigidly to where its handles fit their targets best. A rigid motion of all handles is
+                then followed exactly, where the energy is not negative.
+
+        Returns:
+            Deformed: Points, rotations, energies.
+
+        Raises:
+            ValueError: If an argument breaks a rule, or the energy overflows.
+        """
+        whole("iterations", iterations, 0)
+        number("tolerance", tolerance, least=0.0)
+        targets = _points("positions", positions, len(self.handles), lambda k: f" of handle {self.handles[k]}")
+        f = len(self._start.host)
+        with np.errstate(over="ignore", invalid="ignore"):  # the energy shows it
+            origin = targets.mean(axis=0)
+            held = (targets - origin) / self._unit
+            if initial is None:
+                x = self.carry(self._rest, self._rest[self.handles], held)
+            else:
+                x = (_points("initial", initial, len(self._order), lambda i: f" of vertex {i}") - origin) / self._unit
+            x[self.handles] = held
+            self._x.write(x[self._order])
+            self._start.write(-(self._coupling @ held))
+        energies = [self._fit(0)]
+        least = max(self._rounding * np.abs(x).max() ** 2, tolerance * tolerance * self._size) * self._unit**2
+        converged = f == 0
+        while f and len(energies) <= iterations and not converged:
+            self._factor.solve(self._b, self._x_free)
+            energies.append(self._fit(len(energies)))
+            fall = energies[-2] - energies[-1]
+            converged = tolerance > 0.0 and fall <= max(tolerance * abs(energies[-1]), least)
+        if energies[-1] < -least:
+            warnings.warn(
+                f"the energy ends at {energies[-1]:.3g} m², below 0: negative weights pull the mesh apart; use "
+                'energy = "spokes_and_rims", or weights = "clamped"',
+                stacklevel=3,
+            )
+        points = self._x.read()[self._place] * self._unit + origin
+        points[self.handles] = targets
+        rotations = self._rotations.read()[self._place].astype(np.float64)
+        return Deformed(points, rotations, np.array(energies), len(energies) - 1, bool(converged))
+
+    def _fit(self, iteration):
+        """Fits the rotations to x and gathers the right-hand side of the next solve.
+
+        Returns:
+            float: The energy [m²].
+        """
+        self._local()
+        energy = float(self._energy.read()[0]) * self._unit**2
+        if not np.isfinite(energy):
+            raise ValueError(
+                f"the energy after {iteration} iterations is {energy}; {self.dtype} does not hold the squares of such lengths"
+            )
+        return energy
+
+    @in_turn
+    def carry(self, points, before, after):
+        """Points moved along with the handles: each part of the mesh rigidly, as fits best how its handles went.
+
+        Args:
+            points: (n, 3) [m].
+            before: Where its handles were (h, 3) [m], in their order.
+            after: Where they went (h, 3) [m].
+
+        Returns:
+            np.ndarray: (n, 3) [m].
+        """
+        own = self.parts[self.handles]
+        sets = np.split(np.argsort(own, kind="stable"), np.cumsum(np.bincount(own))[:-1])
+        rotations = kabsch(before, after, neighbours=sets)
+        old, new = (np.stack([places[members].mean(axis=0) for members in sets]) for places in (before, after))
+        return np.einsum("nij,nj->ni", rotations[self.parts], points - old[self.parts]) + new[self.parts]
+
+    def _connected(self, adjacency):
+        """The part of the mesh that each vertex belongs to (n,), numbered from 0.
+
+        Raises:
+            ValueError: If a part has no handle.
+        """
+        from scipy.sparse.csgraph import connected_components
+
+        count, parts = connected_components(adjacency, directed=False)
+        loose = np.setdiff1d(np.arange(count), parts[self.handles])
+        if len(loose):
+            part = np.flatnonzero(parts == loose[0])
+            raise ValueError(
+                f"handles leave {len(loose)} of the {count} parts of the mesh without one, the first of them with {len(part)} "
+                f"vertices, such as vertex {part[0]}; every part that hangs together needs a handle"
+            )
+        return parts
+
+    def _record(self, mesh, pairs, w, rims):
+        """The segment that fits the rotations of the cells and finds the energy and the right-hand side."""
+        rest, place, n = self._rest, self._place, len(self._order)
+        vec3, _ = types(self._scalar)
+        if rims:
+            triangles, cotangents = mesh.triangles, _half_cotangents(mesh)
+            e0, e1, e2 = (rest[triangles[:, (k + 2) % 3]] - rest[triangles[:, (k + 1) % 3]] for k in range(3))
+            c0, c1, c2 = cotangents.T[..., None]
+            moments = np.stack([c1 * e1 - c2 * e2, c2 * e2 - c0 * e0, c0 * e0 - c1 * e1], axis=1)
+            # The moments of a triangle are the same in the cells of its three vertices.
+            entries = np.repeat(triangles, 3, axis=1).ravel(), np.tile(triangles, 3).ravel(), np.tile(moments, (1, 3, 1))
+            elements, kernel, weights, kind = triangles, cells.triangle_energy, cotangents, vec3
+        else:
+            i, j = pairs.T
+            moments = w[:, None] * (rest[j] - rest[i])
+            entries = np.r_[i, i, j, j], np.r_[j, i, i, j], np.concatenate([moments, -moments, -moments, moments])
+            elements, kernel, weights, kind = pairs, cells.edge_energy, w, self._scalar
+        cell, member, moments = _summed(place[entries[0]], place[entries[1]], entries[2].reshape(-1, 3), n)
+        rows = self._compressed(cell, member, moments, n)
+        # Every edge is in 2 cells, or every side of a triangle in 3, so that the sum over cells is that often L x = b.
+        columns = self._compressed(member, cell, moments / (3 if rims else 2), n)
+
+        index = wp.types.vector(elements.shape[1], wp.int32)
+        elements = place[elements].astype(np.int32)
+        order = np.argsort(elements.min(axis=1), kind="stable")  # so that neighbours are read one after another
+        elements, weights = wp.array(elements[order], dtype=index, device=self.device), self._array(weights[order], kind)
+        energies = self._zeros(len(elements), wp.float64)
+        partial = self._zeros((1, CHUNKS if self.device.is_cuda else 1), wp.float64)
+        placed = self._array(rest[self._order], vec3)
+        # By themselves: a graph that held its owner would keep the factors until garbage is collected.
+        device, scalar, x, rotations = self.device, self._scalar, self._x.array, self._rotations.array
+        total, start, b = self._energy.array, self._start.array, self._b
+
+        def launch(kernel, dim, inputs, output):
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[output], device=device)
+
+        def fit_cells():
+            launch(cells.fit_rotations(scalar), n, [*rows, x], rotations)
+            launch(kernel(scalar), len(elements), [elements, weights, placed, rotations, x], energies)
+            launch(reduce.partial_sum(), partial.shape, [energies, len(elements)], partial)
+            launch(reduce.finish_sum(), 1, [partial, 0], total)
+            if len(b):
+                launch(cells.gather(scalar), len(b), [*columns, rotations, start], b)
+
+        return Segment(self.device, fit_cells)
+
+    def _compressed(self, rows, columns, values, count):
+        """(offsets, columns, values) on the device, sorted by row and column, of entries with vectors as values."""
+        order = np.lexsort((columns, rows))
+        offsets = np.searchsorted(rows[order], np.arange(count + 1))
+        indices = [wp.array(part.astype(np.int32), dtype=wp.int32, device=self.device) for part in (offsets, columns[order])]
+        return *indices, self._array(values[order], types(self._scalar)[0])
+
+    def _array(self, values, dtype):
+        return wp.array(np.ascontiguousarray(values, dtype=self._numpy), dtype=dtype, device=self.device)
+
+    def _zeros(self, shape, dtype):
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
+
+def _points(name, value, count, place):
+    """``value`` as finite points (count, 3), float64; ``place`` gives words for a row."""
+    found = numeric(name, value, f"have shape {(count, 3)}")
+    if found.shape != (count, 3):
+        raise ValueError(f"{name} has shape {found.shape}; it must be {(count, 3)}")
+    for k in np.flatnonzero(~np.isfinite(found).all(axis=1))[:1]:
+        raise ValueError(f"{name}[{k}]{place(k)} is {found[k].tolist()}; it must be finite")
+    return found
+
+
+def _half_cotangents(mesh):
+    """½ cot of the angle at each corner of each triangle (T, 3), signed."""
+    corners = mesh.points[mesh.triangles]
+    one, other = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    return 0.5 * np.einsum("tki,tki->tk", one, other) / np.linalg.norm(np.cross(one, other), axis=2)
+
+
+def _edge_weights(mesh, weights):
+    """Pairs of vertices (E, 2), of a matrix the smaller index first, and their weights (E,)."""
+    from scipy.sparse import coo_matrix, triu
+
+    if weights == "uniform":
+        return mesh.edges, np.ones(len(mesh.edges))
+    n = len(mesh.points)
+    if weights == "intrinsic":
+        if not importlib.util.find_spec("igl"):
+            raise ImportError("weights = 'intrinsic' needs libigl: pip install -e '.[intrinsic]' in the checkout")
+        import igl
+
+        triangles = igl.bfs_orient(mesh.triangles.astype(np.int64))[0]  # which its flips rely on
+        sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+        sides, counts = np.unique(sides, axis=0, return_counts=True)
+        for side in sides[counts > 1][:1]:
+            raise ValueError(
+                'weights is "intrinsic", which needs a manifold that can be oriented, and at edge '
+                f"{np.sort(side).tolist()} two triangles run the same way, or three meet; the other weights do without"
+            )
+        matrix = igl.intrinsic_delaunay_cotmatrix(np.array(mesh.points), triangles)[0]
+    else:
+        opposite = mesh.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
+        matrix = coo_matrix((_half_cotangents(mesh).ravel(), np.sort(opposite, axis=1).T), shape=(n, n))
+    upper = triu(matrix.tocsr(), 1).tocoo()
+    values = np.maximum(upper.data, 0.0) if weights == "clamped" else upper.data
+    return np.stack([upper.row, upper.col], axis=1), values
+
+
+def _summed(rows, columns, values, n):
+    """Entries with vectors as values: those of one place added, and those of value 0 dropped but on the diagonal."""
+    keys, inverse = np.unique(rows.astype(np.int64) * n + columns, return_inverse=True)
+    rows, columns = np.divmod(keys, n)
+    values = np.stack([np.bincount(inverse, axis) for axis in values.T], axis=1)
+    keep = values.any(axis=1) | (rows == columns)
+    return rows[keep], columns[keep], values[keep]

@@ -1,0 +1,206 @@
+"""As-rigid-as-possible deformation driven by keyframes: a mesh and moved handles in, an animation out."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..base.checks import number, refuse, shown, whole
+from ..base.interrupts import recording
+from ..mesh.mesh import Mesh
+from ..scene.scene import checked_pins
+from .arap import Arap
+
+PRIMVAR = "rotationAngle"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Deformation:
+    """What a deformation left: a frame for each keyframe.
+
+    Attributes:
+        points: (F, n, 3) [m]; in memory, or read from ``output`` when asked for (float32 then).
+        largest_angles: Largest of the angles of each frame (F,) [rad].
+        angles: Angle by which the neighbourhood of each vertex is turned from its rest shape, (F, n) [rad], 0 to π: no turn
+            counts twice. In the file it is ``primvars:rotationAngle``, in degrees.
+        energies: Energy that is left in each frame (F,) [m²].
+        iterations: Iterations of each frame (F,).
+        converged: Whether each frame reached the tolerance (F,).
+        times: (F,) [s].
+        timings: ``factorise`` and ``frames`` (a list) [s].
+        output: Path of the USD file, or None.
+    """
+
+    points: np.ndarray
+    angles: np.ndarray
+    largest_angles: np.ndarray
+    energies: np.ndarray
+    iterations: np.ndarray
+    converged: np.ndarray
+    times: np.ndarray
+    timings: dict
+    output: str | None = None
+
+    def __repr__(self):
+        frames, vertices, _ = self.points.shape
+        late = np.count_nonzero(~self.converged)
+        result = f"{late} frames did not converge" if late else "converged"
+        where = "" if self.output is None else f", in {self.output}"
+        return f"Deformation({frames} frames of {vertices} vertices, {self.times[-1]:g} s, {result}{where})"
+
+
+def deform(
+    mesh,
+    pins,
+    fps=24.0,
+    weights="cotangent",
+    energy="spokes",
+    iterations=500,
+    tolerance=1e-6,
+    device="cpu",
+    dtype="float64",
+    output=None,
+    single_file=False,
+    progress=None,
+    stage=None,
+    up_axis=None,
+):
+    """Deforms a mesh as rigidly as its moved handles allow (Sorkine & Alexa 2007).
+
+    Each solve starts from the frame before it, carried along with the handles (:meth:`warpcloth.Arap.carry`): they may turn
+    as far as they like in steps of less than half a turn, and what they take along rigidly costs one iteration.
+    A scene with moved pins is deformed by ``deform(scene.mesh, scene.pins, fps=scene.fps, stage=scene.stage)``; of the scene
+    its keyframes count, and where it starts does not.
+
+    Args:
+        mesh: The :class:`warpcloth.Mesh`; its points are the rest shape.
+        pins: :class:`warpcloth.Pins`: the handles and their keyframes (F, p, 3), each of which is a frame.
+        fps: Frames per second.
+        weights: See :class:`warpcloth.Arap`, as for ``energy``, ``device`` and ``dtype``.
+        energy: See there.
+        iterations: Most iterations of a frame.
+        tolerance: See :meth:`warpcloth.Arap.solve`.
+        device: A Warp device.
+        dtype: ``"float32"`` or ``"float64"``.
+        output: Path of a USD file (.usd, .usda, .usdc, .usdz) to write, frame by frame; memory then stays flat. Velocities
+            are differences to the frame before, zero in the first.
+        single_file: Whether ``output`` is to be one file in the end, with nothing beside it.
+        progress: Function called with (frame, frames) once each frame is kept, ``frames`` being those after the first; or None.
+        stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; ``output`` is then a layer over it.
+        up_axis: Up axis of an output that is not a layer, "Y" or "Z"; by default that of the mesh.
+
+    Returns:
+        :class:`Deformation`.
+
+    Raises:
+        BlockingIOError, Interrupted, OSError: As :func:`warpcloth.simulate`.
+        ValueError: If an argument breaks a rule, as :class:`warpcloth.Arap` has them too, or a frame overflows; the frames
+            before it are in ``output``.
+    """
+    if not isinstance(mesh, Mesh):
+        raise ValueError(f"mesh is {shown(mesh)}; it must be a Mesh, such as Mesh.load(path)")
+    number("fps", fps, above=0.0)
+    whole("iterations", iterations, least=0)
+    number("tolerance", tolerance, least=0.0)
+    pins = checked_pins(pins, mesh)
+    if pins.keyframes is None:
+        raise ValueError("pins.keyframes is None; a deformation needs places for its handles, (F, p, 3), in each frame")
+    frames = len(pins.keyframes)
+    if output is not None:  # before an earlier result is replaced
+        _refuse_beyond_float32(pins.keyframes, fps)
+    # First, for it refuses a wrong output before anything is factorised.
+    recorder = _Memory(mesh, frames) if output is None else _File(mesh, pins, fps, output, single_file, stage, up_axis)
+    results, points = [], None
+    with recording(recorder, frames - 1):
+        start = time.perf_counter()
+        arap = Arap(mesh, pins.vertices, weights=weights, energy=energy, device=device, dtype=dtype)
+        timings = {"factorise": time.perf_counter() - start, "frames": []}
+        for frame, places in enumerate(pins.keyframes):
+            start = time.perf_counter()
+            initial = None if points is None else arap.carry(points, pins.keyframes[frame - 1], places)
+            try:
+                result = arap.solve(places, iterations=iterations, tolerance=tolerance, initial=initial)
+            except ValueError as error:
+                raise ValueError(f"frame {frame}: {error}") from error
+            velocities = np.zeros_like(result.points) if points is None else (result.points - points) * fps
+            points = result.points
+            timings["frames"].append(time.perf_counter() - start)
+            angles = rotation_angles(result.rotations)
+            recorder.append(points, velocities, angles)
+            results.append((result.energies[-1], result.iterations, result.converged, angles.max()))
+            if progress is not None:
+                progress(frame, frames - 1)
+    energies, iterations, converged, largest = (np.array(values) for values in zip(*results, strict=True))
+    points, angles = recorder.read()
+    return Deformation(points, angles, largest, energies, iterations, converged, np.arange(frames) / fps, timings, output)
+
+
+def _refuse_beyond_float32(keyframes, fps):
+    """Refuses handles whose places or velocities a file of float32 does not hold."""
+    limit = np.finfo(np.float32).max
+    rule = f"cannot be written: a file holds float32, up to {limit:.2g}"
+    refuse("pins.keyframes", keyframes, ~(np.abs(keyframes) <= limit), rule)
+    with np.errstate(over="ignore"):
+        velocities = np.diff(keyframes, axis=0) * fps
+    refuse("velocities of pins.keyframes", velocities, ~(np.abs(velocities) <= limit), rule)
+
+
+def rotation_angles(rotations):
+    """Angles of rotation matrices (n, 3, 3) → (n,) [rad], 0 to π, as precise near both ends as the matrices are."""
+    R = rotations
+    axial = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    return np.arctan2(np.linalg.norm(axial, axis=1), np.trace(R, axis1=1, axis2=2) - 1.0)  # 2 sin, 2 cos
+
+
+class _Memory:
+    """Keeps frames in memory."""
+
+    def __init__(self, mesh, frames):
+        self.points, self.angles = np.empty((frames, len(mesh.points), 3)), np.empty((frames, len(mesh.points)))
+        self.frames = 0
+
+    def append(self, points, velocities, angles):
+        self.points[self.frames], self.angles[self.frames] = points, angles
+        self.frames += 1
+
+    def close(self):
+        pass
+
+    def saved(self):
+        return "nothing was saved"
+
+    def read(self):
+        return self.points, self.angles
+
+
+class _File:
+    """Writes frames as USD and reads them back when asked."""
+
+    def __init__(self, mesh, pins, fps, output, single_file, stage, up_axis):
+        from ..usd import AnimationWriter
+
+        self.single_file, primvars = single_file, {PRIMVAR: "vertex"}
+        if stage is None:
+            handles = {"handles": pins.vertices}
+            self.writer = AnimationWriter(output, mesh, fps, pins=handles, up_axis=up_axis, primvars=primvars)
+        else:
+            self.writer = AnimationWriter(output, mesh, fps, source=stage.path, prim=stage.prim, primvars=primvars)
+
+    def append(self, points, velocities, angles):
+        self.writer.append(points, velocities, {PRIMVAR: np.degrees(angles)})
+
+    @property
+    def frames(self):
+        return self.writer.frames
+
+    def saved(self):
+        return self.writer.saved()
+
+    def close(self):
+        self.writer.close(single_file=self.single_file)
+
+    def read(self):
+        from ..usd import FrameSequence
+
+        path = self.writer.path
+        return FrameSequence(path), FrameSequence(path, attribute=f"primvars:{PRIMVAR}", scale=np.pi / 180.0)

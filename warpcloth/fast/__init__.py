@@ -1,0 +1,1 @@
+"""Faster ways to do what the core does, behind one door."""

@@ -1,0 +1,80 @@
+"""Blocks of consecutive vertices and, of each term, the pieces of the elements whose lowest vertices these are.
+
+See :mod:`warpcloth.kernels.fast.blocks` for what is done with them.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .incidences import indices
+
+NUMBERS = 6144  # of scratch, if no vertex needs more: 2048 springs, which fit into the first cache
+RUN = 8  # elements, from which on a run is faster than looking stencils up
+
+
+def in_blocks(terms, per_copy, copies):
+    """The first vertex of each block, and the terms in the order of the blocks with their pieces.
+
+    A block ends before the coordinates of one of the terms are more than :data:`NUMBERS`; it has one vertex at least.
+
+    Args:
+        terms: :class:`warpcloth.model.model.DeviceElements` of each term; all copies have the same.
+        per_copy: Vertices of a copy.
+        copies: How many there are.
+
+    Returns:
+        (vertices (blocks + 1,), terms, the most numbers that a term has in a block)
+    """
+    totals = [_numbers_before(elements, per_copy) for elements in terms]
+    vertices = [0]
+    while vertices[-1] < per_copy:
+        ends = [int(np.searchsorted(total, total[vertices[-1]] + NUMBERS, side="right")) - 1 for total in totals]
+        vertices.append(max(min(ends, default=per_copy), vertices[-1] + 1))
+    blocks = np.array(vertices)
+    most = max((int(np.diff(total[blocks]).max()) for total in totals), default=0)
+    firsts = (blocks[:-1] + per_copy * np.arange(copies)[:, None]).ravel()
+    return np.append(firsts, per_copy * copies), [_with_pieces(elements, blocks, copies) for elements in terms], most
+
+
+def _one(elements):
+    """The stencil (E, K) of one copy."""
+    return elements.stencil.numpy()[: elements.per_copy]
+
+
+def _numbers_before(elements, per_copy):
+    """The numbers of the local coordinates of elements with a lowest vertex before each, (per_copy + 1,)."""
+    counts = np.bincount(_one(elements).min(axis=1), minlength=per_copy)
+    return 3 * elements.term.rows * np.append(0, np.cumsum(counts))
+
+
+def _with_pieces(elements, blocks, copies):
+    """The elements block by block, runs first, and their pieces."""
+    stencil = _one(elements)
+    lowest = stencil.min(axis=1)
+    block = np.searchsorted(blocks, lowest, side="right") - 1
+    first, *others = stencil.T
+    order = np.lexsort((first, *(other - first for other in others[::-1]), block))
+    new = _changes(block[order]) | _changes(stencil[order] - np.arange(len(order))[:, None])
+    run = np.cumsum(new) - 1
+    loose = np.bincount(run)[run] < RUN
+    again = np.lexsort((np.where(loose, lowest[order], run), loose, block[order]))
+    order, run, loose = order[again], np.where(loose, -1, run)[again], loose[again]
+    firsts = np.flatnonzero(_changes(block[order]) | _changes(run))
+    counts = np.diff(np.append(firsts, len(order))) * np.where(loose[firsts], -1, 1)
+    offsets = np.searchsorted(block[order][firsts], np.arange(len(blocks)))
+    if copies > 1:
+        copy = np.arange(copies)[:, None]
+        offsets = np.append((offsets[:-1] + len(firsts) * copy).ravel(), len(firsts) * copies)
+        order, firsts = ((each + elements.per_copy * copy).ravel() for each in (order, firsts))
+        counts = np.tile(counts, copies)
+    if (np.diff(order) < 0).any():
+        elements = elements.reordered(order)
+    pieces = indices(elements, offsets), indices(elements, np.column_stack([firsts, counts]).ravel())
+    return replace(elements, pieces=pieces)
+
+
+def _changes(values):
+    """Where a row differs from the last; the first does."""
+    values = values.reshape(len(values), -1)
+    return np.append(np.full(min(len(values), 1), True), (values[1:] != values[:-1]).any(axis=1))

@@ -1,0 +1,170 @@
+"""The elements of each vertex, as kernels read them that take all terms in one pass."""
+
+import numpy as np
+import warp as wp
+
+from ..kernels.elements import Part, chain_of, elements_of
+from ..kernels.fast.jacobi import rows_of
+from .quadratic import entries
+
+SLOTS = 16  # of pairs, which are compiled one by one
+# On CUDA so many threads take a vertex of meshes of so many vertices or less: a step of the springs of 64² takes 2.0 µs, not
+# 3.0, of 128² 2.2, not 3.1, of 256² as long and of larger ones longer.
+LANES, LANED = 4, 50_000
+
+
+def gathered(model, elements, damped=False, rows=True):
+    """The :class:`warpcloth.kernels.elements.Part` of elements and what their struct has, by name, to gather over vertices.
+
+    Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
+    than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and what the element has
+    beside it at hand, unless the rest state is set, by element, in each step. A stiffness that all pairs of a copy share is
+    stored once per vertex, so that a copy gets the same bits as a model of its own. For a quadratic energy without damping the
+    incidences are the rows of its matrix, if ``rows`` allows it. Rows take a third of the time, but their rounding errors do
+    not cancel between vertices: in float32 this noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as
+    with elements.
+    """
+    part = Part(elements.term, damped, shared=0 in elements.stiffness.strides)
+    arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
+    if damped:
+        arrays["damping"] = elements.damping
+    if found := _pairs(elements, model.count):
+        slots, codes, source = found
+        codes = np.where(codes < 0, np.arange(model.count), codes)
+        others = {name: _of_incidences(array, source.ravel()) for name, array in arrays.items() if name != "stencil"}
+        own = None if damped or part.shared else elements.stiffness_of_copies(model)
+        if own is not None:
+            part = part._replace(shared=True)
+            others["stiffness"] = model.array(np.repeat(own, model.per_copy), model.dtype)
+        return part._replace(pairs=slots), {**others, "codes": indices(elements, codes.ravel())}
+    if rows and elements.term.quadratic and not damped and (found := _of_matrix(model, elements)):
+        slots, numbers = found
+        return part._replace(rows=slots), numbers
+    return _by_element(elements, model.count, part, arrays)
+
+
+def gathered_in_rows(elements, count, pairs, **others):
+    """The same for Jacobi sweeps: incidences of pairs in rows, see :func:`warpcloth.kernels.fast.jacobi.rows_of`, or by
+    element.
+
+    Args:
+        elements: :class:`warpcloth.model.model.DeviceElements`.
+        count: Vertices, N.
+        pairs: Whether incidences may name the other vertex in place of the element.
+        others: What else goes along, by name, numbers (B·E,) of the elements.
+    """
+    part = Part(elements.term, shared=0 in elements.stiffness.strides)
+    arrays = {"stiffness": elements.stiffness, "rest": elements.rest, **others}
+    if not pairs or not (found := _pairs(elements, count)):
+        return _by_element(elements, count, part, {"stencil": elements.stencil, **arrays})
+    slots, codes, source = found
+    rows, width = rows_of(sum(slots))
+    empty = ((0, rows * width - sum(slots)), (0, 0))
+    codes, source = np.pad(codes, empty, constant_values=-1), np.pad(source, empty)
+
+    def in_rows(values):
+        """Values (slots, N) or (slots, N, P) as they are stored: of each row P times the slots of each vertex."""
+        parts = values.reshape(rows, width, count, -1).transpose(0, 3, 2, 1)
+        return np.ascontiguousarray(parts).reshape(-1, *values.shape[2:])
+
+    found = {"codes": indices(elements, in_rows(codes))}
+    for name, array in arrays.items():
+        shared = 0 in array.strides
+        found[name] = array if shared else wp.array(in_rows(array.numpy()[source]), dtype=array.dtype, device=array.device)
+    return part._replace(pairs=slots), found
+
+
+def _by_element(elements, count, part, arrays):
+    """The part and the arrays of incidences that name elements."""
+    order, vertices, offsets = _rows(elements.stencil.numpy().ravel(), count)
+    codes, padded = _slots(order, vertices, offsets, count)
+    arrays |= {"offsets": indices(elements, offsets), "codes": indices(elements, codes)}
+    return part._replace(padded=padded), arrays
+
+
+def _pairs(elements, count):
+    """Slots of a vertex as first and as second of a pair, and of each slot and vertex the other vertex and the element.
+
+    -1 and 0 of an empty slot. None where elements are no pairs, or their rest state is set in each step, or there would be too
+    many slots.
+    """
+    stencil = elements.stencil.numpy()
+    if stencil.shape[1] != 2 or elements.origin is not None:
+        return None
+    columns = [_rows(stencil[:, corner], count) for corner in range(2)]
+    slots = tuple(int(np.diff(offsets).max(initial=0)) for _order, _vertices, offsets in columns)
+    if sum(slots) > SLOTS or sum(slots) * count > 2 * stencil.size:
+        return None
+    codes, source = np.full((sum(slots), count), -1), np.zeros((sum(slots), count), dtype=np.int64)
+    for corner, (order, vertices, offsets) in enumerate(columns):
+        place = corner * slots[0] + np.arange(len(order)) - offsets[vertices], vertices
+        codes[place], source[place] = stencil[order, 1 - corner], order
+    return slots, codes, source
+
+
+def _rows(vertices, count):
+    """The order that sorts vertices (E,), the sorted ones, and where those of each of the ``count`` vertices are in it."""
+    order = np.argsort(vertices, kind="stable")
+    return order, vertices[order], np.searchsorted(vertices[order], np.arange(count + 1))
+
+
+def _slots(values, vertices, offsets, count):
+    """Values of incidences, one vertex after another, slot by slot if that is at most twice as many, and whether it is."""
+    slots = int(np.diff(offsets).max(initial=0))
+    if slots * count > 2 * len(values):
+        return values, False
+    padded = np.full(slots * count, -1, dtype=values.dtype)
+    padded[(np.arange(len(values)) - offsets[vertices]) * count + vertices] = values
+    return padded, True
+
+
+def _of_matrix(model, elements):
+    """How long the longest row of kAGᵀG is off the diagonal, and its rows, where 0 of the vertex itself makes all as long.
+
+    None if that makes them more than twice as many, or there are none.
+    """
+    n, count = model.per_copy, model.count
+    rows, columns, entries_of_copies = entries(model, elements)
+    firsts = np.searchsorted(rows, np.arange(n + 1))
+    slots = int(np.diff(firsts).max())
+    if slots * n > 2 * len(rows) or not slots:
+        return None
+    slot = np.arange(len(rows)) - firsts[rows]
+    codes, numbers = np.tile(np.arange(count), (slots, 1)), np.zeros((slots, count))
+    for copy, own in enumerate(entries_of_copies):
+        codes[slot, copy * n + rows], numbers[slot, copy * n + rows] = copy * n + columns, own
+    return slots, {"codes": indices(elements, codes.ravel()), "stiffness": model.array(numbers.ravel(), model.dtype)}
+
+
+def _of_incidences(array, source):
+    """The values of elements ``source``, if elements do not share one."""
+    if 0 in array.strides:
+        return array
+    return wp.array(array.numpy()[source], dtype=array.dtype, device=array.device)
+
+
+def indices(elements, values):
+    """Whole numbers (n,) on the device."""
+    return wp.array(values.astype(np.int32), dtype=wp.int32, device=elements.stencil.device)
+
+
+def lanes(model):
+    """How many threads take a vertex."""
+    return LANES if model.device.is_cuda and model.count <= LANED else 1
+
+
+def chain(parts, arrays, dtype, struct_of=elements_of):
+    """The struct of all terms: that of the first, and the chain of the others."""
+    made = chain_of(tuple(parts), dtype, struct_of)()
+    if parts:
+        made.first = filled(struct_of(parts[0], dtype), arrays[0])
+        made.others = chain(parts[1:], arrays[1:], dtype, struct_of)
+    return made
+
+
+def filled(struct, values):
+    """A struct of these values, by name."""
+    made = struct()
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made

@@ -1,0 +1,85 @@
+"""Quadratic energies by the entries of their matrix Q = kAGᵀG, of which elements that share vertices have one for all."""
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from ..kernels.assemble import constant_blocks
+from ..kernels.terms.quadratic_pair import QUADRATIC_PAIR
+
+CHUNK = 1 << 18  # elements whose blocks are added up at once
+# Pairs an element, up to which they are faster: a hinge takes 5 to 6 ns, a pair of vertices 1.2 (one core).
+PAIRS = 4
+# Weights up to so much of the largest of an element are 0, as of cotangents that cancel in double precision.
+ZERO = 1e-12
+
+
+def entries(model, elements):
+    """The entries of Q off the diagonal, row by row, where elements of a copy share one stiffness without those that cancel.
+
+    Returns:
+        (rows (m,), columns (m,), numbers (B, m) [N/m]) of the vertices of one copy.
+    """
+    from scipy.sparse import coo_matrix
+
+    K, n = elements.term.vertices, model.per_copy
+    stencil = elements.stencil.numpy()
+
+    def places_of(some):
+        """Rows and columns of the entries off the diagonal, and where they are in the blocks."""
+        rows, columns = np.repeat(some, K, axis=1), np.tile(some, K)
+        apart = rows != columns
+        return rows[apart], columns[apart], apart
+
+    # Colours put elements of all copies in one order; all vertices of an element are in one copy.
+    rows, columns, _apart = places_of(stencil[stencil[:, 0] < n])
+    pattern = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n)).tocsr()
+    rows, columns = np.repeat(np.arange(n, dtype=np.int64), np.diff(pattern.indptr)), pattern.indices.astype(np.int64)
+    place = rows * n + columns
+    size, shape = min(CHUNK, elements.count), (model.copies, len(place))
+    numbers, sizes = np.zeros(shape), np.zeros(shape)
+    blocks = wp.zeros((size, K * K), dtype=wp.float64, device=model.device)
+    kernel = model.kernel(constant_blocks, elements.term, model.dtype)
+    for first in range(0, elements.count, size):
+        some = slice(first, min(first + size, elements.count))
+        model.launch(kernel, some.stop - first, [array[some] for array in elements.arguments], [blocks])
+        own_rows, own_columns, apart = places_of(stencil[some].astype(np.int64))
+        found = own_rows // n, np.searchsorted(place, own_rows % n * n + own_columns % n)
+        own = _without_zeros(blocks.numpy()[: len(apart)], K)[apart]
+        np.add.at(numbers, found, own)
+        np.add.at(sizes, found, np.abs(own))
+    if elements.stiffness_of_copies(model) is None:
+        return rows, columns, numbers  # what cancels in a copy need not in others, and copies may not depend on these
+    # What cancels, as elements at right angles do, leaves rounding of itself. It may not be held against what else is at its
+    # vertices: a few large elements may be all that joins two parts of small ones.
+    some = (np.abs(numbers) > 4.0 * np.finfo(model.numpy_dtype).eps * sizes).any(axis=0)
+    return rows[some], columns[some], numbers[:, some]
+
+
+def _without_zeros(blocks, K):
+    """Blocks (E, K·K) without what weights that are 0 but for rounding, as of vertices in one line, have in them."""
+    squares = blocks[:, :: K + 1]
+    small = squares <= ZERO**2 * squares.max(axis=1, keepdims=True)
+    return np.where((small[:, :, None] | small[:, None]).reshape(blocks.shape), 0.0, blocks)
+
+
+def as_pairs(model, elements):
+    """The pairs of vertices that have the same forces as elements of a quadratic energy, or these where they are no faster."""
+    if not elements.term.quadratic or elements.damping is not None:
+        return elements
+    rows, columns, numbers = entries(model, elements)
+    upper = rows < columns
+    per_copy = int(upper.sum())
+    if not 0 < per_copy <= PAIRS * elements.per_copy:
+        return elements
+    firsts = model.per_copy * np.arange(model.copies)[:, None, None]
+    stencil = (np.column_stack([rows, columns])[upper] + firsts).reshape(-1, 2).astype(np.int32)
+    return replace(
+        elements,
+        term=replace(QUADRATIC_PAIR, name=elements.term.name),
+        per_copy=per_copy,
+        stencil=wp.array(stencil, dtype=wp.int32, device=model.device),
+        stiffness=model.array(-numbers[:, upper].ravel(), model.dtype),
+        rest=wp.zeros(len(stencil), dtype=wp.types.vector(1, model.dtype), device=model.device),
+    )

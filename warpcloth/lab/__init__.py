@@ -1,0 +1,1 @@
+"""Measuring: reference solutions, work and precision, stability, failures, benchmarks."""

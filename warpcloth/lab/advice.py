@@ -1,0 +1,204 @@
+"""Which declarations of a scene matter: each is left out or changed in turn, and the result and its cost are compared."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..analysis.distances import surface_distances
+from ..base.checks import number, whole
+from ..run.simulate import simulate
+
+# A cost that the whole scene itself changed by so much between its first and its last run says nothing.
+_STEADY = 0.25
+_FRAMES = 7  # at which surfaces of other resolutions are compared
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A run of the scene with one thing changed, against the scene as it is.
+
+    Attributes:
+        kind: "term", "terms" (all that do not matter by themselves), "precision", "step" or "resolution".
+        name: What was changed, such as "without QuadraticBending" or "n=64".
+        change: RMS distance of the results over vertices and frames, over the longest side of the cloth; of another resolution
+            between the surfaces, both ways. NaN where there is no result.
+        cost: Time of a frame over that of the scene as it is.
+        matters: Whether the change is above the tolerance; None where there is no result.
+        reason: Why there is none, or "".
+        finer: Of another resolution whether it has more vertices, else None.
+    """
+
+    kind: str
+    name: str
+    change: float
+    cost: float
+    matters: bool | None
+    reason: str = ""
+    finer: bool | None = None
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What :func:`advise` found.
+
+    Attributes:
+        trials: List of :class:`Trial`.
+        frames: Frames that were run.
+        declared: Frames that the scene has.
+        milliseconds: Median of a frame of the scene as it is, of its first and of its last run [ms].
+        tolerance: Below which a change does not matter.
+    """
+
+    trials: list
+    frames: int
+    declared: int
+    milliseconds: tuple[float, float]
+    tolerance: float
+
+    @property
+    def steady(self):
+        """Whether both runs of the scene as it is took about as long, so that costs can be compared."""
+        first, last = self.milliseconds
+        return abs(first - last) <= _STEADY * max(first, last)
+
+    @property
+    def sentences(self):
+        """What follows, in words."""
+        found = []
+        step = next(trial for trial in self.trials if trial.kind == "step")
+        if step.matters is not False:
+            found.append(
+                f"half the step changes the result by {step.change:.2%}, so that what changes it by less is not told from the "
+                "step; take a smaller one"
+                if step.matters
+                else f"half the step: {step.reason}"
+            )
+        needless = [trial for trial in self.trials if trial.kind == "term" and trial.matters is False]
+        together = next((trial for trial in self.trials if trial.kind == "terms"), None)
+        redundant = together is not None and together.matters is not False
+        for trial in needless:
+            saved = f", and a frame takes {trial.cost:.2f} times as long" if self.steady else ""
+            leave = "" if redundant else ": leave it out"
+            found.append(f"{trial.name} changes the result by {trial.change:.2%} alone{saved}{leave}")
+        if redundant:
+            why = f"{together.change:.2%}" if np.isfinite(together.change) else together.reason
+            found.append(f"{together.name} at once: {why}; of these leave one out, and try again")
+        if needless and self.frames < self.declared:
+            found.append(
+                f"only {self.frames} of {self.declared} frames were run: what begins to matter later is not seen; give --frames"
+            )
+        for trial in self.trials:
+            if trial.kind == "precision" and trial.matters is False:
+                found.append(f"float32 is enough: float64 changes the result by {trial.change:.2%} alone")
+            elif trial.kind == "precision" and trial.matters:
+                found.append(f"float64 changes the result by {trial.change:.2%}: take it")
+        finer = [trial for trial in self.trials if trial.finer]
+        coarser = [trial for trial in self.trials if trial.finer is False]
+        found += [f"{trial.name}: {trial.reason}" for trial in finer if trial.matters is None]
+        found += [f"{trial.name} changes the result by {trial.change:.2%}: too coarse" for trial in finer if trial.matters]
+        enough = [trial for trial in coarser if trial.matters is False]
+        found += [f"{trial.name} is enough: it changes the result by {trial.change:.2%} alone" for trial in enough]
+        return found
+
+
+def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device="cpu", dtype="float32", progress=None):
+    """Leaves out each term of a scene in turn, and changes precision, step and resolution, over a short run.
+
+    Args:
+        scene: The :class:`warpcloth.Scene`.
+        solver: Its options, with `substeps`.
+        tolerance: Change of the result below which something does not matter, a share of the longest side of the cloth.
+        frames: Frames to run; those of the scene, but no more than 30, if not given.
+        resolutions: The same scene with coarser or finer meshes by name, such as {"n=16": scene}; or None.
+        device: A Warp device.
+        dtype: "float32" or "float64"; the other one is tried.
+        progress: Function called with (trials done, trials) after each; or None.
+
+    Returns:
+        :class:`Advice`.
+
+    Raises:
+        ValueError: An option breaks a rule, or the scene as it is diverges.
+    """
+    number("tolerance", tolerance, above=0.0)
+    frames = min(scene.frames, 30) if frames is None else frames
+    whole("frames", frames, least=1)
+
+    def run(changed, solver=solver, dtype=dtype):
+        found = simulate(changed, solver, device=device, dtype=dtype, frames=frames)
+        return found, 1e3 * float(np.median(found.timings["frames"]))
+
+    base, first = run(scene)
+    if not base.status.ok:
+        raise ValueError(f"{scene.name} as it is: {base.status.message}; advice needs a run that does not diverge")
+    size = float(np.ptp(scene.mesh.points, axis=0).max())
+    other = "float64" if dtype == "float32" else "float32"
+    halved = replace(solver, dt=None, substeps=2 * solver.per_frame(scene.fps))
+    names = _names(scene.terms)
+    plans = [
+        *(
+            ("term", f"without {name}", {"changed": _without(scene, [term])})
+            for name, term in zip(names, scene.terms, strict=True)
+            if len(scene.terms) > 1
+        ),
+        ("precision", other, {"changed": scene, "dtype": other}),
+        ("step", f"substeps={halved.substeps}", {"changed": scene, "solver": halved}),
+        *(("resolution", name, {"changed": changed}) for name, changed in (resolutions or {}).items()),
+    ]
+    trials = []
+    for done, (kind, name, options) in enumerate(plans, 1):
+        trials.append(_trial(kind, name, options, run, base, first, scene, size, tolerance, device))
+        if progress is not None:
+            progress(done, len(plans))
+        if done == len(scene.terms) > 1:
+            # What one of two terms does by itself neither seems to do.
+            needless = [k for k, trial in enumerate(trials) if trial.matters is False]
+            if len(needless) > 1:
+                without = {"changed": _without(scene, [scene.terms[k] for k in needless])}
+                name = "without " + " and ".join(names[k] for k in needless)
+                trials.append(_trial("terms", name, without, run, base, first, scene, size, tolerance, device))
+    return Advice(trials, frames, scene.frames, (first, run(scene)[1]), tolerance)
+
+
+def _names(terms):
+    """Labels of terms, numbered where several have one."""
+    labels = [term.label for term in terms]
+    counted = [(label, labels[:k].count(label) + 1, labels.count(label)) for k, label in enumerate(labels)]
+    return [f"{label} {k} of {count}" if count > 1 else label for label, k, count in counted]
+
+
+def _without(scene, terms):
+    return replace(scene, terms=[other for other in scene.terms if not any(other is term for term in terms)])
+
+
+def _trial(kind, name, options, run, base, first, scene, size, tolerance, device):
+    finer = len(options["changed"].mesh.points) > len(scene.mesh.points) if kind == "resolution" else None
+    try:
+        found, milliseconds = run(**options)
+    except ValueError as error:
+        return Trial(kind, name, np.nan, np.nan, None, str(error), finer)
+    cost = milliseconds / first
+    if not found.status.ok:
+        if not kind.startswith("term"):
+            return Trial(kind, name, np.nan, cost, None, found.status.message, finer)
+        # Of a term that holds the cloth together: it matters, by more than can be said.
+        return Trial(kind, name, np.inf, cost, True, found.status.message)
+    if kind == "resolution":
+        if not (len(scene.mesh.triangles) and len(options["changed"].mesh.triangles)):
+            return Trial(kind, name, np.nan, cost, None, "the mesh has edges alone, and no surface to compare", finer)
+        change = _surface_change(base, scene, found, options["changed"], device)
+    else:
+        between = np.asarray(found.points, dtype=np.float64) - np.asarray(base.points, dtype=np.float64)
+        change = float(np.sqrt((between**2).sum(axis=2).mean()))
+    return Trial(kind, name, change / size, cost, bool(change / size > tolerance), finer=finer)
+
+
+def _surface_change(one, first, other, second, device):
+    """RMS distance between two surfaces, from the vertices of each, over some of the frames [m]."""
+    frames = np.unique(np.linspace(0, len(one.points) - 1, _FRAMES).round().astype(int))
+    squares = []
+    for frame in frames.tolist():
+        a, b = (np.asarray(found.points[frame], dtype=np.float64) for found in (one, other))
+        for points, x, mesh in ((a, b, second.mesh), (b, a, first.mesh)):
+            squares.append((surface_distances(points, x, mesh.triangles, device) ** 2).mean())
+    return float(np.sqrt(np.mean(squares)))

@@ -1,0 +1,154 @@
+"""Benchmarks as data, and their rows: each in a fresh process, one after another."""
+
+import os
+import tempfile
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from ..base.quiet import initialise_warp
+from . import bandwidth
+from .axes import refined
+from .campaign import sweep
+from .measurements import SceneRef, Setup, task
+from .setups import label, setups_of_runs
+from .timing import measure
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A solver on a scene of several sizes.
+
+    Attributes:
+        scene: Of any size.
+        setup: Of explicit without a step, the fewest stable substeps of each size.
+        sizes: Resolutions of the scene, see :func:`warpcloth.lab.axes.refined`; without any the scene as it is.
+        device: A Warp device.
+        dtype: ``"float32"`` or ``"float64"``.
+        frames: To time at most.
+        copies: How many of the scene run at once.
+        threads: That share the steps, on the CPU.
+    """
+
+    scene: SceneRef
+    setup: Setup
+    sizes: tuple = ()
+    device: str = "cpu"
+    dtype: str = "float32"
+    frames: int = 20
+    copies: int = 1
+    threads: int = 1
+
+    def scenes(self):
+        """The scene of each size.
+
+        Raises:
+            ValueError: It has no resolution.
+        """
+        return [refined(self.scene, size) for size in self.sizes] or [self.scene]
+
+    def setup_of(self, scene):
+        """The :class:`Setup` for one of the scenes."""
+        if self.setup.solver != "explicit" or {"dt", "substeps"} & set(self.setup.options):
+            return self.setup
+        (fewest, *_) = setups_of_runs(scene, ["explicit"], self.device, self.dtype)
+        return Setup("explicit", {**fewest.options, **self.setup.options})
+
+
+_STEPS = {"substeps": 4}
+_SWEEPS = {**_STEPS, "iterations": 20}
+# Sizes such that a frame of each solver takes less than about a second, on one core and on an H200.
+_SMALL, _LARGE = (16, 32, 64, 128), (64, 128, 256, 512, 1024)
+_SETUPS = (
+    (Setup("explicit"), {"cpu": _SMALL, "cuda": _LARGE}),
+    (Setup("newton", _STEPS), {"cpu": (16, 32, 64), "cuda": (32, 64, 128)}),
+    (Setup("projective-dynamics", _SWEEPS), {"cpu": (16, 32, 64), "cuda": (32, 64, 128, 256)}),
+    (Setup("admm", _SWEEPS), {"cpu": (16, 32, 64), "cuda": (32, 64, 128, 256)}),
+    (Setup("pbd", _SWEEPS), {"cpu": _SMALL, "cuda": _LARGE}),
+    (Setup("hierarchical-pbd", _SWEEPS), {"cpu": _SMALL, "cuda": _LARGE}),
+    (Setup("xpbd", _SWEEPS), {"cpu": _SMALL, "cuda": _LARGE}),
+    (Setup("constrained-dynamics", {**_STEPS, "iterations": 1}), {"cpu": (8, 16, 32), "cuda": (16, 32, 64)}),
+)
+
+
+# Local sweeps alone: so many that what a frame takes besides, its points on the host above all, does not count.
+_LOCAL = Setup("pbd", {"substeps": 1, "iterations": 1000, "sweep": "vertex-averaged"})
+_LOCAL_SIZES = {"cpu": _SMALL, "cuda": (256, 512, 1024, 2048)}
+
+
+def standard(**given):
+    """Every solver on ``hanging`` of growing size, and Jacobi sweeps over the springs of ``net``.
+
+    Args:
+        given: Further fields of each :class:`Benchmark`.
+    """
+    kind = "cuda" if given.get("device", "cpu").startswith("cuda") else "cpu"
+    local = Benchmark(SceneRef("net"), _LOCAL, _LOCAL_SIZES[kind], **given)
+    return [*(Benchmark(SceneRef("hanging"), setup, sizes[kind], **given) for setup, sizes in _SETUPS), local]
+
+
+class Run:
+    """The rows of benchmarks, which it has as far as it has come: whoever interrupts it keeps them.
+
+    Args:
+        benchmarks: :class:`Benchmark`\\s, of one device.
+
+    Attributes:
+        total: How many rows there will be.
+        rows: Those that are measured: what :func:`warpcloth.lab.timing.measure` returns, with ``scene``, ``parameters``,
+            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``threads``, ``benchmark`` (its place),
+            ``share`` (``bytes_per_s`` over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with
+            no kernel in any cache.
+        bandwidth: What :func:`warpcloth.lab.bandwidth.measure` returns.
+    """
+
+    def __init__(self, benchmarks):
+        self.benchmarks, self.rows, self.bandwidth = list(benchmarks), [], None
+        self.total = sum(len(each.scenes()) for each in self.benchmarks)
+
+    def measure(self, progress=lambda done, total: None):
+        """Measures all rows; ``progress`` is called with (rows, total) before the first and after each."""
+        progress(0, self.total)
+        initialise_warp()  # of this process, whose cache stays as it is
+        device = self.benchmarks[0].device
+        self.bandwidth = _alone(task(bandwidth.measure, device=device))
+        for place, benchmark in enumerate(self.benchmarks):
+            with _kernel_cache():
+                for i, scene in enumerate(benchmark.scenes()):
+                    self.rows.append({**self._row(benchmark, scene, cold=i == 0), "benchmark": place})
+                    progress(len(self.rows), self.total)
+
+    def _row(self, benchmark, scene, cold):
+        setup = benchmark.setup_of(scene)
+        given = {"device": benchmark.device, "dtype": benchmark.dtype, "copies": benchmark.copies, "threads": benchmark.threads}
+
+        def measured(frames):
+            return _alone(task(measure, scene=scene, setup=setup, frames=frames, started=time.time(), **given))
+
+        started = measured(0)["start_s"] if cold else None
+        row = measured(benchmark.frames)
+        share = row["bytes_per_s"] and row["bytes_per_s"] / max(self.bandwidth.values())
+        named = {"scene": scene.name, "parameters": scene.parameters, "solver": setup.solver, "options": setup.options}
+        named |= {"label": label(setup), **given}
+        return {**named, **row, "share": share, "cold_start_s": started}
+
+
+def _alone(asked):
+    """The result of a task in a fresh process."""
+    ((_, result),) = sweep([asked], workers=1)
+    return result
+
+
+@contextmanager
+def _kernel_cache():
+    """An empty folder for the kernels that are compiled meanwhile, by processes that are started."""
+    before = os.environ.get("WARP_CACHE_PATH")
+    with tempfile.TemporaryDirectory(prefix="warpcloth-kernels-") as folder:
+        os.environ["WARP_CACHE_PATH"] = folder
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ["WARP_CACHE_PATH"]
+            else:
+                os.environ["WARP_CACHE_PATH"] = before

@@ -1,0 +1,181 @@
+"""Runs measurements side by side, keeps what is finished, and goes on from there."""
+
+import contextlib
+import json
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from ..base.quiet import initialise_warp
+from .digest import source_digest
+from .measurements import run
+
+_HEAD = b'{"key": "'  # of a line of results
+# One thread a process: more would take the cores of the others, and Warp's CPU kernels use one as it is.
+_ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
+
+
+class Store:
+    """Results by key in a file, a line of JSON each, that several processes may add to at a time.
+
+    A line that was cut, by a crash or a full disk, is left out, and its result is measured again; the file is never rewritten.
+
+    Args:
+        path: The file, made with its folder where there is none; None keeps results in memory.
+
+    Raises:
+        ValueError: The path is no such file.
+    """
+
+    def __init__(self, path=None):
+        self.path, self._results, self._machines = None if path is None else Path(path), {}, {}
+        if self.path is None:
+            return
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if not self.path.exists():
+            return
+        if not self.path.is_file():
+            raise ValueError(f"{self.path}: is no file; it must be one of results, or free")
+        # Text of JSON has no line ends but these; zeros are what a file system may leave of a line after a crash.
+        for number, line in enumerate(self.path.read_bytes().split(b"\n"), 1):
+            line = line.strip(b"\0\r ")
+            try:
+                entry = json.loads(line)
+                self._results[entry["key"]], self._machines[entry["key"]] = entry["result"], entry.get("machine")
+            except (ValueError, TypeError, KeyError):
+                if not line.startswith(_HEAD) and not _HEAD.startswith(line):
+                    raise ValueError(f"{self.path}, line {number}: is no result; remove the file or give another") from None
+
+    def __contains__(self, task):
+        return task.key in self._results
+
+    def __getitem__(self, task):
+        return self._results[task.key]
+
+    def __len__(self):
+        return len(self._results)
+
+    def machine(self, task):
+        """The name of the machine that measured it."""
+        return self._machines[task.key]
+
+    def keep(self, task, result, machine):
+        """Adds a result and the machine that it is of, on the disk before this returns."""
+        self._results[task.key], self._machines[task.key] = result, machine
+        if self.path is None:
+            return
+        asked = {"key": task.key, "function": task.function, "arguments": task.arguments}
+        text = json.dumps(asked | {"machine": machine, "result": result}).encode() + b"\n"
+        try:
+            with self.path.open("ab+", buffering=0) as file:
+                if file.seek(0, os.SEEK_END):
+                    file.seek(-1, os.SEEK_END)
+                    text = text if file.read(1) == b"\n" else b"\n" + text  # what was cut is ended first
+                while text:  # one write, which no other process comes between, unless the disk is full
+                    text = text[file.write(text) :]
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from None
+
+
+def sweep(tasks, executor=None, store=None, progress=None, workers=None):
+    """Measures all tasks that the store does not have, and gives (task, result) as they are finished.
+
+    Args:
+        tasks: :class:`warpcloth.lab.measurements.Task`\\s.
+        executor: Any `concurrent.futures.Executor`, such as :func:`warpcloth.lab.cluster.connect` gives; without one,
+            processes of this machine. As with all of Python's, a script that starts them needs ``if __name__ == "__main__":``.
+            Threads of one process measure one after another.
+        store: A :class:`Store`; without one nothing is kept.
+        progress: Function called with (finished, tasks, seconds left or None) at first and after each; or None.
+        workers: Processes side by side, where there is no executor: as many as cores. Times are of a machine that is as busy.
+
+    Raises:
+        Exception: What a task raises; those that are finished are kept, those that have not begun are dropped.
+        ChildProcessError: A process was killed.
+    """
+    tasks = list(tasks)
+    store = Store() if store is None else store
+    known = [task for task in tasks if task in store]
+    left = list({task.key: task for task in tasks if task not in store}.values())
+    finished, started = len(tasks) - len(left), time.perf_counter()
+    say = progress or (lambda *_: None)
+    say(finished, len(tasks), None)
+    for task in known:
+        yield task, store[task]
+    if not left:
+        return
+    with contextlib.ExitStack() as stack:
+        if executor is None:
+            executor = stack.enter_context(_processes(min(workers or os.cpu_count() or 1, len(left))))
+        futures = {}
+        try:
+            for task in left:
+                futures[executor.submit(run, task, source_digest())] = task
+            for done, future in enumerate(as_completed(futures), 1):
+                task = futures[future]
+                try:
+                    result, machine = future.result()
+                except BrokenExecutor as error:
+                    raise ChildProcessError(
+                        "a process that measures ended: killed, as for want of memory, or begun by a script without "
+                        'if __name__ == "__main__":; what is finished is kept, and with fewer workers it takes less memory'
+                    ) from error
+                store.keep(task, result, machine)
+                seconds = (time.perf_counter() - started) / done * (len(left) - done)
+                say(finished + done, len(tasks), seconds)
+                yield task, result
+        finally:
+            for future, task in futures.items():
+                if not future.cancel() and future.done() and future.exception() is None and task not in store:
+                    store.keep(task, *future.result())  # finished, and not looked at
+
+
+@contextlib.contextmanager
+def _processes(workers):
+    """Fresh processes, each with one thread for arithmetic; they read these settings when they start."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(_ONE_THREAD)
+    try:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin) as pool:
+            try:
+                yield pool
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _begin():
+    """In each process: an interruption ends it without a word, as the first process says what there is to say.
+
+    It also ends when that was killed, which leaves it waiting for ever.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
+    initialise_warp()
+
+
+def _end_with(parent):
+    parent.join()
+    os._exit(1)
+
+
+def kept(name, executor=None):
+    """The :class:`Store` of a chart in the folder for caches; of a cluster another one, for its times are of other machines."""
+    return Store(cache_folder() / getattr(executor, "folder", "") / f"{name}.jsonl")
+
+
+def cache_folder():
+    """Where results and reference solutions are kept: ``WARPCLOTH_CACHE``, else warpcloth in the user's folder for caches."""
+    named = os.environ.get("WARPCLOTH_CACHE")
+    return Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpcloth"

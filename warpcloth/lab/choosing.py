@@ -1,0 +1,240 @@
+"""The cheapest solver and settings that meet a tolerance, or the most accurate within a budget, from measurements."""
+
+import json
+from dataclasses import asdict, dataclass
+
+from ..base.checks import number
+from . import trajectory
+from .campaign import kept, sweep
+from .measurements import Setup, task
+from .reference import reference
+from .setups import setups_of_runs
+
+# Rungs that each ladder goes on with above its last, each with twice the substeps.
+_MORE = 3
+# The reference is to be better than the tolerance by so much.
+_FINER = 5.0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A setup and what was measured of it.
+
+    Attributes:
+        setup: The :class:`warpcloth.lab.measurements.Setup`.
+        error: Of the trajectory, a share of the size of the cloth; None where there is none.
+        milliseconds: Median of a frame [ms]; None where there is none.
+        spread: Quartiles of a frame [ms], (low, high), or None.
+        reason: Why there is no error, or "".
+        machine: What measured it, in few words.
+        final: Whether that holds for finer steps too: it took too long, or its method is refused.
+    """
+
+    setup: Setup
+    error: float | None
+    milliseconds: float | None
+    spread: tuple[float, float] | None = None
+    reason: str = ""
+    machine: str = ""
+    final: bool = False
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What :func:`pick` chose.
+
+    Attributes:
+        chosen: The :class:`Measured`, or None where nothing will do.
+        meets: Whether it meets the tolerance and the budget, those that were given.
+        rivals: Those that are as good but for the spread of the times, the best first.
+        certainty: How sure that is, in a sentence.
+    """
+
+    chosen: Measured | None
+    meets: bool
+    rivals: list
+    certainty: str
+
+
+def pick(measurements, tolerance=None, budget=None, floor=0.0):
+    """Chooses among measurements.
+
+    With a tolerance the cheapest that meets it, and within a budget, if there is one too; without one that does, or with a
+    budget alone, the most accurate within the budget; of a tolerance alone that nothing meets, the most accurate.
+
+    Args:
+        measurements: :class:`Measured`\\s.
+        tolerance: Largest error, a share of the size of the cloth; or None.
+        budget: Longest frame [ms], or None.
+        floor: Error of the reference itself, which each error may be off by.
+
+    Returns:
+        :class:`Choice`.
+
+    Raises:
+        ValueError: Neither tolerance nor budget, or one of them is no number above 0.
+    """
+    if tolerance is None and budget is None:
+        raise ValueError("tolerance, budget: give one of them, or both")
+    for name, value in (("tolerance", tolerance), ("budget", budget)):
+        if value is not None:
+            number(name, value, above=0.0)
+    known = [each for each in measurements if each.error is not None and each.milliseconds is not None]
+    affordable = [each for each in known if budget is None or each.milliseconds <= budget]
+    accurate = [each for each in affordable if _meets(each, tolerance, floor)]
+    if accurate:
+        chosen = min(accurate, key=lambda each: each.milliseconds)
+        rivals = _as_cheap(chosen, accurate)
+        return Choice(chosen, True, rivals, _certainty(chosen, rivals, tolerance, floor))
+    if not affordable:
+        why = "nothing was measured that ended well" if not known else f"the fastest takes {_least(known):.3g} ms a frame"
+        return Choice(None, False, [], f"nothing is within the budget: {why}")
+    chosen = min(affordable, key=lambda each: (each.error, each.milliseconds))
+    if tolerance is None:
+        rivals = [each for each in affordable if each is not chosen and abs(each.error - chosen.error) <= floor]
+        return Choice(chosen, True, rivals, f"its error of {percent(chosen.error)} is known to {percent(floor)} of the size")
+    within = "" if budget is None else " within the budget"
+    known = f", and the reference is known to {percent(floor)} only" if chosen.error <= tolerance else ""
+    sentence = f"nothing measured{within} meets {percent(tolerance)}; the most accurate comes to {percent(chosen.error)}{known}"
+    return Choice(chosen, False, [], sentence)
+
+
+def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=None):
+    """Measures as few setups as :func:`pick` needs: each ladder from its cheapest rung up, all ladders side by side.
+
+    A ladder ends where it meets the tolerance, and where its rungs become dearer than the budget or than what meets it already.
+
+    Args:
+        ladders: Lists of :class:`warpcloth.lab.measurements.Setup`, each from cheap and coarse to dear and accurate.
+        measure: Function from a list of setups to a list of :class:`Measured` in its order.
+        tolerance: As of :func:`pick`, and so the next two.
+        budget: As there.
+        floor: As there.
+        progress: Function called with all that is measured after each round, or None.
+
+    Returns:
+        tuple: The :class:`Choice` and the list of all :class:`Measured`.
+    """
+    left, found = [list(ladder) for ladder in ladders if ladder], []
+    while left:
+        round_ = measure([ladder.pop(0) for ladder in left])
+        found += round_
+        if progress is not None:
+            progress(found)
+        meeting = [each.milliseconds for each in found if _meets(each, tolerance, floor)]
+        most = min([*meeting, float("inf") if budget is None else budget])
+        left = [ladder for ladder, last in zip(left, round_, strict=True) if ladder and not _ends(last, tolerance, floor, most)]
+    return pick(found, tolerance, budget, floor), found
+
+
+def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device="cpu", dtype="float32", limit=60.0, **run):
+    """Measures setups of a scene until the choice among them is made, for this machine or, with an executor, for its workers.
+
+    Args:
+        scene: The :class:`warpcloth.lab.measurements.SceneRef`.
+        tolerance: As of :func:`pick`.
+        budget: As there.
+        solvers: Names of solvers; all where not given.
+        frames: Frames to run, those of the scene where not given.
+        device: A Warp device.
+        dtype: "float32" or "float64", of the runs.
+        limit: Seconds that a run may take.
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; without a store the one
+            in the folder for caches.
+
+    Returns:
+        tuple: :class:`Choice`, the list of :class:`Measured`, and the :class:`warpcloth.lab.reference.Reference`.
+
+    Raises:
+        ValueError: As :func:`pick`, or a name is no solver's.
+    """
+    pick([], tolerance, budget)  # refuses wrong ones before anything is measured
+    # One at a time: side by side they would slow one another.
+    run = {"workers": 1} | run
+    run = run if "store" in run else {"store": kept("trajectories", run.get("executor")), **run}
+    rungs = ladders(setups_of_runs(scene, solvers, device, dtype))
+    exact = reference(scene, frames, **({} if tolerance is None else {"tolerance": tolerance / _FINER}))
+
+    def measure(setups):
+        tasks = [
+            task(trajectory.measure, scene=scene, setup=setup, frames=frames, reference=str(exact.path), device=str(device),
+                 dtype=dtype, limit=limit)
+            for setup in setups
+        ]  # fmt: skip
+        found = {one.key: result for one, result in sweep(tasks, **run)}
+        machine = run["store"].machine
+        return [_measured(setup, found[one.key], machine(one)) for setup, one in zip(setups, tasks, strict=True)]
+
+    choice, found = climb(rungs, measure, tolerance, budget, exact.error)
+    return choice, found, exact
+
+
+def ladders(setups):
+    """Setups by what they have in common but substeps and iterations, from cheap to dear, and some beyond the last.
+
+    Args:
+        setups: A list of :class:`warpcloth.lab.measurements.Setup`.
+    """
+    found = {}
+    for setup in setups:
+        others = {name: value for name, value in setup.options.items() if name != "substeps"}
+        found.setdefault(json.dumps([setup.solver, others], sort_keys=True), []).append(setup)
+    for ladder in found.values():
+        ladder.sort(key=lambda setup: setup.options["substeps"])
+        for _ in range(_MORE):
+            last = ladder[-1]
+            ladder.append(Setup(last.solver, last.options | {"substeps": 2 * last.options["substeps"]}))
+    return list(found.values())
+
+
+def _measured(setup, result, machine):
+    spread = None if result["spread"] is None else tuple(result["spread"])
+    # Of explicit alone a finer step may be taken where one is refused.
+    final = result["status"] == "slow" or (result["status"] == "refused" and setup.solver != "explicit")
+    return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final)
+
+
+def as_json(choice, found, exact):
+    """What was chosen and why, as JSON values."""
+    rows = [asdict(each) | {"label": str(each.setup)} for each in found]
+    chosen = None if choice.chosen is None else asdict(choice.chosen)
+    facts = {"chosen": chosen, "meets": choice.meets, "certainty": choice.certainty}
+    facts["rivals"] = [str(each.setup) for each in choice.rivals]
+    return facts | {"reference_error": exact.error, "reference": str(exact.path), "measured": rows}
+
+
+def _ends(last, tolerance, floor, most):
+    """Whether rungs above this one cannot be chosen."""
+    if last.final or (last.milliseconds is not None and last.milliseconds > most):
+        return True
+    return _meets(last, tolerance, floor)  # of one that diverged a finer one may do
+
+
+def _meets(each, tolerance, floor):
+    return each.error is not None and tolerance is not None and each.error + floor <= tolerance
+
+
+def _as_cheap(chosen, accurate):
+    """Others whose times overlap those of the chosen one, by their medians."""
+    if chosen.spread is None:
+        return []
+    others = [each for each in accurate if each is not chosen and each.spread and each.spread[0] <= chosen.spread[1]]
+    return sorted(others, key=lambda each: each.milliseconds)
+
+
+def _certainty(chosen, rivals, tolerance, floor):
+    margin = f"its error of {percent(chosen.error)} is {tolerance / max(chosen.error, 1e-30):.3g} times below the tolerance"
+    known = f", known to {percent(floor)}" if floor else ""
+    if not rivals:
+        return f"{margin}{known}; nothing else that meets it is as cheap"
+    names = ", ".join(f"{each.setup} ({each.milliseconds:.3g} ms)" for each in rivals[:3])
+    return f"{margin}{known}; within the spread of the times as cheap: {names}"
+
+
+def percent(share):
+    """A share of the whole as text, with three digits however small it is."""
+    return f"{100.0 * share:.3g}%"
+
+
+def _least(known):
+    return min(each.milliseconds for each in known)

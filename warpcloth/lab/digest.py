@@ -1,0 +1,52 @@
+"""Keys of what a measurement depends on: a scene, and the code of this package."""
+
+import hashlib
+from dataclasses import fields, is_dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+
+def scene_digest(scene):
+    """A hash of all of a scene that its motion depends on, whatever it is called and how long it goes on.
+
+    Raises:
+        ValueError: Something in it is no data.
+    """
+    digest = hashlib.sha256()
+    mesh = scene.mesh
+    facts = [mesh.points, mesh.triangles, mesh.edges, mesh.grid_shape, scene.vertex_masses, scene.positions, scene.velocities]
+    for fact in (*facts, scene.terms, scene.pins, scene.gravity, float(scene.fps)):
+        _add(digest, fact)
+    return digest.hexdigest()[:24]
+
+
+def _add(digest, value):
+    """Adds a value so that other values add other bytes: each with its kind, and of what has parts their number."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        digest.update(f"{type(value).__name__} {value!r};".encode())
+    elif isinstance(value, np.ndarray) and value.dtype != object:
+        digest.update(f"array {value.dtype.str} {value.shape};".encode() + np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, (list, tuple, np.ndarray)):
+        digest.update(f"list {len(value)};".encode())
+        for part in value:
+            _add(digest, part)
+    elif is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"{type(value).__name__};".encode())
+        for field in fields(value):
+            _add(digest, getattr(value, field.name))
+    else:
+        raise ValueError(f"a scene has {value!r}, a {type(value).__name__}; a key needs numbers, texts, lists and arrays")
+
+
+@cache
+def source_digest():
+    """A hash of the code of this package: what another version measured is measured again."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    files = [path for path in root.rglob("*.py") if path.is_file()]
+    for path in sorted(files, key=lambda path: path.relative_to(root).as_posix()):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]

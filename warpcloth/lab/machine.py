@@ -1,0 +1,66 @@
+"""What a measurement ran on, for those who read it later."""
+
+import os
+import platform
+from functools import cache
+from pathlib import Path
+
+from ..base.quiet import find_device
+from .digest import source_digest
+
+
+def machine(device="cpu"):
+    """Names of processor and device, numbers of cores, and versions, by name.
+
+    Args:
+        device: A Warp device.
+    """
+    import numpy
+    import scipy
+    import warp as wp
+
+    found = find_device(device)
+    return {
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "device": found.name if found.is_cuda else "cpu",
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "numpy": numpy.__version__,
+        "scipy": scipy.__version__,
+        "warp": wp.__version__,
+        "warpcloth": _version(),
+        "source": source_digest(),
+    }
+
+
+@cache
+def name(device="cpu"):
+    """Host, processor and, where it is no CPU, device, in few words: what stands beside each measurement."""
+    facts = machine(device)
+    return ", ".join([platform.node(), facts["processor"], *([] if facts["device"] == "cpu" else [facts["device"]])])
+
+
+def in_words(facts):
+    """Formats the device of :func:`machine` (for a CPU its name and cores) and the version of Warp for a title."""
+    device = facts["device"] if facts["device"] != "cpu" else f"{facts['processor']}, {facts['cores']} cores"
+    return f"{device}, Warp {facts['warp']}"
+
+
+def processor():
+    """The name on the package; Linux alone says it in a file."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _version():
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("warpcloth")
+    except PackageNotFoundError:
+        return "checkout"

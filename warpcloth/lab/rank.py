@@ -1,0 +1,120 @@
+"""Best rotations of points that lie in a plane, on a line or in one place (Kabsch 1976, *A solution for the best rotation to
+relate two sets of vectors*).
+
+Points whose covariance has the singular values σ₁² ≥ σ₂² ≥ σ₃² fix the rotation about their line by σ₂² beside the rounding
+ε of σ₁², so that it is known to about ε(σ₁/σ₂)²; the line itself is turned to a few ε. A plane still fixes the rotation,
+but UVᵀ is as often the reflection once (σ₃/σ₁)² is below ε. On a line the least rotation is taken, of a point the identity.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..numerics.rotation import kabsch, svd
+from .measurements import task
+from .panels import Panel, point
+
+TITLE = "13. Best rotations of points whose covariance lacks rank"
+EPS = {dtype: float(np.finfo(dtype).eps) for dtype in ("float32", "float64")}
+_SETS, _POINTS = 200, 20
+
+
+def known(ratio, dtype):
+    """ε(σ₁/σ₂)², at most π."""
+    return min(EPS[dtype] / ratio**2, np.pi)
+
+
+def least(degrees):
+    """Angle between a line and itself turned about an axis at 45° to it [°]."""
+    return np.degrees(np.arccos(0.5 + 0.5 * np.cos(np.radians(degrees))))
+
+
+_LAWS = {dtype: f"ε(σ₁/σ₂)², {dtype}" for dtype in EPS}
+_WHOLE, _LEAST, _NONE = "the turn", "angle between the lines", "0"
+PANELS = (
+    Panel(
+        "line",
+        "Points in a plane that becomes a line: the turn about it is lost",
+        "σ₂/σ₁",
+        "largest error of 200 sets [rad]",
+        ("log", "log"),
+        laws={_LAWS[dtype]: (lambda r, dtype=dtype: known(r, dtype)) for dtype in EPS},
+        limits=(1e-25, 30.0),
+    ),
+    Panel(
+        "turn",
+        "What is kept of a turn about an axis at 45° to the line",
+        "turn [°]",
+        "rotation found [°]",
+        laws={_WHOLE: lambda d: d, _LEAST: least, _NONE: lambda d: 0.0},
+        follows={"in a plane": _WHOLE, "on a line": _LEAST, "in one place": _NONE},
+    ),
+    Panel(
+        "reflection",
+        "Points in a volume that becomes a plane: U Vᵀ reflects",
+        "σ₃/σ₁",
+        "rotations that are reflections [%]",
+        ("log", "linear"),
+        marks={float(np.sqrt(eps)): f"√ε, {dtype}" for dtype, eps in EPS.items()},
+    ),
+)
+
+
+def tasks(device):
+    """One measures all."""
+    return [task(measure, device=device)]
+
+
+def sets(ratios, dtype, seed=0):
+    """P and Q = R P (c, n, 3) of that type, R (c, 3, 3) and the first axis of P (c, 3); P has singular values as given."""
+    rng = np.random.default_rng(seed)
+    centred = rng.normal(size=(_SETS, _POINTS, 3))
+    axes, _ = np.linalg.qr(centred - centred.mean(axis=1, keepdims=True))
+    own, R = (Rotation.random(_SETS, random_state=seed + k).as_matrix() for k in (1, 2))
+    P = ((axes * ratios) @ own.mT).astype(dtype)
+    Q = (P.astype(np.float64) @ R.mT).astype(dtype)
+    return P, Q, R, own[:, :, 0]
+
+
+def measure(device):
+    """Points of all panels."""
+    import warp as wp
+
+    def fit(P, Q):
+        if device == "cpu":
+            return kabsch(P, Q).astype(np.float64)
+        return kabsch(wp.array(P, device=device), wp.array(Q, device=device)).numpy().astype(np.float64)
+
+    return [*_lines(fit), *_turns(fit), *_reflections(fit)]
+
+
+def _lines(fit):
+    for dtype in EPS:
+        for ratio in np.geomspace(1.0, 1e-10, 21):
+            P, Q, R, line = sets((1.0, ratio, 0.0), dtype)
+            found = fit(P, Q)
+            whole = Rotation.from_matrix(found @ R.mT).magnitude()
+            moved, right = ((turn @ line[:, :, None])[:, :, 0] for turn in (found, R))
+            yield point("line", f"{dtype}: the rotation", ratio, whole.max())
+            yield point("line", f"{dtype}: where the line goes", ratio, np.linalg.norm(moved - right, axis=1).max())
+
+
+def _turns(fit):
+    t = np.linspace(-1.0, 1.0, 5)
+    shapes = {
+        "in a plane": np.stack([t, t**2, 0.0 * t], axis=1),
+        "on a line": t[:, None] * [1.0, 0.0, 0.0],
+        "in one place": np.zeros((1, 3)),
+    }
+    for degrees in np.arange(0.0, 180.1, 10.0):
+        R = Rotation.from_rotvec(np.radians(degrees) * np.sqrt(0.5) * np.array([1.0, 1.0, 0.0])).as_matrix()
+        for series, P in shapes.items():
+            yield point("turn", series, degrees, np.degrees(Rotation.from_matrix(fit(P, P @ R.T)).magnitude()))
+
+
+def _reflections(fit):
+    for dtype in EPS:
+        for ratio in np.geomspace(1.0, 1e-12, 25):
+            P, Q, _, _ = sets((1.0, 0.5, ratio), dtype)
+            U, _, V = svd(Q.mT @ P)
+            for series, R in ((f"U Vᵀ, {dtype}", U @ V.mT), (f"kabsch, {dtype}", fit(P, Q))):
+                yield point("reflection", series, ratio, 100.0 * (np.linalg.det(R) < 0.0).mean())

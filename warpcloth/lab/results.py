@@ -1,0 +1,144 @@
+"""What benchmarks say together: growth with size, ratios of two results, tables and files."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..base.outputs import TEXT, Output
+
+# What tells a row from another, in two results.
+_SAME = ("scene", "parameters", "solver", "options", "device", "dtype", "copies", "threads")
+# What a CSV has of a row, in this order; what is not known is empty.
+COLUMNS = (
+    *("scene", "parameters", "solver", "options", "device", "dtype", "copies", "threads", "status", "reason"),
+    *(
+        "vertices",
+        "elements",
+        "substeps",
+        "iterations",
+        "frames",
+        "ms",
+        "ms_low",
+        "ms_high",
+        "cloths_per_s",
+        "ns",
+        "bytes",
+        "bytes_per_s",
+        "share",
+    ),
+    "launches",
+    *("start_s", "cold_start_s", "bind_s", "factorise_s", "memory"),
+)
+
+
+def exponent(sizes, values):
+    """p of values ∝ sizesᵖ, by least squares over the logarithms, and its standard error.
+
+    Args:
+        sizes: (m,), above 0.
+        values: (m,), above 0.
+
+    Returns:
+        (p, error): The error is None of two points, and both are None of fewer or where all sizes are one.
+    """
+    x, y = (np.log(np.asarray(each, dtype=np.float64)) for each in (sizes, values))
+    x = x - x.mean() if len(x) else x
+    square = float(x @ x)
+    if square == 0.0:
+        return None, None
+    p = float(x @ y) / square
+    if len(x) == 2:
+        return p, None
+    left = y - y.mean() - p * x
+    return p, float(np.sqrt(left @ left / (len(x) - 2) / square))
+
+
+def growth(rows):
+    """How the time of a frame and that of an iteration grow with the vertices n², of each benchmark with two sizes or more.
+
+    They differ where finer scenes take more substeps or iterations.
+
+    Returns:
+        list: Of each ``solver``, ``options`` that all sizes share, and ``frame`` and ``iteration``, each [p, error] of
+        :func:`exponent`.
+    """
+    found, known = [], [row for row in rows if row["status"] == "ok"]
+    for place in dict.fromkeys(row["benchmark"] for row in known):
+        of = [row for row in known if row["benchmark"] == place]
+        vertices = [row["vertices"] for row in of]
+        frame = exponent(vertices, [row["ms"] for row in of])
+        if frame[0] is None:
+            continue
+        iteration = exponent(vertices, [row["ms"] / (row["substeps"] * max(row["iterations"], 1.0)) for row in of])
+        shared = {k: v for k, v in of[0]["options"].items() if all(row["options"].get(k) == v for row in of)}
+        one = {"benchmark": place, "solver": of[0]["solver"], "options": shared}
+        found.append({**one, "frame": list(frame), "iteration": list(iteration)})
+    return found
+
+
+def ratios(old, new):
+    """New over old, of the rows that two results both have and that are "ok" in both.
+
+    The spread of a ratio of times goes from the lower quartile of the one over the upper of the other to the reverse: a
+    difference exceeds it where the quartiles do not overlap.
+
+    Args:
+        old: A result, see :func:`read`.
+        new: Another.
+
+    Returns:
+        list: Of each row what it is, ``label``, ``ms`` (old, new), ``ratio``, ``spread`` (low, high), ``verdict`` ("faster",
+        "slower" or "" within the spread), and the ratios ``launches``, ``bytes``, ``start``, ``memory``, None of what either
+        does not know.
+    """
+    before, found = {_key(row): row for row in old["rows"] if row["status"] == "ok"}, []
+    for row in new["rows"]:
+        was = before.get(_key(row))
+        if was is None or row["status"] != "ok":
+            continue
+        spread = [row["spread"][0] / was["spread"][1], row["spread"][1] / was["spread"][0]]
+        one = {name: row[name] for name in (*_SAME, "label")}
+        one |= {"ms": [was["ms"], row["ms"]], "ratio": row["ms"] / was["ms"], "spread": spread}
+        one["verdict"] = "faster" if spread[1] < 1.0 else "slower" if spread[0] > 1.0 else ""
+        for name, column in (("launches", "launches"), ("bytes", "bytes"), ("start", "start_s"), ("memory", "memory")):
+            one[name] = row[column] / was[column] if row[column] and was[column] else None
+        found.append(one)
+    return found
+
+
+def _key(row):
+    return json.dumps([row[name] for name in _SAME], sort_keys=True)
+
+
+def read(path):
+    """A result that ``warpcloth bench --json`` printed.
+
+    Raises:
+        ValueError: The file is none.
+    """
+    try:
+        found = json.loads(Path(path).read_text(encoding="utf-8"))
+        found["rows"] = [{"copies": 1, "threads": 1, **row} for row in found["rows"]]  # of before there were more
+        known = {*_SAME, "label", "status", "ms", "spread", "launches", "bytes", "start_s", "memory"}
+        if all(known <= set(row) for row in found["rows"]) and {"device", "processor"} <= set(found["machine"]):
+            return found
+    except (ValueError, TypeError, KeyError):
+        pass
+    raise ValueError(f"{path}: is no result of benchmarks; it must be what warpcloth bench --json prints")
+
+
+def write_csv(path, rows):
+    """Writes a line for each row.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+    """
+    with Output(path, "x", **TEXT) as output:
+        table = csv.DictWriter(output.file, COLUMNS, lineterminator="\n", extrasaction="ignore")
+        table.writeheader()
+        for row in rows:
+            low, high = row["spread"] or (None, None)
+            texts = {name: json.dumps(row[name]) for name in ("parameters", "options")}
+            table.writerow({**row, **texts, "ms_low": low, "ms_high": high})

@@ -1,0 +1,351 @@
+"""Where each method is stable, inaccurate or diverges: cells of a map over two axes, measured row by row."""
+
+import math
+import time
+import warnings
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from ..base.checks import choice, number
+from ..core.status import Result
+from ..run.simulate import Watch
+from ..solvers import Newton
+from .axes import AXES, FIXED, OPTIONS, record_at, refined, scene_at, steps_in, together, vary
+from .digest import scene_digest
+from .measurements import SceneRef, Setup, task
+from .stability_limits import KNOWN, rules
+
+VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
+# RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
+ACCURACY = 0.01
+# Steps of the reference per step of the map, and the most steps that it takes in all (or as many as frames). A run with half as
+# many steps gives the error of the reference.
+_FINER, _MOST = 4, 2000
+_FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a run of B copies left; a copy that diverged is NaN from there.
+
+    Attributes:
+        points: (frames+1, B, n, 3) [m].
+        good: The last good frame of each copy (B,).
+        growth: Largest energy of motion and height in a good frame, divided by what the start, falling and rounding can have
+            put in, (B,), see :class:`warpcloth.run.balance.Balance`.
+        reasons: A sentence for each copy, or "".
+        results: :class:`warpcloth.core.status.Result` of each copy.
+        steps_per_frame: Steps per frame.
+    """
+
+    points: np.ndarray
+    good: np.ndarray
+    growth: np.ndarray
+    reasons: list
+    results: list
+    steps_per_frame: int = 1
+
+
+class Slow(Exception):
+    """A run took longer than its limit."""
+
+
+def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", limit=60.0):
+    """Runs a scene as `simulate` does, with its criterion for divergence except strain, which the reference covers.
+
+    Raises:
+        Slow: The run took more than ``limit`` seconds, which is checked at each frame.
+        ValueError: The solver refuses the scene.
+    """
+    began = time.perf_counter()
+    model = scene.build(device=device, dtype=dtype, copies=copies, vary=varied)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of steps too large, which are the subject
+        stepper = record.bind(model)
+    frames, B = scene.frames, copies
+    watch = Watch(model, stepper, stretched=np.inf)
+    points = np.full((frames + 1, B, model.per_copy, 3), np.nan)
+    points[0] = model.positions.numpy().reshape(B, -1, 3)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for frame in range(1, frames + 1):
+            stepper.frame()
+            x, v = (np.array(array.numpy(), dtype=np.float64) for array in stepper.state)
+            watch.passes(frame, x, v, stepper.results)
+            points[frame, watch.alive] = x.reshape(B, -1, 3)[watch.alive]
+            if not watch.alive.any():
+                break
+            if time.perf_counter() - began > limit:
+                raise Slow(f"stopped after {limit:g} s, in frame {frame} of {frames}")
+    said = [watch.messages.get(copy, each.value if each in _FAILED else "") for copy, each in enumerate(stepper.results)]
+    said = [text.replace(f", copy {copy}:", ":") for copy, text in enumerate(said)]  # which is of the row, not of the map
+    return Trial(points, watch.good, watch.growth, said, list(stepper.results), stepper.steps_per_frame)
+
+
+def measure(
+    scene,
+    setups,
+    fixed,
+    axis,
+    values,
+    steps,
+    accuracy=ACCURACY,
+    device="cpu",
+    dtype="float64",
+    limit=60.0,
+    reference=True,
+    digests=None,
+    duration=None,
+):
+    """Cells that differ in one value, of each setup: a row of copies where one run can have them, else a run each.
+
+    Args:
+        scene: A dictionary of :class:`warpcloth.lab.measurements.SceneRef`.
+        setups: Dictionaries of :class:`warpcloth.lab.measurements.Setup`.
+        fixed: Values by axis that all cells share; ``dt`` is among them or ``axis``.
+        axis: The axis along which they differ.
+        values: Values of that axis.
+        steps: The fewest steps of a run, however long they take, so that runs that diverge show it.
+        accuracy: RMS distance to the reference, over vertices and frames and over the size of the cloth, that is inaccurate.
+        device: Of the run.
+        dtype: Of the run; the reference has float64.
+        limit: Seconds for each run.
+        reference: Whether to compare with Newton and BDF2 at a quarter of the step, or in 2000 steps if that takes more. If
+            Newton refuses the scene there is no reference.
+        digests: Digests of the scene, see :func:`warpcloth.lab.digest.scene_digest`: a scene that was changed has another
+            key.
+        duration: Time of motion that is compared with the reference, the same for all cells [s]; runs last at least as long. By
+            default that of ``steps``.
+
+    Returns:
+        list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS` ("stalled": a step ended in
+        no minimum; "unsure": inaccurate or not, the reference does not tell), ``status`` ("ok", "diverged", "slow" or
+        "refused"), ``reason``, ``step`` (that of divergence, or None), ``steps`` (those of the run), ``growth`` (see
+        :class:`Trial`), ``error`` (or None), ``floor``, the distance of the reference to a run of twice its step, which bounds
+        its own error if each halving at least halves that (or None), and ``rules`` (see
+        :func:`warpcloth.lab.stability_limits.rules`), of which :data:`KNOWN` is ``floor`` over ``accuracy``.
+    """
+    ref, setups = SceneRef(**scene), [Setup(**setup) for setup in setups]
+    groups = [values]
+    if not together(scene_at(ref, {"dt": FIXED["dt"], **fixed}, 1), axis):
+        groups = [[value] for value in values]
+    rows, answer, length = [[] for _ in setups], None, (steps, duration)
+    for nth, group in enumerate(groups):
+        if reference and (nth == 0 or axis not in OPTIONS):  # the axis is not an option of the method
+            answer = _reference(ref, fixed, axis, group, length, device, limit)
+        for row, setup in zip(rows, setups, strict=True):
+            try:
+                record = record_at(setup, fixed if len(group) > 1 else {**fixed, axis: group[0]})
+            except ValueError as error:
+                row += [_cell("refused", str(error)) for _ in group]
+                continue
+            found = _attempt(ref, record, fixed, axis, group, length, device, dtype, limit)
+            for copy, value in enumerate(group):
+                cell = found if isinstance(found, dict) else _judge(found, copy, answer, accuracy)
+                if cell["status"] != "refused":
+                    of_cell = scene_at(ref, {**fixed, axis: value}, *length)
+                    run_for = of_cell.frames * record.per_frame(of_cell.fps)
+                    known = {name: _finite(ratio) for name, ratio in rules(of_cell, record, run_for).items()}
+                    cell = cell | {"steps": run_for, "rules": known}
+                    if cell["floor"] is not None and accuracy > 0.0:
+                        cell["rules"][KNOWN] = cell["floor"] / accuracy
+                row.append(cell)
+    return rows
+
+
+def _attempt(ref, record, fixed, axis, group, length, device, dtype, limit):
+    """The :class:`Trial` of a group, or the cell of all its copies."""
+    try:
+        if len(group) == 1:
+            scene = scene_at(ref, {**fixed, axis: group[0]}, *length)
+            return run(scene, record, device=device, dtype=dtype, limit=limit)
+        scene = scene_at(ref, fixed, *length)
+        return run(scene, record, len(group), vary(scene, axis, group), device, dtype, limit)
+    except Slow as slow:
+        return _cell("slow", str(slow))
+    except ValueError as error:
+        return _cell("refused", str(error))
+
+
+def _reference(ref, fixed, axis, group, length, device, limit):
+    """What a group is compared with: :class:`Trial` of the coarser run and of the reference, or why not; None without any."""
+    dt = {**fixed, axis: group[0]}["dt"]
+    steps, duration = length
+    steps = steps if duration is None else steps_in(duration, dt)
+    scene = scene_at(ref, {**fixed, axis: group[0]}, steps)
+    half = min(_FINER // 2 * round(1.0 / (scene.fps * dt)), -(-_MOST // (2 * scene.frames)))
+    found = []
+    for substeps in (half, 2 * half):
+        record = Newton(substeps=substeps, integrator="bdf2", tolerance=1e-6)
+        found.append(_attempt(ref, record, fixed, axis, group, (steps, None), device, "float64", limit))
+        if isinstance(found[-1], dict):
+            return None if found[-1]["status"] == "refused" else f"no reference: {found[-1]['reason']}"
+    return found
+
+
+def _apart(first, other, copy):
+    """Returns the RMS distance of a copy in two runs, over vertices and frames of the second, divided by the size of the cloth.
+
+    None if one of the runs did not end.
+    """
+    frames = len(other.points)
+    if min(each.good[copy] for each in (first, other)) < frames - 1:
+        return None
+    squares = ((first.points[:frames, copy] - other.points[:, copy]) ** 2).sum(axis=-1)
+    return _finite(math.sqrt(squares.mean()) / np.ptp(other.points[0, copy], axis=0).max())
+
+
+def _judge(trial, copy, answer, accuracy):
+    """The cell of one copy; ``answer`` as of :func:`_reference`."""
+    growth, reason = _finite(trial.growth[copy]), trial.reasons[copy]
+    floor = _apart(*answer, copy) if isinstance(answer, list) else None
+    if trial.good[copy] < len(trial.points) - 1:
+        step = int(trial.good[copy] + 1) * trial.steps_per_frame
+        return _cell("diverged", reason, step=step, growth=growth, floor=floor)
+    error = None if floor is None else _apart(trial, answer[-1], copy)
+    known = {"growth": growth, "error": error, "floor": floor}
+    if trial.results[copy] in _FAILED:
+        return _cell("stalled", reason, **known)
+    if answer is None:
+        return _cell("stable", "", **known)
+    if error is None:
+        return _cell("unsure", answer if isinstance(answer, str) else "no reference: it diverges", **known)
+    reason = f"RMS distance to the reference {100.0 * error:.3g} % of the size, which is known to {100.0 * floor:.2g} %"
+    if error - floor > accuracy:
+        return _cell("inaccurate", reason, **known)
+    return _cell("stable", "", **known) if error + floor <= accuracy else _cell("unsure", reason, **known)
+
+
+def _cell(verdict, reason, **more):
+    status = "ok" if verdict in VERDICTS[:4] else verdict
+    return {
+        "verdict": verdict,
+        "status": status,
+        "reason": reason,
+        "step": None,
+        "steps": None,
+        "growth": None,
+        "error": None,
+        "floor": None,
+        "rules": {},
+    } | more
+
+
+def _finite(value):
+    return float(value) if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A map to be measured.
+
+    Attributes:
+        scene: :class:`warpcloth.lab.measurements.SceneRef`.
+        setups: The methods, :class:`warpcloth.lab.measurements.Setup`, without steps.
+        x, y: Names of the two axes, of :data:`warpcloth.lab.axes.AXES`.
+        xs, ys: Their values.
+        fixed: Values of other axes.
+        steps, duration: As in :func:`measure`; the default duration is half of the scene's.
+
+    Raises:
+        ValueError: The axes are not two, or unknown, or a method has a step of its own.
+    """
+
+    scene: SceneRef
+    setups: tuple
+    x: str
+    y: str
+    xs: tuple
+    ys: tuple
+    fixed: dict
+    steps: int = 120
+    duration: float | None = None
+
+    def __post_init__(self):
+        for name in (self.x, self.y, *self.fixed):
+            choice("axis", name, tuple(AXES))
+        if self.x == self.y or {self.x, self.y} & set(self.fixed):
+            raise ValueError(f"axes are {self.x}, {self.y} and at fixed values {', '.join(self.fixed)}; each must be another")
+        for setup in self.setups:
+            if {"dt", "substeps"} & set(setup.options):
+                raise ValueError(f"{setup}: the map sets the step; leave dt and substeps out")
+        if self.duration is None:
+            object.__setattr__(self, "duration", 0.5 * self.scene.load().duration)
+        number("duration", self.duration, above=0.0)
+
+    def tasks(self, **options):
+        """One :class:`warpcloth.lab.measurements.Task` a row, along the axis that copies can differ in, if one can.
+
+        Args:
+            options: Of :func:`measure`.
+        """
+        scene = scene_at(self.scene, {**FIXED, **self.fixed} | self._first(), 1)
+        along = self.y if together(scene, self.y) and not together(scene, self.x) else self.x
+        other, others = (self.x, self.xs) if along == self.y else (self.y, self.ys)
+        values = self.ys if along == self.y else self.xs
+        rest = {name: value for name, value in {**FIXED, **self.fixed}.items() if name != along}
+        setups = [asdict(setup) for setup in self.setups]
+        given = {"setups": setups, "axis": along, "values": list(values), **options}
+        given |= {"steps": self.steps, "duration": self.duration}
+        given["digests"] = self._digests()
+        return [task(measure, scene=self.scene, fixed={**rest, other: value}, **given) for value in others]
+
+    def _digests(self):
+        """Of the scene at each of its resolutions."""
+        values = {self.x: self.xs, self.y: self.ys}.get("resolution", [])
+        refs = [refined(self.scene, value) for value in values] or [self.scene]
+        return [scene_digest(ref.load()) for ref in refs]
+
+    def _first(self):
+        return {self.x: self.xs[0], self.y: self.ys[0]}
+
+    def table(self, results, store=None):
+        """Cells (setup, y, x) as nested lists, from (task, result) in any order; None where there is none.
+
+        Args:
+            results: As :func:`warpcloth.lab.campaign.sweep` gives them.
+            store: The :class:`warpcloth.lab.campaign.Store` that keeps them, which says the ``machine`` of each cell, or None.
+        """
+        cells = [[[None] * len(self.xs) for _ in self.ys] for _ in self.setups]
+        for done, rows in results:
+            axis, fixed = done.arguments["axis"], done.arguments["fixed"]
+            for row, of_setup in zip(rows, cells, strict=True):
+                for k, cell in enumerate(row):
+                    cell = cell if store is None else cell | {"machine": store.machine(done)}
+                    if axis == self.x:
+                        of_setup[self.ys.index(fixed[self.y])][k] = cell
+                    else:
+                        of_setup[k][self.xs.index(fixed[self.x])] = cell
+        return cells
+
+
+def boundary(scene, setup, axis, low, high, steps=200, fixed=None, accuracy=1e-3, **options):
+    """The value of an axis between a run that holds and one that diverges, by bisection of its logarithm.
+
+    Args:
+        scene: :class:`warpcloth.lab.measurements.SceneRef`.
+        setup: :class:`warpcloth.lab.measurements.Setup`.
+        axis: Its name.
+        low: A value that holds, or that does not.
+        high: A larger one, for which it is the other way round.
+        steps: Length of each run.
+        fixed: Values of other axes.
+        accuracy: Relative width at which to stop.
+        options: Of :func:`run`.
+
+    Raises:
+        ValueError: Both ends hold, or both diverge.
+    """
+
+    def diverges(value):
+        values = {**FIXED, **(fixed or {}), axis: value}
+        found = run(scene_at(scene, values, steps), record_at(setup, values), **options)
+        return bool(found.good[0] < len(found.points) - 1)
+
+    before = diverges(low)
+    if diverges(high) == before:
+        raise ValueError(f"{axis} from {low:g} to {high:g}: both ends {'diverge' if before else 'hold'}")
+    while high / low > 1.0 + accuracy:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if diverges(middle) == before else (low, middle)
+    return math.sqrt(low * high)

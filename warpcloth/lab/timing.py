@@ -1,0 +1,143 @@
+"""One row: a scene with a solver in a process of its own, from its start to its warm frames."""
+
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from ..core.capture import Mirror
+from ..core.status import Result
+from ..mesh.ordering import order_of_run
+from .counts import compulsory_bytes, elements_of, launches_of
+from .measurements import SceneRef, Setup
+
+# Frames before the first that counts, and seconds after which no further one is begun once there are three.
+_WARM_UP, _SECONDS, _FEWEST = 2, 10.0, 3
+
+
+def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
+    """Runs warm frames of a scene with a setup, and counts what a step has to do. All values are such that JSON has them.
+
+    Args:
+        scene: Fields of a :class:`warpcloth.lab.measurements.SceneRef`, by name.
+        setup: Fields of a :class:`warpcloth.lab.measurements.Setup`, by name.
+        frames: How many to time at most; after 10 s of them three are enough. 0 ends with the first frame.
+        device: A Warp device.
+        dtype: ``"float32"`` or ``"float64"``.
+        started: ``time.time()`` when this process was asked for.
+        copies: How many of the scene run at once.
+        threads: That share the steps, on the CPU.
+
+    Returns:
+        dict: What is not known is None.
+
+        - ``status``: "ok", "diverged" or "refused", and ``reason``, a sentence, of the first "".
+        - ``vertices``, ``elements``: Of all terms. ``substeps``: Steps a frame. ``frames``: How many were timed.
+        - ``ms``, ``spread``: What a frame takes with its points on the host, median and quartiles [ms]; ``cloths_per_s``:
+          copies over the median [1/s].
+        - ``iterations``: Of a step, the mean over the frames that were timed.
+        - ``ns``: Time of a frame over elements × iterations × substeps, the median [ns].
+        - ``bytes``: What a step moves at least, see :func:`warpcloth.lab.counts.compulsory_bytes`; ``bytes_per_s``: Over the
+          time of a step.
+        - ``launches``: Of a step, the mean over a frame, see :func:`warpcloth.lab.counts.launches_of`.
+        - ``start_s``: From ``started`` to the end of the first frame. ``bind_s``: Building the model and binding the solver
+          alone, with compiling what is in no cache, but without ``factorise_s``, that of constant matrices [s].
+        - ``memory``: The most that was taken, of the process on a CPU and of Warp's memory pool on CUDA [bytes].
+    """
+    names = (
+        "vertices",
+        "elements",
+        "substeps",
+        "ms",
+        "spread",
+        "cloths_per_s",
+        "iterations",
+        "ns",
+        "bytes",
+        "bytes_per_s",
+        "launches",
+    )
+    found = {"status": "ok", "reason": "", "frames": 0, **dict.fromkeys((*names, "start_s", "bind_s", "factorise_s", "memory"))}
+    declared, device = SceneRef(**scene).load(), wp.get_device(device)
+    began = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            solver = Setup(**setup).record()
+            order = order_of_run(declared, solver)  # as a run has it
+            model = declared.build(device=device, dtype=dtype, copies=copies, order=order, threads=threads)
+            stepper = solver.bind(model)
+        except ValueError as error:
+            return found | {"status": "refused", "reason": str(error)}
+    wp.synchronize_device(device)
+    bound = time.perf_counter() - began
+    points = Mirror(stepper.state.x)
+    _run_frame(stepper, points)
+    found |= {
+        "vertices": model.count,
+        "elements": elements_of(model),
+        "substeps": stepper.steps_per_frame,
+        "start_s": time.time() - started,
+        "bind_s": bound - stepper.factorise_seconds,
+        "factorise_s": stepper.factorise_seconds,
+    }
+    if frames:
+        found |= _warm(stepper, model, points, frames, found["elements"])
+    found["memory"] = _memory(device)
+    if not np.isfinite(stepper.state.x.numpy()).all() or Result.DIVERGED in stepper.results:
+        return found | {"status": "diverged", "reason": f"diverged within {found['frames'] + _WARM_UP} frames"}
+    return found
+
+
+def _warm(stepper, model, points, frames, elements):
+    """What the warm frames say."""
+    for _ in range(_WARM_UP - 1):
+        _run_frame(stepper, points)
+    times, iterations = [], []
+    while len(times) < frames and (len(times) < _FEWEST or sum(times) < _SECONDS):
+        began = time.perf_counter()
+        iterations.append(_run_frame(stepper, points))
+        times.append(time.perf_counter() - began)
+    substeps = stepper.steps_per_frame
+    low, median, high = (1e3 * np.percentile(times, [25, 50, 75])).tolist()
+    mean = float(np.mean(iterations)) / substeps
+    moved = round(compulsory_bytes(model, mean))
+    per_iteration = 1e9 * np.array(times) / np.maximum(np.array(iterations) * elements, 1)
+    return {
+        "frames": len(times),
+        "ms": median,
+        "spread": [low, high],
+        "cloths_per_s": 1e3 * model.copies / median,
+        "iterations": mean,
+        "ns": float(np.median(per_iteration)) if elements else None,
+        "bytes": moved,
+        "bytes_per_s": moved * substeps / (1e-3 * median),
+        "launches": launches_of(lambda: _run_frame(stepper, points)) / substeps,
+    }
+
+
+def _run_frame(stepper, points):
+    """A frame, its points read into memory of the host that is kept; the iterations of all its steps."""
+    iterations = 0
+    if stepper.uniform:
+        stepper.frame()
+        iterations = stepper.steps_per_frame * stepper.iterations
+    else:
+        for _ in range(stepper.steps_per_frame):
+            stepper.step()
+            iterations += stepper.iterations
+    points.read()
+    return iterations
+
+
+def _memory(device):
+    """The most that was taken [bytes], or None; Linux alone says it of this process and not of the one that began it."""
+    if device.is_cuda:
+        return int(wp.get_mempool_used_mem_high(device)) if device.is_mempool_enabled else None
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM")), None)

@@ -1,0 +1,121 @@
+"""How far a setup strays from the reference solution of a scene, and what a frame costs it."""
+
+import math
+import warnings
+
+import numpy as np
+
+from ..base.checks import number, whole
+from ..run.simulate import simulate
+from .clock import Clock, TooSlow
+from .digest import scene_digest
+from .measurements import SceneRef, Setup
+from .reference import Reference, position_error, strain_error
+
+
+def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="float32", limit=60.0, repeats=1):
+    """Runs a scene with a setup. All values are such that JSON has them.
+
+    Args:
+        scene: Fields of a :class:`warpcloth.lab.measurements.SceneRef`, by name.
+        setup: Fields of a :class:`warpcloth.lab.measurements.Setup`, by name.
+        frames: Number of frames; if not given, those of the reference, without one those of the scene.
+        reference: Path of a :class:`warpcloth.lab.reference.Reference` with at least so many frames, or None.
+        device: A Warp device.
+        dtype: ``"float32"`` or ``"float64"``.
+        limit: Seconds that the frames may take, all runs together; what is compiled and factorised before does not count. It
+            is looked at once a frame.
+        repeats: Number of runs to take times from. When the time is up after the first, there are fewer.
+
+    Returns:
+        dict: What is not known is None.
+
+        - ``status``: "ok", "diverged", "slow" or "refused", and ``reason``, a sentence, of the first "".
+        - ``error``: :func:`warpcloth.lab.reference.position_error` against the reference, of the frames after the start.
+        - ``strain_error``: :func:`warpcloth.lab.reference.strain_error` of the same.
+        - ``ms``: What a frame takes, the median of all but the first of each run, which warms up [ms]. Of one frame
+          the next is run too.
+        - ``spread``: Its lower and upper quartile [ms].
+        - ``ms_per_second``: ``ms`` for each second that is simulated.
+        - ``compile_s``: What it takes to build, bind and warm up before the first frame, with compiling what is in no cache,
+          but without ``factorise_s``, that of constant matrices [s].
+        - ``residual``, ``message``: Of the :class:`warpcloth.core.status.Status`, with what the solver warned of.
+        - ``frames``: How many are good.
+
+    Raises:
+        ValueError: An argument breaks a rule, or the reference is that of another scene or too short.
+        FileNotFoundError: There is no such scene or reference.
+    """
+    number("limit", limit, above=0.0)
+    whole("repeats", repeats, 1)
+    declared, record = SceneRef(**scene).load(), Setup(**setup).record()
+    exact = None if reference is None else Reference.load(reference)
+    frames = _checked_frames(frames, declared, exact)
+    least = max(frames, 2)  # as the first warms up
+    found = dict.fromkeys(("error", "strain_error", "ms", "spread", "ms_per_second", "compile_s", "factorise_s", "residual"))
+    found = {"status": "ok", "reason": "", **found, "message": "", "frames": 0}
+    runs, left = [], limit
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", UserWarning)
+        for _ in range(repeats):
+            clock = Clock(left)
+            try:
+                runs.append(simulate(declared, record, device=device, dtype=dtype, frames=least, progress=clock))
+            except TooSlow:
+                if not runs:
+                    reason = f"{len(clock.frames)} of {least} frames took {sum(clock.frames):.3g} s, more than {limit:g} s"
+                    found |= {"status": "slow", "reason": reason, "frames": len(clock.frames)}
+                    found |= _times([clock.frames], declared.fps)
+            except ValueError as error:
+                return found | {"status": "refused", "reason": str(error)}
+            left -= sum(clock.frames)
+            if left <= 0.0 or not runs[-1].status.ok:
+                break
+    if not runs:
+        return found
+    first = runs[0]
+    status, timings = first.status, first.timings
+    found |= {"frames": min(int(status.frame), frames), "residual": _plain(status.residual)}
+    found["message"] = "; ".join(dict.fromkeys([status.message, *(str(warning.message) for warning in warned)]))
+    found |= _times([run.timings["frames"] for run in runs], declared.fps)
+    warm_up = timings["frames"][0] - 1e-3 * found["ms"]
+    found |= {"compile_s": timings["compile"] - timings["factorise"] + max(warm_up, 0.0), "factorise_s": timings["factorise"]}
+    if not status.ok:
+        return found | {"status": "diverged", "reason": status.message}
+    if exact is not None:
+        points, others = first.points[1 : frames + 1].astype(np.float64), exact.points[1 : frames + 1]
+        for name, error in (("error", position_error), ("strain_error", strain_error)):
+            found[name] = _plain(error(points, others, declared.mesh))
+    return found
+
+
+def _checked_frames(frames, scene, exact):
+    """How many frames to run.
+
+    Raises:
+        ValueError: The reference is that of another scene, or too short.
+    """
+    if exact is None:
+        frames = scene.frames if frames is None else frames
+        whole("frames", frames, 1)
+        return frames
+    if exact.scene != scene_digest(scene):
+        raise ValueError(f"{exact.path}: is the reference of another scene than {scene.name}, as its data are now")
+    known = len(exact.points) - 1
+    frames = known if frames is None else frames
+    whole("frames", frames, 1)
+    if frames > known:
+        raise ValueError(f"frames is {frames}; {exact.path} has {known}")
+    return frames
+
+
+def _times(runs, fps):
+    """Medians and quartiles of the warm frames of runs, lists of seconds, [ms]."""
+    warm = np.concatenate([run[1:] if len(run) > 1 else run for run in runs])
+    low, median, high = (1e3 * np.percentile(warm, [25, 50, 75])).tolist()
+    return {"ms": median, "spread": [low, high], "ms_per_second": median * fps}
+
+
+def _plain(value):
+    """A number as JSON has it, None for what is not finite."""
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,303 @@
+"""Speed against accuracy: what all settings are measured by, which of them nothing beats, and the results as tables.
+
+Each diagram is a function of a :class:`warpcloth.lab.measurements.SceneRef` that returns a dictionary of JSON values, with a
+dictionary for each setting in ``rows``; :mod:`warpcloth.chart.pareto` draws it.
+"""
+
+import csv
+import json
+import math
+
+from ..base.outputs import TEXT, Output
+from . import convergence, physics, spectrum, trajectory
+from .campaign import kept, sweep
+from .digest import scene_digest
+from .machine import machine
+from .measurements import task
+from .reference import reference
+from .setups import label, setups_of_runs, setups_of_steps
+
+# The part of a scene's frames before the one step of "solver" and "spectrum", and the part that is run in "time": later motion
+# is chaotic, so that its error says little of a method.
+_BEFORE, _RUN = 3, 2
+SUBSTEPS = 4  # steps a frame of the one step
+WITHIN = 0.01  # the error of which the cheapest setting is named
+# How well the reference solution is to be known, relative to the size of the cloth, and how many times what a setting may
+# take it may, but no less than so many seconds.
+_KNOWN, _TIMES, _SECONDS = 1e-4, 6.0, 120.0
+# What a CSV has of a setting, in this order; what it does not know is empty.
+COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
+COLUMNS += (
+    "h",
+    "stiffness",
+    "ms_per_second",
+    "iterations",
+    "gap",
+    "predicted",
+    "floor",
+    "compile_s",
+    "factorise_s",
+    "residual",
+    "frames",
+    "message",
+    "machine",
+)
+# And of all settings alike, in every line.
+FACTS = ("scene", "dtype", "seed", "processor", "cores", "device", "system", "python", "numpy", "scipy", "warp", "warpcloth")
+FACTS += ("source",)
+
+
+def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float64", limit=20.0, **run):
+    """One step of implicit Euler from the same x̃ by every method that minimises it, see :func:`convergence.measure`.
+
+    Args:
+        scene: A :class:`SceneRef`.
+        solvers: Names as on the command line; None is all that minimise.
+        frames: Frames before the step; a third of the scene's where not given.
+        device: A Warp device.
+        dtype: Of the methods.
+        limit: Seconds a setting.
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+
+    Returns:
+        dict: See the module.
+
+    Raises:
+        ValueError: A name is none of a method that minimises.
+    """
+    setups = setups_of_steps(solvers)
+    declared = scene.load()
+    frame = frames or max(declared.frames // _BEFORE, 1)
+    given = {
+        "digest": scene_digest(declared),
+        "frame": frame,
+        "substeps": SUBSTEPS,
+        "device": str(device),
+        "dtype": dtype,
+        "limit": limit,
+    }
+    rows = _measured(convergence.measure, scene, setups, given, run)
+    facts = {"seed": convergence.SEED, "frame": frame, "rate": declared.fps * SUBSTEPS}
+    return {**_facts("solver", scene, device, dtype), **facts, "rows": rows}
+
+
+def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32", limit=20.0, watch=None, **run):
+    """The error of a trajectory against the time it takes, over steps and iterations, see :func:`trajectory.measure`.
+
+    Args:
+        scene: A :class:`SceneRef`.
+        solvers: Names as on the command line; None is all.
+        frames: Frames that are run, half of the scene's where not given.
+        device: A Warp device.
+        dtype: Of the runs; the reference solution has float64.
+        limit: Seconds a setting; the reference solution may take six times as long, and 120 s in any case.
+        watch: Function that says how far the reference solution is, see :func:`reference`, or None.
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+
+    Returns:
+        dict: See the module; with ``reference`` what the errors are measured against.
+
+    Raises:
+        ValueError: A name is no solver's, or the scene has no reference solution.
+    """
+    setups = setups_of_runs(scene, solvers, device, dtype)
+    frames = frames or max(scene.load().frames // _RUN, 1)
+    exact = reference(scene, frames=frames, tolerance=_KNOWN, limit=max(_TIMES * limit, _SECONDS), progress=watch)
+    if (exact.points == exact.points[0]).all():
+        raise ValueError(f"nothing moves in {scene} within {frames} frames; a chart of errors needs motion")
+    given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}
+    rows = _measured(trajectory.measure, scene, setups, given, run)
+    for place in front(rows, exact.error):
+        rows[place]["front"] = True
+    known = {name: getattr(exact, name) for name in ("error", "strain_error", "substeps", "seconds", "key")}
+    facts = {"seed": None, "frames": frames, "reference": known}  # nothing is drawn at random
+    return {**_facts("time", scene, device, dtype), **facts, "rows": rows}
+
+
+def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):
+    """Errors of plain projective dynamics of a step, for several of its lengths, beside what the spectrum predicts.
+
+    Args:
+        scene: A :class:`SceneRef`, of few vertices.
+        frames: Frames before the step; a third of the scene's where not given.
+        device: A Warp device.
+        limit: Seconds a length.
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+
+    Returns:
+        dict: See the module, and for the rows :func:`spectrum.measure`.
+
+    Raises:
+        ValueError: The mesh is too fine.
+    """
+    declared = scene.load()
+    frame = frames or max(declared.frames // _BEFORE, 1)
+    given = {"scene": scene, "digest": scene_digest(declared), "frame": frame, "device": str(device), "limit": limit}
+    tasks = [task(spectrum.measure, **given, substeps=substeps) for substeps in (1, 2, 4, 8, 16)]
+    results = _results(tasks, run)
+    if all(each["status"] == "refused" for each in results):
+        raise ValueError(results[0]["reason"])
+    rows = [
+        {
+            "solver": "projective-dynamics",
+            "options": {},
+            "label": f"1/{declared.fps * each.arguments['substeps']:g} s",
+            **result,
+        }
+        for each, result in zip(tasks, results, strict=True)
+    ]
+    facts = {"seed": convergence.SEED, "frame": frame}
+    return {**_facts("spectrum", scene, device, "float64"), **facts, "rows": rows}
+
+
+# What the diagram "physics" measures of each scene: arguments of `physics.measure` but for the resolution, and resolutions.
+PHYSICS = {
+    "cantilever": (
+        [
+            {"case": "cantilever", "bending": bending, "pattern": pattern, "angle": angle}
+            for pattern in ("equilateral", "diagonal", "alternating", "jittered")
+            for angle in (0.0, math.pi / 4)
+            for bending in ("quadratic", "dihedral")
+        ],
+        (8, 12, 16, 24),
+    ),
+    "chain": ([{"case": "chain"}], (5, 10, 20, 40, 80)),
+    "catenary": ([{"case": "catenary"}], (8, 16, 32, 64, 128)),
+}
+
+
+def physics_diagram(scene, device="cpu", dtype="float64", limit=20.0, **run):
+    """Errors of rest shapes to closed forms against mesh size and time, see :func:`physics.measure`.
+
+    Args:
+        scene: A :class:`SceneRef` of "cantilever", "chain" or "catenary", without parameters: sizes and nets are varied.
+        device: A Warp device.
+        dtype: "float32" or "float64".
+        limit: Seconds a point.
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+
+    Returns:
+        dict: See the module; a row has ``arguments``, those of `physics.measure`.
+
+    Raises:
+        ValueError: The scene has no closed form here, or has parameters.
+    """
+    if scene.name not in PHYSICS or scene.parameters:
+        raise ValueError(f"{scene}: the diagram physics is of {', '.join(PHYSICS)}, without parameters, which it varies itself")
+    plans, resolutions = PHYSICS[scene.name]
+    given = {"device": str(device), "dtype": dtype, "limit": limit}
+    plans = [{**plan, "resolution": resolution} for plan in plans for resolution in resolutions]
+    tasks = [task(physics.measure, **plan, **given) for plan in plans]
+    rows = [
+        {"solver": "equilibrium", "options": {}, "label": _label_of(plan), "arguments": plan, **result}
+        for plan, result in zip(plans, _results(tasks, run), strict=True)
+    ]
+    return {**_facts("physics", scene, device, dtype), "seed": physics.SEED, "rows": rows}
+
+
+def _label_of(plan):
+    """A point of the diagram "physics" in few words, such as "cantilever quadratic diagonal 45° 16"."""
+    words = [plan["case"], *(plan[name] for name in ("bending", "pattern") if name in plan)]
+    words += [f"{math.degrees(plan['angle']):.0f}°"] if "angle" in plan else []
+    return " ".join([*words, str(plan["resolution"])])
+
+
+def cheapest(rows, floor=0.0):
+    """Of each solver the row of least time with an error of no more than :data:`WITHIN`, the fastest first.
+
+    Args:
+        rows: Of :func:`time_diagram`.
+        floor: Error of the reference, which each error may be off by.
+    """
+    found = {}
+    for row in sorted(filter(_has_error, rows), key=lambda row: row["ms_per_second"]):
+        if row["error"] + floor <= WITHIN:
+            found.setdefault(row["solver"], row)
+    return list(found.values())
+
+
+def front(rows, floor=0.0, name="error"):
+    """Returns the indices of the rows that no other beats in time and error by more than the spread of times, fastest first.
+
+    A row is left out if another has a smaller error and its time is no longer, within the quartiles of both.
+
+    Args:
+        rows: Of :func:`time_diagram`.
+        floor: Error of the reference; errors below it count as equal.
+        name: The error, "error" or "strain_error".
+    """
+    places = [i for i, row in enumerate(rows) if row["status"] == "ok" and row[name] is not None]
+    levels, spreads = {i: max(rows[i][name], floor) for i in places}, {i: spread(rows[i]) for i in places}
+    order = {i: (rows[i]["ms_per_second"], rows[i][name], i) for i in places}
+
+    def beats(i, j):
+        if levels[i] == levels[j]:
+            return order[i] < order[j]
+        return levels[i] < levels[j] and spreads[i][0] <= spreads[j][1]
+
+    return sorted((j for j in places if not any(beats(i, j) for i in places)), key=order.get)
+
+
+def spread(row):
+    """Returns the quartiles of the time for a second of motion, (low, high) [ms]; both are the median if they are unknown."""
+    if not row.get("spread"):
+        return row["ms_per_second"], row["ms_per_second"]
+    return tuple(each * row["ms_per_second"] / row["ms"] for each in row["spread"])
+
+
+def left_out(found):
+    """(label, status and reason) of the rows of a diagram that have no point in the picture, one for all alike of a solver."""
+    groups = {}
+    for row in found["rows"]:
+        if row["status"] != "ok":
+            groups.setdefault((row["solver"], f"{row['status']}: {row['reason']}"), []).append(row["label"])
+    return [
+        (labels[0] if len(labels) == 1 else f"{solver}, {len(labels)} settings", why)
+        for (solver, why), labels in groups.items()
+    ]
+
+
+def write_csv(path, found):
+    """Writes a line for each setting, in the diagram "solver" for each of its points, each with what it was measured on.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+    """
+    with Output(path, "x", **TEXT) as output:
+        table = csv.DictWriter(output.file, COLUMNS + FACTS, lineterminator="\n", extrasaction="ignore")
+        table.writeheader()
+        for row in found["rows"]:
+            facts = {**found, **found["machine"], **row, "options": json.dumps(row["options"])}
+            for point in row.get("points") or [row]:
+                low, high = point.get("spread") or (None, None)
+                table.writerow({**facts, **point, "options": facts["options"], "ms_low": low, "ms_high": high})
+
+
+def _facts(kind, scene, device, dtype):
+    return {
+        "diagram": kind,
+        "scene": str(scene),
+        "device": str(device),
+        "dtype": dtype,
+        "machine": machine(device),
+    }
+
+
+def _has_error(row):
+    return row["status"] == "ok" and row["error"] is not None
+
+
+def _measured(function, scene, setups, given, run):
+    """A row for each setup, in their order."""
+    tasks = [task(function, scene=scene, setup=setup, **given) for setup in setups]
+    return [
+        {"solver": setup.solver, "options": setup.options, "label": label(setup), **result}
+        for setup, result in zip(setups, _results(tasks, run), strict=True)
+    ]
+
+
+def _results(tasks, run):
+    """The result of each task and the machine that measured it, in their order."""
+    run = run if "store" in run else {"store": kept("work-precision", run.get("executor")), **run}
+    results = {each.key: result for each, result in sweep(tasks, **run)}
+    return [{**results[each.key], "machine": run["store"].machine(each)} for each in tasks]

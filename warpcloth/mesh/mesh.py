@@ -1,0 +1,461 @@
+"""The mesh of a cloth: NumPy arrays, validated once, and the topology that energies and solvers read."""
+
+import sys
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..base.checks import choice, shown
+from ..base.limits import refuse_memory
+from ..kernels.deformation import FLATTEST
+from .selection import select
+
+STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+UP_AXES = ("Y", "Z")
+_MOST_VERTICES = 2**31 - 1  # indices are int32
+# Least memory to build a grid: float64 positions and texture coordinates, int64 corners of two triangles.
+_BYTES_OF_A_VERTEX = 24 + 16 + 48
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Mesh:
+    """Triangles, or edges alone as for a chain or a net, in their rest shape.
+
+    Every array is copied, checked and made read-only. Edges are found at once, the rest of the topology when it is
+    first asked for, and kept.
+
+    Attributes:
+        points: Rest positions (n, 3) [m], float64.
+        triangles: Vertices of each triangle (T, 3), int32, counter-clockwise from the front; (0, 3) of an edge mesh.
+        edges: Vertices of each edge (E, 2), int32. Of triangles: store every triangle edge, sort, drop duplicates; so
+            each row has its smaller index first, and rows are in lexicographic order. Of an edge mesh: as given.
+        texture_coordinates: One st pair for each vertex (n, 2), float64, or None.
+        grid_shape: (nx, ny) if vertex i + nx·j is column i, row j of a grid of four-sided cells, or None.
+        up_axis: "Y" or "Z", which gravity and files follow; None if unknown, which they take as "Y".
+
+    Raises:
+        ValueError: An array has the wrong shape or type, is empty, or has an element (named by its index) that is not
+            finite, refers to no vertex, repeats a vertex, has no area or length, or (edges) occurs twice; or the up axis is
+            another.
+    """
+
+    points: np.ndarray
+    triangles: np.ndarray | None = None
+    edges: np.ndarray | None = None
+    texture_coordinates: np.ndarray | None = None
+    grid_shape: tuple[int, int] | None = None
+    up_axis: str | None = None
+
+    def __post_init__(self):
+        if self.up_axis is not None:
+            choice("up_axis", self.up_axis, UP_AXES)
+        points = _numbers("points", self.points, 3)
+        n = len(points)
+        if (self.triangles is None) == (self.edges is None):
+            raise ValueError("triangles, edges: give exactly one of the two, for the edges of triangles follow from them")
+        keep = object.__setattr__
+        keep(self, "points", _read_only(points))
+        if self.triangles is not None:
+            keep(self, "triangles", _read_only(_indices("triangles", self.triangles, 3, n)))
+            self._refuse_degenerate()
+            order, first, _ = self._sides
+            start = order[first]
+            corners = np.stack([start, start + 1], axis=1) % 3
+            keep(self, "edges", _read_only(np.sort(self.triangles[start[:, None] // 3, corners], axis=1)))
+        else:
+            keep(self, "triangles", _read_only(np.empty((0, 3), np.int32)))
+            keep(self, "edges", _read_only(_indices("edges", self.edges, 2, n)))
+            self._refuse_degenerate()
+            self._refuse_repeated_edges()
+        if self.texture_coordinates is not None:
+            st = _coordinates("texture_coordinates", self.texture_coordinates, 2)
+            if len(st) != n:
+                raise ValueError(f"texture_coordinates: {len(st)} rows for {n} points, must be one for each point")
+            keep(self, "texture_coordinates", _read_only(st))
+        if self.grid_shape is not None:
+            if np.shape(self.grid_shape) != (2,):
+                raise ValueError(f"grid_shape = {self.grid_shape}: must be two counts (nx, ny)")
+            nx, ny = (_count("grid_shape", value) for value in self.grid_shape)
+            if nx * ny != n:
+                raise ValueError(f"grid_shape = {self.grid_shape}: {nx}·{ny} must be the number of points, {n}")
+            keep(self, "grid_shape", (nx, ny))
+
+    def __repr__(self):
+        return f"{type(self).__name__}({len(self.points)} points, {len(self.triangles)} triangles, {len(self.edges)} edges)"
+
+    @classmethod
+    def grid(cls, nx, ny, size=1.0, pattern="diagonal"):
+        """A flat grid in the plane y = 0, its first corner at the origin, triangle normals along +y.
+
+        Vertex i + nx·j stands in column i along +x and row j along +z. Patterns:
+
+        - "diagonal": rectangular cells, all diagonals from (i, j) to (i+1, j+1).
+        - "alternating": rectangular cells, the diagonals of neighbouring cells mirrored, like a checkerboard.
+        - "equilateral": rows along x of edge a = size/(nx−1), spaced a·√3/2 along z, odd rows shifted by a/2 along +x;
+          so the two sides at the ends of the rows zigzag by a/2, and there are no half triangles. It has no four-sided
+          cells and so no `grid_shape`. Hinge energies are isotropic on it, and are not on the other two.
+
+        Args:
+            nx: Number of vertices of a row, at least 2.
+            ny: Number of rows, at least 2.
+            size: Width and depth (along x, along z) or one length for both [m]; of "equilateral" the length of a row.
+            pattern: How cells are cut into triangles.
+
+        Returns:
+            Mesh: nx·ny vertices, 2(nx−1)(ny−1) triangles; texture coordinates fill the unit square.
+
+        Raises:
+            ValueError: A count, the size or the pattern is none of those above.
+        """
+        nx, ny = _count("nx", nx), _count("ny", ny)
+        if pattern not in ("diagonal", "alternating", "equilateral"):
+            raise ValueError(f'pattern = {pattern!r}: must be "diagonal", "alternating" or "equilateral"')
+        refuse_memory(f"nx = {nx}, ny = {ny}", _BYTES_OF_A_VERTEX * nx * ny)
+        equilateral = pattern == "equilateral"
+        if np.shape(size) != () and (equilateral or np.shape(size) != (2,)):
+            raise ValueError(f"size = {size}: must be one length{'' if equilateral else ' or two'} for pattern = {pattern!r}")
+        width, depth = (_length("size", length) for length in np.broadcast_to(size, 2).tolist())
+
+        column, row = np.meshgrid(np.arange(nx), np.arange(ny))
+        points = np.zeros((ny, nx, 3))
+        if equilateral:
+            edge = width / (nx - 1)
+            points[..., 0] = edge * (column + 0.5 * (row % 2))
+            points[..., 2] = edge * np.sqrt(0.75) * row
+        else:
+            points[..., 0], points[..., 2] = np.meshgrid(np.linspace(0, width, nx), np.linspace(0, depth, ny))
+        points = points.reshape(-1, 3)
+        st = points[:, [0, 2]] / points[:, [0, 2]].max(axis=0)
+
+        a = (column + nx * row)[:-1, :-1]
+        b, c, d = a + 1, a + nx, a + nx + 1
+        mirrored = {"diagonal": column < 0, "alternating": (column + row) % 2 == 1, "equilateral": row % 2 == 0}[pattern]
+        straight = np.stack([a, c, d, a, d, b], axis=-1)
+        triangles = np.where(mirrored[:-1, :-1, None], np.stack([a, c, b, b, c, d], axis=-1), straight).reshape(-1, 3)
+        return cls(points, triangles, texture_coordinates=st, grid_shape=None if equilateral else (nx, ny))
+
+    @classmethod
+    def chain(cls, n, length=1.0, direction=(0, -1, 0)):
+        """A straight chain: n vertices evenly spaced from the origin, n−1 edges from each to the next.
+
+        Args:
+            n: Number of vertices, at least 2.
+            length: Length of the whole chain [m].
+            direction: The way that it runs, of any length but zero.
+
+        Returns:
+            Mesh: An edge mesh.
+
+        Raises:
+            ValueError: Fewer than two vertices, a length that is not positive, a direction that is not a vector.
+        """
+        n, length = _count("n", n), _length("length", length)
+        refuse_memory(f"n = {n}", _BYTES_OF_A_VERTEX * n)
+        along = _coordinates("direction", [direction], 3)[0]
+        if not along.any():
+            raise ValueError(f"direction = {direction}: must not be zero")
+        points = np.linspace(0, length, n)[:, None] * (along / np.linalg.norm(along))
+        return cls(points, edges=np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
+
+    @classmethod
+    def load(cls, path, prim=None):
+        """The mesh in a file: see `loading.read_file`, and for USD stages `usd.read_mesh`, which give what is raised.
+
+        Args:
+            path: An .obj, .ply, .stl, .off, .glb or .gltf file, or a .usd, .usda, .usdc or .usdz stage.
+            prim: Name of the geometry, or path of the prim, where the file has several.
+
+        Returns:
+            Mesh: Vertices in the order of the file; of the class that it is asked of.
+        """
+        if str(path).lower().endswith(STAGE_ENDINGS):
+            from ..usd import read_mesh
+
+            return read_mesh(path, prim, cls)
+        from .loading import read_file
+
+        return read_file(path, prim, cls)
+
+    def select(self, text):
+        """Vertices described by a text such as "z == 0 and not corners": see `selection.select`.
+
+        Args:
+            text: The description.
+
+        Returns:
+            np.ndarray: Vertex indices, sorted, each once, int32.
+
+        Raises:
+            ValueError: The text does not follow the grammar: where, and what is allowed there.
+        """
+        return select(self, text)
+
+    def corners(self):
+        """Vertices at the corners.
+
+        Of a grid the four corners (0, 0), (nx−1, 0), (0, ny−1), (nx−1, ny−1). Of other triangle meshes the boundary
+        vertices nearest to the four corners of the boundary's bounding box, measured in the plane of its two largest
+        extents, in the same order; a vertex nearest to two of them is given once. An equilateral grid gets the same
+        four as the others. Of edge meshes the ends: vertices of exactly one edge.
+
+        Returns:
+            np.ndarray: Vertex indices, int32.
+
+        Raises:
+            ValueError: The triangles are closed, without a boundary.
+        """
+        if self.grid_shape:
+            nx, ny = self.grid_shape
+            return np.array([0, nx - 1, nx * (ny - 1), nx * ny - 1], dtype=np.int32)
+        if not len(self.triangles):
+            return self.boundary
+        if not len(self.boundary):
+            raise ValueError("corners: the mesh is closed and has no boundary, so it has no corners")
+        points = self.points[self.boundary]
+        plane = np.sort(np.argsort(-np.ptp(points, axis=0), kind="stable")[:2])
+        low, high = points[:, plane].min(axis=0), points[:, plane].max(axis=0)
+        box = np.array([low, (high[0], low[1]), (low[0], high[1]), high])
+        nearest = np.linalg.norm(points[None, :, plane] - box[:, None], axis=2).argmin(axis=1)
+        return self.boundary[list(dict.fromkeys(nearest.tolist()))]
+
+    def springs(self, kind):
+        """Pairs of vertices that springs of one kind join (Provot 1995, "Deformation constraints in a mass-spring model").
+
+        | kind | a grid with `grid_shape` | other triangle meshes | edge meshes |
+        |---|---|---|---|
+        | "structural" | along rows and columns | every edge | every edge |
+        | "shear" | both diagonals of every cell | refused: the edges resist shear already | refused: no cells |
+        | "bending" | vertices two apart in a row or column | the two vertices opposite each hinge | the two neighbours of each vertex that has exactly two |
+        | "edges" | every edge | every edge | every edge |
+
+        Args:
+            kind: One of the four.
+
+        Returns:
+            np.ndarray: Pairs (E, 2), int32: the smaller index first, each pair once. Where they are every edge, row e is
+                edge e of the mesh; all others are in lexicographic order.
+
+        Raises:
+            ValueError: The kind is unknown, or is "shear" where there are no cells, or "bending" where hinges are refused.
+        """  # noqa: E501 (a table's row is one line)
+        if kind not in ("structural", "shear", "bending", "edges"):
+            raise ValueError(f'kind = {kind!r}: must be "structural", "shear", "bending" or "edges"')
+        if self.grid_shape and kind != "edges":
+            nx, ny = self.grid_shape
+            vertex = np.arange(nx * ny).reshape(ny, nx)
+            if kind == "shear":
+                sides = [(vertex[:-1, :-1], vertex[1:, 1:]), (vertex[:-1, 1:], vertex[1:, :-1])]
+            else:
+                skip = 1 if kind == "structural" else 2
+                sides = [(vertex[:, :-skip], vertex[:, skip:]), (vertex[:-skip], vertex[skip:])]
+            pairs = np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in sides])
+        elif kind == "shear":
+            raise ValueError(
+                'kind = "shear": needs the four-sided cells of a diagonal or alternating grid; '
+                "the edges of any other triangle mesh resist shear already"
+            )
+        elif kind != "bending":
+            return np.sort(self.edges, axis=1)
+        elif len(self.triangles):
+            pairs = self.hinges[:, 2:]
+        else:
+            both_ways = np.concatenate([self.edges, self.edges[:, ::-1]])
+            both_ways = both_ways[np.argsort(both_ways[:, 0], kind="stable")]
+            valence = np.bincount(both_ways[:, 0], minlength=len(self.points))
+            pairs = both_ways[valence[both_ways[:, 0]] == 2, 1].reshape(-1, 2)
+        return self._unique(pairs)
+
+    @cached_property
+    def hinges(self):
+        """The four vertices of every pair of triangles that share an edge (H, 4), int32, in the order of the edges.
+
+        [x₀, x₁, x₂, x₃]: the first triangle, that of the lower index, runs along the shared edge from x₀ to x₁, so its
+        normal is (x₁−x₀)×(x₂−x₀) with x₂ its third vertex. x₃ is the third vertex of the second triangle; where both
+        have the same orientation the second runs from x₁ to x₀. Where they do not, it is a hinge all the same.
+
+        Raises:
+            ValueError: More than two triangles share an edge, or two triangles have the same three vertices.
+        """
+        order, first, count = self._sides
+        if (count > 2).any():
+            edge = np.argmax(count > 2)
+            around = (order[first[edge] : first[edge] + count[edge]] // 3).tolist()
+            raise ValueError(
+                f"triangles: edge {self.edges[edge].tolist()} belongs to triangles {around}, at most two are allowed"
+            )
+        shared = first[count == 2]
+        one, two = order[shared], order[shared + 1]
+        # Side k of triangle t, number 3t+k, runs from its corner k to corner k+1; corner k+2 is opposite.
+        sides, corners = np.stack([one, one, one, two], axis=1), [0, 1, 2, 2]
+        hinges = self.triangles[sides // 3, (sides + corners) % 3]
+        folded = np.flatnonzero(hinges[:, 2] == hinges[:, 3])
+        if len(folded):
+            pair = (sides[folded[0], [0, 3]] // 3).tolist()
+            raise ValueError(f"triangles: {pair} have the same three vertices, must be different triangles")
+        return _read_only(hinges)
+
+    @cached_property
+    def boundary_edges(self):
+        """Edges of exactly one triangle (B, 2), int32, rows of `edges`; of an edge mesh none."""
+        return _read_only(self.edges[self._sides[2] == 1] if len(self.triangles) else self.edges[:0])
+
+    @cached_property
+    def boundary(self):
+        """Sorted vertices of the boundary edges, int32; of an edge mesh the ends, vertices of exactly one edge."""
+        if len(self.triangles):
+            return _read_only(np.unique(self.boundary_edges))
+        return _read_only(np.flatnonzero(np.bincount(self.edges.ravel()) == 1).astype(np.int32))
+
+    @cached_property
+    def isolated(self):
+        """Sorted vertices that no triangle (of an edge mesh: no edge) uses, int32; they have no area and no length."""
+        used = np.bincount(self.edges.ravel(), minlength=len(self.points))
+        return _read_only(np.flatnonzero(used == 0).astype(np.int32))
+
+    @cached_property
+    def edge_lengths(self):
+        """Rest lengths (E,) [m]."""
+        return _read_only(np.linalg.norm(self.points[self.edges[:, 1]] - self.points[self.edges[:, 0]], axis=1))
+
+    @cached_property
+    def triangle_areas(self):
+        """Rest areas (T,) [m²], ½‖(x₁−x₀)×(x₂−x₀)‖."""
+        x0, x1, x2 = (self.points[corner] for corner in self.triangles.T)
+        with np.errstate(invalid="ignore", over="ignore"):  # points of a `Surface` may be infinite
+            return _read_only(np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) / 2)
+
+    @cached_property
+    def vertex_areas(self):
+        """Lumped areas (n,) [m²]: a third of the adjacent triangles' areas that are finite; zero without any."""
+        third = np.repeat(np.where(np.isfinite(self.triangle_areas), self.triangle_areas, 0.0) / 3, 3)
+        return _read_only(np.bincount(self.triangles.ravel(), weights=third, minlength=len(self.points)))
+
+    @cached_property
+    def vertex_lengths(self):
+        """Lumped lengths (n,) [m]: half of the adjacent edges' lengths."""
+        half = np.repeat(self.edge_lengths / 2, 2)
+        return _read_only(np.bincount(self.edges.ravel(), weights=half, minlength=len(self.points)))
+
+    @cached_property
+    def _sides(self):
+        """The 3T triangle sides, sorted so that those of one edge are neighbours, lower triangles first.
+
+        Returns:
+            Side indices in that order (3T,), the place of each edge's first side in it (E,), sides of each edge (E,).
+        """
+        keys = self._keys(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
+        order = np.argsort(keys, kind="stable")
+        keys = keys[order]
+        first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
+        return order, first, np.diff(first, append=len(keys))
+
+    def _keys(self, pairs):
+        """Packs pairs (E, 2), smaller index first, in one int64 each: these sort much faster than rows do."""
+        return pairs.min(axis=1).astype(np.int64) * len(self.points) + pairs.max(axis=1)
+
+    def _unique(self, pairs):
+        """Pairs (E, 2) with the smaller index first, in lexicographic order, each once, int32."""
+        return np.stack(np.divmod(np.unique(self._keys(pairs)), len(self.points)), axis=1).astype(np.int32)
+
+    def _flat(self):
+        """Whether a triangle has no area to speak of (T,), or none that can be told."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            sides = self.points[self.triangles] - self.points[np.roll(self.triangles, 1, axis=1)]
+            longest_squared = np.einsum("tki,tki->tk", sides, sides).max(axis=1)
+            # 2·area/longest² is the height over the longest side, by that side.
+            return ~(2 * self.triangle_areas > FLATTEST * longest_squared)
+
+    def _refuse_degenerate(self):
+        _refuse("points", self.points, ~np.isfinite(self.points).all(axis=1), "must be finite")
+        _refuse("triangles", self.triangles, _repeated(self.triangles), "must be 3 different vertices")
+        _refuse("triangles", self.triangles, self._flat(), f"must be higher than {FLATTEST:g} of its longest side")
+
+    def _refuse_repeated_edges(self):
+        _refuse("edges", self.edges, _repeated(self.edges), "must be 2 different vertices")
+        keys = self._keys(self.edges)
+        repeated = np.ones(len(keys), dtype=bool)
+        repeated[np.unique(keys, return_index=True)[1]] = False
+        _refuse("edges", self.edges, repeated, "must occur once, in either direction")
+        _refuse("edges", self.edges, self.edge_lengths == 0, "must have two different end points")
+
+
+class Surface(Mesh):
+    """A mesh that is only measured: a triangle may be flat or name a vertex twice, and a point need not be finite.
+
+    A garment then need not be refused for one bad triangle; whoever measures leaves out those that are `degenerate`, and says
+    so. Edges and what follows from them count such triangles too, so that an edge may join a vertex with itself.
+    """
+
+    @cached_property
+    def degenerate(self):
+        """Sorted triangles (k,), int32, that a `Mesh` would refuse."""
+        return _read_only(np.flatnonzero(self._flat()).astype(np.int32))
+
+    def _refuse_degenerate(self):
+        """Refuses nothing."""
+
+
+def same_topology(one, other):
+    """Whether two meshes have as many vertices and the same triangles."""
+    return len(one.points) == len(other.points) and np.array_equal(one.triangles, other.triangles)
+
+
+def _read_only(array):
+    array.setflags(write=False)
+    return array
+
+
+def _refuse(name, rows, bad, rule):
+    """Raises ValueError for the first row that is bad."""
+    if bad.any():
+        row = np.argmax(bad)
+        raise ValueError(f"{name}[{row}] = {rows[row].tolist()}: {rule}")
+
+
+def _rows(name, value, width, kinds):
+    """The value as an array (count, width), count at least 1, of one of NumPy's kinds of types."""
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name}: must be rows of {width} numbers; {error}") from None
+    if array.ndim != 2 or array.shape[1] != width or not len(array):
+        raise ValueError(f"{name}: has shape {array.shape}, must be (count, {width}) with at least one row")
+    if array.dtype.kind not in kinds:
+        raise ValueError(f"{name}: has type {array.dtype}, must be {'integers' if kinds == 'iu' else 'real numbers'}")
+    return array
+
+
+def _numbers(name, value, width):
+    return _rows(name, value, width, "fiu").astype(np.float64)
+
+
+def _coordinates(name, value, width):
+    rows = _numbers(name, value, width)
+    _refuse(name, rows, ~np.isfinite(rows).all(axis=1), "must be finite")
+    return rows
+
+
+def _indices(name, value, width, n):
+    rows = _rows(name, value, width, "iu")
+    _refuse(name, rows, ((rows < 0) | (rows >= n)).any(axis=1), f"must be indices of the {n} points, 0 to {n - 1}")
+    return rows.astype(np.int32)
+
+
+def _repeated(rows):
+    """Whether a row (count, width) has a number twice."""
+    ordered = np.sort(rows, axis=1)
+    return (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+
+
+def _count(name, value):
+    if not isinstance(value, int | np.integer) or not 2 <= value <= _MOST_VERTICES:
+        allowed = f"a whole number of vertices, at least 2 and at most {_MOST_VERTICES:,}"
+        raise ValueError(f"{name} = {shown(value)}: must be {allowed}")
+    return int(value)
+
+
+def _length(name, value):
+    if not isinstance(value, int | float | np.number) or not 0 < value <= sys.float_info.max:
+        raise ValueError(f"{name} = {shown(value)}: must be a finite positive length")
+    return float(value)

@@ -1,0 +1,219 @@
+"""A small language that names vertices of a mesh."""
+
+import re
+
+import numpy as np
+
+from ..base.checks import shown
+
+# Points often come from float32 files, and 0.1 from a text: nearer than this share of the mesh's size is equal.
+_EQUAL = 1e-6
+
+_DEEPEST = 100  # nested brackets, each of which takes three Python calls
+_EXCERPT = 60  # characters of a long text that are shown before and after an error
+
+_TOKEN = re.compile(
+    r"(?P<space>\s+)|(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),:])"
+)
+
+
+def select(mesh, text):
+    """Vertices that a text describes.
+
+        selection = term {"or" term}
+        term      = factor {"and" factor}
+        factor    = "not" factor | "(" selection ")" | vertices
+        vertices  = ("x" | "y" | "z") ("<" | "<=" | "==" | "!=" | ">=" | ">") number
+                  | "all" | "boundary" | "corners"
+                  | "nearest" "(" x "," y "," z ["," count] ")"
+                  | "index" "(" range {"," range} ")"
+        range     = index | [start] ":" [stop] [":" step]
+
+    Comparisons are of rest points, with 1e-6 of the bounding box's diagonal as tolerance: within it a coordinate is
+    equal, and so neither less nor greater. `nearest` gives the vertex nearest to a point, or that many (of equally near
+    ones the lower indices). A range is Python's, without negative numbers: `10:20` is 10 to 19.
+
+    Args:
+        mesh: A Mesh.
+        text: For example "z == 0 and not corners", "nearest(0.5, 0, 1)" or "index(0, 3, 10:20)".
+
+    Returns:
+        np.ndarray: Vertex indices, sorted, each once, int32; empty if nothing fits.
+
+    Raises:
+        ValueError: The text does not follow the grammar, an index is not of a vertex, or `corners` of a closed mesh:
+            the text, the column and what is allowed there.
+    """
+    if not isinstance(text, str):
+        raise ValueError(f"selection = {text!r}: must be a text")
+    return _Reader(mesh, text).read()
+
+
+def distinct_vertices(name, vertices, mesh):
+    """Vertices (p,) of a mesh, int32, each once, in the order given, from indices or a selection.
+
+    Raises:
+        ValueError: What ``vertices`` are not, under their name.
+    """
+    if isinstance(vertices, str):
+        return select(mesh, vertices)
+    n = len(mesh.points)
+    try:
+        found = np.asarray(vertices)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"{name} is {shown(vertices)}; it must be a list of whole numbers") from None
+    found = found.astype(np.int32) if found.size == 0 else found
+    if found.ndim != 1 or found.dtype.kind not in "iu":
+        raise ValueError(f"{name} has shape {found.shape} and type {found.dtype}; it must be a list of whole numbers")
+    for k in np.flatnonzero((found < 0) | (found >= n))[:1]:
+        raise ValueError(f"{name}[{k}] is {found[k]}; it must lie in 0 … {n - 1}")
+    values, counts = np.unique(found, return_counts=True)
+    for vertex in values[counts > 1][:1]:
+        raise ValueError(f"{name} names vertex {vertex} twice; each may stand once")
+    return found.astype(np.int32)
+
+
+class _Reader:
+    """Recursive descent: each method reads one rule of the grammar and gives a mask of the vertices (n,)."""
+
+    def __init__(self, mesh, text):
+        self.mesh, self.text, self.position, self.depth = mesh, text, 0, 0
+        self.tokens = []
+        column = 0
+        while column < len(text):
+            match = _TOKEN.match(text, column)
+            if not match:
+                self.fail(column, f"unexpected {text[column]!r}, expected a number, a name, a comparison or one of ( ) , :")
+            if match.lastgroup != "space":
+                self.tokens.append((match.lastgroup, match.group(), column))
+            column = match.end()
+        self.tokens.append(("end", "", len(text)))
+
+    def fail(self, column, why):
+        first, last = max(0, column - _EXCERPT), column + _EXCERPT
+        part = "…" * (first > 0) + self.text[first:last] + "…" * (last < len(self.text))
+        raise ValueError(f"selection {part!r}, column {column + 1}: {why}")
+
+    def expected(self, what):
+        _, word, column = self.tokens[self.position]
+        self.fail(column, f"found {shown(word)}, expected {what}" if word else f"the text ends, expected {what}")
+
+    def accept(self, *words):
+        """The next token if it is one of these words, else None."""
+        word = self.tokens[self.position][1]
+        if word not in words:
+            return None
+        self.position += 1
+        return word
+
+    def require(self, *words):
+        return self.accept(*words) or self.expected(" or ".join(words))
+
+    def number(self, whole=False, least=None, most=None):
+        kind, word, column = self.tokens[self.position]
+        if kind != "number":
+            self.expected("a whole number" if whole else "a number")
+        # Python converts only a few thousand digits to a number, and no index needs more than a float represents exactly.
+        if whole and not (word.isdecimal() and least <= float(word) <= most):
+            self.fail(column, f"found {shown(word)[1:-1]}, expected a whole number from {least} to {most}")
+        if not whole and not np.isfinite(float(word)):
+            self.fail(column, f"found {shown(word)[1:-1]}, expected a finite number")
+        self.position += 1
+        return int(word) if whole else float(word)
+
+    def read(self):
+        chosen = self.selection()
+        if self.tokens[self.position][0] != "end":
+            self.expected('"and", "or" or the end')
+        return np.flatnonzero(chosen).astype(np.int32)
+
+    def selection(self):
+        chosen = self.term()
+        while self.accept("or"):
+            chosen = chosen | self.term()
+        return chosen
+
+    def term(self):
+        chosen = self.factor()
+        while self.accept("and"):
+            chosen = chosen & self.factor()
+        return chosen
+
+    def factor(self):
+        inverted = False
+        while self.accept("not"):
+            inverted = not inverted
+        column = self.tokens[self.position][2]
+        if self.accept("("):
+            self.depth += 1
+            if self.depth > _DEEPEST:
+                self.fail(column, f"is {self.depth} brackets deep, must be {_DEEPEST} at most")
+            chosen = self.selection()
+            self.require(")")
+            self.depth -= 1
+        else:
+            chosen = self.vertices()
+        return ~chosen if inverted else chosen
+
+    def vertices(self):
+        column = self.tokens[self.position][2]
+        word = self.accept("x", "y", "z", "all", "boundary", "corners", "nearest", "index")
+        if word is None:
+            self.expected("x, y, z, all, boundary, corners, nearest(…), index(…), not or (")
+        if word in ("x", "y", "z"):
+            return self.comparison("xyz".index(word))
+        if word == "nearest":
+            return self.nearest()
+        if word == "index":
+            return self.index()
+        if word == "all":
+            return self.mask(slice(None))
+        try:
+            return self.mask(self.mesh.boundary if word == "boundary" else self.mesh.corners())
+        except ValueError as error:
+            self.fail(column, str(error))
+
+    def mask(self, vertices):
+        chosen = np.zeros(len(self.mesh.points), dtype=bool)
+        chosen[vertices] = True
+        return chosen
+
+    def comparison(self, axis):
+        sign = self.require("<", "<=", "==", "!=", ">=", ">")
+        above = self.mesh.points[:, axis] - self.number()
+        tolerance = _EQUAL * np.linalg.norm(np.ptp(self.mesh.points, axis=0))
+        less, greater = above < -tolerance, above > tolerance
+        return {"<": less, "<=": ~greater, "==": ~(less | greater), "!=": less | greater, ">=": ~less, ">": greater}[sign]
+
+    def nearest(self):
+        self.require("(")
+        point = [self.number()]
+        for _ in range(2):
+            self.require(",")
+            point.append(self.number())
+        count = 1
+        if self.require(",", ")") == ",":
+            count = self.number(whole=True, least=1, most=len(self.mesh.points))
+            self.require(")")
+        distance = np.linalg.norm(self.mesh.points - point, axis=1)
+        return self.mask(np.argsort(distance, kind="stable")[:count])
+
+    def index(self):
+        n = len(self.mesh.points)
+        chosen = self.mask([])
+        self.require("(")
+        while True:
+            start = self.number(whole=True, least=0, most=n - 1) if self.next_is_number() else None
+            if self.accept(":"):
+                stop = self.number(whole=True, least=0, most=n) if self.next_is_number() else None
+                step = self.number(whole=True, least=1, most=n) if self.accept(":") else None
+                chosen[start:stop:step] = True
+            elif start is None:
+                self.expected("an index or a range such as 10:20")
+            else:
+                chosen[start] = True
+            if self.require(",", ")") == ")":
+                return chosen
+
+    def next_is_number(self):
+        return self.tokens[self.position][0] == "number"

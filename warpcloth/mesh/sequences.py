@@ -1,0 +1,353 @@
+"""Frames of a mesh whose triangles stay the same, whatever they come from, read one at a time.
+
+`open_sequence` takes
+
+- a USD stage with a Mesh prim whose points are sampled: its time codes are the frames, its rates the times;
+- a folder of .obj, .ply or .off files, or a pattern such as "frames/cloth_*.obj": the last number in a name is the frame, and a
+  frame takes 1/fps s, so that file 12 is two frames after file 10;
+- an .npz file, as `np.savez` writes it: `points` (F, n, 3) [m], `triangles` (T, 3), and `times` (F,) [s] if not by fps;
+- an .npy file, (F, n, 3) [m], with a mesh that has the triangles.
+
+`as_sequence` takes what Python holds. Lengths are metres where a file does not say.
+"""
+
+import glob
+import operator
+import os
+import re
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..base import checks
+from .loading import ENDINGS, WELDED, read_arrays
+from .mesh import STAGE_ENDINGS, Mesh, Surface
+
+_MOST_MISSING = 1_000_000
+_FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Frames of one mesh. A frame is read when it is indexed, and nothing is kept, so memory stays flat.
+
+    `sequence[i]` is the points of a frame (n, 3) [m], float64, and a copy; where they are not finite they are as the input has
+    them. It raises a ValueError that names file and frame where the frame does not fit the mesh or cannot be read.
+
+    Attributes:
+        mesh: The rest shape, a `Surface` where it was read from a file.
+        labels: (F,) numbers of the frames as the input has them: time codes, or the numbers in file names; int64 where all are
+            whole, else float64.
+        times: (F,) [s], increasing; None where nobody says them.
+        read: Function that gives the points of a frame from its index, 0 to F − 1.
+        path: The file, folder or pattern, or None.
+        stage: `usd.StageMesh` of a stage, or None; where its space moves, as it is at the first frame.
+        precision: Type of the numbers that the input has, which says how coarsely they are rounded.
+        declared: Whether the input says the rest shape; else `mesh` has the points of the first frame.
+        files: Paths of the files that frames are read from.
+        up_axis: "Y" or "Z"; None if the input does not say.
+
+    Raises:
+        ValueError: The mesh has no triangles.
+    """
+
+    mesh: Mesh
+    labels: np.ndarray
+    times: np.ndarray | None
+    read: Callable
+    path: str | None = None
+    stage: Any = None
+    declared: bool = True
+    precision: type = np.float64
+    files: tuple = ()
+    up_axis: str | None = None
+
+    def __post_init__(self):
+        if not len(self.mesh.triangles):
+            where = "mesh" if self.path is None else self.path
+            raise ValueError(f"{where}: has edges and no triangles; it must have triangles, over which a sequence is measured")
+
+    def __len__(self):
+        return len(self.labels)
+
+    def __getitem__(self, frame):
+        return np.array(self.read(range(len(self))[operator.index(frame)]), dtype=np.float64)
+
+    def rounding(self, points):
+        """What points (n, 3) in the numbers of the input are rounded by [m]; of those that are not finite it tells nothing."""
+        return np.finfo(self.precision).eps * np.abs(points).max(initial=0.0, where=np.isfinite(points))
+
+    @cached_property
+    def missing(self):
+        """Labels that a gap in the numbering leaves out, a list.
+
+        The spacing is the smallest interval; nothing is missing where some other is no multiple of it. Time codes that are not
+        whole may be exposures within a frame: of these no more than a third of the intervals, or one, can be gaps.
+        """
+        intervals = np.diff(self.labels)
+        spacing = intervals.min() if len(intervals) else 1
+        multiples = np.rint(intervals / spacing)
+        gaps = np.flatnonzero(multiples > 1)
+        uneven = np.abs(intervals / spacing - multiples) > 1e-6  # a time code has fewer than ten digits, and float64 sixteen
+        if uneven.any() or (self.labels.dtype.kind == "f" and 3 * len(gaps) > max(3, len(intervals))):
+            return []
+        if (multiples[gaps] - 1.0).sum() > _MOST_MISSING:
+            first, last = self.labels[[gaps[0], gaps[0] + 1]].tolist()
+            where = "" if self.path is None else f"{self.path}: "
+            raise ValueError(f"{where}more than {_MOST_MISSING:,} frames are missing, from {first} to {last} and on")
+        return [(self.labels[gap] + k * spacing).item() for gap in gaps for k in range(1, int(multiples[gap]))]
+
+
+def open_sequence(path, prim=None, fps=None, mesh=None):
+    """Opens a mesh sequence; see the top of this module for what there is.
+
+    Polygons are cut into triangles as `usd.read_stage_mesh` and `loading.read_file` do. A prim in a space that moves is taken
+    to world space at each time code, and its rest shape with the first frame.
+
+    Args:
+        path: A stage, a folder, a pattern, an .npz or an .npy file.
+        prim: Path or name of the prim, or name of the geometry in each of the files, where there are several.
+        fps: Frames a second: numbers in file names, or time codes, in place of what the stage says. Without it there are no
+            times where the input says none.
+        mesh: The `Mesh` of an .npy file, which has no triangles; others have their own, and do not look at it.
+
+    Returns:
+        Sequence: Nothing but its first frame is read yet.
+
+    Raises:
+        FileNotFoundError: There is no such file or folder.
+        ValueError: It is none of the above, holds no frames, or what there is does not fit together; the message
+            begins with the path.
+    """
+    path = os.fspath(path)
+    if fps is not None:
+        checks.number("fps", fps, above=0.0)
+    if path.lower().endswith(STAGE_ENDINGS):
+        return _open_stage(path, prim, fps)
+    if os.path.isdir(path):
+        return _open_files(path, sorted(Path(path).iterdir()), prim, fps)
+    if not os.path.exists(path) and glob.has_magic(path):
+        return _open_files(path, [Path(name) for name in sorted(glob.glob(path))], prim, fps)
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    try:
+        if path.lower().endswith(".npz"):
+            return _open_npz(path, fps)
+        if path.lower().endswith(".npy"):
+            return _open_npy(path, fps, mesh)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if Path(path).suffix.lower() in ENDINGS:
+        raise ValueError(f'{path}: is one mesh; it must be a folder of them, or a pattern such as "{Path(path).parent}/*.obj"')
+    raise ValueError(f"{path}: must be a folder or pattern of mesh files, or end with {' '.join(STAGE_ENDINGS)} .npz .npy")
+
+
+def as_sequence(mesh, frames, dt=None, times=None):
+    """The same for frames that Python holds.
+
+    Args:
+        mesh: The `Mesh`, its points the rest shape.
+        frames: An array (F, n, 3) [m], a list of F arrays (n, 3), `usd.FrameSequence`, `Animation` or `Deformation`.
+        dt: Time from each frame to the next [s].
+        times: (F,) [s], increasing. One of the two; without either those of the frames, if they have any.
+
+    Returns:
+        Sequence: It holds on to `frames`.
+
+    Raises:
+        ValueError: A frame, named by its index, does not fit the mesh; times do not increase; or `mesh`
+            is no mesh with triangles.
+    """
+    if not isinstance(mesh, Mesh):
+        raise ValueError(f"mesh is {checks.shown(mesh)}; it must be a Mesh")
+    if dt is not None and times is not None:
+        raise ValueError("dt, times: both are given; give one of the two")
+    if dt is not None:
+        checks.number("dt", dt, above=0.0)
+    elif times is None:
+        times = getattr(frames, "times", None)
+    count, read, precision = _array("frames", getattr(frames, "points", frames), mesh)
+    if dt is not None:
+        times = dt * np.arange(count)
+    elif times is not None:
+        times = _increasing(times, count)
+    return Sequence(mesh, np.arange(count), times, read, precision=precision, up_axis=mesh.up_axis)
+
+
+def _open_stage(path, prim, fps):
+    from ..usd import FrameSequence, read_stage_mesh
+
+    frames = FrameSequence(path, prim)
+    codes = frames.time_codes
+    stage = read_stage_mesh(path, prim, Surface, codes[0])
+    if frames.shape[1:] != stage.mesh.points.shape:
+        raise ValueError(
+            f"{path}, prim {stage.prim}: {frames.shape[1]} points at time code {codes[0]:g}, "
+            f"must be {len(stage.mesh.points)} as at rest"
+        )
+    labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
+    times = frames.times if fps is None else (codes - codes[0]) / fps
+    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32, frames.files, stage.up_axis)
+
+
+def _open_files(path, found, prim, fps):
+    paths = [file for file in found if file.suffix.lower() in ENDINGS and file.is_file() and file.name[0] != "."]
+    allowed = " ".join(_FRAME_ENDINGS)
+    endings = sorted({file.suffix.lower() for file in paths})
+    if not paths:
+        raise ValueError(f"{path}: no mesh files there; they must end with {allowed}")
+    if len(endings) > 1:
+        raise ValueError(
+            f'{path}: has files of several kinds, {" ".join(endings)}; give a pattern of one, such as "*{endings[0]}"'
+        )
+    if endings[0] in WELDED:
+        raise ValueError(
+            f"{path}: {endings[0]} files repeat vertices, and which of them are one may change between frames; "
+            f"the files must end with {allowed}"
+        )
+    numbered = {}
+    for file in paths:
+        digits = re.findall(r"\d+", file.stem)
+        if not digits:
+            raise ValueError(f"{file}: has no number in its name, which must tell its place among the frames")
+        if len(digits[-1]) > 15:
+            raise ValueError(f"{file}: has a number of {len(digits[-1])} digits in its name, must have 15 at most")
+        other = numbered.setdefault(int(digits[-1]), file)
+        if other != file:
+            raise ValueError(
+                f"{file}: has number {int(digits[-1])}, the last in its name, as {other} has; each must be used once"
+            )
+    labels = np.array(sorted(numbered), dtype=np.int64)
+    paths = [numbered[label] for label in labels.tolist()]
+    points, triangles, st = read_arrays(paths[0], prim)
+    try:
+        mesh = Surface(points, triangles, texture_coordinates=st)
+    except ValueError as error:
+        raise ValueError(f"{paths[0]}: {error}") from error
+    read = partial(_read_file, paths, prim, mesh.triangles, len(points))
+    times = None if fps is None else (labels - labels[0]) / fps
+    return Sequence(mesh, labels, times, read, path, declared=False, files=tuple(paths))
+
+
+def _read_file(paths, prim, expected, count, frame):
+    """Points (n, 3) of a file that has the triangles of the first."""
+    path = paths[frame]
+    points, triangles, _ = read_arrays(path, prim)
+    for name, here, there in (("vertices", len(points), count), ("triangles", len(triangles), len(expected))):
+        if here != there:
+            raise ValueError(f"{path}: {here} {name}, must be {there} as in {paths[0]}")
+    differ = (triangles != expected).any(axis=1)
+    if differ.any():
+        row = int(np.argmax(differ))
+        here, there = triangles[row].tolist(), expected[row].tolist()
+        raise ValueError(f"{path}: triangle {row} has vertices {here}, must be {there} as in {paths[0]}")
+    return points
+
+
+def _open_npz(path, fps):
+    if not zipfile.is_zipfile(path):
+        raise ValueError("is no .npz file")
+    with _numpy_reads(), np.load(path, allow_pickle=False) as archive:
+        lacking = sorted({"points", "triangles"} - set(archive.files))
+        if lacking:
+            raise ValueError(f"has no array {lacking[0]!r}, only {', '.join(archive.files) or 'none'}")
+        triangles = archive["triangles"]
+        times = archive["times"] if "times" in archive.files and fps is None else None
+    with _numpy_reads():
+        points = _mapped(path, "points.npy")
+    if points.ndim != 3:
+        raise ValueError(f"points has shape {points.shape}; it must be (frames, vertices, 3)")
+    mesh = Surface(points[0], triangles)
+    count, read, precision = _array("points", points, mesh)
+    times = _even(count, fps) if times is None else _increasing(times, count)
+    return Sequence(mesh, np.arange(count), times, read, path, declared=False, precision=precision, files=(path,))
+
+
+@contextmanager
+def _numpy_reads():
+    """Turns all errors of NumPy while it reads a file into one kind; a broken header or archive raises many."""
+    try:
+        yield
+    except ValueError:
+        raise
+    except (
+        *(OSError, EOFError, MemoryError, OverflowError, TypeError, KeyError, SyntaxError, RuntimeError, RecursionError),
+        *(NotImplementedError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
+    ) as error:
+        raise ValueError(f"cannot be read, its header or data are broken ({error})") from error
+
+
+def _mapped(path, member):
+    """An array of an .npz file that stays on disk, where `np.load` would read all of it."""
+    with zipfile.ZipFile(path) as archive:
+        info = archive.getinfo(member)
+    if info.compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{member} is compressed, so that no frame can be read by itself; write it by np.savez")
+    with open(path, "rb") as file:
+        file.seek(info.header_offset + 26)  # past it the local header has the lengths of a name and of an extra field
+        file.seek(sum(np.frombuffer(file.read(4), "<u2").tolist()), os.SEEK_CUR)
+        version = np.lib.format.read_magic(file)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, by_columns, dtype = header(file)
+        if dtype.kind not in "iuf":
+            raise ValueError(f"{member} has type {dtype}, must be real numbers")
+        return np.memmap(path, dtype, "r", file.tell(), shape, "F" if by_columns else "C")
+
+
+def _open_npy(path, fps, mesh):
+    with _numpy_reads():
+        points = np.lib.format.open_memmap(path, mode="r")
+    if mesh is None:
+        raise ValueError("has no triangles; give a rest mesh that has them (--rest), or an .npz file")
+    count, read, precision = _array("points", points, mesh)
+    times = _even(count, fps)
+    return Sequence(mesh, np.arange(count), times, read, path, precision=precision, files=(path,), up_axis=mesh.up_axis)
+
+
+def _array(name, frames, mesh):
+    """The number of frames, what gives each from its index, and the type of the numbers, of an array, list or `FrameSequence`
+    that fits the mesh."""
+    shape = mesh.points.shape
+    if isinstance(frames, (list, tuple)):
+        for index, frame in enumerate(frames):
+            found = checks.numeric(f"{name}[{index}]", frame, f"have shape {shape}").shape
+            if found != shape:
+                raise ValueError(f"{name}[{index}] has shape {found}; it must be {shape}")
+        found, dtype = (len(frames), *shape), _coarsest(frames)
+    else:
+        if np.ma.isMaskedArray(frames) and np.ma.is_masked(frames):
+            raise ValueError(f"{name} is masked in places; it must have all points, or NaN where one is not known")
+        frames = frames if hasattr(frames, "exact") else np.asarray(frames)
+        found, dtype = frames.shape, frames.dtype
+        if frames.dtype.kind not in "iuf":
+            raise ValueError(f"{name} has type {frames.dtype}; it must be real numbers")
+    if found[1:] != shape or not found[0]:
+        copies = f"; of several copies give one, as in {name}[:, 0]" if len(found) == 4 else ""
+        raise ValueError(f"{name} has shape {found}; it must be (frames, {shape[0]}, 3) for the points of the mesh{copies}")
+    precision = dtype.type if np.issubdtype(dtype, np.floating) else np.float64
+    return found[0], frames.exact if hasattr(frames, "exact") else frames.__getitem__, precision
+
+
+def _coarsest(frames):
+    """The type of the frame whose numbers are rounded most."""
+    types = [np.asarray(frame).dtype for frame in frames]
+    return max((kind for kind in types if kind.kind == "f"), key=lambda kind: np.finfo(kind).eps, default=np.dtype(np.float64))
+
+
+def _even(count, fps):
+    return None if fps is None else np.arange(count) / fps
+
+
+def _increasing(times, count):
+    times = checks.array("times", times, (count,))
+    checks.refuse("times", times, np.diff(times, prepend=-np.inf) <= 0.0, "must be later than the one before")
+    return times

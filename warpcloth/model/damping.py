@@ -1,0 +1,87 @@
+"""Damping: within a step an energy whose rest state is set where the step begins."""
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from ..kernels import damping as kernels
+from .model import Origin
+
+
+def damped_terms(model, he):
+    """The elements of a step of hₑ [s]: the model's, those with damping merged with it or followed by it."""
+    terms = []
+    for elements in model.terms:
+        if elements.damping is None:
+            terms.append(elements)
+        elif elements.term.dissipation.merges:
+            terms.append(_dissipation(model, elements, he, elements.stiffness.numpy()))
+        else:
+            terms += [elements, _dissipation(model, elements, he, 0.0)]
+    return terms
+
+
+def dissipations(model, he):
+    """The elements of the dissipation alone."""
+    return [_dissipation(model, elements, he, 0.0) for elements in model.terms if elements.damping is not None]
+
+
+def refuse_apart(model, solver):
+    """Refuses damping that does not merge with what a solver projects.
+
+    Raises:
+        ValueError: Naming the term, the solver and what would work.
+    """
+    for elements in model.terms:
+        if elements.damping is not None and not elements.term.dissipation.merges:
+            raise ValueError(
+                f"{solver} cannot take the damping of {elements.label}, which no projection has in it; "
+                "ADMM, Newton or Explicit can"
+            )
+
+
+def _dissipation(model, elements, he, stiffness):
+    """The elements of D, or with their ``stiffness`` those of both."""
+    dissipation, count = elements.term.dissipation, elements.count
+    viscous = elements.damping.numpy().astype(np.float64) / he
+    both = stiffness + viscous
+    share = np.divide(viscous, both, out=np.zeros(count), where=both > 0.0)
+    term = dissipation.term or elements.term
+    damped = replace(
+        elements,
+        term=term,
+        stiffness=_put(model, both),
+        rest=wp.zeros(count, dtype=wp.types.vector(term.parameters, model.dtype), device=model.device),
+        damping=None,
+        origin=Origin(elements.term, elements.rest, _put(model, share)),
+    )
+    Past(model, [damped]).launch(model.positions)  # for those who ask for weights and measures before the first step
+    return damped
+
+
+def _put(model, values):
+    same = values[0] == values[-1] and (values == values[0]).all()
+    return model.constant(values[0], len(values)) if same else model.array(values, model.dtype)
+
+
+class Past:
+    """Sets what damped elements know of where a step begins.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        terms: :class:`warpcloth.model.model.DeviceElements`; those without an origin are left out.
+    """
+
+    def __init__(self, model, terms):
+        self.model = model
+        self.terms = [elements for elements in terms if elements.origin]
+
+    def launch(self, x, move=None, scale=1.0, bdf2=False, midpoint=False):
+        """For the state x (N,), and what else :func:`warpcloth.kernels.damping.set_damped_rest` takes of an integrator."""
+        model = self.model
+        for elements in self.terms:
+            origin = elements.origin
+            kernel = model.kernel(kernels.set_damped_rest, origin.term, model.dtype, bdf2, midpoint)
+            given = [elements.stencil, origin.rest, origin.share, x, move, scale]
+            model.launch(kernel, elements.count, given, [elements.rest])

@@ -1,0 +1,515 @@
+"""What is built from a scene on a device: arrays of one or more copies laid out one after another, and nothing undeclared."""
+
+import inspect
+from collections.abc import Mapping
+from copy import copy as shallow_copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from ..base.checks import array, choice, numeric, shown, whole
+from ..base.quiet import find_device
+from ..base.turns import in_turn
+from ..core.thread_pool import Team
+from ..kernels.assemble import types
+from ..kernels.term import Term
+from ..mesh.selection import distinct_vertices
+from .precision import cast, refuse_coarse
+
+_PINNED = 1e3  # what a pinned vertex of a cell counts, in masses of the rest of the cell: it does not move, so the cell must
+
+DTYPES = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """What the rest state of damped elements is set from, see :class:`warpcloth.kernels.term.Dissipation`.
+
+    Attributes:
+        term: The term that is damped.
+        rest: Its rest state (B·E,).
+        share: (B·E,).
+    """
+
+    term: Term
+    rest: wp.array
+    share: wp.array
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of elements: those from offsets[c] to offsets[c+1] are the vertices of cell c.
+
+    Attributes:
+        offsets: (B·C + 1,) int32.
+        per_copy: Cells of one copy, C.
+        shape: Rest place of each element about the centre of mass of its cell, (B·E,) vectors [m].
+    """
+
+    offsets: wp.array
+    per_copy: int
+    shape: wp.array
+
+    @property
+    def count(self):
+        """Cells of all copies, B·C."""
+        return len(self.offsets) - 1
+
+    @property
+    def sizes(self):
+        """Elements of each cell, (B·C,)."""
+        return np.diff(self.offsets.numpy())
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceElements:
+    """The elements of one term in all copies, on the device.
+
+    Attributes:
+        label, kind, term: As in :class:`warpcloth.terms.terms.Elements`.
+        per_copy: Elements of one copy, E.
+        stencil: (B·E, K) int32.
+        stiffness: (B·E,); of stride 0 where all elements share one value.
+        rest: (B·E,) vectors of P.
+        hard: Whether any stiffness is infinite.
+        damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
+        origin: :class:`Origin` of a rest state that is set in each step, or None.
+        cells: :class:`Cells` that the elements are the vertices of, or None.
+        pieces: Of elements in blocks where the pieces of each begin, and the first element and the count of each; or None. See
+            :mod:`warpcloth.kernels.fast.blocks`.
+    """
+
+    label: str
+    kind: str
+    term: Term
+    per_copy: int
+    stencil: wp.array
+    stiffness: wp.array
+    rest: wp.array
+    hard: bool
+    damping: wp.array | None = None
+    origin: Origin | None = None
+    cells: Cells | None = None
+    pieces: tuple[wp.array, wp.array] | None = None
+
+    @property
+    def arguments(self):
+        """The arguments that every kernel over elements starts with."""
+        return [self.stencil, self.stiffness, self.rest]
+
+    @property
+    def arrays(self):
+        """All arrays of the term."""
+        cells = [self.cells.offsets, self.cells.shape] if self.cells else []
+        return self.arguments + ([] if self.damping is None else [self.damping]) + [*(self.pieces or ())] + cells
+
+    @property
+    def count(self):
+        """Elements of all copies, B·E."""
+        return len(self.stencil)
+
+    def stiffness_of_copies(self, model):
+        """Returns the stiffness (B,) that all elements of each copy share, or None if the elements of a copy differ."""
+        # Colours put elements of all copies in one order; all vertices of an element are in one copy.
+        by_copy = np.argsort(self.stencil.numpy()[:, 0] // model.per_copy, kind="stable")
+        values = self.stiffness.numpy()[by_copy].reshape(model.copies, -1)
+        return values[:, 0] if values.size and (values == values[:, :1]).all() else None
+
+    def with_unit_stiffness(self):
+        """Returns these elements with a stiffness of 1, or 0 where it is 0."""
+        stiffness = self.stiffness.numpy()
+        array = wp.array((stiffness > 0.0).astype(stiffness.dtype), device=self.stiffness.device)
+        return replace(self, stiffness=array, hard=False)
+
+    @property
+    def constraints(self):
+        """Vertices (B·C, K) of each constraint, or of cells a list of arrays: elements, and cells as a whole."""
+        stencil = self.stencil.numpy()
+        return stencil if self.cells is None else np.split(stencil[:, 0], self.cells.offsets.numpy()[1:-1])
+
+    def reordered(self, order):
+        """The same elements, or cells, with those of index ``order`` in that order."""
+
+        def put(array):
+            if 0 in array.strides:
+                return array
+            return wp.array(array.numpy()[order], dtype=array.dtype, device=array.device)
+
+        cells = self.cells
+        if cells:
+            firsts, sizes = cells.offsets.numpy()[order], cells.sizes[order]
+            ends = np.cumsum(sizes)
+            order = np.arange(ends[-1]) + np.repeat(firsts - (ends - sizes), sizes)
+            offsets = wp.array(np.append(0, ends).astype(np.int32), dtype=wp.int32, device=self.stencil.device)
+            cells = replace(cells, offsets=offsets, shape=put(cells.shape))
+        changed = {name: put(getattr(self, name)) for name in ("stencil", "stiffness", "rest")}
+        if self.damping is not None:
+            changed["damping"] = put(self.damping)
+        origin = self.origin and replace(self.origin, rest=put(self.origin.rest), share=put(self.origin.share))
+        return replace(self, **changed, origin=origin, cells=cells)
+
+    def by_lowest(self):
+        """The same elements in the order of their lowest vertices; themselves where that is theirs."""
+        lowest = self.stencil.numpy().min(axis=1)
+        return self.reordered(np.argsort(lowest, kind="stable")) if (np.diff(lowest) < 0).any() else self
+
+    def share(self, first, count):
+        """Those of ``count`` of the copies from ``first`` on, as a model of these alone has them."""
+        E = self.per_copy
+        chosen = slice(first * E, (first + count) * E)
+        changed = {name: getattr(self, name)[chosen] for name in ("stiffness", "rest")}
+        if self.damping is not None:
+            changed["damping"] = self.damping[chosen]
+        cells = self.cells
+        if cells:
+            cells = replace(cells, offsets=cells.offsets[: count * cells.per_copy + 1], shape=cells.shape[chosen])
+        return replace(self, **changed, stencil=self.stencil[: count * E], cells=cells)
+
+    def taut(self, points):
+        """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
+        if not self.term.slack:
+            return self
+        rest = self.term.rest_state(points, self.stencil.numpy() % len(points), least=1.0, most=1.0)
+        held = rest.astype(wp.dtype_to_numpy(self.stiffness.dtype))
+        return replace(self, rest=wp.array(held, dtype=self.rest.dtype, device=self.rest.device))
+
+    @cached_property
+    def incidences(self):
+        """(offsets (N+1,), incidences (B·E·K,)): for each vertex K·element + corner, in order. Built when first asked for."""
+        stencil = self.stencil.numpy().ravel()
+        order = np.argsort(stencil, kind="stable").astype(np.int32)
+        vertices = int(stencil.max()) + 1
+        offsets = np.searchsorted(stencil[order], np.arange(vertices + 1)).astype(np.int32)
+        device = self.stencil.device
+        return wp.array(offsets, dtype=wp.int32, device=device), wp.array(order, dtype=wp.int32, device=device)
+
+
+class Model:
+    """A scene on a device, as B copies one after another: vertex i of copy b is vertex b·n + i.
+
+    Args:
+        scene: The :class:`warpcloth.Scene`.
+        device: A Warp device, ``"cpu"`` or ``"cuda:0"``.
+        dtype: ``"float32"`` or ``"float64"``.
+        copies: B.
+        vary: What differs between the copies, by name, each with B entries: ``"gravity"`` (B, 3), ``"density"`` (B,),
+            ``"masses"`` (B, n), ``"positions"`` and ``"velocities"`` (B, n, 3), and of terms, by their name or class,
+            ``"Spring.stiffness"`` and ``"Spring.damping"``, (B,) or (B, E).
+        order: The scene's vertices in the order that the model has them in, (n,), such as
+            :func:`warpcloth.mesh.ordering.near_order` gives; elements are then in the order of their lowest vertices there. All
+            arguments here, and what is said of them, have the scene's own order, and all attributes and what solvers make of
+            them have this one; :meth:`in_scene_order` leads back. None keeps the scene's, of vertices and elements.
+        threads: Of this process that share the steps, on the CPU.
+
+    Attributes:
+        positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
+        mass, inverse_mass: (B·n,) [kg], [1/kg]; the inverse of a pinned vertex is 0.
+        gravity: (B,) vectors [m/s²].
+        pins, keyframes: Moved pins (p,) and their places (F, p) [m], or None.
+        terms: One :class:`DeviceElements` for each declared term.
+        rest_points: Rest shape of one copy, (n, 3) [m].
+        order: As given, int32, or None.
+        places: Where each vertex of the scene is in a copy, (n,) int32; None without an order.
+        kernels: Names of the kernels that solvers asked for.
+        launches: How many launches there have been, a list of one that models of other terms share.
+        team: The :class:`warpcloth.core.thread_pool.Team` of its threads.
+        state: x and v that steps move on, if not arrays of their own; or None.
+
+    Raises:
+        ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
+    """
+
+    @in_turn
+    def __init__(self, scene, device="cpu", dtype="float32", copies=1, vary=None, order=None, threads=1):
+        choice("dtype", dtype, tuple(DTYPES))
+        whole("copies", copies, 1)
+        copies = int(copies)
+        self.scene, self.copies = scene, copies
+        self.device = find_device(device)
+        self.team, self.state = Team(threads, self.device), None
+        self.dtype, self.numpy_dtype = DTYPES[dtype]
+        self.vec3, self.mat33 = types(self.dtype)
+        self.per_copy = len(scene.mesh.points)
+        self.count = copies * self.per_copy
+        self.kernels, self.launches = set(), [0]
+        self.order = self.places = None
+        self.rest_points = scene.mesh.points
+        if order is not None:
+            self._set_order(order)
+        vary = _Varied({} if vary is None else vary, copies)
+
+        masses = self._varied_masses(vary)
+        with np.errstate(over="ignore"):  # an inverse that no precision holds is refused below
+            inverse = 1.0 / np.where(masses > 0.0, masses, np.inf)
+        inverse[:, scene.pins.vertices] = 0.0
+        positions = vary.take("positions", scene.positions)
+        velocities = vary.take("velocities", scene.velocities)
+        velocities[:, scene.pins.vertices] = 0.0
+        if vary.has("positions"):
+            for copy, start in enumerate(positions):
+                scene.pins.refuse_far(start, f" in copy {copy}")
+        refuse_coarse(scene.mesh, positions, self.numpy_dtype, lambda copy, i: self._place("vertex", copy, i))
+        self.positions = self._put("position", "m", positions, self.vec3)
+        self.velocities = self._put("velocity", "m/s", velocities, self.vec3)
+        self.mass = self._put("mass", "kg", masses, self.dtype)
+        self.inverse_mass = self._put("inverse mass", "1/kg", inverse, self.dtype)
+        self.gravity = self._put("gravity", "m/s²", vary.take("gravity", scene.gravity)[:, None], self.vec3, each=None)
+        self.pins = self.keyframes = None
+        if scene.pins.keyframes is not None:
+            places, vertices = scene.pins.keyframes, scene.pins.vertices
+            refuse_coarse(
+                scene.mesh, places, self.numpy_dtype, lambda frame, i: f"keyframe {frame} of pinned vertex {vertices[i]}"
+            )
+            self.pins = wp.array(self._placed(vertices), dtype=wp.int32, device=self.device)
+            self.keyframes = self.array(places, self.vec3)
+        self.terms = tuple(self._on_device(term, positions, vary) for term in scene.terms)
+        vary.refuse_rest()
+
+    def _set_order(self, order):
+        self.order = distinct_vertices("order", order, self.scene.mesh)
+        if len(self.order) != self.per_copy:
+            raise ValueError(f"order names {len(self.order)} vertices; it must name each of the {self.per_copy} once")
+        self.places = np.argsort(self.order).astype(np.int32)
+        self.rest_points = self.scene.mesh.points[self.order]
+
+    def _placed(self, vertices):
+        """Where vertices of the scene are in a copy."""
+        return vertices if self.places is None else self.places[vertices]
+
+    def in_scene_order(self, values):
+        """NumPy ``values`` of all vertices (B·n, …) in the order of the scene; the same array where that is the model's."""
+        if self.places is None:
+            return values
+        return values.reshape(self.copies, self.per_copy, *values.shape[1:])[:, self.places].reshape(values.shape)
+
+    def with_terms(self, terms):
+        """This model with other :class:`DeviceElements`, all else shared."""
+        other = shallow_copy(self)
+        other.terms = tuple(terms)
+        return other
+
+    def alone(self, copy):
+        """A model of one copy, whose arrays are parts of those of this one."""
+        return self if self.copies == 1 else self.share(copy, 1)
+
+    def share(self, first, count, state=None):
+        """A model of ``count`` of the copies from ``first`` on, for one thread; x and v are theirs of ``state``, if given."""
+        n = self.per_copy
+        other, of_copies, of_vertices = shallow_copy(self), slice(first, first + count), slice(first * n, (first + count) * n)
+        other.copies, other.count, other.team = count, count * n, Team(1, self.device)
+        for name in ("positions", "velocities", "mass", "inverse_mass"):
+            setattr(other, name, getattr(self, name)[of_vertices])
+        other.gravity = self.gravity[of_copies]
+        other.state = state and tuple(array[of_vertices] for array in state)
+        other.terms = tuple(elements.share(first, count) for elements in self.terms)
+        return other
+
+    @in_turn
+    def array(self, values, dtype):
+        """``values`` on the model's device, in its precision."""
+        return wp.array(np.ascontiguousarray(values, dtype=self.numpy_dtype), dtype=dtype, device=self.device)
+
+    def _varied_masses(self, vary):
+        """Masses of all copies (B, n) [kg]."""
+        scene = self.scene
+        if vary.has("density") and vary.has("masses"):
+            raise ValueError("vary has density and masses; at most one of the two may be given")
+        if vary.has("density") and scene.density is None:
+            raise ValueError("vary['density'] needs a scene with a density, and this one has masses; vary['masses'] instead")
+        masses = vary.take("masses", scene.vertex_masses)
+        if vary.has("density"):
+            density = vary.take("density", np.float64(scene.density))
+            for copy in np.flatnonzero(~(density > 0.0)):
+                raise ValueError(f"vary['density'] is {density[copy]} in copy {copy}; it must be above 0")
+            masses = masses * (density / scene.density)[:, None]
+        allowed = masses > 0.0
+        allowed[:, scene.pins.vertices] |= masses[:, scene.pins.vertices] == 0.0
+        for copy, vertex in np.argwhere(~allowed)[:1]:
+            raise ValueError(
+                f"vary['masses'] of vertex {vertex} is {masses[copy, vertex]} kg in copy {copy}; it must be above 0, "
+                "of a pinned vertex 0 or more"
+            )
+        return masses
+
+    def _put(self, name, unit, values, dtype, each="vertex", infinite=False):
+        """Values (B, count, …) on the device, one row after another, as :func:`warpcloth.model.precision.cast` lets them be."""
+        held = cast(name, unit, values, self.numpy_dtype, lambda copy, i: self._place(each, copy, i), infinite)
+        if each == "vertex" and self.order is not None:
+            held = held[:, self.order]
+        return self.array(held.reshape(-1, *held.shape[2:]), dtype)
+
+    def _place(self, each, copy, i):
+        """The words for one of what ``each`` names, or for a whole copy."""
+        words = [] if each is None else [f"{each} {i}"]
+        return " of ".join(words + ([f"copy {copy}"] if self.copies > 1 else []))
+
+    @in_turn
+    def vectors(self):
+        """A new array of one zero vector for each vertex of all copies."""
+        return wp.zeros(self.count, dtype=self.vec3, device=self.device)
+
+    @in_turn
+    def kernel(self, factory, *key):
+        """The kernel that ``factory(*key)`` makes, noted for :meth:`report` as factory(variant).Term."""
+        kernel = factory(*key)
+        terms = [part.name for part in key if isinstance(part, Term)]
+        terms += [part.term.name for parts in key if isinstance(parts, tuple) for part in parts]
+        variants = [name for name, part in zip(inspect.signature(factory).parameters, key, strict=False) if part is True]
+        variant = f"({', '.join(variants)})" if variants else ""
+        self.kernels.add(".".join([f"{factory.__name__}{variant}", *terms]))
+        return kernel
+
+    @in_turn
+    def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
+        self.launches[0] += 1
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
+
+    def _on_device(self, term, positions, vary):
+        copies = [term.elements(self.scene.mesh, start) for start in (positions if vary.has("positions") else positions[:1])]
+        one = copies[0]
+        E = len(one.stencil)
+        vertices = self._placed(one.stencil)
+        if self.order is not None and vertices.shape[1] == 2:
+            vertices = np.sort(vertices, axis=1)  # a pair has no direction, and those of one are faster
+        stencil = vertices[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
+        rest = np.stack([copy.rest for copy in copies] * (self.copies // len(copies)))
+        stiffness = vary.take_of_elements("stiffness", one, E if one.cells is None else len(one.cells) - 1)
+        for copy, e in np.argwhere(~(stiffness >= 0.0))[:1]:
+            raise ValueError(f"{one.label}.stiffness is {stiffness[copy, e]} in copy {copy}; it must be 0 or more")
+        damping = vary.take_of_elements("damping", one, E)
+        for copy, e in np.argwhere(~((damping >= 0.0) & np.isfinite(damping)))[:1]:
+            raise ValueError(f"{one.label}.damping is {damping[copy, e]} in copy {copy}; it must be finite, 0 or more")
+        if damping.any() and one.term.dissipation is None:
+            raise ValueError(f"{one.label} cannot be damped; leave its damping out of vary")
+        rest_type = wp.types.vector(one.term.parameters, self.dtype)
+        cells = None
+        if one.cells is not None:
+            cells, rest = self._cells(one)
+            if stiffness.shape[1] > 1:
+                stiffness = np.repeat(stiffness, np.diff(one.cells), axis=1)
+        found = DeviceElements(
+            label=one.label,
+            kind=one.kind,
+            term=one.term,
+            per_copy=E,
+            stencil=wp.array(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), dtype=wp.int32, device=self.device),
+            stiffness=self._broadcast(f"{one.label}.stiffness", stiffness, E),
+            rest=self._put(f"{one.label}: rest state", "", rest, rest_type, "element", infinite=True),  # a limit may be none
+            hard=bool(np.isinf(stiffness).any()),
+            damping=self._broadcast(f"{one.label}.damping", damping, E) if damping.any() else None,
+            cells=cells,
+        )
+        return found if self.order is None or cells else found.by_lowest()
+
+    def _cells(self, elements):
+        """:class:`Cells` of a term's :class:`warpcloth.terms.terms.Elements`, and its rest state with the masses, (B, E, P)."""
+        vertices, firsts = elements.stencil[:, 0], elements.cells[:-1]
+        sizes = np.diff(elements.cells)
+        shape = (self.copies, self.per_copy)
+        mass, inverse = (array.numpy().astype(np.float64).reshape(shape) for array in (self.mass, self.inverse_mass))
+        places = self._placed(vertices)
+        weight = np.where(inverse > 0.0, mass, 0.0)[:, places]
+        body = np.repeat(np.add.reduceat(weight, firsts, axis=1), sizes, axis=1)
+        weight = np.where(inverse[:, places] > 0.0, weight, np.where(body > 0.0, _PINNED * body, 1.0))
+        points = np.broadcast_to(self.scene.mesh.points[vertices], (self.copies, len(vertices), 3))
+        points = points - np.repeat(points[:, firsts], sizes, axis=1)
+        total = np.add.reduceat(weight, firsts, axis=1)
+        centre = np.add.reduceat(weight[..., None] * points, firsts, axis=1) / total[..., None]
+        offsets = np.append((elements.cells[:-1] + np.arange(self.copies)[:, None] * len(vertices)).ravel(), weight.size)
+        cells = Cells(
+            wp.array(offsets.astype(np.int32), dtype=wp.int32, device=self.device),
+            len(sizes),
+            self._put(f"{elements.label}: shape", "m", points - np.repeat(centre, sizes, axis=1), self.vec3, "element"),
+        )
+        rest = np.zeros((*weight.shape, elements.term.parameters))
+        rest[..., -1] = weight
+        return cells, rest
+
+    def _broadcast(self, name, values, E):
+        """(B, 1) or (B, E) values as an array (B·E,), of stride 0 where all are one value."""
+        each = "element" if values.shape[1] > 1 else None
+        if (values != values[0, 0]).any() or len(values) * values.shape[1] == self.copies * E:
+            return self._put(name, "", np.broadcast_to(values, (self.copies, E)), self.dtype, each, infinite=True)
+        return self._repeat(self._put(name, "", values[:1, :1], self.dtype, None, infinite=True), self.copies * E)
+
+    def constant(self, value, count):
+        """An array (count,) of one value, of stride 0."""
+        return self._repeat(self.array([value], self.dtype), count)
+
+    def _repeat(self, value, count):
+        array = wp.array(ptr=value.ptr, shape=(count,), strides=(0,), dtype=self.dtype, device=self.device)
+        array.value = value  # keeps the memory alive
+        return array
+
+    def report(self):
+        """What was built: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels.
+
+        Terms of one label are numbered from the second on: Spring, Spring 2. Kernels are factory(variant).Term.
+        """
+        labels = [elements.label for elements in self.terms]
+        before = [labels[:i].count(label) for i, label in enumerate(labels)]
+        arrays = [self.positions, self.velocities, self.mass, self.inverse_mass, self.gravity]
+        arrays += [array for array in (self.pins, self.keyframes) if array is not None]
+        terms = [
+            {
+                "term": elements.label + (f" {count + 1}" if count else ""),
+                "elements": elements.count,
+                "bytes": sum(_bytes(array) for array in elements.arrays),
+            }
+            for elements, count in zip(self.terms, before, strict=True)
+        ]
+        return {
+            "scene": self.scene.name,
+            "vertices": self.count,
+            "copies": self.copies,
+            "dtype": np.dtype(self.numpy_dtype).name,
+            "device": str(self.device),
+            "bytes": sum(_bytes(array) for array in arrays) + sum(term["bytes"] for term in terms),
+            "terms": terms,
+            "kernels": sorted(self.kernels),
+        }
+
+
+def _bytes(array):
+    return wp.types.type_size_in_bytes(array.dtype) if 0 in array.strides else array.size * array.strides[-1]
+
+
+class _Varied:
+    """The values of ``vary``, taken by name; what nobody takes is refused."""
+
+    def __init__(self, values, copies):
+        if not isinstance(values, Mapping):
+            raise ValueError(f"vary is {shown(values)}; it must be a dict of names and arrays, such as {{'gravity': …}}")
+        self.values, self.copies, self.taken = dict(values), copies, set()
+
+    def has(self, name):
+        return name in self.values
+
+    def take(self, name, default):
+        """``values[name]`` as (B, *shape of default), or the default B times."""
+        if name not in self.values:
+            return np.repeat(np.asarray(default, dtype=np.float64)[None], self.copies, axis=0)
+        self.taken.add(name)
+        return array(f"vary[{name!r}]", self.values[name], (self.copies, *np.shape(default))).copy()
+
+    def take_of_elements(self, field, elements, E):
+        """Stiffness or damping of a term as (B, 1) or (B, E)."""
+        for name in (f"{elements.label}.{field}", f"{elements.kind}.{field}"):
+            if name in self.values:
+                self.taken.add(name)
+                rule = f"({self.copies},) or ({self.copies}, {E})"
+                values = numeric(f"vary[{name!r}]", self.values[name], f"have shape {rule}")
+                if values.shape not in ((self.copies,), (self.copies, E)):
+                    raise ValueError(f"vary[{name!r}] has shape {values.shape}; it must be {rule}")
+                return values.reshape(self.copies, -1)
+        return np.repeat(np.atleast_1d(getattr(elements, field))[None], self.copies, axis=0)
+
+    def refuse_rest(self):
+        rest = sorted(set(self.values) - self.taken, key=str)
+        if rest:
+            raise ValueError(
+                f"vary[{rest[0]!r}] names nothing in this scene; allowed are gravity, density or masses, positions, "
+                "velocities, <term>.stiffness and <term>.damping"
+            )

@@ -1,0 +1,1 @@
+"""Minimisers, linear systems, sweeps and integrators that solvers are made of."""

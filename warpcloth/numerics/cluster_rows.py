@@ -1,0 +1,93 @@
+"""The constraint rows of rigid clusters, beside those of terms in :mod:`warpcloth.numerics.constraints`."""
+
+from itertools import pairwise
+
+import numpy as np
+import warp as wp
+
+from ..core.capture import Mirror
+from ..kernels import cluster_rows as kernels
+
+
+class ClusterRows:
+    """The rows of one term of rigid clusters, see :mod:`warpcloth.kernels.cluster_rows`.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        elements: The :class:`warpcloth.model.model.DeviceElements`, of cells.
+
+    Attributes:
+        count: Rows of one copy.
+    """
+
+    def __init__(self, model, elements):
+        self.model, self.elements, self.cells = model, elements, elements.cells
+        self.count = 3 * elements.per_copy
+        names = ("linearise_clusters", "apply_cluster_rows", "pull_clusters", "gather_pulls")
+        self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
+        self._stencil, self._offsets = elements.stencil.numpy()[:, 0], self.cells.offsets.numpy()
+        self._mass = elements.rest.numpy()[:, 3].astype(np.float64)
+        self._places = self.cells.shape.numpy().astype(np.float64)
+        self._inverses = np.stack([np.linalg.pinv(each, 1e-12, True) for each in self._inertias()])
+        self._inertia = model.array(self._inverses, model.mat33)
+        self._rotations = wp.zeros(self.cells.count, dtype=model.mat33, device=model.device)
+        self._turned = Mirror(self._rotations)
+        self._incidences = elements.incidences  # now: made during a capture they would only be recorded
+        self._pulls = wp.zeros(elements.count, dtype=model.vec3, device=model.device)
+
+    def _inertias(self):
+        """Σ m(q²I − qqᵀ) of each cell at rest, (C, 3, 3) [kg m²]."""
+        mass, q = self._mass, self._places
+        each = mass[:, None, None] * ((q**2).sum(axis=1)[:, None, None] * np.eye(3) - q[:, :, None] * q[:, None, :])
+        return np.add.reduceat(each, self._offsets[:-1], axis=0)
+
+    def place(self, first, per_copy):
+        """Where its rows are: from ``first`` on in the ``per_copy`` of each copy."""
+        self._where = [self.elements.per_copy, first, per_copy]
+
+    def launch_linearise(self, x, d, h, least, multipliers, *out):
+        """As :meth:`warpcloth.numerics.constraints.TermRows.launch_linearise`."""
+        cells = self.cells
+        given = [cells.offsets, cells.shape, *self.elements.arguments, x, d, h, least, *self._where]
+        self._launch("linearise_clusters", cells.count, given, [multipliers, self._rotations, *out])
+
+    def launch_apply(self, v, out, active=None):
+        """out += J v, of all copies."""
+        given = [*self._shape(), self.elements.stencil, self.elements.rest, v, *self._where]
+        self._launch("apply_cluster_rows", self.cells.count, given, [out])
+
+    def launch_transpose(self, rows, out, active=None):
+        """out += Jᵀ rows, of all copies."""
+        given = [*self._shape(), self.elements.rest, rows, *self._where]
+        self._launch("pull_clusters", self.cells.count, given, [self._pulls])
+        self._launch("gather_pulls", len(self._incidences[0]) - 1, [*self._incidences, self._pulls], [out])
+
+    def entries(self):
+        """J on the host: values, rows and columns."""
+        mass, q, R, found = self._mass, self._places, self._turned.read().astype(np.float64), []
+        per_copy, first, rows_per_copy = self._where
+        for cell, (start, stop) in enumerate(pairwise(self._offsets)):
+            if not R[cell].any():
+                continue
+            elements = np.arange(start, stop)
+            root, r = np.sqrt(mass[elements]), q[elements] @ R[cell].T
+            turns = np.stack([np.cross(r, axis) for axis in np.eye(3)], axis=2)  # r × v as a matrix
+            linear = np.kron(root[:, None], np.eye(3))  # (3E, 3)
+            angular = (root[:, None, None] * turns).reshape(-1, 3, 3)
+            moments = np.concatenate(list(angular), axis=1)  # Σ √m r × v, (3, 3E)
+            world = R[cell] @ self._inverses[cell] @ R[cell].T
+            Q = linear @ linear.T / mass[elements].sum() + moments.T @ world @ moments
+            block = (np.eye(len(Q)) - Q) * np.repeat(root, 3)
+            copy, e = np.divmod(elements, per_copy)
+            rows = ((copy * rows_per_copy + first + 3 * e)[:, None] + np.arange(3)).ravel()
+            columns = (3 * self._stencil[elements][:, None] + np.arange(3)).ravel()
+            found.append((block.ravel(), np.repeat(rows, len(columns)), np.tile(columns, len(rows))))
+        if not found:
+            return np.zeros(0), np.zeros(0, dtype=int), np.zeros(0, dtype=int)
+        return tuple(np.concatenate(each) for each in zip(*found, strict=True))
+
+    def _shape(self):
+        return [self.cells.offsets, self.cells.shape, self._inertia, self._rotations]
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.model.launch(self._kernels[name], dim, inputs, outputs)

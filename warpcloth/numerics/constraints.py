@@ -1,0 +1,172 @@
+"""The rows of all constraints of a model and their Schur complement J W Jᵀ + α̃: what constrained dynamics solves for λ.
+
+The rows of a term are an object that knows its part of J; anything with the same methods can stand beside it.
+"""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from ..core.capture import Mirror
+from ..kernels import constraint_rows as kernels
+from .cluster_rows import ClusterRows
+
+
+class TermRows:
+    """The rows of one term, see :mod:`warpcloth.kernels.constraint_rows`.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        elements: The :class:`warpcloth.model.model.DeviceElements`.
+        curved: Whether tension stiffens.
+
+    Attributes:
+        count: Rows of one copy.
+    """
+
+    def __init__(self, model, elements, curved):
+        term, cuda = elements.term, model.device.is_cuda
+        scalar = term.constraint is not None
+        key = (term, model.dtype, scalar, curved and scalar)
+        self.model, self.elements, self._key = model, elements, key
+        self.rows = kernels.rows_of(term, *key[2:])
+        self.count = self.rows * elements.per_copy
+        self._slopes = wp.zeros(elements.count, dtype=kernels.slope_type(*key), device=model.device)
+        self._linearise, self._apply = model.kernel(kernels.linearise, *key), model.kernel(kernels.apply_rows, *key)
+        self._transpose = model.kernel(kernels.gather_rows if cuda else kernels.scatter_rows, *key)
+        self._incidences = elements.incidences if cuda else ()
+
+    def place(self, first, per_copy):
+        """Where its rows are: from ``first`` on in the ``per_copy`` of each copy."""
+        self._first, self._where = first, [self.elements.per_copy, first, per_copy]
+
+    def launch_linearise(self, x, d, h, least, multipliers, *out):
+        """Of x + d its part of what :func:`warpcloth.kernels.constraint_rows.linearise` makes, in the order of that."""
+        model = self.model
+        given = [*self.elements.arguments, model.inverse_mass, x, d, h, least, *self._where]
+        model.launch(self._linearise, self.elements.count, given, [multipliers, self._slopes, *out])
+
+    def launch_apply(self, v, out, active=None):
+        """out += J v, of the copies that are ``active`` (B,), all of them where it is None."""
+        given = [self.elements.stencil, self.elements.rest, self._slopes, v, *self._where, active]
+        self.model.launch(self._apply, self.elements.count, given, [out])
+
+    def launch_transpose(self, rows, out, active=None):
+        """out += Jᵀ rows, likewise."""
+        given = [*self._incidences, self.elements.stencil, self.elements.rest, self._slopes, rows, *self._where, active]
+        dim = len(self._incidences[0]) - 1 if self._incidences else self.elements.count
+        self.model.launch(self._transpose, dim, given, [out])
+
+    @cached_property
+    def _in_full(self):
+        """Scratch, kernel and pattern of :meth:`entries`: rows and columns of every entry in one matrix of all copies."""
+        elements, Q = self.elements, self.rows
+        stencil = elements.stencil.numpy().astype(np.int64)
+        E, K = stencil.shape
+        blocks = Mirror(wp.zeros((E, Q * K), dtype=wp.vec3d, device=self.model.device))
+        copy, e = np.divmod(np.arange(E), elements.per_copy)
+        rows = copy * self._where[2] + self._first + e * Q
+        rows = np.broadcast_to(rows[:, None, None, None] + np.arange(Q)[None, None, :, None], (E, K, Q, 3))
+        columns = np.broadcast_to(3 * stencil[:, :, None, None] + np.arange(3), (E, K, Q, 3))
+        return blocks, self.model.kernel(kernels.rows_in_full, *self._key), rows.ravel(), columns.ravel()
+
+    def entries(self):
+        """J on the host: values, rows and columns."""
+        blocks, kernel, rows, columns = self._in_full
+        self.model.launch(kernel, self.elements.count, [self.elements.rest, self._slopes], [blocks.array])
+        return blocks.read().ravel(), rows, columns
+
+
+class Constraints:
+    """All rows of a model; as a matrix their Schur complement A = J W Jᵀ + α̃, W the inverse masses.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        h: Step [s].
+        curved: Whether tension stiffens.
+
+    Attributes:
+        parts: :class:`TermRows` of each term.
+        count, per_copy: Rows of all copies and of one.
+        multipliers: λ (count,) [kg m over the unit of the constraint].
+        gap: C + α̃λ (count,).
+        residual, rounding, carried: (count,) [m], see :func:`warpcloth.kernels.constraint_rows.linearise`.
+    """
+
+    def __init__(self, model, h, curved):
+        self.model, self.h = model, h
+        self.parts = [
+            ClusterRows(model, elements) if elements.cells else TermRows(model, elements, curved) for elements in model.terms
+        ]
+        self.per_copy = sum(part.count for part in self.parts)
+        self.count = self.per_copy * model.copies
+        first = 0
+        for part in self.parts:
+            part.place(first, self.per_copy)
+            first += part.count
+
+        def rows(dtype=model.dtype):
+            return wp.zeros(self.count, dtype=dtype, device=model.device)
+
+        self.multipliers, self.gap, self._compliance, self._inverse = (rows() for _ in range(4))
+        self.residual, self.rounding, self.carried = (rows(wp.float64) for _ in range(3))
+        self._vectors = model.vectors()
+        self._weigh, self._scale = (model.kernel(factory, model.dtype) for factory in (kernels.weigh, kernels.scale_rows))
+        self.vector = self.block = model.dtype
+        # Of redundant hard rows A would be singular, and what they share of λ undetermined.
+        self.least = float(np.finfo(model.numpy_dtype).eps) ** 0.7
+
+    def launch_linearise(self, x, d):
+        """All rows at x + d, with λ as it is."""
+        out = [self.multipliers, self.gap, self._compliance, self._inverse, self.residual, self.rounding, self.carried]
+        for part in self.parts:
+            part.launch_linearise(x, d, self.h, self.least, *out)
+
+    def launch_apply(self, v, out, active=None):
+        """out += J v; of copies that are not ``active`` (B,), if that is given, less or nothing."""
+        for part in self.parts:
+            part.launch_apply(v, out, active)
+
+    def launch_moves(self, rows, out, active=None):
+        """out = W Jᵀ rows, (N,) vectors [m] for λ, likewise."""
+        out.zero_()
+        for part in self.parts:
+            part.launch_transpose(rows, out, active)
+        self.model.launch(self._weigh, self.model.count, [self.model.inverse_mass], [out])
+
+    # As a matrix, see ConjugateGradients.
+
+    def prepare(self):
+        """Nothing is left to find."""
+
+    def multiply(self, p, q, active):
+        """q = A p, of the copies that are ``active`` (B,)."""
+        self.launch_moves(p, self._vectors, active)
+        self.model.launch(self._scale, self.count, [self._compliance, p], [q])
+        self.launch_apply(self._vectors, q, active)
+
+    def invert_diagonal(self, out):
+        """out = the inverse diagonal, 0 where that is 0."""
+        wp.copy(out, self._inverse)
+
+    @cached_property
+    def _on_host(self):
+        """The inverse masses of coordinates, and the mirror of the compliances."""
+        return np.repeat(self.model.inverse_mass.numpy().astype(np.float64), 3), Mirror(self._compliance)
+
+    def matrices(self):
+        """A of each copy on the host, scipy matrices in double precision."""
+        from scipy.sparse import csr_matrix, diags
+
+        n, R, copies = 3 * self.model.per_copy, self.per_copy, self.model.copies
+        values, rows, columns = (np.concatenate(each) for each in zip(*(part.entries() for part in self.parts), strict=True))
+        J = csr_matrix((values, (rows, columns)), shape=(self.count, copies * n))
+        w, compliance = self._on_host
+        compliance = compliance.read().astype(np.float64)
+        found = []
+        for copy in range(copies):
+            own = J[copy * R : (copy + 1) * R, copy * n : (copy + 1) * n]
+            weights = diags(w[copy * n : (copy + 1) * n])
+            found.append((own @ weights @ own.T + diags(compliance[copy * R : (copy + 1) * R])).tocsc())
+        return found

@@ -1,0 +1,299 @@
+"""Coarser and coarser levels of a cloth, for solvers that carry information over many vertices at once (Müller 2008).
+
+What the levels are made of are bounds: pairs of vertices that the terms of a model keep no farther apart than a length, see
+``reach`` of :class:`warpcloth.kernels.term.Term`. A level keeps some vertices of the finer one, no two of which are linked
+there, so that every dropped vertex is linked to at least one kept one; pins are all kept. A bound between kept vertices is the
+shortest way over up to two dropped ones, with its length: what meets all finer bounds meets it, on any mesh, however folded.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from ..kernels.terms import SPRING_LIMIT
+from ..model.model import DeviceElements
+
+_HUB = 8  # kept neighbours of a dropped vertex, above which they are linked to the nearest of them alone, not each to each
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Pairs of vertices and how far apart they may be.
+
+    Attributes:
+        pairs: (E, 2), each pair once.
+        lengths: (E,) [m].
+        compliance: 1/k of each copy, (E, B), or (E, 1) where copies do not differ [m/N].
+    """
+
+    pairs: np.ndarray
+    lengths: np.ndarray
+    compliance: np.ndarray
+
+    def __len__(self):
+        return len(self.pairs)
+
+    def take(self, which):
+        return Bounds(self.pairs[which], self.lengths[which], self.compliance[which])
+
+    def shortest(self, n):
+        """The shortest of the bounds of each pair, of equal ones the first; in lexicographic order, smaller index first."""
+        keys = self.pairs.min(axis=1).astype(np.int64) * n + self.pairs.max(axis=1)
+        order = np.lexsort((self.lengths, keys))
+        unique, first = np.unique(keys[order], return_index=True)
+        found = self.take(order[first])
+        return replace(found, pairs=np.stack(np.divmod(unique, n), axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """A level of the vertices of one copy, and the way from it to the next finer one.
+
+    Attributes:
+        bounds: The :class:`Bounds` between kept vertices, as tuples (soft, hard).
+        inverse_mass: (B, n) [1/kg]: of a kept vertex that of itself and its parts of the dropped ones, so that a move of the
+            level has the momentum of the move of all that follow it. 0 of pins.
+        dropped: The vertices (D,) that the finer level has and this one has not.
+        offsets, parents, weights: Of each of these the kept vertices that it follows, with weights of sum 1, as CSR.
+    """
+
+    bounds: tuple
+    inverse_mass: np.ndarray
+    dropped: np.ndarray
+    offsets: np.ndarray
+    parents: np.ndarray
+    weights: np.ndarray
+
+
+def levels(model, most=None):
+    """The levels above the finest, finer ones first: as many as have bounds, or ``most`` of them.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        most: Number of levels, or None.
+
+    Returns:
+        A list of :class:`Level`; without bounds between vertices of which one moves it is empty.
+    """
+    n, inverse = model.per_copy, model.inverse_mass.numpy().reshape(model.copies, -1).astype(np.float64)
+    free = inverse[0] > 0.0
+    mass = np.where(free, model.mass.numpy().reshape(inverse.shape), 0.0).astype(np.float64)
+    groups, found = _finest(model, free), []
+    while most is None or len(found) < most:
+        links = Bounds(
+            np.concatenate([each.pairs for each in groups]),
+            np.concatenate([each.lengths for each in groups]),
+            np.zeros((sum(map(len, groups)), 0)),
+        ).shortest(n)
+        kept = _independent(links.pairs, free)
+        dropped, offsets, parents, weights = _followers(links, kept)
+        for copy_mass in mass:  # of the dropped vertices nothing is left behind
+            np.add.at(copy_mass, parents, weights * np.repeat(copy_mass[dropped], np.diff(offsets)))
+            copy_mass[dropped] = 0.0
+        groups = tuple(_scaled(_coarser(each, kept, free), each, free) for each in groups)
+        if not any(map(len, groups)):
+            break
+        level = np.divide(1.0, mass, out=np.zeros_like(mass), where=free & kept)
+        found.append(Level(groups, level, *(each.astype(np.int32) for each in (dropped, offsets, parents)), weights))
+    return found
+
+
+def _finest(model, free):
+    """The bounds of a model's terms, (soft, hard): a hard bound must not be merged with a soft one of another length."""
+    n, soft, hard = model.per_copy, [], []
+    points = model.rest_points
+    for elements in model.terms:
+        if elements.term.reach is None:
+            continue
+        E = elements.per_copy
+        stiffness = elements.stiffness.numpy().reshape(model.copies, E).astype(np.float64).T
+        if (stiffness == stiffness[:, :1]).all():
+            stiffness = stiffness[:, :1]
+        pairs, lengths, factors = elements.term.reach(points, elements.stencil.numpy()[:E], elements.rest.numpy()[:E])
+        each = len(pairs) // E
+        with np.errstate(divide="ignore"):
+            compliance = 1.0 / (np.repeat(stiffness, each, axis=0) * factors[:, None])
+        bounds = Bounds(pairs, lengths.astype(np.float64), compliance)
+        used = np.isfinite(lengths) & free[pairs].any(axis=1) & np.isfinite(compliance).any(axis=1)
+        is_hard = (compliance == 0.0).any(axis=1)
+        soft.append(bounds.take(used & ~is_hard))
+        hard.append(bounds.take(used & is_hard))
+    return _parallel(soft, n, model.copies), _joined(hard, model.copies).shortest(n)
+
+
+def _joined(bounds, copies):
+    wide = copies if any(each.compliance.shape[1] > 1 for each in bounds) else 1
+    empty = Bounds(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros((0, wide)))
+    bounds = [empty, *bounds]
+    return Bounds(
+        np.concatenate([each.pairs for each in bounds]),
+        np.concatenate([each.lengths for each in bounds]),
+        np.concatenate([np.broadcast_to(each.compliance, (len(each), wide)) for each in bounds]),
+    )
+
+
+def _parallel(bounds, n, copies):
+    """Soft bounds of one pair as one: of the sum of their stiffness, and as long as where their forces cancel in copy 0."""
+    bounds = _joined(bounds, copies)
+    stiffness = 1.0 / bounds.compliance
+    keys = bounds.pairs.min(axis=1).astype(np.int64) * n + bounds.pairs.max(axis=1)
+    unique, place = np.unique(keys, return_inverse=True)
+    total = np.stack([np.bincount(place, each, len(unique)) for each in stiffness.T], axis=1)
+    mean = stiffness.mean(axis=1)
+    lengths = np.bincount(place, mean * bounds.lengths, len(unique)) / np.bincount(place, mean, len(unique))
+    with np.errstate(divide="ignore"):
+        return Bounds(np.stack(np.divmod(unique, n), axis=1), lengths, 1.0 / total)
+
+
+def _independent(pairs, free):
+    """Which vertices are kept, (n,): linked ones, pins first, then each in its order that is linked to none that is kept."""
+    n = len(free)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    offsets = np.searchsorted(both[:, 0], np.arange(n + 1)).tolist()
+    neighbours = both[:, 1].tolist()
+    linked = np.diff(offsets) > 0
+    kept = linked & ~free
+    decided = bytearray(kept | ~linked)
+    for v in both[kept[both[:, 0]], 1].tolist():
+        decided[v] = 1
+    for v in range(n):
+        if not decided[v]:
+            kept[v] = True
+            for u in neighbours[offsets[v] : offsets[v + 1]]:
+                decided[u] = 1
+    return kept
+
+
+def _followers(links, kept):
+    """The dropped vertices and what each follows: linked kept ones, and where that is one only those of dropped neighbours.
+
+    Weights are one over the length of the way, 1/L over Σ 1/L.
+    """
+    n = len(kept)
+    dropped, near = _nearest(links, kept)
+    count = np.bincount(dropped, minlength=n)
+    between = ~kept[links.pairs].any(axis=1)
+    ends, lengths = links.pairs[between], links.lengths[between]
+    ends, lengths = np.concatenate([ends, ends[:, ::-1]]), np.concatenate([lengths, lengths])
+    lone = count[ends[:, 0]] == 1
+    ends, lengths = ends[lone], lengths[lone]
+    first = np.searchsorted(dropped, np.arange(n))
+    rows, entries = _spread(first[ends[:, 1]], count[ends[:, 1]])
+    ways = Bounds(
+        np.stack(
+            [np.concatenate([dropped, ends[rows, 0]]), np.concatenate([near.pairs[:, 1], near.pairs[entries, 1]])], axis=1
+        ),
+        np.concatenate([near.lengths, lengths[rows] + near.lengths[entries]]),
+        np.zeros((len(dropped) + len(rows), 0)),
+    )
+    keys = ways.pairs[:, 0] * n + ways.pairs[:, 1]
+    order = np.lexsort((ways.lengths, keys))
+    unique, first = np.unique(keys[order], return_index=True)
+    source, parents = np.divmod(unique, n)
+    lengths = ways.lengths[order[first]]
+    least = 1e-6 * lengths.max(initial=0.0)
+    weights = 1.0 / np.maximum(lengths, least if least > 0.0 else 1.0)
+    vertices, starts = np.unique(source, return_index=True)
+    offsets = np.append(starts, len(source))
+    weights /= np.repeat(np.add.reduceat(weights, starts), np.diff(offsets)) if len(source) else 1.0
+    return vertices, offsets, parents, weights
+
+
+def _nearest(bounds, kept):
+    """Bounds from a dropped to a kept vertex, pairs (dropped, kept) by the dropped one and then by length; and the former."""
+    inside = kept[bounds.pairs]
+    one = inside[:, 0] != inside[:, 1]
+    some, inside = bounds.take(one), inside[one]
+    pairs = np.where(inside[:, :1], some.pairs[:, ::-1], some.pairs)
+    order = np.lexsort((pairs[:, 1], some.lengths, pairs[:, 0]))
+    some = replace(some, pairs=pairs).take(order)
+    return some.pairs[:, 0], some
+
+
+def _spread(first, count):
+    """(rows, entries): entries first[i] … first[i] + count[i] − 1 of each row i, one after another."""
+    rows = np.repeat(np.arange(len(first)), count)
+    return rows, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+
+
+def _coarser(bounds, kept, free):
+    """Bounds between kept vertices: their own, over one dropped vertex, and over two, each by its nearest kept one."""
+    n = len(kept)
+    inside = kept[bounds.pairs]
+    own = bounds.take(inside.all(axis=1))
+    dropped, near = _nearest(bounds, kept)
+    first = np.searchsorted(dropped, np.arange(n))
+    count = np.bincount(dropped, minlength=n)
+    # Each way to a kept vertex goes on to those before it, from a hub to the nearest alone.
+    before = np.arange(len(dropped)) - first[dropped]
+    back, other = _spread(first[dropped], np.where(count[dropped] > _HUB, np.minimum(before, 1), before))
+    over_one = Bounds(
+        np.stack([near.pairs[back, 1], near.pairs[other, 1]], axis=1),
+        near.lengths[back] + near.lengths[other],
+        near.compliance[back] + near.compliance[other],
+    )
+    between = bounds.take(~inside.any(axis=1) & (count[bounds.pairs] > 0).all(axis=1))
+    a, b = first[between.pairs].T
+    over_two = Bounds(
+        np.stack([near.pairs[a, 1], near.pairs[b, 1]], axis=1),
+        near.lengths[a] + between.lengths + near.lengths[b],
+        near.compliance[a] + between.compliance + near.compliance[b],
+    )
+    ways = _joined([own, over_one, over_two], bounds.compliance.shape[1])
+    different = ways.pairs[:, 0] != ways.pairs[:, 1]
+    return ways.take(different & free[ways.pairs].any(axis=1)).shortest(n)
+
+
+def _scaled(coarse, fine, free):
+    """``coarse`` with a stiffness that keeps Σ kL², twice the energy of a uniform stretch, of each connected part of cloth.
+
+    In a chain the way in series has that already; a sheet has as many ways side by side as a level drops.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not len(coarse):
+        return coarse
+    n = len(free)
+    loose = fine.pairs[free[fine.pairs].all(axis=1)]
+    _, label = connected_components(coo_array((np.ones(len(loose)), loose.T), shape=(n, n)), directed=False)
+
+    def energy(bounds):
+        part = label[np.where(free[bounds.pairs[:, 0]], bounds.pairs[:, 0], bounds.pairs[:, 1])]
+        with np.errstate(divide="ignore"):
+            stiffness = 1.0 / bounds.compliance
+        given = np.where(np.isfinite(stiffness), stiffness, 0.0) * bounds.lengths[:, None] ** 2
+        return part, np.stack([np.bincount(part, each, n) for each in given.T], axis=1)
+
+    _, before = energy(fine)
+    part, after = energy(coarse)
+    factor = np.divide(after, before, out=np.ones_like(after), where=(before > 0.0) & (after > 0.0))
+    return replace(coarse, compliance=coarse.compliance * factor[part])
+
+
+def on_device(model, level):
+    """The model of a level: the same vertices and kernels, with its masses, and its bounds as the one term."""
+    bounds = _joined(level.bounds, model.copies)
+    E, B = len(bounds), model.copies
+    with np.errstate(divide="ignore"):
+        stiffness = np.broadcast_to(1.0 / bounds.compliance.T, (B, E))
+    stencil = bounds.pairs[None] + (np.arange(B) * model.per_copy)[:, None, None]
+    rest = np.tile(np.stack([np.zeros(E), bounds.lengths], axis=1), (B, 1))
+    view = model.with_terms(
+        [
+            DeviceElements(
+                label="bounds",
+                kind="bounds",
+                term=SPRING_LIMIT,
+                per_copy=E,
+                stencil=wp.array(stencil.reshape(-1, 2).astype(np.int32), dtype=wp.int32, device=model.device),
+                stiffness=model.array(stiffness.ravel(), model.dtype),
+                rest=model.array(rest, wp.types.vector(2, model.dtype)),
+                hard=bool(np.isinf(stiffness).any()),
+            ),
+        ]
+    )
+    view.inverse_mass = model.array(level.inverse_mass.ravel(), model.dtype)
+    return view

@@ -1,0 +1,387 @@
+"""The only thing that solves a sparse system: conjugate gradients on the device, or a factorisation."""
+
+import importlib.util
+import time
+
+import numpy as np
+import warp as wp
+
+from ..base.interrupts import deferred
+from ..core.capture import Mirror, on_host
+from ..kernels import linear
+
+# Most unknowns for which all eigenvalues are computed at once.
+SMALL = 100
+
+
+class ConjugateGradients:
+    """Solves A x = b for each copy by conjugate gradients with the inverse diagonal blocks as preconditioner.
+
+    Runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) fell to its tolerance times the first, or at
+    a direction without positive curvature: then x is a descent direction of ½xᵀAx − bᵀx all the same and ``negative`` is 1
+    (Steihaug 1983).
+
+    Args:
+        matrix: A, such as :class:`warpcloth.core.operators.Hessian`: what it has of ``count``, ``per_copy``, ``vector`` and
+            ``block``, ``prepare``, ``multiply`` and ``invert_diagonal``.
+        sums: :class:`warpcloth.core.operators.Sums` over its unknowns.
+        iterations: The most iterations of one solve.
+    """
+
+    capturable = True
+
+    def __init__(self, matrix, sums, iterations):
+        model = self.model = matrix.model
+        self.matrix, self.sums, self.iterations = matrix, sums, iterations
+        matrix.prepare()
+
+        def per_unknown(dtype):
+            return wp.zeros(matrix.count, dtype=dtype, device=model.device)
+
+        self.r, self.z, self.p, self.q = (per_unknown(matrix.vector) for _ in range(4))
+        self.preconditioner = per_unknown(matrix.block)
+
+        def per_copy(dtype):
+            return wp.zeros(model.copies, dtype=dtype, device=model.device)
+
+        self.rz, self.new_rz, self.pq, self.first, self.ratio = (per_copy(wp.float64) for _ in range(5))
+        self.active, self.negative, self.tolerance = (
+            per_copy(wp.int32),
+            Mirror(per_copy(wp.int32)),
+            Mirror(per_copy(wp.float64)),
+        )
+        self.proceed, self.iteration = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        numbers = matrix.vector is model.dtype
+        names = ("start_iteration", "advance", "new_direction")
+        self.kernels = {name: model.kernel(getattr(linear, name), model.dtype, numbers) for name in names}
+        names = ("start_copies", "begin_check", "check_copies", "limit_iterations")
+        self.kernels |= {name: model.kernel(getattr(linear, name)) for name in names}
+
+    def solve(self, b, x, wanted):
+        """x = A⁻¹ b to the relative ``tolerance`` (B,) of each copy that is wanted, 0 for the rest."""
+        N, B = self.matrix.count, self.model.copies
+        self.matrix.invert_diagonal(self.preconditioner)
+        self._launch("start_iteration", N, [self.preconditioner, b], [x, self.r, self.z, self.p])
+        self.sums.dot(self.r, self.z, self.rz)
+        self.negative.array.zero_()
+        self._launch("start_copies", B, [self.rz, wanted], [self.first, self.active, self.iteration, self.proceed])
+        wp.capture_while(self.proceed, self._iterate, x=x)
+
+    def _iterate(self, x):
+        N, B, n = self.matrix.count, self.model.copies, self.matrix.per_copy
+        self.matrix.multiply(self.p, self.q, self.active)
+        self.sums.dot(self.p, self.q, self.pq, self.active)
+        scalars = [self.rz, self.pq, self.active, self.iteration, n]
+        self._launch("advance", N, [self.preconditioner, self.p, self.q, *scalars], [x, self.r, self.z])
+        self.sums.dot(self.r, self.z, self.new_rz, self.active)
+        self._launch("begin_check", 1, [], [self.iteration, self.proceed])
+        given = [self.new_rz, self.pq, self.first, self.tolerance.array]
+        changed = [self.rz, self.active, self.negative.array, self.ratio, self.proceed]
+        self._launch("check_copies", B, given, changed)
+        self._launch("limit_iterations", 1, [self.iteration, self.iterations], [self.proceed])
+        self._launch("new_direction", N, [self.z, self.ratio, self.active, n], [self.p])
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.model.launch(self.kernels[name], dim, inputs, outputs)
+
+
+class Factorised:
+    """Solves A x = b by a sparse factorisation on the host (scipy's SuperLU in symmetric mode), exact and for any stiffness.
+
+    Pivots are taken from the diagonal, so that their signs are those of the eigenvalues (Sylvester): ``negative`` is 1 for a
+    copy with a negative one. Of two pivots of about 0 in an indefinite matrix no promise is made.
+
+    Args:
+        hessian: The :class:`warpcloth.core.operators.Hessian`.
+    """
+
+    capturable = False
+
+    def __init__(self, hessian):
+        model = self.model = hessian.model
+        self.matrices = hessian.matrices()
+        self.starts = np.cumsum([0, *(len(matrix.data) for matrix in self.matrices)])
+        self.values = Mirror(hessian.values)
+        self.negative = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
+        self._mirrors = {}
+
+    def solve(self, b, x, wanted):
+        """x = A⁻¹ b, in double precision; 0 for a copy that is not wanted, or whose A is singular or not finite."""
+        right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
+        sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
+        solution, negative = np.zeros_like(sides), np.zeros(self.model.copies, dtype=bool)
+        values = self.values.read()
+        for copy in np.flatnonzero(wanted.read()):
+            factor = self._factor(copy, values)
+            found = None if factor is None else factor.solve(sides[copy])
+            if found is not None and np.isfinite(found).all():
+                solution[copy], negative[copy] = found, (factor.U.diagonal() < 0.0).any()
+        left.write(solution.reshape(-1, 3))
+        self.negative.write(negative)
+
+    def curves_down(self, unresolved=0.0):
+        """Whether some copy has an eigenvalue below −1000 ε times its largest diagonal entry − ``unresolved`` [N/m]."""
+        shift = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
+        values = self.values.read()
+        factors = (self._factor(copy, values, shift, unresolved) for copy in range(self.model.copies))
+        return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
+
+    def lowest_eigenvalue(self, copy=0):
+        """Finds the lowest eigenvalue of a copy's matrix without its pinned vertices [N/m], see :func:`lowest_eigenvalue`."""
+        matrix = self.matrices[copy]
+        matrix.data[:] = self.values.read()[self.starts[copy] : self.starts[copy + 1]]
+        n = self.model.per_copy
+        free = np.flatnonzero(np.repeat(self.model.inverse_mass.numpy()[copy * n : (copy + 1) * n] > 0.0, 3))
+        return lowest_eigenvalue(matrix.tocsr()[free][:, free])
+
+    def _mirror(self, array):
+        """The mirror of an array, built when the array is first seen."""
+        if array.ptr not in self._mirrors:
+            self._mirrors[array.ptr] = Mirror(array)
+        return self._mirrors[array.ptr]
+
+    def _factor(self, copy, values, shift=0.0, unresolved=0.0):
+        """The factors of a copy's matrix, or None; with ``shift`` times its largest entry + ``unresolved`` on the diagonal."""
+        from scipy.sparse import identity
+        from scipy.sparse.linalg import splu
+
+        matrix = self.matrices[copy]
+        matrix.data[:] = values[self.starts[copy] : self.starts[copy + 1]]
+        if not np.isfinite(matrix.data).all():
+            return None
+        columns = matrix.tocsc()
+        if shift:
+            added = shift * np.abs(columns.diagonal()).max() + unresolved
+            columns = columns + added * identity(columns.shape[0], format="csc")
+        options = {"SymmetricMode": True, "Equil": False}
+        try:
+            return splu(columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        except RuntimeError:  # exactly singular
+            return None
+
+
+def lowest_eigenvalue(matrix):
+    """Finds the lowest eigenvalue of a sparse symmetric matrix, by Lanczos iterations with the inverse of A + σ.
+
+    σ starts at 1000 ε times the largest entry of the diagonal and grows tenfold until A + σ has no negative pivot. Then no
+    eigenvalue lies below −σ, the lowest is the nearest to −σ, and few iterations find it (Ericsson and Ruhe 1980).
+
+    Args:
+        matrix: A, scipy (n, n).
+
+    Returns:
+        float: Accurate to about 1e-10 (λ + σ), where σ is at most 10 |λ| or 1000 ε times the largest entry. Infinite if n is 0,
+            NaN if an entry is not finite.
+    """
+    from scipy.sparse import identity
+    from scipy.sparse.linalg import LinearOperator, eigsh, splu
+
+    n, columns = matrix.shape[0], matrix.tocsc().astype(np.float64)
+    if n == 0:
+        return np.inf
+    if not np.isfinite(columns.data).all():
+        return np.nan
+    if n <= SMALL:
+        return float(np.linalg.eigvalsh(columns.toarray())[0])
+    shift = 1e3 * np.finfo(np.float64).eps * (np.abs(columns.diagonal()).max() or 1.0)
+    options = {"SymmetricMode": True, "Equil": False}
+    while True:
+        try:
+            shifted = columns + shift * identity(n, format="csc")
+            factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            if (factor.U.diagonal() > 0.0).all():
+                break
+        except RuntimeError:  # exactly singular
+            pass
+        shift *= 10.0
+    inverse = LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=n)
+    (largest,) = eigsh(inverse, k=1, which="LA", v0=start, tol=1e-10, return_eigenvectors=False)
+    return float(1.0 / largest - shift)
+
+
+class FactorisedRows:
+    """Solves A x = b for A = J W Jᵀ + α̃ of constraint rows by a sparse factorisation on the host, scaled to a unit diagonal.
+
+    Args:
+        matrix: The :class:`warpcloth.numerics.constraints.Constraints`.
+        arrays: b, x and wanted, as they will be given to :meth:`solve`, which then allocates nothing.
+    """
+
+    capturable = False
+
+    def __init__(self, matrix, arrays):
+        self.matrix, self.model = matrix, matrix.model
+        self._mirrors = {array.ptr: Mirror(array) for array in arrays}
+        if matrix.count:
+            matrix.matrices()  # allocates what it needs
+
+    def solve(self, b, x, wanted):
+        """x = A⁻¹ b of each copy that is wanted, NaN where A or b is not finite, 0 for the rest."""
+        from scipy.sparse import diags
+        from scipy.sparse.linalg import splu
+
+        right, left, wanted = (self._mirrors[array.ptr] for array in (b, x, wanted))
+        sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
+        solution, matrices = np.zeros_like(sides), self.matrix.matrices()
+        for copy in np.flatnonzero(wanted.read()):
+            A, side = matrices[copy], sides[copy]
+            if not (np.isfinite(A.data).all() and np.isfinite(side).all()):
+                solution[copy] = np.nan
+                continue
+            diagonal = A.diagonal()
+            scale = np.divide(1.0, np.sqrt(diagonal), out=np.zeros_like(diagonal), where=diagonal > 0.0)
+            A, side = diags(scale) @ A @ diags(scale) + diags((scale == 0.0).astype(float)), scale * side
+            options = {"SymmetricMode": True, "Equil": False}
+            factor = splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            found = factor.solve(side)
+            found += factor.solve(side - A @ found)  # redundant rows leave A hardly definite
+            solution[copy] = scale * found
+        left.write(solution.ravel())
+
+
+def constant_factor(matrix, device, dtype):
+    """The factors of a constant matrix: :class:`CholeskyFactor` where cholespy is installed, else :class:`LUFactor`.
+
+    Of several CUDA devices cholespy knows the first alone.
+    """
+    if importlib.util.find_spec("cholespy") and not (device.is_cuda and device.ordinal):
+        return CholeskyFactor(matrix, device, dtype)
+    return LUFactor(matrix, device, dtype)
+
+
+class CholeskyFactor:
+    """Solves A x = b for a constant symmetric positive definite A by cholespy: CHOLMOD on the CPU, its own kernels on CUDA.
+
+    A is factorised once, in double precision, and solved on its device without copies of vectors.
+
+    Args:
+        matrix: A, a scipy sparse matrix (n, n), n at least 1.
+        device: The Warp device of the vectors.
+        dtype: Their scalar type, ``wp.float32`` or ``wp.float64``.
+
+    Attributes:
+        seconds: What factorising took [s].
+
+    Raises:
+        ValueError: If A is not finite or not positive definite.
+    """
+
+    def __init__(self, matrix, device, dtype):
+        import cholespy
+
+        self.device = device
+        columns = _finite_columns(matrix)
+        parts = zip((columns.indptr, columns.indices, columns.data), (wp.int32, wp.int32, wp.float64), strict=True)
+        compressed = [wp.array(part, dtype=kind, device=device) for part, kind in parts]
+        solver = {wp.float32: cholespy.CholeskySolverF, wp.float64: cholespy.CholeskySolverD}[dtype]
+        try:
+            start = time.perf_counter()
+            with deferred():
+                self.solver = solver(columns.shape[0], *compressed, cholespy.MatrixType.CSC)
+            self.seconds = time.perf_counter() - start
+        except ValueError:
+            raise ValueError(_INDEFINITE) from None
+
+    def solve(self, b, x):
+        """x = A⁻¹ b; both (n,) vectors or (n, k) numbers. NaN in b is NaN in x."""
+        on_host(self.device, "a sparse factorisation")
+        wp.synchronize_device(self.device)  # on CUDA cholespy has a stream of its own
+        with deferred():  # while it looks at arrays, cholespy makes a TypeError of an interrupt
+            self.solver.solve(b, x)
+        wp.synchronize_device(self.device)
+
+
+class LUFactor:
+    """Solves A x = b as :class:`CholeskyFactor` does, by scipy's SuperLU on the host, in double precision.
+
+    Arguments and what is raised are those of :class:`CholeskyFactor`.
+    """
+
+    def __init__(self, matrix, device, dtype):
+        from scipy.sparse.linalg import splu
+
+        options = {"SymmetricMode": True, "Equil": False}
+        try:
+            start = time.perf_counter()
+            self.factors = splu(_finite_columns(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            self.seconds = time.perf_counter() - start
+        except RuntimeError:  # exactly singular
+            raise ValueError(_INDEFINITE) from None
+        if not (self.factors.U.diagonal() > 0.0).all():
+            raise ValueError(_INDEFINITE)
+        self._mirrors = {}
+
+    def solve(self, b, x):
+        """x = A⁻¹ b; both (n,) vectors or (n, k) numbers. NaN in b is NaN in x."""
+        right, left = (self._mirrors.get(array.ptr) or self._mirrors.setdefault(array.ptr, Mirror(array)) for array in (b, x))
+        left.write(self.factors.solve(right.read().astype(np.float64)))
+
+
+class CopyFactors:
+    """Solves A x = b for each copy with a constant scalar matrix, factorised once for all copies that have the same.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        matrices: A of each copy, scipy matrices (n, n) of one pattern.
+
+    Attributes:
+        seconds: What factorising took [s].
+
+    Raises:
+        ValueError: If a matrix is not finite or not positive definite.
+    """
+
+    def __init__(self, model, matrices):
+        self.per_copy, found = model.per_copy, {}
+        self.factors = []
+        for matrix in matrices:
+            key = matrix.data.tobytes()
+            if key not in found:
+                found[key] = constant_factor(matrix, model.device, model.dtype)
+            self.factors.append(found[key])
+        self.seconds = sum(factor.seconds for factor in found.values())
+        self._parts = {}
+
+    def solve(self, b, x):
+        """x = A⁻¹ b, both (N,) vectors; a call of the host. NaN in b is NaN in x of that copy."""
+        for factor, right, left in zip(self.factors, self._of_copies(b), self._of_copies(x), strict=True):
+            factor.solve(right, left)
+
+    def _of_copies(self, array):
+        """The parts of an array that belong to the copies, made when the array is first seen."""
+        if array.ptr not in self._parts:
+            n = self.per_copy
+            self._parts[array.ptr] = [array[first : first + n] for first in range(0, len(array), n)]
+        return self._parts[array.ptr]
+
+
+class DiagonalScaling:
+    """x = D⁻¹ b, the step of a Jacobi iteration; runs on the device and may be captured.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        diagonal: D of each copy, (B, n), above 0.
+    """
+
+    seconds = 0.0  # there is nothing to factorise
+
+    def __init__(self, model, diagonal):
+        self.model, self._inverse = model, model.array(1.0 / diagonal.ravel(), model.dtype)
+        self._scale = model.kernel(linear.scale, model.dtype)
+
+    def solve(self, b, x):
+        """x = D⁻¹ b, both (N,) vectors."""
+        self.model.launch(self._scale, self.model.count, [self._inverse, b], [x])
+
+
+_INDEFINITE = "the matrix is not positive definite, so it has no Cholesky factors"
+
+
+def _finite_columns(matrix):
+    """A sparse matrix in sorted compressed columns of double precision."""
+    columns = matrix.tocsc().astype(np.float64)
+    columns.sort_indices()
+    if not np.isfinite(columns.data).all():
+        raise ValueError(f"the matrix has {np.count_nonzero(~np.isfinite(columns.data))} entries that are not finite")
+    return columns

@@ -1,0 +1,211 @@
+"""Newton's method with a line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d, shared by motion and equilibrium."""
+
+import numpy as np
+import warp as wp
+
+from ..core.capture import Mirror, Segment
+from ..core.operators import Hessian, Sums
+from ..core.status import Result
+from ..kernels import minimise as kernels
+from ..kernels.linear import rounding
+from ..kernels.term import HessianPolicy
+from .linear import ConjugateGradients, Factorised
+from .search import Search
+
+# Roundings that a force takes: of the lengths, of the strain, of the products and of the sum over a vertex's elements.
+ROUNDINGS = 4.0
+# Of the energy that roundings lose at worst what they lose as a rule, adding up like a random walk.
+TYPICAL = 0.1
+
+POLICIES = {
+    "adaptive": HessianPolicy.RAW,
+    "raw": HessianPolicy.RAW,
+    "clamp": HessianPolicy.CLAMP,
+    "absolute": HessianPolicy.ABSOLUTE,
+}
+
+LINEAR = ("cg", "factorised")
+
+
+class Minimiser:
+    """Finds the d that minimises φ for each copy, from d = 0 (for the equation see the module).
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        base: Where d = 0 is, (N,) vectors [m]; the caller's array, read only.
+        hessian: ``"adaptive"`` (raw; clamped in an iteration whose matrix shows a negative curvature), ``"raw"``,
+            ``"clamp"`` or ``"absolute"``.
+        linear: ``"cg"`` or ``"factorised"``.
+        s: Weight of the inertia, 1/h² [1/s²].
+        load: Part of gravity that acts as a force.
+        linear_iterations: The most iterations of a conjugate gradient solve.
+
+    Attributes:
+        correction: d (N,) [m].
+        residual: The largest unbalanced acceleration of each copy over ``scale``, (B,), after :meth:`minimise`.
+        scale: The acceleration of each copy that its residual is relative to [m/s²], (B,), after :meth:`minimise`.
+        iterations: Newton iterations of the last :meth:`minimise`.
+    """
+
+    def __init__(self, model, base, hessian, linear, s, load=0.0, linear_iterations=10_000):
+        self.model, self.base = model, base
+        self.adaptive = hessian == "adaptive"
+        self.sums = Sums(model)
+        self.search = Search(model, base, self.sums, s, load)
+        self.correction = self.search.correction
+        self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
+        if linear == "cg":
+            self.linear = ConjugateGradients(self.hessian, self.sums, linear_iterations)
+        else:
+            self.linear = Factorised(self.hessian)
+        self.right = model.vectors()
+        self.work, self.lost = (wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2))
+
+        def per_copy(dtype):
+            return wp.zeros(model.copies, dtype=dtype, device=model.device)
+
+        self.square, self.rounding, self.lost_energy, self.acceleration = (per_copy(wp.float64) for _ in range(4))
+        self.active = per_copy(wp.int32)
+        self._active, self._policy = Mirror(self.active), Mirror(self.hessian.policy)
+        search = self.search
+        read = (search.energy, self.square, self.rounding, self.lost_energy, search.step, search.slope)
+        self._energy, self._square, self._rounding, self._lost, self._step, self._slope = (Mirror(array) for array in read)
+        self._acceleration = Mirror(self.acceleration)
+        self.edge = float(np.median(model.scene.mesh.edge_lengths))
+        self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
+        self.kernels = {"negate": model.kernel(kernels.negate, model.dtype), "rounding": model.kernel(rounding, model.dtype)}
+        self._record()
+        self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
+        self.residual, self.iterations = np.zeros(model.copies), 0
+
+    def _record(self):
+        device = self.model.device
+        self._start = Segment(device, self._launch_start)
+        self._assemble = Segment(device, self._launch_assemble)
+        self._solve = Segment(device, self._launch_solve) if self.linear.capturable else self._launch_solve
+        self._step_on = Segment(device, self._launch_search)
+
+    def set_objective(self, s, load):
+        """Another s and load; what was recorded holds the old ones and is recorded again."""
+        self.search.s, self.search.load = s, load
+        self._record()
+
+    def minimise(self, tolerance, iterations, scale=None):
+        """Iterates until every vertex is in balance, or nothing is left to gain in the model's precision.
+
+        In balance is a copy with max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a. The acceleration a is ``scale`` (B,) [m/s²], by default
+        gravity's, without any the largest at d = 0. Nothing is left to gain when ‖∇φ‖ is no more than rounding may make of it,
+        4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) a vertex, and an iteration has not lowered φ by more than rounding: the
+        norm alone would let the noise of stiff directions hide what soft ones still lack.
+
+        Returns:
+            A :class:`Result` for each copy.
+        """
+        B = self.model.copies
+        self._start()
+        if scale is None:
+            scale = np.where(self.gravity > 0.0, self.gravity, self._acceleration.read())
+            scale[scale == 0.0] = 1.0
+        self.scale = scale
+        energy = self._energy.read().copy()
+        rounded = stalled = np.zeros(B, dtype=bool)
+        # Linear systems are solved no better than the residual has fallen (Eisenstat and Walker 1996).
+        first = np.maximum(self._acceleration.read() / scale, 1.0)
+        self.iterations = 0
+        while True:
+            self.residual = self._acceleration.read() / scale
+            finite = np.isfinite(self.residual)
+            converged = finite & (self.residual <= tolerance)
+            active = finite & ~(converged | rounded | stalled)
+            if not active.any() or self.iterations == iterations:
+                break
+            self._active.write(active)
+            if self.linear.capturable:
+                self.linear.tolerance.write(np.clip(self.residual / first, 1e-12, 0.1))
+            self._find_direction()
+            self._step_on()
+            self.iterations += 1
+            noisy = self._square.read() <= ROUNDINGS**2 * self._rounding.read()
+            before, energy = energy, self._energy.read().copy()
+            with np.errstate(invalid="ignore"):  # of a copy that is not finite
+                level = before - energy <= self.resolution * np.abs(before) + TYPICAL * self._lost.read()
+            # A copy is stuck where no step was found, or there was none to look for.
+            stuck = active & ((self._step.read() == 0.0) | ~(self._slope.read() < 0.0))
+            rounded = rounded | (active & noisy & (stuck | level))
+            stalled = stalled | (stuck & ~noisy)
+        conditions = [~finite, converged, rounded, stalled]
+        results = [Result.DIVERGED, Result.CONVERGED, Result.ROUNDED, Result.STALLED]
+        return list(np.select(conditions, np.array(results, dtype=object), Result.ITERATIONS_USED_UP))
+
+    def _find_direction(self):
+        if self.adaptive:
+            self._policy.write(int(HessianPolicy.RAW))
+        self._assemble()
+        self._solve()
+        if self.adaptive and (negative := self.linear.negative.read()).any():
+            self._policy.write(negative * int(HessianPolicy.CLAMP))
+            self._assemble()
+            self._solve()
+
+    def curves_down(self, tolerance):
+        """Whether the unchanged Hessian at d = 0 of some copy has a negative eigenvalue that ``tolerance`` does not explain.
+
+        Balance to ``tolerance`` may leave a force of ``tolerance`` times the scale and the mass of the cloth. That force can
+        compress an edge, which adds the force divided by the edge length [N/m] to the Hessian. A sheet without bending
+        stiffness has no other resistance to motion out of its plane.
+        """
+        self._assemble_raw()
+        unresolved = tolerance * float((self.scale * self.model.mass.numpy().reshape(self.model.copies, -1).sum(axis=1)).max())
+        return Factorised(self.hessian).curves_down(unresolved / self.edge)
+
+    def lowest_eigenvalue(self):
+        """Finds the lowest eigenvalue of the unchanged Hessian at d = 0 over the free vertices of the first copy [N/m]."""
+        self._assemble_raw()
+        return Factorised(self.hessian).lowest_eigenvalue()
+
+    def unbalanced(self):
+        """Σ‖∇φᵢ‖ at d of each copy, (B,) [N]."""
+        gradient = self.search.gradient.numpy().astype(np.float64).reshape(self.model.copies, -1, 3)
+        return np.linalg.norm(gradient, axis=2).sum(axis=1)
+
+    def _assemble_raw(self):
+        before = self._policy.read().copy()
+        self.start()
+        self._policy.write(int(HessianPolicy.RAW))
+        self._assemble()
+        self._policy.write(before)
+
+    def start(self):
+        """Sets d = 0 and everything that depends on it."""
+        self._start()
+
+    # What the segments record.
+
+    def _launch_start(self):
+        self.search.launch_start()
+        self._launch_norms()
+
+    def _launch_assemble(self):
+        self.hessian.assemble(self.base, self.search.s, self.correction)
+        self._launch("negate", self.model.count, [self.search.gradient], [self.right])
+        hessian, model = self.hessian, self.model
+        given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
+        self._launch("rounding", model.count, [*given, np.finfo(model.numpy_dtype).eps, self.edge], [self.work, self.lost])
+        for values, total in ((self.work, self.rounding), (self.lost, self.lost_energy)):
+            self.sums.sum(values, model.per_copy, total)
+
+    def _launch_solve(self):
+        self.linear.solve(self.right, self.search.direction, self.active)
+
+    def _launch_search(self):
+        self.search.launch(self.active)
+        self._launch_norms()
+
+    def _launch_norms(self):
+        """‖∇φ‖² and the largest unbalanced acceleration at d."""
+        gradient = self.search.gradient
+        self.sums.dot(gradient, gradient, self.square)
+        self.sums.largest(self.model.inverse_mass, gradient, self.acceleration)
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.model.launch(self.kernels[name], dim, inputs, outputs)

@@ -1,0 +1,87 @@
+"""The objective φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d, and steps along a direction that lower it, for each copy."""
+
+import numpy as np
+import warp as wp
+
+from ..core.operators import Energy, Gradient
+from ..kernels import minimise as kernels
+
+# Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
+HALVINGS = 30
+
+
+class Search:
+    """A line search on φ by halving (Armijo, and Hager and Zhang 2005 where φ no longer resolves the decrease).
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        base: Where d = 0 is, (N,) vectors [m]; the caller's array, read only.
+        sums: :class:`warpcloth.core.operators.Sums`.
+        s: Weight of the inertia, 1/h² [1/s²].
+        load: Part of gravity that acts as a force.
+
+    Attributes:
+        correction: d (N,) [m].
+        direction: What is searched along (N,) [m], set by the caller.
+        gradient: ∇φ at d (N,) [N].
+        energy, slope, step: φ [J], its slope along the direction [J] and the step taken of each copy, (B,); 0 where none was
+            found.
+    """
+
+    def __init__(self, model, base, sums, s, load=0.0):
+        self.model, self.base, self.sums, self.s, self.load = model, base, sums, s, load
+        self.gradient_of, self.energy_of = Gradient(model, corrected=True), Energy(model, sums, corrected=True)
+        self.correction, self.trial, self.gradient, self.direction = (model.vectors() for _ in range(4))
+        self.work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+
+        def per_copy(dtype):
+            return wp.zeros(model.copies, dtype=dtype, device=model.device)
+
+        scalars = (per_copy(wp.float64) for _ in range(5))
+        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step = scalars
+        self.searching = per_copy(wp.int32)
+        self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
+        # energy to 2ε/e, so that √ε covers strains down to √ε.
+        self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
+        self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("set_trial", "add_inertia")}
+        names = ("begin_search", "check_trial", "begin_trial", "end_trial")
+        self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in names}
+
+    def launch_start(self):
+        """d = 0, with its φ and ∇φ."""
+        self.correction.zero_()
+        self.direction.zero_()
+        self.step.zero_()
+        self._launch_trial()
+        wp.copy(self.energy, self.trial_energy)
+
+    def launch(self, active):
+        """d += step·p, with the longest step of 1, ½, ¼ … that lowers φ, of the copies that are ``active`` (B,)."""
+        self.sums.dot(self.gradient, self.direction, self.slope)
+        self._launch("begin_search", self.model.copies, [active], [self.step, self.searching, self.trials, self.proceed])
+        wp.capture_while(self.proceed, self._try_step)
+        wp.copy(self.correction, self.trial)
+        wp.copy(self.energy, self.trial_energy)
+
+    def _launch_trial(self):
+        """trial = d + step·p with its φ, ∇φ and slope φ'."""
+        model = self.model
+        N, n = model.count, model.per_copy
+        self._launch("set_trial", N, [self.correction, self.direction, self.step, n], [self.trial, self.gradient])
+        self.gradient_of.add(self.base, self.gradient, self.trial)
+        given = [model.mass, model.inverse_mass, model.gravity, n, self.s, self.load, self.trial]
+        self._launch("add_inertia", N, given, [self.gradient, self.work])
+        self.sums.sum(self.work, n, self.trial_energy)
+        self.energy_of.add(self.base, self.trial_energy, self.trial)
+        self.sums.dot(self.gradient, self.direction, self.trial_slope)
+
+    def _try_step(self):
+        self._launch_trial()
+        self._launch("begin_trial", 1, [], [self.trials, HALVINGS, self.proceed])
+        given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
+        self._launch("check_trial", self.model.copies, given, [self.step, self.searching, self.proceed])
+        self._launch("end_trial", 1, [self.trials, HALVINGS], [self.proceed])
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.model.launch(self.kernels[name], dim, inputs, outputs)

@@ -1,0 +1,187 @@
+"""Sweeps over the constraints of a model: Jacobi with three ways to keep it from overshooting, Gauss–Seidel by colour or not.
+
+Gauss–Seidel lets each constraint see what those before it did. Constraints of one colour share no vertex that moves, so that
+their order is no matter and they run at once; between colours, and between terms, the order is fixed and changes the result.
+"""
+
+import numpy as np
+import warp as wp
+
+from ..fast.jacobi import Gather, Scatter
+from ..kernels import project as kernels
+from ..kernels.clusters import correct_clusters
+from ..model.damping import refuse_apart
+
+# By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
+# the largest n of its vertices. Jacobi: the plain sum.
+SWEEPS = ("vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential")
+# Gauss–Seidel: what an element sees depends on those before it.
+IN_PLACE = ("coloured", "sequential")
+
+
+def colours(constraints, free):
+    """Colours of elements, so that no two of one colour share a free vertex: (E,) int, from 0 without gaps.
+
+    By Warp's maximum cardinality search: 8 colours for the structural and shear springs of a grid, which is the least, and 18
+    for the hinges of an alternating one.
+
+    Args:
+        constraints: Vertices of each, (E, K) or a list of E arrays.
+        free: Which vertices move, (n,); pinned ones may be shared (the hinges of ``bunny`` then need 17 colours, not 20).
+    """
+    sizes = [len(vertices) for vertices in constraints]
+    elements, vertices = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), np.concatenate(constraints)
+    keep = free[vertices]
+    order = np.argsort(vertices[keep], kind="stable")
+    elements, vertices = elements[keep][order], vertices[keep][order]
+    # Each element at a vertex is a neighbour of those before it there.
+    first = np.searchsorted(vertices, vertices)
+    before = np.arange(len(vertices)) - first
+    place = np.arange(before.sum()) - np.repeat(np.cumsum(before) - before - first, before)
+    pairs = np.stack([np.repeat(elements, before), elements[place]], axis=1)
+    found = wp.zeros(len(sizes), dtype=wp.int32, device="cpu")
+    if len(pairs):
+        wp.utils.graph_coloring_assign(wp.array(pairs, dtype=wp.int32, device="cpu"), found)
+    return found.numpy()
+
+
+def refuse_unprojectable(model, solver):
+    """Refuses terms that have nothing to project on.
+
+    Raises:
+        ValueError: Naming the term, the solver and what would work.
+    """
+    refuse_apart(model, solver)
+    for elements in model.terms:
+        if elements.term.project is None and elements.term.constraint is None:
+            raise ValueError(
+                f"{solver} cannot project {elements.label}, whose energy is no distance to a constraint; "
+                "ADMM, Newton or Explicit can"
+            )
+
+
+class Sweep:
+    """One sweep over all constraints of a model, term by term as declared: ``launch`` moves the correction d from x̃ on.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        x: x̃, (N,) vectors [m]; read only.
+        h: Step [s].
+        kind: One of :data:`SWEEPS`.
+        relaxation: ω, a factor of every Δλ.
+        alpha: α of the average by vertex.
+        scalar: Whether terms that have both are taken by their scalar constraint.
+        multipliers: Whether λ adds up over the sweeps of a step (XPBD).
+        spread: The number of sweeps that finite stiffness is spread over, or None.
+        correction: The d to move on, if not one of its own.
+
+    Attributes:
+        correction: d (N,) [m].
+        multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, in the order of ``elements``, or Nones.
+        elements: :class:`warpcloth.model.model.DeviceElements` of each term, in the order of the sweep.
+        ranges: Of each term what one launch takes, as (first, count).
+    """
+
+    def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None, correction=None):
+        self.model, self.x, self.h, self.relaxation = model, x, h, relaxation
+        self.spread = spread or 1
+        self.in_place, self.ordered = kind in IN_PLACE, kind == "sequential"
+        self.correction = model.vectors() if correction is None else correction
+        self.elements, self.ranges = list(model.terms), [[(0, (elements.cells or elements).count)] for elements in model.terms]
+        if kind == "coloured":
+            self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True) if model.terms else ((), ())
+        keys = []
+        for elements in model.terms:
+            of_constraint = elements.term.project is None or (scalar and elements.term.constraint is not None)
+            keys.append((elements.term, model.dtype, of_constraint))
+        self.multipliers = [
+            wp.zeros(elements.count, dtype=kernels.multiplier_type(*key), device=model.device) if multipliers else None
+            for elements, key in zip(model.terms, keys, strict=True)
+        ]
+        if not self.in_place:
+            way = Gather if model.device.is_cuda else Scatter
+            self._jacobi = way(model, x, h, self.correction, self.multipliers, keys, *self._weights(kind, alpha), spread)
+            return
+        more = multipliers, spread is not None
+        self._kernels = [
+            model.kernel(correct_clusters, model.dtype, *more)
+            if elements.cells
+            else model.kernel(kernels.correct_in_place, *key, *more)
+            for elements, key in zip(model.terms, keys, strict=True)
+        ]
+
+    def _by_colour(self, elements):
+        """The elements of all copies by colour, and the range of each colour."""
+        model = self.model
+        free = model.inverse_mass.numpy()[: model.per_copy] > 0.0
+        one = elements.constraints[: elements.cells.per_copy if elements.cells else elements.per_copy]
+        colour = np.tile(colours(one, free), model.copies)
+        counts = np.bincount(colour)
+        firsts = np.cumsum(counts) - counts
+        return elements.reordered(np.argsort(colour, kind="stable")), list(zip(firsts.tolist(), counts.tolist(), strict=True))
+
+    def _weights(self, kind, alpha):
+        """Factors of elements and of vertices."""
+        model, terms = self.model, self.model.terms
+        even = [model.constant(self.relaxation, elements.count) for elements in terms]
+        if kind == "jacobi":
+            return even, model.constant(1.0, model.count)
+        constraints = np.zeros(model.count)
+        for elements in terms:
+            constraints += np.bincount(elements.stencil.numpy().ravel(), minlength=model.count)
+        if kind == "vertex-averaged":
+            return even, model.array(1.0 / np.maximum(constraints + alpha, np.finfo(np.float32).tiny), model.dtype)
+        constraints[model.inverse_mass.numpy() == 0.0] = 1.0  # what does not move cannot overshoot
+        largest = [constraints[elements.stencil.numpy()].max(axis=1) for elements in terms]
+        for i, elements in enumerate(terms):
+            if elements.cells:  # one factor for all of a cell
+                firsts = elements.cells.offsets.numpy()[:-1]
+                largest[i] = np.repeat(np.maximum.reduceat(largest[i], firsts), elements.cells.sizes)
+        return [model.array(self.relaxation / each, model.dtype) for each in largest], model.constant(1.0, model.count)
+
+    def launch_start(self):
+        """d = 0, λ = 0, after x̃ is there."""
+        if not self.in_place:
+            self._jacobi.launch_start()
+            return
+        for array in (self.correction, *self.multipliers):
+            if array is not None:
+                array.zero_()
+
+    def launch(self, backward=False):
+        """One sweep; of Gauss–Seidel also backward, from the last term, colour and element to the first."""
+        if self.in_place:
+            self._launch_in_place(backward)
+        else:
+            self._jacobi.launch()
+
+    def parts(self, sweeps):
+        """Pairs of a function that launches and of how many times it runs, for so many sweeps."""
+        return [(self.launch, sweeps)] if self.in_place else self._jacobi.parts(sweeps)
+
+    def _launch_in_place(self, backward):
+        model, team = self.model, self.model.team
+        way = -1 if backward else 1
+        for i in range(len(self.elements))[::way]:
+            elements = self.elements[i]
+            cells = elements.cells
+            of_cells = [cells.offsets, cells.shape] if cells else []
+            each = (cells or elements).per_copy if self.ordered else 1
+            for first, count in self.ranges[i][::way]:
+                before, part = team.part(count // each)
+                # A thread of the CPU goes through what it has in a loop, in half of the time that as many threads take.
+                threads, each_thread = (1, part * each) if model.device.is_cpu else (part, each)
+                given = [
+                    *of_cells,
+                    *elements.arguments,
+                    model.inverse_mass,
+                    self.x,
+                    first + before * each,
+                    way * each_thread,
+                    self.h,
+                    self.spread,
+                    self.relaxation,
+                ]
+                if part:
+                    model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
+                team.launch_meeting(model)

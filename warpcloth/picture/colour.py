@@ -1,0 +1,170 @@
+"""Colours of a measure: one fixed scale for all frames of a sequence."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from ..base.checks import number, shown
+from .figures import require_matplotlib
+
+SEQUENTIAL = "viridis"
+# Of matplotlib's diverging maps the most even one (Moreland 2009, "Diverging color maps for scientific visualization"). Its
+# lightness L* rises from 38 to 88 and falls back the same way to 0.3, monotone on both sides; red to blue through white, the
+# next best, differs by 4.4 between its sides. Its middle is grey without a tint, which stands out from a white page, and its
+# ends are light enough to be shaded.
+DIVERGING = "coolwarm"
+# sRGB of what is excluded, 31 ΔE or more from every colour of the one map and 60 from the other.
+EXCLUDED = (0.25, 0.25, 0.25)
+# Of the largest magnitude: float32 rounds by 6e-8 of it, and rounding alone must not fill a scale.
+_NARROWEST = 1e-6
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Maps values to colours; what is beyond an end has the colour of the end, and NaN the grey `EXCLUDED`.
+
+    Attributes:
+        low: Value at the lower end.
+        high: Value at the upper end.
+        neutral: Value in the middle of a diverging map, about which the ends are moved apart until they are symmetric. None
+            is a sequential map.
+        colormap: Name of a colour map of matplotlib; by default `DIVERGING` with a neutral value, `SEQUENTIAL` without.
+
+    Raises:
+        ValueError: A value is not finite, low is not below high, or matplotlib has no such map.
+    """
+
+    low: float
+    high: float
+    neutral: float | None = None
+    colormap: str | None = None
+
+    def __post_init__(self):
+        if self.colormap is not None:
+            check_colormap(self.colormap)
+        number("low", self.low)
+        number("high", self.high)
+        if not self.low < self.high:
+            raise ValueError(f"low is {self.low:g} and high {self.high:g}; low must be below high")
+        if self.neutral is not None:
+            number("neutral", self.neutral)
+        low, high = _symmetric(self.low, self.high, self.neutral)
+        object.__setattr__(self, "low", low)
+        object.__setattr__(self, "high", high)
+
+    @property
+    def map(self):
+        """Name of the map, as matplotlib has it."""
+        return self.colormap or (SEQUENTIAL if self.neutral is None else DIVERGING)
+
+    def srgb(self, values):
+        """Colours (…, 3) of values (…) in sRGB, for plots.
+
+        Raises:
+            ImportError: matplotlib, which has the maps, is not installed.
+        """
+        values = np.asarray(values, dtype=np.float64)
+        stops = table(self.map)
+        at = np.linspace(self.low, self.high, len(stops))
+        if self.neutral is not None:
+            at[len(at) // 2] = self.neutral  # to the last bit
+        colours = np.stack([np.interp(values, at, channel) for channel in stops.T], axis=-1)
+        colours[np.isnan(values)] = EXCLUDED
+        return colours
+
+    def linear(self, values):
+        """Colours (…, 3) of values (…) in linear Rec. 709, as the displayColor of USD has them.
+
+        Raises:
+            ImportError: matplotlib, which has the maps, is not installed.
+        """
+        return to_linear(self.srgb(values))
+
+    def legend(self, measure, unit, stops=9):
+        """The scale as a dictionary of numbers and texts, for the metadata of a file; colours are linear Rec. 709.
+
+        Args:
+            measure: Name of what is coloured.
+            unit: Its unit.
+            stops: Number of values, evenly from low to high, that have their colours beside them.
+        """
+        values = np.linspace(self.low, self.high, stops)
+        if self.neutral is not None and stops % 2:
+            values[stops // 2] = self.neutral
+        facts = {"measure": measure, "unit": unit, "map": self.map, "low": self.low, "high": self.high}
+        if self.neutral is not None:
+            facts["neutral"] = float(self.neutral)
+        for k, (value, colour) in enumerate(zip(values.tolist(), self.linear(values), strict=True)):
+            facts[f"stop_{k}"] = {"value": value, **_channels(colour)}
+        return {**facts, "excluded": _channels(self.linear(np.nan))}
+
+
+def range_over(summaries, neutral=None):
+    """Low and high of one scale for all frames: the least first percentile and the largest ninety-ninth.
+
+    Args:
+        summaries: Of one scalar, one a frame, each with ``percentiles``: of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %. Those that
+            are not finite do not count.
+        neutral: Value about which the range is symmetric, or None.
+
+    Returns:
+        tuple: (low, high), of which low is below high also where all values are equal, or where there are none.
+    """
+    rows = np.array([summary.percentiles for summary in summaries], dtype=np.float64).reshape(-1, 9)
+    ends = rows[:, [1, -2]]
+    ends = ends[np.isfinite(ends)]
+    if not len(ends):
+        ends = np.array([neutral or 0.0])
+    low, high = _symmetric(ends.min(), ends.max(), neutral)
+    width = _NARROWEST * max(abs(low), abs(high))
+    if high - low <= width:
+        width = width or 1.0
+        return (low, low + width) if neutral is None else (neutral - width, neutral + width)
+    return low, high
+
+
+def to_linear(colours):
+    """sRGB to linear Rec. 709, as IEC 61966-2-1 has it."""
+    return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+
+
+def check_colormap(name):
+    """Refuses a name that is not a colour map of matplotlib.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        ValueError: There is no such map; the message suggests similar names, or some that exist.
+    """
+    require_matplotlib()
+    from difflib import get_close_matches
+
+    from matplotlib import colormaps
+
+    if not isinstance(name, str) or name not in colormaps:
+        near = get_close_matches(str(name), list(colormaps), 3) or ["viridis", "cividis", "coolwarm", "RdBu"]
+        raise ValueError(f"colormap is {shown(name)}; it must be a colour map of matplotlib, such as {', '.join(near)}")
+
+
+@cache
+def table(name):
+    """A map of matplotlib as (257, 3) in sRGB, so that one is in the middle.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib import colormaps
+
+    return colormaps[name].resampled(257)(np.arange(257))[:, :3]
+
+
+def _symmetric(low, high, neutral):
+    if neutral is None:
+        return float(low), float(high)
+    half = max(abs(high - neutral), abs(low - neutral))
+    return float(neutral - half), float(neutral + half)
+
+
+def _channels(colour):
+    return dict(zip(("red", "green", "blue"), map(float, colour), strict=True))

@@ -1,0 +1,56 @@
+"""Figures of matplotlib without pyplot, which holds figures and a window system for the whole process."""
+
+import importlib.util
+from pathlib import Path
+
+from ..base.outputs import Output
+
+GREY = "0.35"
+PICTURES = (".png", ".svg", ".pdf")
+# Without the date the same figure has the same bytes.
+_METADATA = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+
+
+def require_matplotlib():
+    """Says in a sentence what is missing.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    if not importlib.util.find_spec("matplotlib"):
+        raise ImportError("colours and charts need matplotlib: pip install -e '.[chart]' in the checkout")
+
+
+def check_path(path, endings):
+    """Refuses a file that cannot be written, before anything is drawn.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The name has none of the endings.
+    """
+    require_matplotlib()
+    path = Path(path)
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {' or '.join(endings)}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
+
+
+def number_axis(axis):
+    """Numbers a logarithmic axis of less than two decades, where the usual numbers overlap, or there may be none."""
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    low, high = axis.get_view_interval()
+    if high < 100.0 * low:
+        ticks = LogLocator(subs=(1.0, 3.0)) if high > 10.0 * low else MaxNLocator(4)
+        axis.set(major_locator=ticks, major_formatter="{x:g}", minor_formatter="")
+
+
+def save(figure, path):
+    """Writes a figure in the format of its ending: .png, .svg or .pdf."""
+    from matplotlib import rc_context
+
+    ending = Path(path).suffix.lower()
+    with rc_context({"svg.hashsalt": "warpcloth"}), Output(path, "xb") as output:  # ids in an SVG are random without a salt
+        figure.savefig(output.file, format=ending[1:], dpi=150, facecolor="white", metadata=_METADATA[ending])

@@ -1,0 +1,186 @@
+"""A still picture of a cloth, coloured by a measure."""
+
+from itertools import cycle
+
+import numpy as np
+
+from ..base.checks import choice
+from .colour import EXCLUDED
+from .figures import GREY, check_path, save
+from .view import View, brightness
+
+# Inches: the longer side of what is shown, what is beside, above and, of several panels, below it, and gaps.
+_SIDE, _RIGHT, _TOP, _FOOT, _GAP = 6.0, 1.2, 0.5, 0.3, 0.15
+# Points: edges in the colour of their triangle close the hairlines between neighbours, at 150 dots per inch from 0.8 on.
+_EDGE, _LINE = 0.8, 0.7
+# The bar has the colours in full light, from which shaded ones must not stray far.
+_LEAST_LIGHT = 0.85
+_GREYS = (0.0, 1.0, 0.5)
+
+
+def draw(
+    path, points, triangles, values, scale, on="triangle", title="", unit="1", view=None, directions=None, both_sides=False
+):
+    """Writes a PNG of a cloth in parallel projection, coloured on both sides, with a bar of the colours.
+
+    A value of a vertex colours a third of each triangle beside it, the part that is nearest in barycentric coordinates. Dark
+    grey has no value. A triangle with a corner that is not finite cannot be drawn; the picture says how many they are.
+
+    Args:
+        path: The file.
+        points: (n, 3) [m].
+        triangles: Vertices (T, 3).
+        values: (T,), or (n,) on vertices; NaN where there is none.
+        scale: The :class:`Scale`.
+        on: "triangle" or "vertex".
+        title: Above the picture.
+        unit: Of the values, beside the bar.
+        view: The :class:`View`, fitted to all frames of a sequence if they are to be seen alike. It is fitted to these
+            points if it is None or without a window.
+        directions: Segments to draw on the cloth, as a dictionary from names to (centres (E, 3) [m], vectors (E, 3) [m] from
+            end to end); the first are black, the second white, the third grey. Those that are not finite are left out.
+        both_sides: Whether a second panel shows the cloth from the opposite side; each panel then has its view as a title.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: An array has another shape, a triangle refers to no vertex, no point is finite, the file is no .png.
+    """
+    check_path(path, (".png",))
+    choice("on", on, ("triangle", "vertex"))
+    points, values, triangles = np.asarray(points, np.float64), np.asarray(values, np.float64), np.asarray(triangles)
+    _check(points, triangles, values, on)
+    view = view or View()
+    if view.window is None:
+        view = view.fit([points])
+    views = [view, view.opposite()] if both_sides else [view]
+    figure, panels, beside = _layout(view.window, title, len(views))
+    colours = scale.srgb(values if on == "triangle" else values[triangles])
+    for axes, one in zip(panels, views, strict=True):
+        left, right, bottom, top = one.window
+        axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+        axes.axis("off")
+        if both_sides:
+            text = f"from azimuth {one.azimuth:g}°, elevation {one.elevation:g}°".replace("-", "−")
+            axes.text(0.02, 0.0, text, transform=axes.transAxes, va="top", fontsize=8, color=GREY)
+        unplaced = _paint_cloth(axes, one, points, triangles, colours, on, directions)
+    _explain(figure, beside, scale, unit, bool(np.isnan(values).any()), unplaced)
+    save(figure, path)
+
+
+def _paint_cloth(axes, view, points, triangles, colours, on, directions):
+    """Draws the triangles and directions in a view; returns how many triangles have a corner that is not finite."""
+    corners = view.project(points)[triangles]
+    placed = np.isfinite(corners).all(axis=(1, 2))
+    outlines, colours = (_whole if on == "triangle" else _thirds)(corners[placed], colours[placed])
+    widths = np.full(len(outlines), _EDGE)
+    depths = outlines[..., 2].mean(axis=1)
+    if directions:
+        segments, greys = _segments(view, directions)
+        # As outlines that go there and back, a little towards the viewer, before the triangles that they cross.
+        lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+        depths = np.append(depths, segments[..., 2].mean(axis=1) + lengths / 2.0)
+        outlines = np.concatenate([outlines, segments[:, np.minimum(np.arange(outlines.shape[1]), 1)]])
+        colours, widths = np.concatenate([colours, greys]), np.append(widths, np.full(len(segments), _LINE))
+    paint(axes, outlines[..., :2], depths, colours, widths)
+    return int((~placed).sum())
+
+
+def paint(axes, outlines, depths, colours, widths):
+    """Draws polygons from the back to the front.
+
+    Args:
+        axes: Of matplotlib.
+        outlines: Corners (P, k, 2), to the right and up.
+        depths: Towards the viewer (P,).
+        colours: sRGB (P, 3) or with alpha (P, 4).
+        widths: Of the edges [pt], one or (P,).
+    """
+    from matplotlib.collections import PolyCollection
+
+    order = np.argsort(depths)
+    colours, widths = colours[order], widths[order] if np.ndim(widths) else widths
+    axes.add_collection(PolyCollection(outlines[order], facecolors=colours, edgecolors=colours, linewidths=widths))
+
+
+def _check(points, triangles, values, on):
+    """Refuses arrays that do not go together."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points has shape {points.shape}; it must be (n, 3)")
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+        raise ValueError(f"triangles has shape {triangles.shape} and type {triangles.dtype}; it must be (T, 3), whole numbers")
+    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+        raise ValueError(f"triangles refers to vertices {triangles.min()} to {triangles.max()}; there are {len(points)}")
+    count = len(triangles) if on == "triangle" else len(points)
+    if values.shape != (count,):
+        raise ValueError(f"values has shape {values.shape}; it must be ({count},), one for each {on}")
+
+
+def _whole(corners, colours):
+    """Outlines (T, 3, 3) and lit colours (T, 3) of triangles, by their corners and colours (T, 3)."""
+    return corners, colours * brightness(corners, _LEAST_LIGHT)[:, None]
+
+
+def _thirds(corners, colours):
+    """Outlines (3T, 4, 3) and lit colours (3T, 3) of thirds of triangles, by their corners and the colours there (T, 3, 3)."""
+    following, before = np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)
+    middle = np.broadcast_to(corners.mean(axis=1, keepdims=True), corners.shape)
+    outlines = np.stack([corners, (corners + following) / 2.0, middle, (corners + before) / 2.0], axis=2)
+    return outlines.reshape(-1, 4, 3), (colours * brightness(corners, _LEAST_LIGHT)[:, None, None]).reshape(-1, 3)
+
+
+def _segments(view, directions):
+    """Ends (S, 2, 3) as they are seen and greys (S, 3) of all directions; nothing is drawn of those that are not finite."""
+    ends, greys = [], []
+    for (name, (centres, vectors)), grey in zip(directions.items(), cycle(_GREYS), strict=False):
+        if np.shape(centres) != np.shape(vectors) or np.shape(centres)[1:] != (3,):
+            shapes = f"centres {np.shape(centres)} and vectors {np.shape(vectors)}"
+            raise ValueError(f"directions[{name!r}] has {shapes}; both must be (E, 3)")
+        centres, halves = view.project(centres), view.project(vectors) / 2.0
+        ends.append(np.stack([centres - halves, centres + halves], axis=1))
+        greys.append(np.full((len(centres), 3), grey))
+    return np.concatenate(ends), np.concatenate(greys)
+
+
+def _layout(window, title, count=1):
+    """Creates a figure, ``count`` axes as large as the window, and axes for the colour bar; they depend only on the window.
+
+    Panels that are taller than wide are side by side, others one above the other.
+    """
+    from matplotlib.figure import Figure
+
+    left, right, bottom, top = window
+    width, height = np.array([right - left, top - bottom]) * _SIDE / max(right - left, top - bottom)
+    columns, rows = (count, 1) if width <= height else (1, count)
+    foot = _FOOT if count > 1 else 0.0
+    height = max(height, (2.0 - rows * foot) / rows)
+    size = np.array([columns * width + _RIGHT, rows * (height + foot) + _TOP])
+    figure = Figure(figsize=size)
+    panels = []
+    for k in range(count):
+        corner = np.array([k % columns * width, (rows - 1 - k // columns) * (height + foot) + foot])
+        panels.append(figure.add_axes([*(corner / size), *([width, height] / size)]))
+    figure.text(_GAP / size[0], 1.0 - 0.3 * _TOP / size[1], title, va="center", color=GREY, parse_math=False)
+    beside = figure.add_axes([(columns * width + _GAP) / size[0], 0.25, _GAP / size[0], 0.5])
+    return figure, panels, beside
+
+
+def _explain(figure, beside, scale, unit, excluded, unplaced):
+    """The bar of the colours, and what is grey or cannot be drawn."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
+    colours = ListedColormap(scale.srgb(np.linspace(scale.low, scale.high, 257)))
+    bar = figure.colorbar(ScalarMappable(Normalize(scale.low, scale.high), colours), cax=beside, extend="both")
+    bar.ax.tick_params(labelsize=8, colors=GREY)
+    bar.ax.yaxis.offsetText.set(size=8, color=GREY)
+    bar.outline.set_visible(False)
+    if unit != "1":
+        bar.ax.set_title(unit, color=GREY, fontsize=8, pad=14.0)
+    if excluded:
+        beside.plot([0.5], [-0.25], "s", color=EXCLUDED, transform=beside.transAxes, clip_on=False)
+        beside.text(1.8, -0.25, "excluded", transform=beside.transAxes, va="center", fontsize=8, color=GREY)
+    if unplaced:
+        text = f"{unplaced} triangle{'s' if unplaced > 1 else ''} without a place not drawn"
+        width, height = figure.get_size_inches()
+        figure.text(_GAP / width, 1.0 - 0.75 * _TOP / height, text, va="center", fontsize=8, color=GREY)

@@ -1,0 +1,97 @@
+"""From where a cloth is seen, and in what light."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..base.checks import array, choice, number
+
+# Columns of a z-up point that make it y-up, and their signs.
+_UPRIGHT = {"Y": ([0, 1, 2], [1.0, 1.0, 1.0]), "Z": ([0, 2, 1], [1.0, 1.0, -1.0])}
+_MARGIN = 0.03
+# Of the longer side; a cloth seen edge-on still has a picture.
+_THINNEST = 0.2
+
+
+@dataclass(frozen=True)
+class View:
+    """A parallel projection, and the window of it that is shown.
+
+    Attributes:
+        azimuth: Angle of the viewer about the vertical [°], from +z of a y-up world, from −y of a z-up one.
+        elevation: Angle of the viewer above the horizontal [°].
+        up_axis: "Y" or "Z".
+        window: (left, right, bottom, top) [m] of what is shown, in the plane of the picture; None until :meth:`fit`.
+
+    Raises:
+        ValueError: A number is not finite, the axis is neither of the two, or the window is empty.
+    """
+
+    azimuth: float = -38.0
+    elevation: float = 24.0
+    up_axis: str = "Y"
+    window: tuple[float, float, float, float] | None = None
+
+    def __post_init__(self):
+        number("azimuth", self.azimuth)
+        number("elevation", self.elevation)
+        choice("up_axis", self.up_axis, tuple(_UPRIGHT))
+        if self.window is not None:
+            left, right, bottom, top = array("window", self.window, (4,))
+            if not (left < right and bottom < top):
+                raise ValueError(f"window is {self.window}; left must be below right and bottom below top")
+
+    def fit(self, frames):
+        """This view with a window that shows all of some frames.
+
+        Args:
+            frames: Points (n, 3) of each [m], read once, one at a time; points that are not finite do not count.
+
+        Raises:
+            ValueError: No point is finite.
+        """
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        for points in frames:
+            seen = self.project(points)[..., :2].reshape(-1, 2)
+            seen = seen[np.isfinite(seen).all(axis=1)]
+            low, high = np.minimum(low, seen.min(axis=0, initial=np.inf)), np.maximum(high, seen.max(axis=0, initial=-np.inf))
+        if not (low <= high).all():
+            raise ValueError("no point of the frames is finite; a view must have something to show")
+        middle, half = (low + high) / 2.0, (high - low) / 2.0
+        half = (1.0 + _MARGIN) * np.maximum(half, _THINNEST * half.max() or 1.0)
+        (left, bottom), (right, top) = (middle - half).tolist(), (middle + half).tolist()
+        return replace(self, window=(left, right, bottom, top))
+
+    def opposite(self):
+        """Returns the view from the opposite side, with the same window."""
+        azimuth = (self.azimuth + 360.0) % 360.0 - 180.0
+        window = self.window and (-self.window[1], -self.window[0], *self.window[2:])
+        return replace(self, azimuth=azimuth, elevation=-self.elevation, window=window)
+
+    def project(self, points):
+        """Right, up and towards the viewer (…, 3) of points or vectors (…, 3)."""
+        a, e = np.radians([self.azimuth, self.elevation])
+        towards = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+        right = np.array([np.cos(a), 0.0, -np.sin(a)])
+        columns, signs = _UPRIGHT[self.up_axis]
+        upright = np.asarray(points)[..., columns] * signs
+        with np.errstate(invalid="ignore"):  # of a point that is not finite every coordinate may become NaN
+            return upright @ np.stack([right, np.cross(towards, right), towards], axis=1)
+
+
+def brightness(corners, least):
+    """Light from the viewer's upper left on either side of triangles.
+
+    Args:
+        corners: Of each triangle (T, 3, 3), to the right, up and towards the viewer.
+        least: Brightness of what the light does not reach, up to 1.
+
+    Returns:
+        numpy.ndarray: (T,), from ``least`` to 1.
+    """
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)[:, None]
+    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+    normals *= np.where(normals[:, 2] < 0.0, -1.0, 1.0)[:, None]
+    light = np.array([-0.4, 0.6, 0.7])
+    return least + (1.0 - least) * np.clip(normals @ (light / np.linalg.norm(light)), 0.0, 1.0)

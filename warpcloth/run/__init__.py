@@ -1,0 +1,1 @@
+"""Runs of scenes: simulation, equilibrium, the watch over energy, and scene files."""

@@ -1,0 +1,184 @@
+"""Rest shapes: where the energy of a scene and of its weight is least, without inertia."""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from ..base.checks import choice, number, whole
+from ..base.turns import in_turn
+from ..core.status import Residual, Result, Status, digits, sentence
+from ..numerics.minimise import Minimiser
+from ..solvers.solver import refuse_hard
+
+SETTLED = (Result.CONVERGED, Result.ROUNDED)
+RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
+# Part of the size of the cloth; a descent that rounding ended after less than this has nowhere left to go.
+NEAR = 1e-5
+
+
+class Equilibrium(NamedTuple):
+    """A rest shape.
+
+    Attributes:
+        points: (n, 3) [m].
+        status: How it ended, see :class:`warpcloth.core.status.Result`, with the residual: the sum Σ‖fᵢ‖ of the unbalanced
+            forces of all free vertices, divided by the whole load Σmᵢ‖g‖ (without gravity, by its value at the start).
+        iterations: Newton iterations in all, each round of proximal steps counting as one more.
+        lowest_eigenvalue: Lowest eigenvalue of the Hessian of the energy over the free vertices [N/m]; NaN if the descent did
+            not end in balance.
+        stable: Whether the descent ended in balance and no eigenvalue is negative by more than rounding and the tolerance
+            explain. Then no small move lowers the energy to second order. Moves that cost nothing, such as those of a body
+            that nothing holds, have the eigenvalue 0 and count as stable.
+    """
+
+    points: np.ndarray
+    status: Status
+    iterations: int
+    lowest_eigenvalue: float = np.nan
+    stable: bool = False
+
+
+@in_turn
+def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cpu", dtype="float64", linear="factorised"):
+    """Finds the shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins in their final positions.
+
+    Pins with keyframes end at the last keyframe; all others stay where they start.
+
+    Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
+    the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
+    is taken with inertia, s/2‖x − x_now‖²_M, and s is lowered from there: a proximal point method, which goes downhill all
+    the way. Cloth that nothing holds has no rest shape and is reported as not converged. Where the Hessian has a negative
+    eigenvalue in the end, the shape is in balance without being a minimum: it is nudged and settles again.
+
+    Args:
+        scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
+        tolerance: Of the residual, see :class:`Equilibrium`, and of the unbalanced acceleration of each vertex over gravity's
+            (without any, over the largest at the start). Where rounding leaves more at a vertex, the descent ends when nothing
+            is left to gain, and the residual decides; with half the weight or more unbalanced it does not pass for a rest
+            shape. Without gravity there is no load to hide.
+        load_steps: Number of steps in which gravity grows and pins move along their keyframes. Pins that turn far need several.
+        iterations: The most Newton iterations in all.
+        device: A Warp device.
+        dtype: ``"float32"`` or ``"float64"``.
+        linear: ``"factorised"``, which stiff and slender cloth needs, or ``"cg"``.
+
+    Returns:
+        :class:`Equilibrium`.
+
+    Raises:
+        ValueError: If an argument breaks a rule, or a stiffness is infinite.
+    """
+    number("tolerance", tolerance, above=0.0)
+    whole("load_steps", load_steps, 1)
+    whole("iterations", iterations, 1)
+    choice("linear", linear, ("factorised", "cg"))
+    model = scene.build(device=device, dtype=dtype)
+    refuse_hard(model, "equilibrium", "give a finite stiffness")
+    base = wp.clone(model.positions)
+    minimiser = Minimiser(model, base, "adaptive", linear, s=0.0)
+    descent = _Descent(minimiser, base, tolerance, iterations)
+    for part in range(1, load_steps + 1):
+        _move_pins(scene.pins, base, part / load_steps)
+        result = descent.run(part / load_steps, _frequency_scale(model))
+    # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
+    if result in SETTLED and minimiser.curves_down(tolerance):
+        base.assign(base.numpy() + _nudge(model))
+        result = descent.run(1.0, _frequency_scale(model))
+        if result in SETTLED and minimiser.curves_down(tolerance):
+            result = Result.SADDLE
+    residual, began = descent.residual, result.value
+    if result is Result.ROUNDED and residual <= tolerance:
+        result = Result.CONVERGED
+    # A sheet that has not moved leaves its whole weight, up to an ulp. Without gravity a start at rest leaves its own rounding.
+    elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity[0] > 0.0:
+        result, began = Result.STALLED, f"rounding hides the rest shape in {dtype}"
+    lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
+    use = None if result in SETTLED else "not a rest shape"
+    if result is Result.SADDLE:
+        use = f"not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
+    unit = RESIDUAL.unit if minimiser.gravity[0] > 0.0 else RESIDUAL.weightless
+    message = sentence(result, dtype, residual, RESIDUAL.measure, unit, tolerance, use=use)
+    if result is Result.STALLED:
+        message = message.replace(result.value, began)
+    status = Status(result, residual=residual, message=message, measure=RESIDUAL.measure, unit=unit)
+    return Equilibrium(np.array(base.numpy()), status, descent.used, lowest, result in SETTLED)
+
+
+class _Descent:
+    """Minimises from where the cloth is and moves it there, again and again, with so many iterations in all."""
+
+    def __init__(self, minimiser, base, tolerance, iterations):
+        self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
+        self.used, self.moved = 0, 0.0
+        self.scale = None  # from the first descent: without gravity a later one would be scaled by its own rounding
+        model = minimiser.model
+        self.load = float(minimiser.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64))
+        self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
+
+    def run(self, load, s):
+        """Settles without inertia, with proximal steps in between where that does not go on; the last result."""
+        while True:
+            result = self._settle(0.0, load, self.iterations)
+            least, found = (np.inf, np.inf), (self.moved, self.unbalanced)
+            # A long d rounds much; from here it is short, unless a move costs nothing and rounding makes one.
+            while result is Result.ROUNDED and self.moved > NEAR and self.used < self.iterations and _halved(found, least):
+                least = tuple(map(min, found, least))
+                result = self._settle(0.0, load, self.iterations)
+                found = self.moved, self.unbalanced
+            if result in SETTLED or result is Result.DIVERGED or self.used >= self.iterations:
+                return result
+            for _ in range(8):
+                self._settle(s, load, 20)
+            s /= 16.0
+            self.used += 1  # so that a round which finds no direction at all ends too
+
+    @property
+    def residual(self):
+        """The fraction of the load that is unbalanced after the last descent."""
+        return self.unbalanced / self.load
+
+    def _settle(self, s, load, most):
+        self.minimiser.set_objective(s, load)
+        if self.load == 0.0:
+            self.minimiser.start()
+            self.load = float(self.minimiser.unbalanced()[0]) or 1.0
+        (result,) = self.minimiser.minimise(self.tolerance, min(most, max(self.iterations - self.used, 0)), self.scale)
+        self.scale = self.minimiser.scale
+        self.unbalanced = float(self.minimiser.unbalanced()[0])
+        self.used += self.minimiser.iterations
+        correction = self.minimiser.correction.numpy()
+        self.moved = np.abs(correction).max(initial=0.0) / self.size
+        self.base.assign(self.base.numpy() + correction)
+        return result
+
+
+def _halved(found, least):
+    """Whether some number is at most half of the least that it was."""
+    return any(one <= 0.5 * before for one, before in zip(found, least, strict=True))
+
+
+def _move_pins(pins, base, part):
+    """Moves pins with keyframes, in place, to their positions after the fraction ``part`` of the keyframes."""
+    if pins.keyframes is None:
+        return
+    at = part * (len(pins.keyframes) - 1)
+    before = min(int(at), len(pins.keyframes) - 1)
+    one, two = pins.keyframes[before], pins.keyframes[min(before + 1, len(pins.keyframes) - 1)]
+    points = base.numpy()
+    points[pins.vertices] = one + (at - before) * (two - one)
+    base.assign(points)
+
+
+def _nudge(model):
+    """A move of the free vertices by about 1e-4 of the size of the cloth, the same at every call (n, 3) [m]."""
+    size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
+    noise = np.random.default_rng(0).normal(size=(model.count, 3))
+    return 1e-4 * size * noise * (model.inverse_mass.numpy() > 0.0)[:, None]
+
+
+def _frequency_scale(model):
+    """100 g over the size of the cloth [1/s²], 10 times the frequency at which it would swing by its end, squared; or 1."""
+    size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
+    gravity = float(np.linalg.norm(model.gravity.numpy()))
+    return 100.0 * gravity / size if gravity > 0.0 else 1.0

@@ -1,0 +1,148 @@
+"""The frames of a run on the host, in the order of the scene, computed ahead of who watches and writes them."""
+
+import itertools
+import time
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from ..base.turns import in_turn
+from ..core.capture import on_host
+from ..kernels.copy import take_vertices
+
+
+class Frame(NamedTuple):
+    """A frame, and what its stepper said of it.
+
+    Attributes:
+        points: (B·n, 3) [m], in the order of the scene; as the velocities an array of its own.
+        velocities: (B·n, 3) [m/s].
+        results: The worst :class:`warpcloth.core.status.Result` of each copy until then, a list of B.
+        residual: The largest residual of each copy until then, (B,).
+        seconds: What computing it took; on CUDA as its clock says.
+    """
+
+    points: np.ndarray
+    velocities: np.ndarray
+    results: list
+    residual: np.ndarray
+    seconds: float
+
+
+def frames_of(stepper, count, ahead):
+    """The next frames of a stepper, as a generator that must be closed: it waits for what is still being computed.
+
+    While one is in use a thread computes those after it. The first is computed alone, for it may record graphs, beside which
+    the device takes nothing else.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`; closed early it has gone on further than the last frame taken.
+        count: How many.
+        ahead: The most that are computed beyond the one in use; 0 computes each when it is asked for, without a thread.
+    """
+    copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
+
+    def compute():
+        copy = next(copies)
+        copy.frame()
+        return copy, list(stepper.results), np.array(stepper.residual)
+
+    def taken(copy, results, residual):
+        points, velocities, seconds = copy.take()
+        return Frame(points, velocities, results, residual, seconds)
+
+    first = taken(*compute())
+    if ahead == 0:
+        yield first
+        for _ in range(count - 1):
+            yield taken(*compute())
+        return
+    with ThreadPoolExecutor(1, thread_name_prefix="frames") as pool:
+        try:
+            pending = deque(pool.submit(compute) for _ in range(min(ahead, count - 1)))
+            yield first
+            for left in range(count - 1, 0, -1):
+                found = taken(*pending.popleft().result())
+                if left > ahead:
+                    pending.append(pool.submit(compute))  # in the buffers that are free now
+                yield found
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+@in_turn
+def state_of(stepper):
+    """Points and velocities as they are now, (B·n, 3) each, in the order of the scene, as arrays of their own."""
+    model = stepper.model
+    on_host(model.device, "reading a frame")
+    return tuple(np.array(model.in_scene_order(array.numpy())) for array in stepper.state)  # on the CPU numpy() is a view
+
+
+@in_turn
+def _copies(stepper, number):
+    """What takes so many frames from a stepper."""
+    model = stepper.model
+    if not model.device.is_cuda:
+        return [_HostCopy(stepper) for _ in range(number)]
+    on_host(model.device, "reading a frame")
+    shape = (number, len(stepper.state), model.count)
+    found = wp.empty(shape, dtype=model.vec3, device=model.device)
+    host = wp.empty(shape, dtype=model.vec3, device="cpu", pinned=True)
+    places = None if model.places is None else wp.array(model.places, dtype=wp.int32, device=model.device)
+    stream = wp.Stream(model.device)
+    return [_DeviceCopy(stepper, stream, places, found[k], host[k]) for k in range(number)]
+
+
+class _HostCopy:
+    """A frame that is computed on the host."""
+
+    def __init__(self, stepper):
+        self.stepper = stepper
+
+    @in_turn
+    def frame(self):
+        began = time.perf_counter()
+        self.stepper.frame()
+        self._state = state_of(self.stepper)
+        self._seconds = time.perf_counter() - began
+
+    def take(self):
+        return *self._state, self._seconds
+
+
+class _DeviceCopy:
+    """A frame on its way from the device: x and v put in the order of the scene, and copied from there by a second stream.
+
+    So the next frame begins while this one is copied, and who takes it waits for its event alone.
+    """
+
+    def __init__(self, stepper, stream, places, found, host):
+        self.stepper, self._stream, self._places, self._found, self._host = stepper, stream, places, found, host
+        self._began, self._ended = (wp.Event(stream.device, enable_timing=True) for _ in range(2))
+        self._copied = wp.Event(stream.device)
+        if places is not None:
+            self._take = stepper.model.kernel(take_vertices, stepper.model.dtype)
+
+    @in_turn
+    def frame(self):
+        model, stream = self.stepper.model, self.stepper.model.device.stream
+        stream.record_event(self._began)
+        self.stepper.frame()
+        for k, array in enumerate(self.stepper.state):
+            found = self._found[k]
+            if self._places is None:
+                wp.copy(found, array)
+            else:
+                model.launch(self._take, model.count, [array, self._places], [found])
+        stream.record_event(self._ended)
+        self._stream.wait_event(self._ended)
+        wp.copy(self._host, self._found, stream=self._stream)
+        self._stream.record_event(self._copied)
+
+    def take(self):
+        wp.synchronize_event(self._copied)
+        seconds = 1e-3 * wp.get_event_elapsed_time(self._began, self._ended, synchronize=False)
+        return *(np.array(each) for each in self._host.numpy()), seconds

@@ -1,0 +1,1 @@
+"""The records that a scene is made of."""

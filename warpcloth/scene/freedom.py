@@ -1,0 +1,136 @@
+"""Counts the degrees of freedom that hard and stiff edges leave a cloth, by the rank of the Jacobian of their lengths.
+
+E edges between n vertices remove at most E of 3n degrees of freedom (Maxwell 1864, *On the calculation of the equilibrium and
+stiffness of frames*). All edges of a triangulated disc are independent. However fine it is, it keeps 3 degrees of freedom plus
+one for each boundary edge, 6 of them rigid motion. A closed surface is rigid (Gluck 1975, *Almost all simply connected closed
+surfaces are rigid*), and so is a grid with both diagonals in each cell. The count holds in general position. A flat or evenly
+curved cloth may have more freedom: a regular net bends in any one direction, and loses that freedom as it leaves this shape.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..terms.terms import CorotatedMembrane, DihedralBending, NeoHookeanMembrane, QuadraticBending, Spring, StVKMembrane
+
+# Most free vertices for which the rank is computed, in a few seconds; time and memory grow faster than their number.
+MOST = 20_000
+# Radius, in edges, of the fold whose cost decides whether an edge is stiff.
+FOLD = 4.0
+# Squares of singular values below this are 0, for rows of unit length. Nets of up to MOST vertices have nonzero ones of 1e-9
+# and more, and zeros that round to some 1e-13.
+_ZERO = 1e-11
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """Degrees of freedom that edges of fixed length leave, in general position.
+
+    Attributes:
+        edges: Number of edges that hold their length. Each pair of vertices counts once, pairs of pinned vertices do not count.
+        hard: Whether some of them are hard.
+        coordinates: Number of coordinates of the vertices that are not pinned.
+        rank: Rank of the Jacobian of the lengths with respect to these coordinates.
+        left: Degrees of freedom that are left, ``coordinates`` − ``rank``.
+        rigid: Degrees of freedom of the pieces of cloth, each as one rigid body that hangs on its pins.
+        counted: Whether ``rank`` is only an upper bound from the number of edges, because the mesh is too large to compute it.
+    """
+
+    edges: int
+    hard: bool
+    coordinates: int
+    rank: int
+    left: int
+    rigid: int
+    counted: bool
+
+    @property
+    def locked(self):
+        """Whether only rigid motion is left, so the cloth cannot bend; with ``counted``, whether that is possible."""
+        return self.edges > 0 and self.left <= self.rigid
+
+
+def freedom(scene):
+    """Counts the degrees of freedom that the hard and stiff edges of a scene leave.
+
+    Springs hold their pairs, and membranes the edges of their triangles, if they are hard or stiff. A net that bends round a
+    fold of radius r = 4h strains by (h/r)²/24. An edge is stiff if that costs more than bending and weight,
+    K/2·((h/r)²/24)² > D/2r² + ρgL. K is 2k/√3 for springs and Et for membranes, D is the sum over all bending terms, and L the
+    diagonal of the bounding box. Limits, which act only when they are reached, and rigid clusters are left out.
+
+    Args:
+        scene: The :class:`warpcloth.Scene`.
+
+    Returns:
+        :class:`Freedom`.
+    """
+    mesh = scene.mesh
+    pairs, hard = _held(scene)
+    free = np.ones(len(mesh.points), dtype=bool)
+    free[scene.pins.vertices] = False
+    coordinates, rigid = 3 * int(free.sum()), _rigid(mesh, pairs, free)
+    pairs = pairs[free[pairs].any(axis=1)]
+    counted = int(free.sum()) > MOST
+    rank = min(len(pairs), max(coordinates - rigid, 0)) if counted else rank_of(pairs, free)
+    return Freedom(len(pairs), hard, coordinates, rank, coordinates - rank, rigid, counted)
+
+
+def rank_of(pairs, free):
+    """Rank of the Jacobian of the lengths of pairs (E, 2) with respect to the vertices that are free (n,), in general position.
+
+    The rank is the number of nonzero eigenvalues of JᵀJ at random positions. The signs of the pivots of JᵀJ − ε, with a small
+    ε, count them (Sylvester's law of inertia).
+    """
+    from scipy.sparse import csr_array, identity
+    from scipy.sparse.linalg import splu
+
+    columns = np.flatnonzero(np.repeat(free, 3))
+    if not (len(pairs) and len(columns)):
+        return 0
+    points = np.random.default_rng(0).normal(size=(len(free), 3))
+    along = points[pairs[:, 1]] - points[pairs[:, 0]]
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    values, places = np.stack([-along, along], axis=1), 3 * pairs[:, :, None] + np.arange(3)
+    shape = len(pairs), 3 * len(free)
+    J = csr_array((values.ravel(), places.ravel(), 6 * np.arange(len(pairs) + 1)), shape=shape)[:, columns]
+    shifted = (J.T @ J - _ZERO * identity(len(columns))).tocsc()
+    options = {"SymmetricMode": True, "Equil": False}
+    factors = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return int((factors.U.diagonal() > 0.0).sum())
+
+
+def _held(scene):
+    """Finds the pairs of vertices whose distance is held (E, 2), each once, and whether some of them are hard."""
+    mesh, found, hard = scene.mesh, [np.empty((0, 2), dtype=np.int64)], False
+    area, size = mesh.triangle_areas.sum(), np.linalg.norm(np.ptp(mesh.points, axis=0))
+    bending = [term.stiffness for term in scene.terms if isinstance(term, (QuadraticBending, DihedralBending))]
+    D = sum(float(np.max(stiffness)) for stiffness in bending)
+    # A mesh of edges alone does not strain in a fold.
+    weight = scene.vertex_masses.sum() / area * np.linalg.norm(scene.gravity) * size if area else np.inf
+    for term in scene.terms:
+        triangles = isinstance(term, (CorotatedMembrane, StVKMembrane, NeoHookeanMembrane))
+        if not (triangles or isinstance(term, Spring)):
+            continue
+        elements = term.elements(mesh, scene.positions)
+        stiffness = np.broadcast_to(elements.stiffness, len(elements.stencil))
+        pairs = elements.stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2) if triangles else elements.stencil
+        K = np.repeat(stiffness, 3) if triangles else 2.0 / np.sqrt(3.0) * stiffness
+        radius = FOLD * np.linalg.norm(mesh.points[pairs[:, 1]] - mesh.points[pairs[:, 0]], axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):  # springs between vertices in one position
+            stiff = 0.5 * K * (FOLD**-2 / 24.0) ** 2 > 0.5 * D / radius**2 + weight
+        found.append(np.sort(pairs[stiff | np.isinf(K)], axis=1))
+        hard |= bool(np.isinf(stiffness).any())
+    return np.unique(np.concatenate(found), axis=0), hard
+
+
+def _rigid(mesh, pairs, free):
+    """Counts the degrees of freedom of the pieces of cloth, each a rigid body that can move about its pinned vertices."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(free)
+    joined = np.concatenate([mesh.edges, pairs])
+    _, piece = connected_components(coo_array((np.ones(len(joined)), tuple(joined.T)), shape=(n, n)), directed=False)
+    sizes, pinned = np.bincount(piece), np.bincount(piece, weights=~free).astype(int)
+    unpinned = np.array([0, 3, 5, 6])[np.minimum(sizes, 3)]
+    return int(np.maximum(unpinned - np.array([0, 3, 5, 6])[np.minimum(pinned, 3)], 0).sum())

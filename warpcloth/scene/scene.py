@@ -1,0 +1,202 @@
+"""What is declared: a scene is data, and holds no solver. Any solver that supports its terms runs it unchanged."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+
+from ..base.checks import array, number, refuse, shown
+from ..mesh.mesh import Mesh
+from ..mesh.selection import distinct_vertices
+from ..model.model import Model
+from ..terms.terms import Declared
+
+EARTH = 9.81  # [m/s²]
+DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
+_MOST_FRAMES = 2**31 - 1  # what counts them on the device is int32
+
+
+@dataclass(frozen=True, eq=False)
+class Pins:
+    """Vertices that do not obey forces.
+
+    Attributes:
+        vertices: Indices (p,), or a selection of the mesh such as ``"x<0.01"``.
+        keyframes: Places (F, p, 3) [m] at the scene's frames 0 … F−1, linear between them, at rest after the last; in the
+            order of ``vertices``. Without them the pins stay where they start.
+    """
+
+    vertices: str | Sequence[int] | np.ndarray
+    keyframes: np.ndarray | None = None
+
+    def refuse_far(self, positions, copy=""):
+        """Refuses pins whose first keyframe is not where their vertices start, at ``positions`` (n, 3) [m].
+
+        Raises:
+            ValueError: Saying how far apart they are.
+        """
+        if self.keyframes is None:
+            return
+        gap = np.abs(self.keyframes[0] - positions[self.vertices]).max(initial=0.0)
+        # Either may have been float32 once, whose rounding grows with the distance from the origin.
+        near = 1e-6 * np.ptp(positions, axis=0).max() + 2.0 * np.finfo(np.float32).eps * np.abs(positions).max()
+        if gap > near:
+            raise ValueError(f"pins.keyframes[0] is {gap:.3g} m from where the pinned vertices start{copy}; it must be there")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A cloth, what acts on it, and for how long. SI units. ``dataclasses.replace`` changes fields of one.
+
+    Attributes:
+        mesh: The :class:`Mesh`; its points are the rest shape.
+        density: Mass per area [kg/m²], lumped: a third of each adjacent triangle; of a mesh of edges alone per length
+            [kg/m], half of each adjacent edge.
+        masses: Mass of each vertex, (n,) [kg], in place of ``density``; of a scene with a density it is None, and
+            :attr:`vertex_masses` has those of both.
+        positions: Where the vertices start, (n, 3) [m]; the rest shape if not given.
+        velocities: How they start, (n, 3) [m/s]; at rest if not given. What they say of pinned vertices does not matter.
+        terms: The energies, see :mod:`warpcloth.terms.terms`.
+        pins: :class:`Pins`, or vertices or a selection of fixed ones.
+        gravity: Acceleration (3,) [m/s²]; by default 9.81 down the up axis of the mesh, or down y if it has none.
+        duration: [s], a whole number of frames.
+        fps: Frames per second.
+        name: For reports and files.
+        stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; an animation is then written as a
+            layer over that stage.
+
+    Raises:
+        ValueError: If a value breaks a rule; the sentence names it.
+    """
+
+    mesh: Mesh
+    density: float | None = None
+    masses: np.ndarray | None = None
+    positions: np.ndarray | None = None
+    velocities: np.ndarray | None = None
+    terms: Sequence = ()
+    pins: Pins | str | Sequence[int] | np.ndarray | None = None
+    gravity: Sequence[float] | None = None
+    duration: float = 1.0
+    fps: float = 60.0
+    name: str = "scene"
+    stage: object | None = None
+
+    def __post_init__(self):
+        if not isinstance(self.mesh, Mesh):
+            raise ValueError(f"mesh is {shown(self.mesh)}; it must be a Mesh, such as Mesh.grid(32, 32)")
+        n = len(self.mesh.points)
+
+        def keep(field, value):
+            object.__setattr__(self, field, value)
+
+        number("fps", self.fps, above=0.0)
+        number("duration", self.duration, above=0.0)
+        frames = float(self.duration) * float(self.fps)
+        if not (0.5 < frames < _MOST_FRAMES and abs(frames - round(frames)) < 1e-6 * frames):
+            raise ValueError(
+                f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames from 1 to {_MOST_FRAMES}"
+            )
+        keep("terms", self._checked_terms())
+        gravity = EARTH * np.array(DOWN[self.mesh.up_axis or "Y"]) if self.gravity is None else self.gravity
+        keep("gravity", array("gravity", gravity, (3,)))
+        keep("positions", self.mesh.points if self.positions is None else array("positions", self.positions, (n, 3)))
+        keep("velocities", np.zeros((n, 3)) if self.velocities is None else array("velocities", self.velocities, (n, 3)))
+        keep("pins", checked_pins(self.pins, self.mesh))
+        self.pins.refuse_far(self.positions)
+        if (self.density is None) == (self.masses is None):
+            raise ValueError("exactly one of density and masses must be given")
+        if self.masses is None:
+            number("density", self.density, above=0.0)
+        else:
+            keep("masses", array("masses", self.masses, (n,)))
+        self._check_masses()
+
+    def _checked_terms(self):
+        rule = "it must be a list of energies, such as [Spring(stiffness=1e3)]"
+        if isinstance(self.terms, Declared):
+            raise ValueError(f"terms is one {type(self.terms).__name__} on its own; {rule}")
+        if not isinstance(self.terms, Iterable):
+            raise ValueError(f"terms is {shown(self.terms)}; {rule}")
+        terms = tuple(self.terms)
+        for i, term in enumerate(terms):
+            if not isinstance(term, Declared):
+                given = f"the class {term.__name__}" if isinstance(term, type) else shown(term)
+                raise ValueError(f"terms[{i}] is {given}; it must be an energy, such as Spring(stiffness=1e3)")
+        return terms
+
+    def _check_masses(self):
+        masses = self.vertex_masses
+        free = np.ones(len(masses), dtype=bool)
+        free[self.pins.vertices] = False
+        bad = np.flatnonzero(free & ~((masses > 0.0) & np.isfinite(masses)))
+        if len(bad):
+            raise ValueError(
+                f"vertex {bad[0]} has mass {masses[bad[0]]} kg; a vertex that is not pinned must have a finite one above 0"
+            )
+        refuse("masses", masses, ~((masses >= 0.0) & np.isfinite(masses)), "must be 0 or more, pinned or not")
+
+    @cached_property
+    def vertex_masses(self):
+        """Mass of each vertex, given or lumped from the density, (n,) [kg]."""
+        if self.masses is not None:
+            return self.masses
+        with np.errstate(over="ignore"):
+            masses = self.density * (self.mesh.vertex_areas if len(self.mesh.triangles) else self.mesh.vertex_lengths)
+        masses.setflags(write=False)
+        return masses
+
+    @property
+    def frames(self):
+        """Number of frames after the first."""
+        return round(self.duration * self.fps)
+
+    @property
+    def up_axis(self):
+        """The axis along which gravity acts, "Y" or "Z"; without gravity the up axis of the mesh."""
+        if not self.gravity[1:].any():
+            return self.mesh.up_axis or "Y"
+        return "Z" if abs(self.gravity[2]) > abs(self.gravity[1]) else "Y"
+
+    def build(self, device="cpu", dtype="float32", copies=1, vary=None, order=None, threads=1):
+        """The scene on a device, see :class:`warpcloth.model.model.Model`."""
+        return Model(self, device=device, dtype=dtype, copies=copies, vary=vary, order=order, threads=threads)
+
+    def __str__(self):
+        mesh, pins = self.mesh, self.pins
+        lines = [
+            f"{self.name}: {len(mesh.points)} vertices, {len(mesh.triangles)} triangles, {len(mesh.edges)} edges",
+            f"  mass {self.vertex_masses.sum():.4g} kg, gravity {self.gravity.tolist()} m/s²",
+            f"  {self.duration:g} s in {self.frames} frames of 1/{self.fps:g} s",
+            f"  pins: {len(pins.vertices)}" + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
+        ]
+        return "\n".join(lines + [f"  {_described(term)}" for term in self.terms])
+
+
+def checked_pins(pins, mesh):
+    """`Pins` whose vertices are indices of a mesh, int32, from all that a scene takes as pins.
+
+    Raises:
+        ValueError: A vertex that the mesh has not, or twice; keyframes of a wrong shape or not finite.
+    """
+    pins = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins)
+    vertices = distinct_vertices("pins.vertices", pins.vertices, mesh)
+    keyframes = pins.keyframes
+    if keyframes is not None:
+        if np.ndim(keyframes) == 3 and not len(keyframes):
+            raise ValueError("pins.keyframes has no frame; it must have one or more, (F, p, 3)")
+        count = len(keyframes) if np.ndim(keyframes) == 3 else 1
+        keyframes = array("pins.keyframes", keyframes, (count, len(vertices), 3))
+    return Pins(vertices, keyframes)
+
+
+def _described(term):
+    """A term in one line: Spring(pairs='structural', stiffness=1000.0)."""
+    parts = []
+    for field in fields(term):
+        value = getattr(term, field.name)
+        if value is not None:
+            shown = f"array{np.shape(value)}" if np.ndim(value) and np.size(value) > 4 else repr(value)
+            parts.append(f"{field.name}={shown}")
+    return f"{type(term).__name__}({', '.join(parts)})"
