@@ -99,7 +99,7 @@ def test_a_constant_velocity_gradient(name, neighbourhood, dtype, device):
 
 
 def turned_rate(method, axis, angle, before, normal):
-    """Computes DΔt, in the tangent plane, of a small strain (3, 3) given before the turn, as docs/measures.md says."""
+    """Computes DΔt, in the tangent plane, of a small strain (3, 3) given before the turn, as docs/measuring.md says."""
     half, k = turn(axis, angle / 2.0), np.outer(axis, axis)
     E, across, n = half @ before @ half.T, np.eye(3) - k, half @ normal
     G = k + across / np.cos(angle / 2.0)
@@ -140,13 +140,13 @@ def test_what_a_turn_does_to_the_rate_of_strain(axis, degrees, neighbourhood, de
             bounded(found["stretch_rate"][1], stretches, size**2 + 1e-12)
 
 
-TURNS = ("N", "N", "e₁", "e₁", "45°")  # axes of the columns of the table in docs/measures.md
+TURNS = ("N", "N", "e₁", "e₁", "45°")  # axes of the columns of the table in docs/measuring.md
 
 
 @pytest.mark.parametrize("degrees", [10, 30, 90, 150])
 def test_what_a_turn_does_to_a_dilation(degrees, device):
     """Checks the table, and for a turn about the normal the closed form for any dilation."""
-    text = (Path(__file__).parents[1] / "docs" / "measures.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[1] / "docs" / "measuring.md").read_text(encoding="utf-8")
     (row,) = (line.split("|")[2:-1] for line in text.splitlines() if line.startswith(f"| {degrees}° |"))
     mesh, angle, e = flat(), np.radians(degrees), 0.2
     largest = []

@@ -115,8 +115,8 @@ STUDY = run_path(str(ROOT / "benchmarks" / "neighbourhoods.py"))
 
 
 def test_the_study_of_neighbourhoods():
-    """Checks the table of docs/measures.md to half of its last digit, plus what other rounding may add."""
-    text = (ROOT / "docs" / "measures.md").read_text(encoding="utf-8")
+    """Checks the table of docs/measuring.md to half of its last digit, plus what other rounding may add."""
+    text = (ROOT / "docs" / "measuring.md").read_text(encoding="utf-8")
     rows = {line.split("|")[1].strip(" `"): line.split("|")[2:-1] for line in text.splitlines() if line.startswith("| `")}
     for kind, *numbers in STUDY["table"]():
         assert [float(cell) for cell in rows[kind]] == pytest.approx(numbers, rel=0.055), kind

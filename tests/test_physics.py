@@ -24,7 +24,7 @@ from warpcloth.lab.strips import PATTERNS, inner_shares, plate, rolled, strip
 
 ANGLES = (0.0, 13.0, 30.0, 45.0, -15.0, -45.0)
 BENDING = ("dihedral", "quadratic")
-METHODS = (Path(__file__).parents[1] / "docs" / "methods.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[1] / "docs" / "solvers.md").read_text(encoding="utf-8")
 POISSON = -1.0 / 3.0  # of the equilateral net
 
 
@@ -111,7 +111,7 @@ def test_an_irregular_net_that_is_rolled_is_too_stiff(bending, device):
     assert min(found) > 1.2 and max(found) < 1.4, found
 
 
-# Curvatures (κ_xx, κ_zz, κ_xz) by the first word of their rows in docs/methods.md, but for their size.
+# Curvatures (κ_xx, κ_zz, κ_xz) by the first word of their rows in docs/solvers.md, but for their size.
 CURVED = {
     "cylinder along a row": (1.0, 0.0, 0.0),
     "cylinder at 45°": (0.5, 0.5, 0.5),
@@ -152,7 +152,7 @@ def test_a_curved_net_costs_what_its_hinges_measure(shape, bending, device):
     turned = [curved_cost(strip("equilateral", np.radians(a), 0.1).mesh, curvature, bending, device) for a in ANGLES]
     assert turned == pytest.approx(len(ANGLES) * [isotropic(curvature, POISSON)], rel=1e-5)
     cost["jittered"] = [curved_cost(strip("jittered", 0.0, 1.0 / 32).mesh, curvature, bending, device)]
-    (row,) = (line.split("|")[2:-1] for line in METHODS.splitlines() if line.startswith(f"| {shape}"))
+    (row,) = (line.split("|")[2:-1] for line in PAGE.splitlines() if line.startswith(f"| {shape}"))
     plates = [isotropic(curvature, ratio) for ratio in (-POISSON, POISSON)]
     assert [float(cell) for cell in row] == pytest.approx([*plates, *(found[-1] for found in cost.values())], abs=0.006)
 

@@ -80,7 +80,7 @@ def test_the_copies(capsys):
 
 
 def test_every_measure_is_in_the_docs():
-    text = (ROOT / "docs" / "measures.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "measuring.md").read_text(encoding="utf-8")
     for on, part in zip(MEASURES.values(), re.split(r"^## Of vertices", text, flags=re.MULTILINE), strict=True):
         rates = text[text.index("## Rates") :]
         for measure in on.values():
@@ -188,7 +188,7 @@ def test_tables_are_whole(head, names):
 
 
 def test_the_table_of_residuals_is_that_of_the_solvers():
-    methods = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
+    methods = (ROOT / "docs" / "solvers.md").read_text(encoding="utf-8")
     rows = re.findall(
         r"^\| `(\w+)` \| (.+) \| (.+) \| (.+) \| (.+) \|$", methods.split("## The residual of a run")[1], re.MULTILINE
     )
