@@ -66,7 +66,10 @@ class Term:
         reach: NumPy function (points (n, 3) [m], stencil (E, K), rest (E, P)) → (pairs (E·m, 2), lengths (E·m,) [m], factors
             (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it does
             not), and how stiff a spring between them would be, kₑ = 1; or None.
+        cells: Whether elements of K = 1 are the vertices of cells of any size, see :class:`warpcloth.model.model.Cells`.
         project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or None.
+        prox: (v, rest, compliance) → argmin u(y) + ‖y − v‖²/(2·compliance) (M, 3), compliance 0 or more, in closed form, the
+            local step where u is not ½‖y − p(y)‖²; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices.
         quadratic: Whether p is 0 and the weights of an element add up to 0: U is then quadratic in the differences of vertices.
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next four.
@@ -89,7 +92,9 @@ class Term:
     hessian: Any
     slack: bool = False
     reach: Callable | None = None
+    cells: bool = False
     project: Any = None
+    prox: Any = None
     linear: bool = False
     quadratic: bool = False
     constraint: Any = None
@@ -98,3 +103,8 @@ class Term:
     stiffening: Any = None
     stiffening_rows: int = 0
     dissipation: Dissipation | None = None
+
+    @property
+    def moves(self):
+        """Whether it has a local step: a projection, a scalar constraint or a prox."""
+        return any(function is not None for function in (self.project, self.constraint, self.prox))

@@ -4,6 +4,7 @@ Elements are tested by themselves, as stencils that share no vertex, through the
 """
 
 from functools import cache
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from warpcloth.kernels.elements import chain_of
 from warpcloth.kernels.fast import gather
 from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.model.model import DTYPES
+from warpcloth.terms import needs
 
 RAW, CLAMP, ABSOLUTE = HessianPolicy
 # Elements by themselves; cells are in test_clusters.py.
@@ -1348,3 +1350,52 @@ def test_a_cylinder_costs_its_curvature(name, pattern, degrees, least, most, dev
     # Angles and chords of a circle differ from arcs by (κ h)²/24 in relation, h up to √3 edges, and enter squared.
     tolerance = 3.0 * 2.0 * BEND**2 / 24.0
     assert least * (1.0 - tolerance) <= ratio <= most * (1.0 + tolerance)
+
+
+# --- what a solver needs
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "wanted", "sentence"),
+    [
+        ("Spring", {"hard": True}, [needs.FINITE], "Spring with infinite stiffness; B can, or give a finite stiffness"),
+        ("RigidCluster", {}, [needs.ELEMENTS], "RigidCluster, whose bodies are no elements by themselves; B or C can"),
+        (
+            "DihedralBending",
+            {},
+            [needs.PROJECTION],
+            "DihedralBending, whose energy is no squared distance to a set; B or C can",
+        ),
+        (
+            "StVKMembrane",
+            {},
+            [needs.FINITE, needs.LOCAL_STEP],
+            "StVKMembrane, whose energy is no distance to a constraint; no solver can",
+        ),
+        ("StVKMembrane", {}, [needs.ROWS], "StVKMembrane, whose energy is no square of a constraint; no solver can"),
+        (
+            "CorotatedMembrane",
+            {"damping": 1.0},
+            [needs.MERGED_DAMPING],
+            "the damping of CorotatedMembrane, which no projection has in it; B or C can, or leave the damping out",
+        ),
+        (
+            "StrainLimit",
+            {"hard": True},
+            [needs.STEADY_ROWS],
+            "StrainLimit with infinite stiffness, as it has no scalar constraint; B can, or give a finite stiffness",
+        ),
+        ("QuadraticBending", {"damping": 1.0, "hard": True}, [needs.MERGED_DAMPING, needs.STEADY_ROWS, needs.ROWS], None),
+        ("DihedralBending", {"damping": 1.0}, [needs.MERGED_DAMPING, needs.LOCAL_STEP, needs.ROWS], None),
+    ],
+)
+def test_a_solver_refuses_a_term_that_lacks_what_it_needs(name, changes, wanted, sentence):
+    term = next(term for term in energies.CATALOGUE if term.name == name)
+    elements = SimpleNamespace(**{"term": term, "label": name, "hard": False, "damping": None} | changes)
+    others = {"A": wanted, "B": [needs.LOCAL_STEP], "C": [needs.LOCAL_STEP, needs.FINITE]}
+    if sentence is None:
+        needs.refuse_unmet([elements], "A", wanted, others)
+        return
+    with pytest.raises(ValueError) as refusal:
+        needs.refuse_unmet([elements], "A", wanted, others)
+    assert str(refusal.value) == f"A cannot take {sentence}"

@@ -76,5 +76,6 @@ RIGID_CLUSTER = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
+    cells=True,
     project=project,
 )

@@ -1,0 +1,74 @@
+"""What a solver needs of every term, and the one sentence that refuses a term which lacks it.
+
+The :class:`..kernels.term.Term` says whether it projects, has a scalar constraint or a prox of its own, is made of cells, and
+how its damping enters; its elements say whether a stiffness is infinite and whether they are damped.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Need:
+    """A property that a solver needs of every term.
+
+    Attributes:
+        met: (elements) → whether a term has it; ``elements`` is a :class:`warpcloth.model.model.DeviceElements`, or anything
+            else with ``term``, ``hard`` and ``damping`` (None of what is not damped).
+        lack: What a solver cannot take of a term that has it not, with {label} in it.
+        remedy: What a user can change in the term instead of the solver, if anything.
+    """
+
+    met: Callable
+    lack: str
+    remedy: str = ""
+
+
+FINITE = Need(lambda elements: not elements.hard, "{label} with infinite stiffness", "give a finite stiffness")
+ELEMENTS = Need(lambda elements: not elements.term.cells, "{label}, whose bodies are no elements by themselves")
+PROJECTION = Need(lambda elements: elements.term.project is not None, "{label}, whose energy is no squared distance to a set")
+# A projection, a scalar constraint or a prox.
+LOCAL_STEP = Need(lambda elements: elements.term.moves, "{label}, whose energy is no distance to a constraint")
+ROWS = Need(
+    lambda elements: elements.term.project is not None or elements.term.constraint is not None,
+    "{label}, whose energy is no square of a constraint",
+)
+# λ of a projection that moves would keep parts of earlier directions.
+STEADY_ROWS = Need(
+    lambda elements: not elements.hard or elements.term.constraint is not None or elements.term.linear or elements.term.cells,
+    "{label} with infinite stiffness, as it has no scalar constraint",
+    "give a finite stiffness",
+)
+MERGED_DAMPING = Need(
+    lambda elements: elements.damping is None or elements.term.dissipation.merges,
+    "the damping of {label}, which no projection has in it",
+    "leave the damping out",
+)
+
+
+def lacks(elements, needs):
+    """The first of some needs that a term does not meet, or None."""
+    return next((need for need in needs if not need.met(elements)), None)
+
+
+def refuse_unmet(terms, solver, needs, others):
+    """Refuses the first term that lacks something that a solver needs.
+
+    Args:
+        terms: Elements of each term, see :class:`Need`.
+        solver: Name of the solver, for the sentence.
+        needs: Its needs, those to be told first at first.
+        others: The needs of each solver that could be used instead, by name.
+
+    Raises:
+        ValueError: Naming the term, the solver and what would work.
+    """
+    for elements in terms:
+        need = lacks(elements, needs)
+        if need is not None:
+            able = [name for name, theirs in others.items() if lacks(elements, theirs) is None]
+            listed = ", ".join(able[:-1]) + " or " * (len(able) > 1) + "".join(able[-1:])
+            instead = [f"{listed} can"] * bool(able) + [need.remedy] * bool(need.remedy)
+            raise ValueError(
+                f"{solver} cannot take {need.lack.format(label=elements.label)}; {', or '.join(instead) or 'no solver can'}"
+            )
