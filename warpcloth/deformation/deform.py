@@ -9,6 +9,7 @@ from ..base.checks import number, refuse, shown, whole
 from ..base.interrupts import recording
 from ..mesh.mesh import Mesh
 from ..scene.scene import checked_pins
+from ..usd import AnimationWriter, FrameSequence
 from .arap import Arap
 
 PRIMVAR = "rotationAngle"
@@ -177,8 +178,6 @@ class _File:
     """Writes frames as USD and reads them back when asked."""
 
     def __init__(self, mesh, pins, fps, output, single_file, stage, up_axis):
-        from ..usd import AnimationWriter
-
         self.single_file, primvars = single_file, {PRIMVAR: "vertex"}
         if stage is None:
             handles = {"handles": pins.vertices}
@@ -200,7 +199,5 @@ class _File:
         self.writer.close(single_file=self.single_file)
 
     def read(self):
-        from ..usd import FrameSequence
-
         path = self.writer.path
         return FrameSequence(path), FrameSequence(path, attribute=f"primvars:{PRIMVAR}", scale=np.pi / 180.0)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from ..base.quiet import initialise_warp
 from ..run import scene_files
+from ..usd import flattened
 from .digest import source_digest
 from .machine import processor
 
@@ -52,8 +53,6 @@ class Cluster(Executor):
         """Name and content of a file, which each worker gets once."""
         if path not in self._sent:
             if path.suffix in scene_files.STAGES:
-                from ..usd import flattened
-
                 name, content = f"{path.stem}.usda", flattened(path).encode()
             else:
                 name, content = path.name, path.read_bytes()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .mesh import STAGE_ENDINGS, Mesh
+from .mesh import READERS, Mesh
 
 # What is read, and how: trimesh would split vertices at texture seams and make a mesh of every material; an OBJ's objects
 # stay apart.
@@ -58,6 +58,9 @@ def read_file(path, name=None, kind=Mesh):
         raise ValueError(f"{path}: {error}") from error
 
 
+READERS.update(dict.fromkeys(ENDINGS, read_file))
+
+
 def read_arrays(path, name=None):
     """What a mesh is made of, as `read_file` describes it.
 
@@ -77,7 +80,7 @@ def read_arrays(path, name=None):
         raise FileNotFoundError(f"{path}: no such file")
     ending = path.suffix.lower()
     if ending not in ENDINGS:
-        raise ValueError(f"{path}: the ending must be one of {' '.join((*ENDINGS, *STAGE_ENDINGS))}")
+        raise ValueError(f"{path}: the ending must be one of {' '.join(ENDINGS)}")
     if path.stat().st_size == 0:
         raise ValueError(f"{path}: the file is empty")
     # trimesh counts relative indices from the end of the file instead of from their line: other triangles, silently.

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from ..base.limits import refuse_memory
 from ..kernels.deformation import FLATTEST
 from .selection import select
 
-STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+# By the ending of a file, what reads a mesh from it: (path, name of the geometry, class) → mesh. Modules that read files enter
+# theirs: `loading`, and `usd` for stages.
+READERS = {}
 UP_AXES = ("Y", "Z")
 _MOST_VERTICES = 2**31 - 1  # indices are int32
 # Least memory to build a grid: float64 positions and texture coordinates, int64 corners of two triangles.
@@ -160,7 +163,7 @@ class Mesh:
 
     @classmethod
     def load(cls, path, prim=None):
-        """The mesh in a file: see `loading.read_file`, and for USD stages `usd.read_mesh`, which give what is raised.
+        """Reads the mesh in a file: see `loading.read_file`, and for USD stages `usd.read_mesh`, which say what is raised.
 
         Args:
             path: An .obj, .ply, .stl, .off, .glb or .gltf file, or a .usd, .usda, .usdc or .usdz stage.
@@ -169,13 +172,10 @@ class Mesh:
         Returns:
             Mesh: Vertices in the order of the file; of the class that it is asked of.
         """
-        if str(path).lower().endswith(STAGE_ENDINGS):
-            from ..usd import read_mesh
-
-            return read_mesh(path, prim, cls)
-        from .loading import read_file
-
-        return read_file(path, prim, cls)
+        read = READERS.get(Path(path).suffix.lower())
+        if read is None:
+            raise ValueError(f"{path}: the ending must be one of {' '.join(READERS)}")
+        return read(path, prim, cls)
 
     def select(self, text):
         """Vertices described by a text such as "z == 0 and not corners": see `selection.select`.

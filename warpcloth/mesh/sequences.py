@@ -30,8 +30,10 @@ import numpy as np
 
 from ..base import checks
 from .loading import ENDINGS, WELDED, read_arrays
-from .mesh import STAGE_ENDINGS, Mesh, Surface
+from .mesh import Mesh, Surface
 
+# By the ending of a file, what opens the sequence in it: (path, prim, fps) → :class:`Sequence`; `usd` enters that of stages.
+OPENERS = {}
 _MOST_MISSING = 1_000_000
 _FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
 
@@ -131,8 +133,8 @@ def open_sequence(path, prim=None, fps=None, mesh=None):
     path = os.fspath(path)
     if fps is not None:
         checks.number("fps", fps, above=0.0)
-    if path.lower().endswith(STAGE_ENDINGS):
-        return _open_stage(path, prim, fps)
+    if open_file := OPENERS.get(Path(path).suffix.lower()):
+        return open_file(path, prim, fps)
     if os.path.isdir(path):
         return _open_files(path, sorted(Path(path).iterdir()), prim, fps)
     if not os.path.exists(path) and glob.has_magic(path):
@@ -148,7 +150,7 @@ def open_sequence(path, prim=None, fps=None, mesh=None):
         raise ValueError(f"{path}: {error}") from error
     if Path(path).suffix.lower() in ENDINGS:
         raise ValueError(f'{path}: is one mesh; it must be a folder of them, or a pattern such as "{Path(path).parent}/*.obj"')
-    raise ValueError(f"{path}: must be a folder or pattern of mesh files, or end with {' '.join(STAGE_ENDINGS)} .npz .npy")
+    raise ValueError(f"{path}: must be a folder or pattern of mesh files, or end with {' '.join(OPENERS)} .npz .npy")
 
 
 def as_sequence(mesh, frames, dt=None, times=None):
@@ -181,22 +183,6 @@ def as_sequence(mesh, frames, dt=None, times=None):
     elif times is not None:
         times = _increasing(times, count)
     return Sequence(mesh, np.arange(count), times, read, precision=precision, up_axis=mesh.up_axis)
-
-
-def _open_stage(path, prim, fps):
-    from ..usd import FrameSequence, read_stage_mesh
-
-    frames = FrameSequence(path, prim)
-    codes = frames.time_codes
-    stage = read_stage_mesh(path, prim, Surface, codes[0])
-    if frames.shape[1:] != stage.mesh.points.shape:
-        raise ValueError(
-            f"{path}, prim {stage.prim}: {frames.shape[1]} points at time code {codes[0]:g}, "
-            f"must be {len(stage.mesh.points)} as at rest"
-        )
-    labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
-    times = frames.times if fps is None else (codes - codes[0]) / fps
-    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32, frames.files, stage.up_axis)
 
 
 def _open_files(path, found, prim, fps):

@@ -17,6 +17,7 @@ import warp as wp
 
 from ..base.turns import TURN
 from ..core.operators import Energy, Gradient, Sums
+from ..numerics.rotation import kabsch
 
 # A run has diverged when it has this many times the energy that its sources can have put in. Stable runs reach up to 1.4 times
 # with unconverged or large steps and 1.3 times with sweeps averaged by vertex. Single hierarchical sweeps, 16 a frame, reach
@@ -179,8 +180,6 @@ class Pins(Source):
     @cached_property
     def _maps(self):
         """The rigid motion of each patch since the start, as affine maps (F, 3, 4)."""
-        from ..numerics.rotation import kabsch
-
         found = []
         for patch in self._patches:
             frames = self._frames[:, patch]

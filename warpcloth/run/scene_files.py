@@ -14,8 +14,9 @@ from pathlib import Path
 
 from ..base.checks import number
 from ..scene.scene import Scene
+from ..usd import ENDINGS as STAGES
+from ..usd import read_scene
 
-STAGES = (".usd", ".usda", ".usdc", ".usdz")
 WORDS = {bool: "true or false", int: "a whole number", float: "a number, or two as in 1/240", str: "a text"}
 _TRUTH = dict.fromkeys(("true", "yes", "on", "1"), True) | dict.fromkeys(("false", "no", "off", "0"), False)
 _number_of_modules = itertools.count()
@@ -116,8 +117,6 @@ def find_source(name, pins=None):
     if path.suffix == ".py":
         return _python_source(path, pins)
     if path.suffix in STAGES:
-        from ..usd import read_scene
-
         parameters = parameters_of(read_scene)
         del parameters["path"]
         return SceneSource(path, lambda **values: read_scene(str(path), **values), parameters, pins)

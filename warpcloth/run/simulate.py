@@ -15,6 +15,7 @@ from ..base.turns import in_turn
 from ..core.status import Result, Status, sentence
 from ..mesh.ordering import order_of_run
 from ..model.model import DTYPES
+from ..usd import AnimationWriter, FrameSequence
 from .balance import GAIN, STRETCHED, Balance
 from .frames import frames_of, state_of
 from .lines import lines_of
@@ -279,8 +280,6 @@ class _File:
     """Writes frames as USD and reads them back when asked."""
 
     def __init__(self, scene, output, single_file):
-        from ..usd import AnimationWriter
-
         stage, self.single_file = scene.stage, single_file
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
@@ -298,7 +297,5 @@ class _File:
         self.writer.close(single_file=self.single_file)
 
     def read(self):
-        from ..usd import FrameSequence
-
         path = self.writer.path
         return FrameSequence(path), FrameSequence(path, attribute="velocities")

@@ -1,15 +1,21 @@
-"""USD stages: a cloth or a scene read from one, an animation or measures written as one. Nothing else here imports pxr."""
+"""USD stages: a cloth or a scene read from one, an animation or measures written as one.
 
-from . import modules as modules  # first
+Nothing else here imports pxr, and that is loaded when a stage is first touched.
+"""
 
-# isort: split
-from .frames import FrameSequence
+from ..mesh.mesh import READERS
+from ..mesh.sequences import OPENERS
+from .frames import FrameSequence, open_sequence
 from .measures import MeasureWriter
 from .scene import read_scene, write_scene
-from .stage import StageMesh, flattened, read_mesh, read_stage_mesh
+from .stage import ENDINGS, StageMesh, flattened, read_mesh, read_stage_mesh
 from .writer import AnimationWriter
 
+READERS.update(dict.fromkeys(ENDINGS, read_mesh))
+OPENERS.update(dict.fromkeys(ENDINGS, open_sequence))
+
 __all__ = [
+    "ENDINGS",
     "AnimationWriter",
     "FrameSequence",
     "MeasureWriter",

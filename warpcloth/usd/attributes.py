@@ -26,8 +26,8 @@ What else a stage says:
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
+from .modules import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from .values import refuse_unknown, value_of
 
 
@@ -41,16 +41,21 @@ class Attribute:
         name: Name of the attribute; <name> is any name for a term.
         place: Where it stands: "cloth", the prim; "body", it or the nearest prim above with PhysicsDeformableBodyAPI;
             "material", the physics material bound to it; "physics scene".
-        types: Types that it may have, of any precision; the first for one value, the last for several.
+        type_names: Types that it may have, of any precision; the first for one value, the last for several.
         kilograms, metres: Powers of kilogramsPerUnit and metersPerUnit that make it SI.
     """
 
     field: str
     name: str
     place: str
-    types: tuple
+    type_names: tuple
     kilograms: int = 0
     metres: int = 0
+
+    @property
+    def types(self):
+        """The types that `type_names` stands for."""
+        return [Sdf.ValueTypeNames.Find(name) for name in self.type_names]
 
     @property
     def infinite(self):
@@ -58,45 +63,44 @@ class Attribute:
         return self.field.startswith("terms.") or self.field == "(gravity magnitude)"
 
 
-_T = Sdf.ValueTypeNames
 ATTRIBUTES = (
     # Our own. Of one field, those that are first here are taken first.
-    Attribute("name", "warpcloth:name", "cloth", (_T.String,)),
-    Attribute("density", "warpcloth:density", "cloth", (_T.Double,)),
-    Attribute("masses", "warpcloth:masses", "cloth", (_T.DoubleArray,)),
-    Attribute("positions", "warpcloth:positions", "cloth", (_T.Double3Array,)),
-    Attribute("velocities", "warpcloth:velocities", "cloth", (_T.Double3Array,)),
-    Attribute("gravity", "warpcloth:gravity", "cloth", (_T.Double3,)),
-    Attribute("duration", "warpcloth:duration", "cloth", (_T.Double,)),
+    Attribute("name", "warpcloth:name", "cloth", ("string",)),
+    Attribute("density", "warpcloth:density", "cloth", ("double",)),
+    Attribute("masses", "warpcloth:masses", "cloth", ("double[]",)),
+    Attribute("positions", "warpcloth:positions", "cloth", ("double3[]",)),
+    Attribute("velocities", "warpcloth:velocities", "cloth", ("double3[]",)),
+    Attribute("gravity", "warpcloth:gravity", "cloth", ("double3",)),
+    Attribute("duration", "warpcloth:duration", "cloth", ("double",)),
     # Places of the pinned vertices, those of lower index first, a time sample for each frame.
-    Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", (_T.Double3Array,)),
-    Attribute("terms.type", "warpcloth:terms:<name>:type", "cloth", (_T.Token,)),
+    Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", ("double3[]",)),
+    Attribute("terms.type", "warpcloth:terms:<name>:type", "cloth", ("token",)),
     # Only where <name> is not the name of the term; empty where it has none.
-    Attribute("terms.name", "warpcloth:terms:<name>:name", "cloth", (_T.String,)),
-    Attribute("terms.stiffness", "warpcloth:terms:<name>:stiffness", "cloth", (_T.Double, _T.DoubleArray)),
-    Attribute("terms.damping", "warpcloth:terms:<name>:damping", "cloth", (_T.Double, _T.DoubleArray)),
-    Attribute("terms.pairs", "warpcloth:terms:<name>:pairs", "cloth", (_T.Token, _T.TokenArray, _T.Int2Array)),
-    Attribute("terms.rest_lengths", "warpcloth:terms:<name>:restLengths", "cloth", (_T.Double, _T.DoubleArray)),
-    Attribute("terms.poisson_ratio", "warpcloth:terms:<name>:poissonRatio", "cloth", (_T.Double, _T.DoubleArray)),
-    Attribute("terms.least", "warpcloth:terms:<name>:least", "cloth", (_T.Double, _T.DoubleArray)),
-    Attribute("terms.most", "warpcloth:terms:<name>:most", "cloth", (_T.Double, _T.DoubleArray)),
-    Attribute("terms.vertices", "warpcloth:terms:<name>:vertices", "cloth", (_T.String, _T.TokenArray, _T.IntArray)),
-    Attribute("terms.sizes", "warpcloth:terms:<name>:sizes", "cloth", (_T.IntArray,)),
-    Attribute("terms.targets", "warpcloth:terms:<name>:targets", "cloth", (_T.Double3Array,)),
+    Attribute("terms.name", "warpcloth:terms:<name>:name", "cloth", ("string",)),
+    Attribute("terms.stiffness", "warpcloth:terms:<name>:stiffness", "cloth", ("double", "double[]")),
+    Attribute("terms.damping", "warpcloth:terms:<name>:damping", "cloth", ("double", "double[]")),
+    Attribute("terms.pairs", "warpcloth:terms:<name>:pairs", "cloth", ("token", "token[]", "int2[]")),
+    Attribute("terms.rest_lengths", "warpcloth:terms:<name>:restLengths", "cloth", ("double", "double[]")),
+    Attribute("terms.poisson_ratio", "warpcloth:terms:<name>:poissonRatio", "cloth", ("double", "double[]")),
+    Attribute("terms.least", "warpcloth:terms:<name>:least", "cloth", ("double", "double[]")),
+    Attribute("terms.most", "warpcloth:terms:<name>:most", "cloth", ("double", "double[]")),
+    Attribute("terms.vertices", "warpcloth:terms:<name>:vertices", "cloth", ("string", "token[]", "int[]")),
+    Attribute("terms.sizes", "warpcloth:terms:<name>:sizes", "cloth", ("int[]",)),
+    Attribute("terms.targets", "warpcloth:terms:<name>:targets", "cloth", ("double3[]",)),
     # What the prim's own points and curves lose. Used while they agree with these: an artist's edit wins.
-    Attribute("mesh.points", "warpcloth:points", "cloth", (_T.Double3Array,)),  # in the prim's own space
-    Attribute("mesh.edges", "warpcloth:edges", "cloth", (_T.Int2Array,)),  # of curves, in order
-    Attribute("mesh.grid_shape", "warpcloth:gridShape", "cloth", (_T.Int2,)),
+    Attribute("mesh.points", "warpcloth:points", "cloth", ("double3[]",)),  # in the prim's own space
+    Attribute("mesh.edges", "warpcloth:edges", "cloth", ("int2[]",)),  # of curves, in order
+    Attribute("mesh.grid_shape", "warpcloth:gridShape", "cloth", ("int2",)),
     # Standard: UsdPhysics, and the AOUSD proposal for deformable bodies.
-    Attribute("(total mass)", "physics:mass", "body", (_T.Float,), kilograms=1),  # spread evenly
-    Attribute("(mass per volume)", "physics:density", "body", (_T.Float,), kilograms=1, metres=-3),
-    Attribute("(mass per volume)", "physics:density", "material", (_T.Float,), kilograms=1, metres=-3),
-    Attribute("(thickness)", "physics:surfaceThickness", "material", (_T.Float,), metres=1),  # 1 mm where not given
+    Attribute("(total mass)", "physics:mass", "body", ("float",), kilograms=1),  # spread evenly
+    Attribute("(mass per volume)", "physics:density", "body", ("float",), kilograms=1, metres=-3),
+    Attribute("(mass per volume)", "physics:density", "material", ("float",), kilograms=1, metres=-3),
+    Attribute("(thickness)", "physics:surfaceThickness", "material", ("float",), metres=1),  # 1 mm where not given
     # A spring of this stiffness on each edge: an approximation, whose stretch and shear depend on the triangulation.
-    Attribute("(stretch stiffness)", "physics:surfaceStretchStiffness", "material", (_T.Float,), kilograms=1),
-    Attribute("(bend stiffness)", "physics:surfaceBendStiffness", "material", (_T.Float,), kilograms=1, metres=2),
-    Attribute("(gravity direction)", "physics:gravityDirection", "physics scene", (_T.Vector3f,)),
-    Attribute("(gravity magnitude)", "physics:gravityMagnitude", "physics scene", (_T.Float,), metres=1),
+    Attribute("(stretch stiffness)", "physics:surfaceStretchStiffness", "material", ("float",), kilograms=1),
+    Attribute("(bend stiffness)", "physics:surfaceBendStiffness", "material", ("float",), kilograms=1, metres=2),
+    Attribute("(gravity direction)", "physics:gravityDirection", "physics scene", ("vector3f",)),
+    Attribute("(gravity magnitude)", "physics:gravityMagnitude", "physics scene", ("float",), metres=1),
 )
 
 # Attributes of a term, whose names say which it is.
@@ -187,7 +191,7 @@ def author(cloth, field, value, key=None, time=None):
         type_name = row.types[0]
         value = value if isinstance(value, str) else float(value)
     elif isinstance(value[0], str):
-        type_name, value = _T.TokenArray, Vt.TokenArray([str(text) for text in value])
+        type_name, value = Sdf.ValueTypeNames.TokenArray, Vt.TokenArray([str(text) for text in value])
     else:
         type_name = row.types[-1]
         whole = np.asarray(type_name.scalarType.defaultValue).dtype.kind == "i"

@@ -11,11 +11,11 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Usd
 
 from ..base.interrupts import deferred
 from ..base.outputs import Lock
 from .layers import flatten, named_from, relative_path
+from .modules import Sdf, Usd
 from .packages import Contents
 from .stage import METADATA_KEY, followed, identity
 from .values import refuse_path, sentences

@@ -1,9 +1,9 @@
 """Directions of elements as curves beside the prim that they are measured on: one straight segment for each element."""
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from .layers import CURVE_WIDTH, bind_material
+from .modules import Gf, Sdf, Usd, UsdGeom, Vt
 from .stage import local_to_metres
 from .targets import Target
 

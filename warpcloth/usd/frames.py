@@ -4,9 +4,11 @@ import os
 from contextlib import contextmanager
 
 import numpy as np
-from pxr import Sdf, UsdGeom
 
+from ..mesh.mesh import Surface
+from ..mesh.sequences import Sequence
 from .layers import files_of
+from .modules import Sdf, UsdGeom
 from .stage import (
     curve_vertices,
     find_prim,
@@ -17,12 +19,28 @@ from .stage import (
     moving_space,
     open_stage,
     placed,
+    read_stage_mesh,
     refuse_change,
     topology,
 )
 from .values import array_of, check_composed, sentences, time_codes_of
 
 _VECTORS = ("points", "velocities")
+
+
+def open_sequence(path, prim, fps):
+    """Opens the frames of a stage for :func:`warpcloth.open_sequence`."""
+    frames = FrameSequence(path, prim)
+    codes = frames.time_codes
+    stage = read_stage_mesh(path, prim, Surface, codes[0])
+    if frames.shape[1:] != stage.mesh.points.shape:
+        raise ValueError(
+            f"{path}, prim {stage.prim}: {frames.shape[1]} points at time code {codes[0]:g}, "
+            f"must be {len(stage.mesh.points)} as at rest"
+        )
+    labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
+    times = frames.times if fps is None else (codes - codes[0]) / fps
+    return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32, frames.files, stage.up_axis)
 
 
 class FrameSequence:

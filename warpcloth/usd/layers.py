@@ -3,8 +3,8 @@
 import os
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
 
+from .modules import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
 from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh, triangles_of_faces
 from .targets import SAMPLED, Target
 from .values import array_of
@@ -223,7 +223,7 @@ def over_layer(source, prim, mesh, primvars):
         scheme = Sdf.AttributeSpec(over, "subdivisionScheme", Sdf.ValueTypeNames.Token, Sdf.VariabilityUniform)
         scheme.default = UsdGeom.Tokens.none
     for name in defaults:
-        Sdf.AttributeSpec(over, name, SAMPLED[name]).default = rest[name]
+        Sdf.AttributeSpec(over, name, Sdf.ValueTypeNames.Find(SAMPLED[name])).default = rest[name]
     if "normals" in defaults:
         over.attributes["normals"].SetInfo("interpolation", UsdGeom.Tokens.vertex)
     for name in _BLOCKED:

@@ -4,8 +4,6 @@ import math
 import warnings
 from dataclasses import replace
 
-from pxr import Sdf, Usd, UsdGeom, UsdShade
-
 from .chunks import ChunkWriter, check_scene
 from .directions import check_directions, define_directions, free_place, middle, segments, to_metres
 from .layers import (
@@ -18,6 +16,7 @@ from .layers import (
     root_metadata,
     scene_layer,
 )
+from .modules import Sdf, Usd, UsdGeom, UsdShade
 from .stage import read_stage_mesh
 from .targets import DISPLAY_COLOUR, check_primvars
 

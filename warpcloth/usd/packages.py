@@ -6,7 +6,7 @@ import warnings
 import zipfile
 from itertools import chain
 
-from pxr import Ar, Sdf, UsdUtils
+from .modules import Ar, Sdf, UsdUtils
 
 _TILES = "<UDIM>"
 

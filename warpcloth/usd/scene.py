@@ -5,7 +5,6 @@ from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from ..base.limits import MOST_FRAMES
 from ..mesh.mesh import Mesh
@@ -14,6 +13,7 @@ from ..terms.terms import TERMS, QuadraticBending, Spring
 from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
 from .chunks import export
 from .layers import scene_layer
+from .modules import Sdf, Usd, UsdGeom, UsdPhysics
 from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
 from .values import array_of, refuse_unknown, sentences, shown, time_codes_of
 

@@ -5,9 +5,9 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom
 
 from ..mesh.mesh import Mesh
+from .modules import Sdf, Tf, Usd, UsdGeom
 from .values import (
     array_of,
     check_composed,
@@ -21,6 +21,7 @@ from .values import (
     token_of,
 )
 
+ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 # Where an animation keeps, in the root layer's customLayerData, the prim that it animates.
 METADATA_KEY = "warpcloth"
 # Primvar of curves: the mesh vertex of each curve point, for curves repeat the vertices where several of them meet.

@@ -3,17 +3,12 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from pxr import Sdf, Vt
 
+from .modules import Sdf, Vt
 from .stage import VERTEX_PRIMVAR
 
-# Attributes with one sample for each frame.
-SAMPLED = {
-    "points": Sdf.ValueTypeNames.Point3fArray,
-    "velocities": Sdf.ValueTypeNames.Vector3fArray,
-    "normals": Sdf.ValueTypeNames.Normal3fArray,
-    "extent": Sdf.ValueTypeNames.Float3Array,
-}
+# Types of the attributes with one sample for each frame.
+SAMPLED = {"points": "point3f[]", "velocities": "vector3f[]", "normals": "normal3f[]", "extent": "float3[]"}
 DISPLAY_COLOUR = "primvars:displayColor"
 # Primvars that say something else already.
 _TAKEN = ("normals", "st", "displayColor", "displayOpacity", VERTEX_PRIMVAR)
@@ -49,8 +44,9 @@ class Target:
     def attributes(self):
         """Types of the sampled attributes by name."""
         own = {name: SAMPLED[name] for name in self.vectors if name != "normals" or len(self.triangles)}
-        own |= {f"primvars:{name}": Sdf.ValueTypeNames.FloatArray for name in self.primvars}
-        return own | ({DISPLAY_COLOUR: Sdf.ValueTypeNames.Color3fArray} if self.coloured else {})
+        own |= {f"primvars:{name}": "float[]" for name in self.primvars}
+        own |= {DISPLAY_COLOUR: "color3f[]"} if self.coloured else {}
+        return {name: Sdf.ValueTypeNames.Find(type_name) for name, type_name in own.items()}
 
     def declare(self, layer, names):
         """Makes sure that a layer has some of the sampled attributes, without giving them values."""

@@ -8,9 +8,9 @@ from contextlib import contextmanager, redirect_stderr
 from io import StringIO
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from ..base.checks import shown
+from .modules import Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 # Beyond it neighbouring time codes, which are float64, are more than 1e-7 apart and cannot tell frames apart.
 MOST_TIME_CODE = 1e9
