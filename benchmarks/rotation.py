@@ -16,8 +16,7 @@ import numpy as np
 import warp as wp
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from matrices import CLASSES, angle, determinant, orthogonality, reconstruction, reference, samples, times
-
+from support.matrices import CLASSES, angle, determinant, orthogonality, reconstruction, reference, samples, times
 from warpcloth.kernels import decompose, rotation
 
 CHUNK = 1_000_000

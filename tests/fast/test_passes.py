@@ -1,0 +1,361 @@
+"""The explicit step in one pass against forces and update apart, and frames against steps, to the bit."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpcloth as wc
+from support.energies import damping_forces
+from support.setups import SOLVERS, allocations, square
+from support.sheets import SPRINGS, TERMS, N, declared
+from warpcloth.core.operators import Gradient
+from warpcloth.core.status import Result
+from warpcloth.fast import blocks, incidences, jacobi, passes
+from warpcloth.fast.blocks import in_blocks
+from warpcloth.fast.incidences import gathered
+from warpcloth.fast.jacobi import Scatter
+from warpcloth.fast.passes import Gather, Sweep
+from warpcloth.model.damping import Past, damped_terms
+from warpcloth.numerics import sweeps
+from warpcloth.solvers import explicit, solver
+from warpcloth.solvers.explicit import step_limits
+
+
+def apart(model, stepper, scheme, steps):
+    """x and v after so many steps, forces by the kernels of one term each and the rest in NumPy."""
+    scene, h = model.scene, stepper.h
+    forces, gradient = Gradient(model), model.vectors()
+    x, v = (array.numpy().astype(np.float64) for array in (model.positions, model.velocities))
+    inverse = model.inverse_mass.numpy().astype(np.float64)[:, None]
+    gravity = np.repeat(model.gravity.numpy(), model.per_copy, axis=0)
+    for step in range(1, steps + 1):
+        gradient.zero_()
+        place = model.array(x, model.vec3)
+        forces.add(place, gradient)
+        a = gravity - inverse * (gradient.numpy() + damping_forces(model, h, place, v))
+        a = np.where(inverse > 0.0, a, 0.0)
+        before, v = v, v + h * a
+        move = h * (v if scheme == "symplectic" else before)
+        x = x + np.where(inverse > 0.0, move, 0.0)
+        frame, part = divmod(step / stepper.steps_per_frame, 1.0)
+        keyframes = scene.pins.keyframes
+        frames = np.minimum([int(frame), int(frame) + 1], len(keyframes) - 1)
+        place = (1.0 - part) * keyframes[frames[0]] + part * keyframes[frames[1]]
+        for first in range(0, model.count, model.per_copy):
+            i = first + scene.pins.vertices
+            x[i], v[i] = place, (place - x[i]) / h
+    return x, v
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("scheme", ["symplectic", "forward"])
+@pytest.mark.parametrize("way", ["own", "small blocks", "gathered"])
+@pytest.mark.parametrize("name", TERMS)
+def test_one_pass_is_forces_and_update(name, way, scheme, dtype, device, monkeypatch):
+    if way == "gathered":  # of CUDA, but right on the CPU too
+        monkeypatch.setattr(explicit, "Sweep", Gather)
+    if way == "small blocks":
+        monkeypatch.setattr(blocks, "NUMBERS", 60)
+        monkeypatch.setattr(blocks, "RUN", 3)
+    scene, steps = declared(TERMS[name], fps=250.0), 5
+    vary = {"gravity": [[0.0, -9.81, 0.0], [1.0, 2.0, 3.0]]}
+    model = scene.build(device=device, dtype=dtype, copies=2, vary=vary)
+    stepper = wc.Explicit(substeps=4, scheme=scheme, above_limit="allow").bind(model)
+    assert stepper.h <= step_limits(model)[1]
+    for _ in range(steps):
+        stepper.step()
+    x, v = (array.numpy() for array in stepper.state)
+    exact_x, exact_v = apart(model, stepper, scheme, steps)
+    # Below the limit h²k/m + 2hc/m ≤ 4, so that a few roundings of places and moves of size 1, 16 of them here, change v by
+    # no more than 16·4ε/h a step.
+    tolerance = steps * 64 * np.finfo(dtype).eps / stepper.h
+    assert np.abs(v - exact_v).max() < tolerance
+    assert np.abs(x - exact_x).max() < steps * stepper.h * tolerance
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("way", ["own", "gathered"])
+def test_a_soft_crease_joins_stiff_parts(way, dtype, device, monkeypatch):
+    """What is left out of a matrix is not what is small beside all else at its vertices: the torque that unfolds is there."""
+    if way == "gathered":
+        monkeypatch.setattr(explicit, "Sweep", Gather)
+    sheet, eps = wc.Mesh.grid(9, 9), float(np.finfo(dtype).eps)
+    x, _y, z = sheet.points.T
+    mean = x.mean()
+    far = x > mean
+    folded = np.column_stack([np.where(far, mean, x), np.where(far, x - mean, 0.0), z])
+    crease = (np.abs(x[wc.QuadraticBending(stiffness=1.0).stencil(sheet)[:, :2]] - mean) < 1e-9).all(axis=1)
+    torques = []
+    for stiff in (0.0, 64.0 / eps):
+        terms = [wc.QuadraticBending(stiffness=np.where(crease, 1.0, stiff))]
+        scene = wc.Scene(sheet, density=1.0, terms=terms, positions=folded, gravity=[0.0, 0.0, 0.0], fps=100.0, duration=1.0)
+        stepper = wc.Explicit(substeps=1, above_limit="allow").bind(scene.build(device=device, dtype=dtype))
+        stepper.step()
+        momenta = scene.vertex_masses[far, None] * stepper.state.v.numpy()[far]
+        torques.append(np.cross(folded[far] - [mean, 0.0, 0.0], momenta)[:, 2].sum())
+    # Forces of the stiff parts are rounding, 64 in all, along lines through the crease but for ε of them.
+    assert torques[0] and torques[1] == pytest.approx(torques[0], rel=1024.0 * eps)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize(
+    "name", ["nothing", "springs", "springs, the higher vertex first, each of its own stiffness", "damped springs"]
+)
+def test_steps_of_one_launch_are_steps(name, dtype, device, monkeypatch):
+    """Of CUDA, but right on the CPU too: an even number and an odd one, of the CPU to the bit those of a launch each."""
+    monkeypatch.setattr(explicit, "Sweep", Gather)
+    monkeypatch.setattr(incidences, "LANED", 0)  # as of many copies
+    vary = {"gravity": [[0.0, -9.81, 0.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]}
+    model = declared(TERMS[name], pins=[0, 6], fps=250.0).build(device=device, dtype=dtype, copies=3, vary=vary)
+    states, launches = [], []
+    for sizes in ([4, 5], [1] * 9):
+        stepper = wc.Explicit(substeps=4, above_limit="allow").bind(model)
+        before = model.launches[0]
+        for steps in sizes:
+            stepper.launch_steps(steps)
+        launches.append(model.launches[0] - before)
+        states.append([array.numpy() for array in stepper.state])
+        monkeypatch.setattr(passes, "block_of", lambda model, parts: 0)
+    assert launches == [2, 9]
+    # Compilers of GPUs contract the products of the two kernels as each allows: a few roundings a step, as above.
+    tolerance = 9 * 64 * np.finfo(dtype).eps / stepper.h if model.device.is_cuda else 0.0
+    assert np.abs(np.array(states[0]) - states[1]).max() <= tolerance
+
+
+@pytest.mark.parametrize(
+    ("scene", "one"),
+    [
+        (declared([SPRINGS], pins=[0, 6]), True),
+        (declared([SPRINGS]), False),  # whose pins are led
+        (declared([SPRINGS, wc.QuadraticBending(stiffness=1e-3)], pins=None), False),
+        (declared(TERMS["clusters"], pins=None), False),
+        (wc.Scene(wc.Mesh.grid(33, 33), density=0.1, terms=[SPRINGS], duration=1.0), False),
+    ],
+)
+def test_which_copies_are_blocks(scene, one, device, monkeypatch):
+    model = scene.build(device=device)
+
+    def threads():
+        return Gather(model, (model.vectors(), model.vectors()), 1e-3, True)._threads
+
+    assert wp.get_device(device).is_cpu or not threads()
+    monkeypatch.setattr(incidences, "LANED", 0)
+    assert bool(threads()) == one
+
+
+LAUNCHED = [name for name, made in SOLVERS.items() if isinstance(made, (wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD))]
+
+
+@pytest.mark.parametrize("launches", [1, 10, 10_000])
+@pytest.mark.parametrize("name", [*LAUNCHED, "xpbd midpoint", "newton"])
+def test_frames_are_steps_to_the_bit(name, launches, device, monkeypatch):
+    """In graphs of one step, of some with some over, and of all; with pins that move, a counter of their own, and damping."""
+    monkeypatch.setattr(solver, "LAUNCHES", launches)
+    record = wc.XPBD(substeps=1, iterations=4, integrator="midpoint") if name == "xpbd midpoint" else SOLVERS[name]
+    record = replace(record, substeps=7)
+    scene = declared([replace(SPRINGS, damping=0.01), wc.QuadraticBending(stiffness=1e-4)], fps=60.0)
+    steppers = [record.bind(scene.build(device=device, copies=2, vary={"Spring.stiffness": [50.0, 100.0]})) for _ in range(2)]
+    for _ in range(3):
+        steppers[0].frame()
+        for _ in range(7):
+            steppers[1].step()
+    for one, other in zip(*(stepper.state for stepper in steppers), strict=True):
+        assert np.array_equal(one.numpy(), other.numpy())
+    assert np.array_equal(steppers[0].residual, steppers[1].residual)
+    assert steppers[0].results == steppers[1].results
+
+
+@pytest.mark.parametrize("name", LAUNCHED)
+def test_a_frame_allocates_nothing(name, device):
+    record = replace(SOLVERS[name], substeps=5)
+    stepper = record.bind(square(solver=record, damping=0.01, fps=120.0, pins="corners").build(device=device))
+    stepper.frame()
+    with wp.ScopedMemoryTracker("frames", print=False) as tracker:
+        assert allocations(tracker, lambda: [stepper.frame() for _ in range(3)]) == 0
+
+
+SWEEPS = {
+    "plain": {"kind": "jacobi"},
+    "averaged by vertex": {"kind": "vertex-averaged", "alpha": 1.0},
+    "averaged by constraint": {"kind": "constraint-averaged"},
+    "stiffness per step": {"kind": "vertex-averaged", "spread": 4},
+    "multipliers": {"kind": "constraint-averaged", "multipliers": True},
+    "scalar constraints": {"kind": "constraint-averaged", "multipliers": True, "scalar": True},
+}
+PROJECTED = {name: terms for name, terms in TERMS.items() if name not in ("St. Venant-Kirchhoff", "Neo-Hookean")}
+PROJECTED["corotated"] = [wc.CorotatedMembrane(stiffness=100.0)]
+
+
+@pytest.mark.parametrize(
+    ("options", "dtype"),
+    [
+        pytest.param(options, dtype, id=f"{name}-{dtype}")
+        for name, options in SWEEPS.items()
+        for dtype in (("float32", "float64") if name in ("plain", "multipliers") else ("float32",))
+    ],
+)
+@pytest.mark.parametrize("name", PROJECTED)
+def test_jacobi_sweeps_gather_what_they_scatter(name, options, dtype, device, monkeypatch):
+    """d and λ, whether sweeps run one by one, which copies what they leave in the other arrays back, or in pairs."""
+    scene, steps, h, found = declared(PROJECTED[name]), 3, 0.02, []
+    moves = np.random.default_rng(7).normal(scale=0.01, size=(2 * N, 3))
+    for way, pairs in ((Scatter, False), (jacobi.Gather, False), (jacobi.Gather, True)):
+        # Scattering is for one thread, of the CPU.
+        model = scene.build(device="cpu" if way is Scatter else device, dtype=dtype, copies=2)
+        model = model.with_terms(damped_terms(model, h))
+        Past(model, model.terms).launch(model.positions)  # sets the rest state of what is damped, by element
+        d = model.array(moves, model.vec3)
+        monkeypatch.setattr(sweeps, "Scatter", way)
+        monkeypatch.setattr(sweeps, "Gather", way)
+        made = sweeps.Sweep(model, model.positions, h, relaxation=0.1, **options)
+        made.correction.assign(d)
+        made.launch_start()
+        assert not made.correction.numpy().any()
+        made.correction.assign(d)
+        for launch, times in made.parts(steps) if pairs else [(made.launch, steps)]:
+            for _ in range(times):
+                launch()
+        found.append([made.correction.numpy(), *(array.numpy() for array in made.multipliers if array is not None)])
+    assert not np.array_equal(found[0][0], d.numpy()) or name == "nothing"
+    # A sweep moves a vertex by ω of what its constraints ask for, of y that are wrong by a few roundings of places; λ is that
+    # times the mass. The same kernels make the same bits.
+    for scattered, gathered_, paired in zip(*found, strict=True):
+        assert np.array_equal(gathered_, paired)
+        assert np.abs(scattered - gathered_).max() <= steps * 8 * np.finfo(dtype).eps * max(np.abs(scattered).max(), 0.1)
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_blocks_have_every_element_once(copies, device, monkeypatch):
+    """In the block of its lowest vertex; runs have all vertices one higher from element to element; copies are alike."""
+    monkeypatch.setattr(blocks, "NUMBERS", 60)
+    monkeypatch.setattr(blocks, "RUN", 3)
+    scene = declared([SPRINGS, wc.DihedralBending(stiffness=1e-3), wc.NeoHookeanMembrane(stiffness=100.0)])
+    model = scene.build(device=device, copies=copies)
+    vertices, terms, numbers = in_blocks(model.terms, model.per_copy, copies)
+    assert vertices[0] == 0 and vertices[-1] == model.count and (np.diff(vertices) > 0).all()
+    assert np.isin(np.arange(copies) * N, vertices).all()
+    assert numbers <= 60
+    runs = 0
+    for before, after in zip(model.terms, terms, strict=True):
+        stencil = after.stencil.numpy()
+        assert sorted(map(tuple, stencil)) == sorted(map(tuple, before.stencil.numpy()))
+        offsets, codes = (array.numpy() for array in after.pieces)
+        firsts, counts = codes.reshape(-1, 2).T
+        assert np.array_equal(firsts, np.cumsum(np.abs(counts)) - np.abs(counts))
+        assert np.abs(counts).sum() == len(stencil)
+        for block, (first, last) in enumerate(itertools.pairwise(vertices)):
+            for first_element, count in codes.reshape(-1, 2)[offsets[block] : offsets[block + 1]]:
+                piece = stencil[first_element : first_element + abs(count)]
+                assert ((piece.min(axis=1) >= first) & (piece.min(axis=1) < last)).all()
+                if count > 0:
+                    runs += 1
+                    assert count >= 3 and (np.diff(piece, axis=0) == 1).all()
+    assert runs
+
+
+def test_what_is_in_order_is_not_copied(device):
+    """Elements are put in the order of a sweep once."""
+    model = declared([SPRINGS, wc.DihedralBending(stiffness=1e-3)]).build(device=device)
+    swept = Sweep(model, (model.vectors(), model.vectors()), 1e-3, True).model
+    pieces = sum(array.size for elements in swept.terms for array in elements.pieces)
+    assert swept.report()["bytes"] == model.report()["bytes"] + 4 * pieces
+    _vertices, again, _numbers = in_blocks(swept.terms, model.per_copy, 1)
+    for elements, same in zip(swept.terms, again, strict=True):
+        assert same.stencil is elements.stencil
+
+
+@pytest.mark.parametrize("spokes", [0, 10, 100])
+def test_a_vertex_of_many_elements_does_not_blow_up_memory(spokes, device):
+    """Rows of equal length have at most twice as many slots as there are incidences; else there are no slots to spare."""
+    n = 200
+    chain, star = np.arange(1, n), np.arange(2, spokes + 2)
+    edges = np.vstack([np.stack([chain - 1, chain], axis=1), np.stack([0 * star, star], axis=1)])
+    mesh = wc.Mesh(np.random.default_rng(0).normal(size=(n, 3)), edges=edges)
+    model = wc.Scene(mesh, masses=np.ones(n), terms=[wc.Spring(stiffness=1.0)]).build(device=device)
+    part, arrays = gathered(model, model.terms[0])
+    assert part.pairs == (None if spokes else (1, 1)) and not part.padded
+    assert len(arrays["codes"]) == (2 * len(edges) if spokes else 2 * n)
+
+
+def test_the_residual_is_that_of_the_worst_step(device):
+    """Of XPBD, which reads it once a frame; what is not finite stays so and is a divergence."""
+    stepper = wc.XPBD(substeps=7, iterations=4).bind(declared([SPRINGS], fps=60.0).build(device=device))
+    residuals = []
+    for _ in range(14):
+        stepper.step()
+        residuals.append(stepper.residual[0])
+    change = np.diff(residuals)
+    assert (change >= 0.0).all() and (change == 0.0).any()
+    place = stepper.state.x.numpy()
+    stepper.state.x.assign(place * np.nan)
+    stepper.step()
+    stepper.state.x.assign(place)
+    stepper.state.v.zero_()
+    stepper.frame()
+    assert np.isnan(stepper.residual[0]) and stepper.results == [Result.DIVERGED]
+
+
+@pytest.mark.parametrize("way", ["own", "gathered"])
+@pytest.mark.parametrize(("away", "substeps"), [(0.0, 64), (128.0, 64), (4096.0, 512)])
+def test_motion_does_not_depend_on_where_the_origin_is(away, substeps, way, device, monkeypatch):
+    """Far from it places are kept to more digits than x has; frames are steps, and a run repeats itself, to the bit.
+
+    Farther, steps of less than the unit of what is packed too.
+    """
+    if way == "gathered":
+        monkeypatch.setattr(explicit, "Sweep", Gather)
+    sheet = wc.Mesh.grid(17, 17)  # of places that float32 has in both
+
+    def stepper_of(away, dtype):
+        mesh = wc.Mesh(sheet.points + away, sheet.triangles)
+        terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)]
+        scene = wc.Scene(mesh, density=0.1, terms=terms, pins=[0, 16], duration=1.0)
+        return wc.Explicit(substeps=substeps).bind(scene.build(device=device, dtype=dtype))
+
+    exact, stepper, other = (stepper_of(*key) for key in ((0.0, "float64"), (away, "float32"), (away, "float32")))
+    assert (stepper.low is not None) == (away > 0.0)
+    for _ in range(20):
+        exact.frame()
+        stepper.frame()
+        for _ in range(substeps):
+            other.step()
+    x = stepper.state.x.numpy()
+    # x is rounded by half of this; without the rest it is 50 times as far off.
+    assert np.abs(x - away - exact.state.x.numpy()).max() < max(2.0 * np.spacing(np.float32(away)), 2e-5)
+    assert np.array_equal(x, other.state.x.numpy())
+    stepper.reset()
+    for _ in range(20):
+        stepper.frame()
+    assert np.array_equal(x, stepper.state.x.numpy())
+
+
+@pytest.mark.parametrize(
+    ("scene", "varied", "packed"),
+    [
+        ({"pins": [0]}, {}, True),
+        ({"pins": [0], "duration": 1e4}, {}, True),  # held
+        ({"duration": 1.0}, {}, True),
+        ({"duration": 1e3}, {}, False),  # falls 5000 km
+        ({"velocities": [1e5, 0.0, 0.0]}, {}, False),
+        ({}, {"velocities": [0.0, 1e5, 0.0]}, False),
+        ({}, {"gravity": [0.0, 0.0, 1e5]}, False),
+        ({"pins": [0]}, {"positions": [4096.0, 0.0, 0.0]}, False),
+        ({"pins": [0]}, {"velocities": [0.0, 1e5, 0.0]}, True),
+        ({"pins": wc.Pins([0], [[[128.0] * 3], [[4096.0] * 3]])}, {}, False),
+    ],
+)
+def test_what_places_are_rounded_by_is_packed_where_that_holds_it(scene, varied, packed, device):
+    """Also at the ends that are known before a run: by units of less than what places may be rounded by there."""
+    sheet = wc.Mesh.grid(17, 17)
+    mesh = wc.Mesh(sheet.points + 128.0, sheet.triangles)
+    if "velocities" in scene:
+        scene = scene | {"velocities": np.zeros_like(mesh.points) + scene["velocities"]}
+    scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=100.0)], **scene)
+    first = {"positions": mesh.points, "velocities": 0.0 * mesh.points, "gravity": np.array(scene.gravity)}
+    vary = {name: np.stack([first[name], first[name] + more]) for name, more in varied.items()}
+    model = scene.build(device=device, copies=2, vary=vary)
+    low = Gather(model, (model.vectors(), model.vectors()), 1e-3, True, passes.is_fine(model)).low
+    assert (low.dtype is wp.int32) == packed

@@ -1,0 +1,207 @@
+"""A run that gains energy which no source put in is named, and no other run is."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpcloth as wc
+from support.meshes import PAIR
+from support.scenes import LIVELY, QUICK, scene
+from support.scenes import SMALL as SIZES
+from warpcloth.cli import main
+from warpcloth.core.operators import Energy, Sums
+from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.stability import measure
+from warpcloth.run import balance
+from warpcloth.run.simulate import Watch
+from warpcloth.scenes import flag, hanging, net
+
+SMALL = SIZES | {"mobile": {"n": 5}, "net": {"n": 6}}
+# Frames of the larger of them; the others have 30.
+FRAMES = {"usd_cloth": 3, "bunny": 2, "bar_twist": 15, "mobile": 15}
+
+
+def noisy(declared, size):
+    """A scene whose free vertices start with noise [m]."""
+    noise = size * np.random.default_rng(0).normal(size=declared.positions.shape)
+    noise[declared.pins.vertices] = 0.0
+    return replace(declared, positions=declared.positions + noise)
+
+
+BLOWN_UP = {
+    "over-relaxed sweeps": (
+        lambda: hanging.scene(n=8, stiffness=np.inf),
+        wc.PBD(substeps=1, iterations=1, sweep="sequential", relaxation=1.5),
+        "gained energy",
+    ),
+    "ADMM with too small a weight": (
+        lambda: hanging.scene(n=32, duration=0.5),
+        wc.ADMM(substeps=1, integrator="midpoint", weight=1e-6),
+        "an edge has a strain",
+    ),
+    "noise in Jacobi sweeps": (
+        lambda: noisy(net.scene(stiffness=np.inf), 1e-6),
+        wc.PBD(substeps=1, iterations=1, sweep="jacobi", relaxation=1.2),
+        "gained energy",
+    ),
+    "a net that falls": (
+        lambda: replace(noisy(net.scene(stiffness=np.inf), 1e-6), gravity=(0.0, -9.81, 0.0), duration=2.0),
+        wc.PBD(substeps=1, iterations=1, sweep="coloured", relaxation=1.5),
+        "gained energy",
+    ),
+    "moving pins": (
+        lambda: flag.scene(nx=9, ny=6),
+        wc.XPBD(substeps=1, iterations=2, integrator="midpoint"),
+        "moving pins and falling can have put in",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BLOWN_UP)
+def test_what_gains_energy_is_named(name, device):
+    """These runs completed without the balance, with strains of 464 and 5530 %, 10 m/s from 1e-6 m, 200 and 2640 %."""
+    make, solver, said = BLOWN_UP[name]
+    animation = wc.simulate(make(), solver, device=device)
+    assert not animation.status.ok and said in animation.status.message
+    assert len(animation.points) == animation.status.frame + 1 > 1 and np.isfinite(animation.points).all()
+    assert animation.worst_strain < balance.STRETCHED
+
+
+def test_the_command_line_says_so_and_keeps_the_good_frames(tmp_path, capsys, monkeypatch, device):
+    monkeypatch.chdir(tmp_path)
+    options = "-s sweep=sequential relaxation=1.5 iterations=1 substeps=1 -o out.usdc".split()
+    command = ["run", "hanging", "-p", "n=8", "stiffness=inf", "--solver", "pbd", *options, "--device", device]
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert "it has gained energy" in said and " J of motion and height" in said and "the last good frame is" in said
+    assert (tmp_path / "out.usdc").is_file()
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("solver", QUICK)
+@pytest.mark.parametrize("name", SMALL)
+def test_no_scene_that_holds_is_called_diverged(name, solver, device):
+    declared, record = scene(name, **SMALL[name]), QUICK[solver]
+    if name == "net":
+        declared = noisy(declared, 0.01)
+    try:
+        record.bind(declared.build(device=device))
+    except ValueError:  # what a solver cannot take it refuses
+        return
+    status = wc.simulate(declared, record, device=device, frames=FRAMES.get(name, 30)).status
+    assert status.ok, status.message
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("solver", QUICK)
+@pytest.mark.parametrize("name", LIVELY)
+def test_energy_of_the_start_is_a_source(name, solver, device):
+    """Springs that start long, an attachment far away: sweeps that close their gaps in a step throw more than ½kx²."""
+    make, mesh = LIVELY[name]
+    record = wc.Explicit(substeps=4000) if solver == "explicit" else QUICK[solver]
+    status = wc.simulate(wc.Scene(mesh, duration=0.1, **make(mesh)), record, device=device).status
+    assert status.ok, status.message
+
+
+def spring(part):
+    """A mass on a spring of ω = 2π/s without gravity, with frames of this part of 2/ω."""
+    omega, positions = 2.0 * np.pi, [[0.0, 0.0, 0.0], [1.01, 0.0, 0.0]]
+    given = {"fps": omega / (2.0 * part), "duration": 400 * 2.0 * part / omega, "gravity": (0, 0, 0), "pins": [0]}
+    return wc.Scene(PAIR, masses=[1.0, 1.0], positions=positions, terms=[wc.Spring(stiffness=omega**2)], **given)
+
+
+def test_symplectic_euler_is_judged_by_what_it_keeps(device):
+    """At ωh = 1.995 ½v² is up to 1/(1 − ω²h²/4) = 200 times that of the start, with v at the time of x no more than it."""
+    part = 0.9975
+    model = spring(part).build(device=device, dtype="float64")
+    with pytest.warns(UserWarning, match="in motion"):
+        stepper = wc.Explicit(substeps=1).bind(model)
+    watch, energy, swings = Watch(model, stepper), Energy(model, Sums(model)), []
+    U = wp.zeros(1, dtype=wp.float64, device=device)
+    energy.add(model.positions, U)
+    start = U.numpy()[0]
+    for frame in range(1, 401):
+        stepper.frame()
+        x, v = (np.array(array.numpy()) for array in stepper.state)
+        swings.append(0.5 * v[1, 0] ** 2 / start)
+        assert watch.passes(frame, x, v, stepper.results), watch.messages
+    # Of E = ½ω²x₀² the kept quantity is ½u² + (1 − part²)½ω²x²; of v it is reached only if a step ends at its peak.
+    assert 100.0 < max(swings) <= 1.001 / (1.0 - part**2)
+    assert watch.growth[0] <= balance.GAIN
+    above = wc.Explicit(substeps=1, above_limit="allow")
+    assert not wc.simulate(spring(1.01), above, device=device, dtype="float64").status.ok
+
+
+def moved(path, duration=2.0):
+    """A hanging chain of 5 links whose pin is moved along a path (times) → (F, 3) [m]."""
+    mesh = wc.Mesh.chain(6, length=1.0, direction=(0.0, -1.0, 0.0))
+    keyframes = path(np.arange(round(60 * duration) + 1) / 60.0)[:, None]
+    terms = [wc.Spring(stiffness=1e3)]
+    return wc.Scene(mesh, masses=np.full(6, 0.01), terms=terms, pins=wc.Pins([0], keyframes), duration=duration)
+
+
+PATHS = {
+    "lifted": lambda t: np.outer(t, [0.0, 3.0, 0.0]),
+    "lowered fast": lambda t: np.outer(np.minimum(t, 0.2), [0.0, -20.0, 0.0]),
+    "shaken": lambda t: np.outer(0.2 * np.sin(12.0 * t), [1.0, 0.0, 0.0]),
+    "shaken up and down": lambda t: np.outer(0.1 * np.sin(20.0 * t), [0.0, 1.0, 0.0]),
+    "started and stopped": lambda t: np.outer(np.clip(t - 0.2, 0.0, 0.5), [8.0, 0.0, 0.0]),
+    "swung round": lambda t: 0.5 * np.column_stack([np.cos(9.0 * t) - 1.0, np.sin(9.0 * t), 0.0 * t]),
+}
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("solver", ["explicit", "newton", "pbd", "xpbd"])
+@pytest.mark.parametrize("name", PATHS)
+def test_pins_may_put_energy_in(name, solver, device):
+    status = wc.simulate(moved(PATHS[name]), QUICK[solver], device=device, dtype="float64").status
+    assert status.ok, status.message
+
+
+def test_what_pins_stretch_may_turn_into_motion(device):
+    """A chain between pins that stretch it by half and let it snap back has nothing but what they stored in it."""
+    mesh = wc.Mesh.chain(9, length=1.0, direction=(1.0, 0.0, 0.0))
+    ends = np.zeros((61, 2, 3))
+    ends[:, 1, 0] = 1.0 + 0.5 * np.clip(np.arange(61) / 20.0, 0.0, 1.0)
+    ends[21:, 1, 0] = 1.0
+    terms = [wc.Spring(stiffness=2e3)]
+    given = {"masses": np.full(9, 0.01), "terms": terms, "pins": wc.Pins([0, 8], ends), "gravity": (0, 0, 0)}
+    animation = wc.simulate(wc.Scene(mesh, **given), wc.Explicit(substeps=256), device=device, dtype="float64")
+    assert animation.status.ok, animation.status.message
+    speed = np.linalg.norm(animation.velocities[22:], axis=-1).max()
+    assert speed > 10.0  # kept in float64, the waves that the jump of the pin leaves
+
+
+def test_each_copy_has_a_balance_of_its_own(device):
+    """Among three copies that differ in stiffness, the one whose step is too long is named."""
+    declared = noisy(hanging.scene(n=6, stiffness=10.0), 1e-3)
+    vary = {"Spring.stiffness": [10.0, 1e4, 50.0]}
+    solver = wc.Explicit(substeps=16, above_limit="allow")
+    status = wc.simulate(declared, solver, device=device, copies=3, vary=vary, frames=12).status
+    assert "copy 1: it has gained energy" in status.message and "copy 0" not in status.message
+    assert status.good[0] == status.good[2] == 12 > status.good[1]
+
+
+def test_a_source_of_a_new_kind_counts(device, monkeypatch):
+    """A new solver that carries a mass along declares its source by an entry of SOURCES."""
+
+    class Wind(balance.Source):
+        name = "wind"
+
+        def energy(self, frame, speed):
+            return 1e6
+
+    make, solver, _ = BLOWN_UP["over-relaxed sweeps"]
+    monkeypatch.setattr(balance, "SOURCES", [*balance.SOURCES, lambda balance, stepper: Wind()])
+    assert wc.simulate(make(), solver, device=device).status.ok
+
+
+def test_a_cell_of_a_map_that_gains_is_not_stable(device):
+    """By (1 + h²ω²) a step forward Euler grows little in few steps: 3.7 times by h = 0.07 s."""
+    scene, setup = SceneRef("net", {"n": 8}), Setup("explicit", {"scheme": "forward"})
+    given = {"device": device, "reference": False}
+    cells = measure(asdict(scene), [asdict(setup)], {}, "dt", [0.02, 0.07], 80, **given)[0]
+    assert [cell["verdict"] for cell in cells] == ["stable", "diverged"]
+    assert cells[0]["growth"] < balance.GAIN and "it has gained energy" in cells[1]["reason"]

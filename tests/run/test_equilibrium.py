@@ -1,0 +1,308 @@
+"""Rest shapes against closed forms: the heavy elastica, a hanging chain, the elastic catenary."""
+
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import warpcloth as wc
+from support.scenes import scene
+from warpcloth.core.status import digits
+from warpcloth.lab.elastica import aspect
+from warpcloth.numerics.linear import lowest_eigenvalue
+from warpcloth.run.equilibrium import SETTLED
+
+# H/W of the tip for Γ, to 8 digits.
+ASPECT = {
+    0.1: 0.012499554,
+    0.5: 0.062444457,
+    1.0: 0.12456177,
+    2.0: 0.24667321,
+    5.0: 0.58572118,
+    10.0: 1.0668023,
+    20.0: 1.8639301,
+    50.0: 3.705561,
+    100.0: 5.8881046,
+}
+GAMMAS = (0.1, 1.0, 5.0, 10.0, 20.0, 50.0)
+
+
+def tip_aspect(scene, points):
+    """H/W between the middle of the pinned vertices and the mean of the ends of the rows."""
+    rest = scene.mesh.points[:, 0]
+    spacing = np.unique(rest.round(9))[1]  # of vertices along the strip: half an edge, or a row
+    tip = points[rest > rest.max() - 1.5 * spacing].mean(axis=0)
+    clamp = 0.5 * rest[scene.pins.vertices].max()
+    return -tip[1] / (tip[0] - clamp)
+
+
+@pytest.mark.parametrize("gamma", ASPECT)
+def test_table_of_the_elastica(gamma):
+    assert aspect(gamma) == pytest.approx(ASPECT[gamma], rel=1e-7)
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("bending", ["quadratic", "dihedral"])
+@pytest.mark.parametrize("gamma", GAMMAS)
+def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
+    """One row of triangles bends with 8/9 of D: H/W at 9Γ/8 to 0.2 %, at second order in the mesh size."""
+    errors = []
+    for elements in (20, 40, 80):
+        strip = scene("cantilever", gamma=gamma, elements=elements, bending=bending, stretching=1e6)
+        rest = wc.equilibrium(strip, device=device)
+        assert rest.status.result in SETTLED, rest.status
+        errors.append(abs(tip_aspect(strip, rest.points) / aspect(9 * gamma / 8) - 1.0))
+    assert errors[2] < 0.002
+    orders = np.log2(errors[0] / errors[1]), np.log2(errors[1] / errors[2])
+    print(f"{bending} Γ={gamma:g}: errors {errors}, orders {orders}")
+    assert min(orders) > 1.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bending", ["quadratic", "dihedral"])
+@pytest.mark.parametrize("gamma", GAMMAS)
+def test_a_wide_sheet_is_the_elastica(gamma, bending, device):
+    """As wide as long and nearly inextensible its edges stay flat: H/W at Γ to 1.5 %.
+
+    They do where it bends by much more than its thickness, L√(12D/KL²). At Γ = 0.1 and KL²/D = 1e7 that is 11 times, and H/W
+    1.9 % off however fine the mesh; there the sheet is ten times stiffer.
+    """
+    stretching = 1e8 if gamma == 0.1 else 1e7
+    sheet = scene("cantilever", gamma=gamma, width=1.0, elements=45, bending=bending, stretching=stretching)
+    rest = wc.equilibrium(sheet, device=device)
+    assert rest.status.result in SETTLED, rest.status
+    error = tip_aspect(sheet, rest.points) / ASPECT[gamma] - 1.0
+    print(f"{bending} Γ={gamma:g}: {error:+.3%}, {rest.iterations} iterations")
+    assert abs(error) < 0.015
+
+
+@pytest.mark.parametrize("links", [1, 5, 20])
+def test_a_hanging_chain(links, device):
+    """N springs k and N masses m: the tip hangs (mg/k)·N(N+1)/2 lower."""
+    k, m = 1e3, 0.01
+    chain = scene("chain", links=links, mass=m, stiffness=k)
+    rest = wc.equilibrium(chain, tolerance=1e-13, device=device)
+    extension = -rest.points[-1, 1] - 1.0
+    assert extension == pytest.approx(m * 9.81 / k * links * (links + 1) / 2, rel=1e-9)
+
+
+@pytest.mark.parametrize(("stretching", "sag"), [(1e4, 0.29240076), (1e2, 0.29792987)])
+def test_an_elastic_catenary(stretching, sag, device):
+    """Sag of the continuous cable at second order in the number of links."""
+    errors = []
+    for links in (50, 100, 200):
+        rest = wc.equilibrium(scene("catenary", links=links, stretching=stretching), device=device)
+        assert rest.status.result in SETTLED, rest.status
+        errors.append(-rest.points[:, 1].min() / sag - 1.0)
+    orders = np.log2(errors[0] / errors[1]), np.log2(errors[1] / errors[2])
+    assert errors[2] < 2e-5
+    assert np.allclose(orders, 2.0, atol=0.05)
+
+
+def test_load_steps_end_in_the_same_shape(device):
+    strip = scene("cantilever", gamma=10.0, elements=20, stretching=1e5)
+    shapes = [wc.equilibrium(strip, load_steps=steps, device=device).points for steps in (1, 3)]
+    assert np.abs(shapes[0] - shapes[1]).max() < 1e-6
+
+
+def test_without_anything_that_holds_it_is_not_converged(device):
+    """A free cloth under gravity has no rest shape, and that is said."""
+    free = wc.Scene(wc.Mesh.grid(3, 3), density=0.1, terms=[wc.Spring(stiffness=10.0)])
+    rest = wc.equilibrium(free, iterations=50, device=device)
+    assert rest.status.result not in SETTLED
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"tolerance": 0.0}, "tolerance is 0.0"),
+        ({"load_steps": 0}, "load_steps is 0"),
+        ({"iterations": 2.5}, "iterations is 2.5"),
+        ({"linear": "lu"}, "linear is 'lu'"),
+    ],
+)
+def test_options_are_checked(option, message):
+    with pytest.raises(ValueError, match=message):
+        wc.equilibrium(scene("chain"), **option)
+
+
+UNSTABLE = {
+    "a chain that stands on its pin": wc.Scene(
+        wc.Mesh.chain(6, direction=(0, 1, 0)), masses=np.full(6, 0.01), terms=[wc.Spring(stiffness=1e3)], pins=[0]
+    ),
+    "a sheet upright on two corners": wc.Scene(
+        wc.Mesh(wc.Mesh.grid(9, 9).points[:, [0, 2, 1]], wc.Mesh.grid(9, 9).triangles),
+        density=0.1,
+        terms=[wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-3)],
+        pins=[0, 8],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNSTABLE)
+def test_balance_that_is_no_minimum_is_left(name, device):
+    """In exact symmetry no force says so, but the Hessian does: nudged, they fall and hang."""
+    rest = wc.equilibrium(UNSTABLE[name], device=device)
+    assert rest.status.result in SETTLED, rest.status
+    assert rest.points[:, 1].mean() < -0.4 and rest.stable
+
+
+def test_float32_comes_near_float64(device):
+    """The noise of stiff springs in the residual must not end the descent while the strip still sinks.
+
+    With kL²/D = 1e4 float32 resolves the springs well enough; at 1e5 it ends 2e-6 m (CPU) or 0.07 m (CUDA, and says so) off.
+    """
+    strip = scene("cantilever", stretching=1e4)
+    single, double = (wc.equilibrium(strip, dtype=dtype, device=device) for dtype in ("float32", "float64"))
+    assert single.status.message.startswith("converged as far as rounding allows")
+    assert np.abs(single.points - double.points).max() < 1e-4
+
+
+def test_what_rounding_hides_is_no_rest_shape(device):
+    """With kL²/D = 1e6 float32 leaves forces of 8 times the weight, and the strip 0.2 m away."""
+    rest = wc.equilibrium(scene("cantilever", stretching=1e6), dtype="float32", device=device)
+    assert rest.status.result not in SETTLED
+    assert rest.status.message.startswith("rounding hides the rest shape in float32")
+
+
+def test_a_sheet_too_stiff_to_move_is_no_rest_shape(device):
+    """Its whole weight is left unbalanced, 1 in the residual but for an ulp to either side, which decides nothing."""
+    mesh = wc.Mesh.grid(5, 5)
+    for density in (0.1, 0.3, 0.7, 1e-3):
+        sheet = wc.Scene(mesh, density=density, terms=[wc.Spring(stiffness=1e18)], pins=[0, 4])
+        rest = wc.equilibrium(sheet, device=device)
+        assert rest.status.result not in SETTLED and not rest.stable, rest.status
+        assert rest.status.residual > 1.0 - 1e-6  # and what lengths are rounded by times the stiffness, which is 0 on the CPU
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_what_is_at_rest_without_weight_is_settled(dtype, device):
+    """The forces at the start are rounding, and those that are left are as large: nothing that a rest shape could hide."""
+    for seed in range(4):
+        mesh = wc.Mesh.grid(5, 5)
+        mesh = wc.Mesh(mesh.points + 0.05 * np.random.default_rng(seed).normal(size=mesh.points.shape), mesh.triangles)
+        for terms in ([wc.Spring(stiffness=1e3), wc.DihedralBending(stiffness=1e-3)], [wc.NeoHookeanMembrane(stiffness=1e3)]):
+            rest = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, gravity=(0, 0, 0)), dtype=dtype, device=device)
+            assert rest.status.result in SETTLED and rest.stable, rest.status
+            assert np.abs(rest.points - mesh.points).max() < (1e-2 if dtype == "float32" else 1e-6)
+
+
+def test_a_saddle_that_is_not_left_is_reported(device, monkeypatch):
+    """What no nudge moves away from is in balance, and said to be no more."""
+    monkeypatch.setattr("warpcloth.numerics.minimise.Minimiser.curves_down", lambda self, tolerance: True)
+    rest = wc.equilibrium(scene("chain", links=3), device=device)
+    assert rest.status.result.name == "SADDLE"
+
+
+@pytest.mark.parametrize("stretch", [1.01, 1.02, 1.05, 1.1, 1.2, 1.3])
+def test_a_circle_of_minima_is_no_saddle(stretch, device):
+    """A chain of two links too long for its span may buckle any way round: a zero eigenvalue is not a negative one."""
+    mesh = wc.Mesh([[0, 0, 0], [1, 1, 0], [2, 2, 0]], edges=[[0, 1], [1, 2]])
+    spring = wc.Spring(stiffness=10.0, rest_lengths=stretch * np.sqrt(2.0))
+    rest = wc.equilibrium(wc.Scene(mesh, masses=np.ones(3), terms=[spring], pins=[0, 2], gravity=(0, 0, 0)), device=device)
+    assert rest.status.result in SETTLED
+    lengths = np.linalg.norm(np.diff(rest.points, axis=0), axis=1)
+    assert lengths == pytest.approx(stretch * np.sqrt(2.0), rel=1e-6)
+
+
+def test_a_slack_part_does_not_hide_a_saddle(device):
+    """A link that lies slack makes the Hessian singular; the chain under pressure beside it still buckles."""
+    mesh = wc.Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 0, 0], [6, 0, 0]], edges=[[0, 1], [1, 2], [3, 4]])
+    spring = wc.Spring(stiffness=10.0, rest_lengths=[1.5, 1.5, 1.0])
+    cloth = wc.Scene(mesh, masses=np.ones(5), terms=[spring], pins=[0, 2, 3], gravity=(0, 0, 0))
+    rest = wc.equilibrium(cloth, device=device)
+    assert np.linalg.norm(rest.points[1] - rest.points[0]) == pytest.approx(1.5, rel=1e-6)
+
+
+def test_a_light_vertex_is_in_balance_beside_a_heavy_one(device):
+    """Balance is asked of every vertex: 1e6 kg elsewhere excuse nothing at 1e-3 kg."""
+    mesh = wc.Mesh([[0, 0, 0], [1, 0, 0], [3, 0, 0], [4, 0, 0]], edges=[[0, 1], [2, 3]])
+    spring = wc.Spring(stiffness=[10.0, 1e9])
+    cloth = wc.Scene(mesh, masses=[1.0, 1e-3, 1.0, 1e6], terms=[spring], pins=[0, 2])
+    rest = wc.equilibrium(cloth, device=device)
+    assert rest.points[1] == pytest.approx([0.0, -1.0 - 1e-3 * 9.81 / 10.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("light", [1.0, 1e-6, 1e-12])
+def test_what_weighs_nothing_hides_no_rest_shape(light, device):
+    """A chain under its own weight: the forces that rounding leaves at a light mass are held against the whole load."""
+    k, masses = 1e5, np.full(6, 1e-3) * [1, 1, 1, light, 1, 1]
+    chain = wc.Scene(wc.Mesh.chain(6), masses=masses, terms=[wc.Spring(stiffness=k)], pins=[0])
+    rest = wc.equilibrium(chain, device=device)
+    assert rest.status.result.name == "CONVERGED" and rest.status.residual <= 1e-8, rest.status
+    assert "times the weight (tolerance 1e-08)" in rest.status.message
+    below = np.cumsum(masses[:0:-1])[::-1] * 9.81
+    assert -np.diff(rest.points[:, 1]) == pytest.approx(0.2 + below / k, rel=1e-9)
+
+
+STANDING = {"held": (1.5, True), "held too little": (0.5, False)}
+
+
+@pytest.mark.parametrize(("share", "stable"), STANDING.values(), ids=STANDING)
+def test_stability_of_a_mass_on_a_strut(share, stable, device, monkeypatch):
+    """A mass on a strut of length l falls sideways with −mg/l, and an attachment k at its head holds it: k − mg/l [N/m]."""
+    k, m = 1e3, 0.5
+    length = 1.0 - m * 9.81 / k
+    head = share * m * 9.81 / length
+    strut = wc.Scene(
+        wc.Mesh.chain(2, direction=(0, 1, 0)),
+        masses=np.full(2, m),
+        terms=[wc.Spring(stiffness=k), wc.Attachment(vertices=[1], stiffness=head, targets=[[0.0, length, 0.0]])],
+        pins=[0],
+    )
+    monkeypatch.setattr(import_module("warpcloth.run.equilibrium"), "_nudge", lambda model: 0.0)
+    rest = wc.equilibrium(strut, device=device)
+    assert rest.points[1] == pytest.approx([0.0, length, 0.0], abs=1e-9)
+    assert rest.lowest_eigenvalue == pytest.approx(head - m * 9.81 / length, rel=1e-6)
+    assert rest.stable is stable and (rest.status.result in SETTLED) is stable
+    said = f"not stable, because the lowest eigenvalue of the Hessian is {digits(rest.lowest_eigenvalue)} N/m: "
+    assert (said in rest.status.message) is not stable
+    monkeypatch.undo()
+    assert wc.equilibrium(strut, device=device).stable
+
+
+def test_rigid_motions_are_no_instability(device):
+    """A sheet that nothing holds has six eigenvalues of 0, here stirred by its rounding; a hanging one has none."""
+    mesh = wc.Mesh.grid(9, 9)
+    turned = mesh.points @ wc.polar(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    terms = [wc.Spring(stiffness=1e3), wc.DihedralBending(stiffness=1e-3)]
+    free = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, positions=turned, gravity=(0, 0, 0)), device=device)
+    assert free.stable and abs(free.lowest_eigenvalue) < 1e-9
+    held = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, pins="corners"), device=device)
+    assert held.stable and held.lowest_eigenvalue > 1e-3
+    pinned = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms, pins="all"), device=device)
+    assert pinned.stable and pinned.lowest_eigenvalue == np.inf
+    unfinished = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms), iterations=20, device=device)
+    assert not unfinished.stable and np.isnan(unfinished.lowest_eigenvalue)
+    assert "; not a rest shape: " in unfinished.status.message
+
+
+@pytest.mark.parametrize("lowest", [-3e4, -1e-3, 0.0, 1e-3, 10.0])
+@pytest.mark.parametrize("n", [30, 600])
+def test_the_lowest_eigenvalue(n, lowest):
+    """Of the Laplacian of a path, 2 − 2 cos(πj/(n+1)), where all are moved and one is put far below."""
+    matrix = 1e5 * scipy.sparse.diags([-1.0, 2.0, -1.0], [-1, 0, 1], (n, n))
+    smallest = 1e5 * (2.0 - 2.0 * np.cos(np.pi / (n + 1)))
+    moved = matrix + (lowest - smallest) * scipy.sparse.identity(n)
+    assert lowest_eigenvalue(moved) == pytest.approx(lowest, rel=1e-6, abs=1e-7)
+    assert lowest_eigenvalue(scipy.sparse.block_diag([moved, [[-1e3]]])) == pytest.approx(min(lowest, -1e3), rel=1e-6)
+    assert np.isnan(lowest_eigenvalue(moved * np.nan)) and lowest_eigenvalue(scipy.sparse.csc_array((0, 0))) == np.inf
+
+
+@pytest.mark.parametrize("load_steps", [1, 4])
+def test_pins_end_at_their_last_keyframe(load_steps, device):
+    """A cable whose end is carried to where another starts hangs as that one does."""
+    started = scene("catenary", links=20)
+    ends = started.positions[started.pins.vertices]
+    away = ends + np.linspace(0.0, 1.0, 5)[:, None, None] * [[[0.0, 0.0, 0.0], [0.0, -0.3, 0.2]]]
+    moved = replace(started, pins=wc.Pins(started.pins.vertices, away))
+    fixed = replace(started, pins=started.pins.vertices)
+    positions = started.positions.copy()
+    positions[started.pins.vertices] = away[-1]
+    one = wc.equilibrium(moved, load_steps=load_steps, device=device)
+    other = wc.equilibrium(replace(fixed, positions=positions), device=device)
+    assert one.status.result in SETTLED and other.status.result in SETTLED
+    assert np.array_equal(one.points[started.pins.vertices], away[-1])
+    assert np.abs(one.points - other.points).max() < 1e-6

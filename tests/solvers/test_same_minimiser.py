@@ -1,0 +1,115 @@
+"""One state, one step, one answer: who minimises ends at the x(t + h) of Newton; who does not is listed, with the reason.
+
+The state is that of ``hanging`` with 16² vertices at 0.3 s, springs of 1e3 N/m and quadratic bending of 1e-5 N·m, h = 1/60 s.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from support.steps import after_one_step, swinging
+from warpcloth.core.operators import Gradient
+from warpcloth.solvers import SOLVERS
+from warpcloth.solvers.projective_dynamics import ACCELERATIONS
+
+slow = pytest.mark.slow
+# So far iterated that the gradient is rounding.
+PD = wc.ProjectiveDynamics(substeps=1, tolerance=1e-11)
+TAKE_PART = {
+    **{
+        f"newton {policy} {linear}": wc.Newton(substeps=1, tolerance=1e-11, hessian=policy, linear=linear)
+        for policy in ("adaptive", "clamp", "absolute", "raw")
+        for linear in ("cg", "factorised")
+    },
+    "projective dynamics anderson": replace(PD, iterations=5_000, acceleration="anderson"),
+    "projective dynamics l-bfgs": replace(PD, iterations=3_000, acceleration="l-bfgs"),
+    "projective dynamics matrix-free": replace(PD, iterations=6_000, acceleration="l-bfgs", linear="jacobi"),
+    "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=12_000, weight=0.1),
+    **{
+        f"constrained dynamics {linear}": wc.ConstrainedDynamics(substeps=1, tolerance=1e-12, iterations=200, linear=linear)
+        for linear in ("cg", "factorised")
+    },
+    "xpbd coloured": wc.XPBD(substeps=1, iterations=30_000),
+    "xpbd sequential": wc.XPBD(substeps=1, iterations=30_000, sweep="sequential"),
+}
+SLOW = {
+    "projective dynamics none": replace(PD, iterations=200_000, acceleration="none"),
+    "projective dynamics chebyshev": replace(PD, iterations=20_000, acceleration="chebyshev"),
+    "projective dynamics chebyshev-jacobi": replace(PD, iterations=60_000, acceleration="chebyshev", linear="jacobi"),
+    "admm heavy": wc.ADMM(substeps=1, tolerance=1e-11, iterations=200_000),
+    "xpbd jacobi": wc.XPBD(substeps=1, iterations=1_000_000, sweep="constraint-averaged"),
+}
+DO_NOT = {
+    wc.Explicit: "takes the forces of where the step begins and minimises nothing",
+    wc.PBD: "projects onto constraints whose stiffness depends on iterations and step",
+    wc.HierarchicalPBD: "does the same, after levels of constraints that the scene does not have",
+}
+FEW = ("newton", "constrained")  # iterations; the fixed points of the others are tested on devices with fewer vertices too
+each_solver = pytest.mark.parametrize(
+    "name",
+    [
+        *(pytest.param(name, marks=() if name.startswith(FEW) else pytest.mark.host) for name in TAKE_PART),
+        *(pytest.param(name, marks=slow) for name in SLOW),
+    ],
+)
+
+
+@cache
+def newton_step(device):
+    """x(t + h) (n, 3) [m]."""
+    solver = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised")
+    return after_one_step(swinging(16), solver, device)[0]
+
+
+def unbalanced(x, device):
+    """The largest ‖∇φᵢ‖/mᵢ over gravity's at x, and what rounding of lengths may make of it: 4ε k times valence and size."""
+    declared = swinging(16)
+    model = declared.build(device=device, dtype="float64")
+    gradient, h = model.vectors(), 1.0 / declared.fps
+    Gradient(model).add(model.array(x, model.vec3), gradient)
+    mass = declared.vertex_masses[:, None]
+    predicted = declared.positions + h * declared.velocities + h**2 * declared.gravity
+    total = (gradient.numpy() + mass * (x - predicted) / h**2)[model.inverse_mass.numpy() > 0.0]
+    noise = 4.0 * np.finfo(np.float64).eps * (1e3 * 8 + mass[0, 0] / h**2) / mass[0, 0]
+    return np.linalg.norm(total, axis=1).max() / mass[0, 0] / 9.81, noise / 9.81
+
+
+@each_solver
+def test_all_meet(name, device):
+    """1e-8 m in float64, where the gradient falls to rounding too, and 1e-4 m in float32."""
+    solver = (TAKE_PART | SLOW)[name]
+    x, _ = after_one_step(swinging(16), solver, device)
+    residual, noise = unbalanced(x, device)
+    print(name, "from Newton", np.abs(x - newton_step(device)).max(), "unbalanced", residual, "of rounding", noise)
+    assert np.abs(x - newton_step(device)).max() < 1e-8
+    assert residual < 10.0 * noise
+    # A million sweeps of XPBD would add up roundings of d and of λ, which each go their own way, to 2e-4 m.
+    short = replace(solver, iterations=min(solver.iterations, 400_000))
+    x, _ = after_one_step(swinging(16), short, device, "float32")
+    assert np.abs(x - newton_step(device)).max() < 1e-4
+    if not isinstance(solver, (wc.Newton, wc.ConstrainedDynamics)):  # which need fewer
+        few, _ = after_one_step(swinging(16), replace(solver, iterations=50), device)
+        assert np.abs(few - newton_step(device)).max() > 1e-4, "fifty iterations are not enough to say anything"
+
+
+@pytest.mark.host
+def test_scalar_xpbd_stops_short(device):
+    """It neglects how ∇C turns within the step: a gap that more sweeps leave and smaller steps close, at order 2 or more."""
+    gaps = []
+    for substeps in (1, 2, 4, 8):
+        newton = wc.Newton(substeps=substeps, tolerance=1e-12, linear="factorised")
+        scalar = wc.XPBD(substeps=substeps, iterations=30_000, form="scalar")
+        ends = [after_one_step(swinging(16), solver, device) for solver in (newton, scalar)]
+        gaps.append(np.abs(ends[1][0] - ends[0][0]).max())
+        assert substeps > 1 or ends[1][1].residual[0] > 1.0
+    assert gaps == pytest.approx([1.3e-3, 2.0e-4, 4.8e-5, 5.0e-6], rel=0.1)
+    assert (np.log2(np.array(gaps[:-1]) / gaps[1:]) > 2.0).all()
+
+
+def test_every_solver_is_named():
+    named = {type(solver) for solver in (TAKE_PART | SLOW).values()} | set(DO_NOT)
+    assert named == set(SOLVERS.values())
+    assert {solver.acceleration for solver in (TAKE_PART | SLOW).values() if type(solver) is type(PD)} == set(ACCELERATIONS)

@@ -1,0 +1,568 @@
+"""Solvers against closed forms: oscillators, free fall, momentum, limits of stability, convergence."""
+
+import gc
+import weakref
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpcloth as wc
+from support.meshes import PAIR
+from support.nets import net
+from support.setups import SOLVERS, allocations, square
+from warpcloth.core.capture import Segment, on_host
+from warpcloth.core.operators import Hessian, RowSums, Sums
+from warpcloth.core.status import Result
+from warpcloth.numerics.constraints import Constraints
+from warpcloth.solvers import explicit
+from warpcloth.solvers.explicit import limit_in_motion, step_limits
+
+EPS = np.finfo(np.float64).eps
+
+
+def oscillator(omega, h):
+    """A unit mass at x = 1 on a linear spring to the origin; the other vertex is pinned and takes no part."""
+    return wc.Scene(
+        PAIR,
+        masses=[1.0, 1.0],
+        terms=[wc.Attachment(vertices=[1], targets=[[0.0, 0.0, 0.0]], stiffness=omega**2)],
+        pins=[0],
+        gravity=(0.0, 0.0, 0.0),
+        fps=1.0 / h,
+        duration=200 * h,
+    )
+
+
+RANDOM = np.random.default_rng(5)
+UNLIKE = {
+    "stiffness and gravity": {
+        "Spring.stiffness": [50.0, 100.0, 200.0],
+        "gravity": [[0, -9.81, 0], [0, -1.6, 0], [3.0, 0, 0]],
+    },
+    "density, bending and damping": {
+        "density": [0.05, 0.1, 0.2],
+        "QuadraticBending.stiffness": [0.0, 1e-4, 1e-3],
+        "Spring.damping": [0.0, 0.01, 0.05],
+    },
+    "masses and start": {
+        "masses": RANDOM.uniform(0.002, 0.004, (3, 36)),
+        "positions": square().mesh.points + RANDOM.normal(scale=0.01, size=(3, 36, 3)),
+        "velocities": RANDOM.normal(scale=0.1, size=(3, 36, 3)),
+    },
+}
+
+
+def one_of(scene, vary, copy):
+    """The scene that is one of the copies."""
+    for name, values in vary.items():
+        label, _, field = name.rpartition(".")
+        if label:
+            terms = [replace(each, **{field: values[copy]}) if each.label == label else each for each in scene.terms]
+            scene = replace(scene, terms=terms)
+        else:
+            scene = replace(scene, **{name: values[copy]}, **({"density": None} if name == "masses" else {}))
+    return scene
+
+
+@pytest.mark.parametrize("omega_h", [0.1, 1.0, 1.9])
+@pytest.mark.parametrize("method", ["symplectic", "forward", "implicit"])
+def test_oscillator_keeps_its_invariant(method, omega_h, device):
+    """v² + ω²x² − hω²xv is kept; forward multiplies the energy by 1 + ω²h² a step, implicit by 1/(1 + ω²h²)."""
+    h, omega = 0.1, omega_h / 0.1
+    solver = (
+        wc.Newton(substeps=1, tolerance=1e-14)
+        if method == "implicit"
+        else wc.Explicit(substeps=1, scheme=method, above_limit="allow")
+    )
+    scene = oscillator(omega, h)
+    stepper = solver.bind(scene.build(device=device, dtype="float64"))
+    energies = []
+    for _ in range(40):
+        x, v = stepper.state.x.numpy()[1, 0], stepper.state.v.numpy()[1, 0]
+        mixed = -h * omega**2 * x * v if method == "symplectic" else 0.0
+        energies.append(v * v + omega**2 * x * x + mixed)
+        stepper.step()
+    factor = {"symplectic": 1.0, "forward": 1 + omega_h**2, "implicit": 1 / (1 + omega_h**2)}[method]
+    expected = energies[0] * factor ** np.arange(40)
+    # A few roundings a step of terms as large as v² + ω²x².
+    assert np.allclose(energies, expected, rtol=40 * 20 * EPS, atol=40 * 20 * EPS * omega**2)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_free_fall(name, dtype, device):
+    """y_n = −g h² n(n+1)/2 for every method of first order, −½g(nh)² for those of second, and no strain."""
+    scene = square(solver=SOLVERS[name], fps=600.0)
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype=dtype))
+    start, steps = scene.mesh.points, 300
+    for _ in range(steps):
+        stepper.step()
+    drop = stepper.state.x.numpy() - start
+    second = getattr(SOLVERS[name], "integrator", "euler") != "euler"
+    exact = -9.81 * stepper.h**2 * steps * (steps + (0 if second else 1)) / 2
+    # Every step rounds x to ε·|x|, |x| up to the larger of size and drop, and v to ε·|v|, which h carries into x each step.
+    eps = np.finfo(dtype).eps
+    tolerance = 2 * steps * eps * (1.0 + abs(exact))
+    assert np.abs(drop - [0.0, exact, 0.0]).max() < tolerance
+
+
+# Averaging by vertex keeps neither; Jacobi steps of one matrix keep momentum in the end, not on the way.
+@pytest.mark.parametrize("name", [name for name in SOLVERS if "vertex" not in name and "matrix-free" not in name])
+def test_momentum_is_conserved(name, device):
+    """Inner forces cancel: P is kept; symplectic Euler and midpoint keep L too, the others lose it in x_new − x_old."""
+    angular, implicit = name in ("explicit", "newton midpoint"), name.startswith("newton")
+    rng = np.random.default_rng(1)
+    scene = square(solver=SOLVERS[name], gravity=(0.0, 0.0, 0.0), fps=600.0, duration=1.0, velocities=rng.normal(size=(36, 3)))
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
+    mass = scene.vertex_masses[:, None]
+
+    def momenta():
+        x, v = stepper.state.x.numpy(), stepper.state.v.numpy()
+        return (mass * v).sum(axis=0), np.cross(x, mass * v).sum(axis=0)
+
+    (P, L), scale = momenta(), np.sum(mass * np.abs(scene.velocities))
+    for _ in range(50):
+        stepper.step()
+    P1, L1 = momenta()
+    # The residual of an implicit step is a force; 1e-12 of the scale of forces for 50 steps stays below 1e-9 of the momentum.
+    assert np.abs(P1 - P).max() < (1e-9 if implicit else 50 * 100 * EPS) * scale
+    kept = np.abs(L1 - L).max() < 50 * 100 * EPS * scale
+    assert kept == angular
+
+
+def tensioned():
+    """A cloth stretched by a tenth between two pinned sides, plucked: every spring longer than at rest."""
+    mesh = wc.Mesh.grid(8, 8)
+    positions = 1.1 * mesh.points
+    positions[:, 1] = 0.05 * np.sin(np.pi * mesh.points[:, 0]) * np.sin(np.pi * mesh.points[:, 2])
+    terms = [wc.Spring(pairs=("structural", "shear"), stiffness=100.0), wc.QuadraticBending(stiffness=1e-3)]
+    return wc.Scene(mesh, density=0.1, positions=positions, terms=terms, pins="x<0.01 or x>0.99")
+
+
+@pytest.mark.parametrize("linear", ["cg", "factorised"])
+def test_newton_converges_quadratically(linear, device):
+    """Where all springs are in tension: r_{i+1} ≤ C r_i², down to 1e-12 of the residual at x̃."""
+    solver = wc.Newton(substeps=2, tolerance=1e-15, linear=linear)
+    stepper = solver.bind(tensioned().build(device=device, dtype="float64"))
+    stepper._predict()
+    residuals = []
+    for iterations in range(9):
+        stepper.minimiser.minimise(1e-15, iterations)
+        residuals.append(stepper.minimiser.residual[0])
+    r = np.array(residuals) / residuals[0]
+    assert r[-1] <= 1e-12
+    # Order from three iterates in a row, log r₂/r₁ over log r₁/r₀, above rounding (2e-15). CG solves as well as r has fallen,
+    # so that it keeps order 2.
+    r = r[r > 1e-13]
+    assert len(r) >= 4
+    assert (np.log(r[2:] / r[1:-1]) / np.log(r[1:-1] / r[:-2]))[-1] > 1.7
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda scene: wc.Explicit(substeps=1, scheme="forward"), "forward Euler is stable at no step"),
+        (lambda scene: wc.Explicit(substeps=1), "symplectic Euler is stable below .* substeps a frame"),
+    ],
+)
+def test_unstable_steps_are_refused_with_the_limit(build, message, device):
+    scene = square(duration=1.0, pins="corners")
+    scene = replace(scene, terms=[wc.Spring(pairs="structural", stiffness=1e5)])
+    with pytest.raises(ValueError, match=message):
+        build(scene).bind(scene.build(device=device))
+
+
+def test_steps_above_gershgorins_bound_warn(device):
+    scene = net("shear", duration=1.0, fps=1.0)
+    rest, motion = step_limits(scene.build(device=device))
+    h = 0.5 * (rest + motion)
+    scene = net("shear", duration=h, fps=1 / h)
+    with pytest.warns(UserWarning, match="in motion, hinges and membranes counted as at rest"):
+        wc.Explicit(substeps=1).bind(scene.build(device=device))
+
+
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.host)])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_sheet_at_rest_stays_there(name, dtype, device):
+    """Its rest shape, one pinned vertex, no gravity: it does not move in a second, and does not spin about the pin."""
+    pin, solver = 14, SOLVERS[name]
+    scene = square(solver=solver, gravity=(0.0, 0.0, 0.0), fps=600.0, pins=[pin])
+    stepper = solver.bind(scene.build(device=device, dtype=dtype))
+    for _ in range(600):
+        stepper.step()
+    x, v = (array.numpy().astype(np.float64) for array in stepper.state)
+    arms, mass, eps = scene.mesh.points - scene.mesh.points[pin], scene.vertex_masses, np.finfo(dtype).eps
+    L = np.cross(arms, mass[:, None] * v).sum(axis=0)
+    inertia = np.einsum("n,nkk,ij->ij", mass, arms[:, :, None] * arms[:, None], np.eye(3))
+    inertia -= np.einsum("n,ni,nj->ij", mass, arms, arms)
+    # Forces are made of rounding: a step moves a place of size 1 by up to ε, to and fro or, at worst, as in a random walk.
+    assert np.abs(x - scene.mesh.points).max() < 2.0 * np.sqrt(600) * eps
+    # A random walk of the velocity ends √3 times as fast as it is in the mean: of a vertex 0.5 m off that moves by that much.
+    assert np.linalg.norm(np.linalg.solve(inertia, L)) * 600 * stepper.h * 0.5 < np.sqrt(3.0) * 2.0 * np.sqrt(600) * eps
+
+
+VARIED = {
+    "nothing": (2, {}),
+    "where they are": (2, {"gravity": RANDOM.normal(size=(2, 3)), "velocities": RANDOM.normal(size=(2, 36, 3))}),
+    "density": (3, {"density": [0.1, 0.3, 0.1]}),
+    "stiffness": (3, {"Spring.stiffness": [100.0, 100.0, 400.0]}),
+    "damping": (2, {"Spring.damping": [0.1, 0.0]}),
+}
+
+
+@pytest.mark.parametrize("name", VARIED)
+def test_limits_of_copies_are_the_least_of_each(name, device, monkeypatch):
+    """Found once for those that are alike, whatever number of them there is; and the quick one by itself."""
+    (copies, vary), built = VARIED[name], {"device": device, "dtype": "float64"}
+    scene = square(pins="corners", damping=0.05)
+    alone = np.array([step_limits(one_of(scene, vary, copy).build(**built)) for copy in range(copies)])
+    searches = []
+    monkeypatch.setattr(explicit, "_at_rest", lambda *given, before=explicit._at_rest: searches.append(1) or before(*given))
+    model = scene.build(copies=copies, vary=vary, **built)
+    assert step_limits(model) == tuple(alone.min(axis=0))
+    assert len(searches) == len(np.unique(alone, axis=0))
+    assert limit_in_motion(model) == alone[:, 1].min()
+    # Below the second a step is stable about the rest shape too: no need to look for the first.
+    fps = 1.0 / (0.999 * alone[:, 1].min())
+    wc.Explicit(substeps=1).bind(replace(scene, fps=fps, duration=1 / fps).build(copies=copies, vary=vary, **built))
+    assert len(searches) == len(np.unique(alone, axis=0)) and (alone[:, 1] <= alone[:, 0]).all()
+
+
+@pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1)])
+def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
+    with pytest.raises(ValueError, match="cannot take Spring with infinite stiffness; PBD"):
+        solver.bind(net("structural", n=4, stiffness=np.inf).build(device=device))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: wc.Newton(), "exactly one of dt and substeps"),
+        (lambda: wc.Newton(dt=0.01, substeps=2), "exactly one of dt and substeps"),
+        (lambda: wc.Newton(dt=-0.01), "dt is -0.01"),
+        (lambda: wc.Newton(dt=float("nan")), "dt is nan"),
+        (lambda: wc.Newton(substeps=0), "substeps is 0"),
+        (lambda: wc.Newton(substeps=1.5), "substeps is 1.5"),
+        (lambda: wc.Newton(substeps=1, integrator="trapezoid"), "integrator is 'trapezoid'; it must be one of 'euler'"),
+        (lambda: wc.Newton(substeps=1, hessian="psd"), "hessian is 'psd'; it must be one of"),
+        (lambda: wc.Newton(substeps=1, linear="lu"), "linear is 'lu'"),
+        (lambda: wc.Newton(substeps=1, tolerance=0.0), "tolerance is 0.0"),
+        (lambda: wc.Explicit(substeps=1, scheme="verlet"), "scheme is 'verlet'"),
+        (lambda: wc.PBD(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.PBD(substeps=1, alpha=-1.0), "alpha is -1.0"),
+        (lambda: wc.PBD(substeps=1, alpha=1.0), "alpha is 1; it belongs to sweep='vertex-averaged'"),
+        (lambda: wc.PBD(substeps=1, relaxation=0.0), "relaxation is 0.0"),
+        (lambda: wc.PBD(substeps=1, sweep="gauss"), "sweep is 'gauss'; it must be one of 'vertex-averaged'"),
+        (lambda: wc.PBD(substeps=1, stiffness="1e3"), "stiffness is '1e3'"),
+        (lambda: wc.HierarchicalPBD(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.HierarchicalPBD(substeps=1, coarse_iterations=0), "coarse_iterations is 0"),
+        (lambda: wc.HierarchicalPBD(substeps=1, levels=-1), "levels is -1"),
+        (lambda: wc.HierarchicalPBD(substeps=1, relaxation=0.0), "relaxation is 0.0"),
+        (lambda: wc.XPBD(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.XPBD(substeps=1, sweep="vertex-averaged"), "sweep is 'vertex-averaged'; it must be one of 'coloured'"),
+        (lambda: wc.XPBD(substeps=1, form="row"), "form is 'row'"),
+        (lambda: wc.XPBD(substeps=1, relaxation=-1.0), "relaxation is -1.0"),
+        (lambda: wc.ProjectiveDynamics(), "exactly one of dt and substeps"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, tolerance=0.0), "tolerance is 0.0"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, acceleration="lbfgs"), "acceleration is 'lbfgs'; it must be one of 'none'"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, window=0), "window is 0"),
+        (lambda: wc.ProjectiveDynamics(substeps=1, linear="cg"), "linear is 'cg'; it must be one of 'factorised', 'jacobi'"),
+        (lambda: wc.ConstrainedDynamics(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.ConstrainedDynamics(substeps=1, tolerance=0.0), "tolerance is 0.0"),
+        (lambda: wc.ConstrainedDynamics(substeps=1, stabilisation="on"), "stabilisation is 'on'; it must be one of 'none'"),
+        (lambda: wc.ConstrainedDynamics(substeps=1, linear="lu"), "linear is 'lu'"),
+        (lambda: wc.ADMM(substeps=1, iterations=0), "iterations is 0"),
+        (lambda: wc.ADMM(substeps=1, tolerance=-1.0), "tolerance is -1.0"),
+        (lambda: wc.ADMM(substeps=1, weight=0.0), "weight is 0.0"),
+        (lambda: wc.ADMM(substeps=1, weight="car"), "weight is 'car'; it must be 'auto' or a number above 0"),
+    ],
+)
+def test_options_are_checked(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("kind", ["hessian", "constraints"])
+def test_copies_that_are_done_are_left_out(kind, device):
+    """Of a product with the matrix, and of its sums: those that are active have theirs, what the others hold is as it was."""
+    model = square(positions=square().mesh.points + RANDOM.normal(scale=0.01, size=(36, 3))).build(
+        device=device, dtype="float64", copies=3
+    )
+    if kind == "hessian":
+        matrix, sums = Hessian(model), Sums(model)
+        matrix.assemble(model.positions, 1.0)
+    else:
+        matrix = Constraints(model, 0.01, curved=False)
+        matrix.launch_linearise(model.positions, model.vectors())
+        sums = RowSums(model, matrix.per_copy)
+    matrix.prepare()
+    p = RANDOM.normal(size=(3, *np.shape(matrix.matrices()[0])[:1]))
+    given = wp.array(p.reshape(matrix.count, -1).squeeze(), dtype=matrix.vector, device=device)
+    product, active = wp.zeros_like(given), wp.array([1, 0, 1], dtype=wp.int32, device=device)
+    matrix.multiply(given, product, active)
+    exact = np.array([each @ one for each, one in zip(matrix.matrices(), p, strict=True)])
+    found = product.numpy().reshape(3, -1)
+    # Rounding of sums of up to 100 terms.
+    assert np.allclose(found[[0, 2]], exact[[0, 2]], rtol=0.0, atol=100 * EPS * np.abs(exact).max())
+    assert not np.allclose(found[1], exact[1], rtol=1e-3, atol=0.0)
+    out = wp.full(3, np.nan, dtype=wp.float64, device=device)
+    sums.dot(given, given, out, active)
+    assert np.allclose(out.numpy()[[0, 2]], (p**2).sum(axis=1)[[0, 2]], rtol=100 * EPS)
+    assert not np.isclose(out.numpy()[1], (p[1] ** 2).sum())
+
+
+def test_a_frame_is_a_whole_number_of_steps(device):
+    with pytest.raises(ValueError, match="a frame must be a whole number of steps"):
+        wc.Newton(dt=0.01).bind(square().build(device=device))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_step_allocates_nothing(name, device):
+    """Of arrays of Warp; what scipy allocates to factorise on the host is outside the tracker's sight."""
+    solver = SOLVERS[name]
+    stepper = solver.bind(square(solver=solver, damping=0.01, fps=600.0, pins="corners").build(device=device, dtype="float64"))
+    stepper.step()
+    with wp.ScopedMemoryTracker("steps", print=False) as tracker:
+        assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1, "the tracker sees an allocation"
+        assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_same_run_gives_the_same_bits(name, dtype, device):
+    def run():
+        scene = square(solver=SOLVERS[name], damping=0.01, fps=600.0, pins="corners")
+        return wc.simulate(scene, SOLVERS[name], device=device, dtype=dtype, frames=10).points
+
+    assert np.array_equal(run(), run())
+
+
+@pytest.mark.parametrize("unlike", UNLIKE)
+@pytest.mark.parametrize("name", SOLVERS)
+def test_copies_run_as_if_alone(name, unlike, device):
+    """Every reduction is per copy: copies that differ do not notice one another."""
+    vary, solver = UNLIKE[unlike], SOLVERS[name]
+    velocities = np.random.default_rng(6).normal(scale=0.1, size=(36, 3))
+    base = square(solver=solver, fps=600.0, pins="corners", velocities=velocities)
+    kept = {"device": device, "dtype": "float64", "frames": 10}
+    batch = wc.simulate(base, solver, copies=3, vary=vary, **kept).points
+    for copy in range(3):
+        points = wc.simulate(one_of(base, vary, copy), solver, **kept).points
+        # Factorising all copies at once eliminates in another order, hence not the same bits there.
+        assert np.abs(batch[:, copy] - points).max() < 1e-9
+    assert np.ptp(batch[-1], axis=0).max() > 1e-5, "the copies are not alike"
+
+
+def led(solver, copies=3, device="cpu", dtype="float64", **vary):
+    """Copies of a damped cloth whose corners are led away, of different stiffness and gravity, bound."""
+    corners = [0, 5]
+    keyframes = square().mesh.points[corners] + np.linspace(0.0, 0.02, 5)[:, None, None] * [0.0, 1.0, 0.5]
+    scene = square(solver=solver, damping=0.01, fps=1200.0, pins=wc.Pins(corners, keyframes))
+    vary |= {"Spring.stiffness": [50.0, 100.0, 200.0], "gravity": [[0, -9.81, 0], [0, -1.6, 0], [3.0, 0, 0]]}
+    return solver.bind(scene.build(device=device, dtype=dtype, copies=copies, vary=vary))
+
+
+def seen(stepper):
+    """x and v of all copies, (2, B, n, 3), of its own."""
+    return np.array([array.numpy() for array in stepper.state]).reshape(2, stepper.model.copies, -1, 3)
+
+
+def stepped(stepper, steps):
+    """The states after each of so many steps, (steps, 2, B, n, 3)."""
+    states = []
+    for _ in range(steps):
+        stepper.step()
+        states.append(seen(stepper))
+    return np.array(states)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_copy_put_back_starts_again(name, device):
+    """To the bit, though it has become NaN, and the other copies notice neither; keyframes start again as well."""
+    states = stepped(led(SOLVERS[name], device=device), 10)
+    stepper = led(SOLVERS[name], device=device)
+    start = seen(stepper)
+    assert np.array_equal(stepped(stepper, 3), states[:3])
+    spoilt = stepper.state.x.numpy()
+    spoilt[stepper.model.per_copy + 7] = np.nan
+    stepper.state.x.assign(spoilt)
+    others = stepped(stepper, 2)
+    assert np.isnan(others[:, :, 1]).any()
+    stepper.reset([False, True, False])
+    assert np.array_equal(seen(stepper)[:, 1], start[:, 1])
+    assert stepper.results[1] is Result.COMPLETED
+    assert stepper.residual[1] == 0.0
+    again = stepped(stepper, 5)
+    assert np.array_equal(again[:, :, 1], states[:5, :, 1])
+    assert np.array_equal(np.concatenate([others, again])[:, :, [0, 2]], states[3:, :, [0, 2]])
+    assert Result.DIVERGED not in stepper.results
+    assert np.isfinite(stepper.residual).all()
+
+
+def test_a_residual_starts_again_where_it_is_kept(device):
+    """XPBD keeps the largest on the device: what comes after is that of a fresh run."""
+    fresh, stepper = (led(SOLVERS["xpbd"], device=device) for _ in range(2))
+    stepped(fresh, 2), stepped(stepper, 9)
+    kept = stepper.residual.copy()
+    stepper.reset([False, True, False])
+    stepped(stepper, 2)
+    assert kept[1] > fresh.residual[1] == stepper.residual[1]
+    assert (stepper.residual[[0, 2]] >= kept[[0, 2]]).all()
+
+
+@pytest.mark.parametrize("kind", ["numpy", "warp", "vectors", "Warp's own vectors"])
+@pytest.mark.parametrize("name", ["explicit", "newton midpoint", "xpbd"])
+def test_copies_start_where_one_says(name, kind, device):
+    """As a model does whose copies vary so; pins stay with their keyframes and have no velocity."""
+    rng = np.random.default_rng(2)
+    positions = np.array(square().mesh.points + 0.01 * rng.normal(size=(3, 36, 3)))
+    velocities = rng.normal(size=(3, 36, 3))
+    stepper = led(SOLVERS[name], device=device)
+    model = stepper.model
+    held = positions.copy()
+    held[:, [0, 5]] = square().mesh.points[[0, 5]]
+    expected = stepped(led(SOLVERS[name], device=device, positions=held, velocities=velocities), 4)
+    stepped(stepper, 6)
+    given, mask = [positions, velocities], np.ones(3, dtype=bool)
+    if kind == "warp":
+        given = [wp.array(each, dtype=wp.float64, device=device) for each in given]
+    elif kind == "vectors":
+        given = [model.array(each.reshape(-1, 3), model.vec3) for each in given]
+    elif kind != "numpy":
+        given = [wp.array(each, dtype=wp.vec3d, device=device) for each in given]
+    stepper.reset(mask if kind == "numpy" else wp.array(mask, dtype=wp.bool, device=device), *given)
+    assert np.array_equal(stepped(stepper, 4), expected)
+    stepper.reset()
+    assert np.array_equal(stepped(stepper, 4), stepped(led(SOLVERS[name], device=device), 4))
+
+
+def test_putting_copies_back_allocates_nothing(device):
+    """After the first time, with arrays of the host and of the device."""
+    stepper = led(SOLVERS["xpbd"], device=device)
+    places, mask = np.zeros((3, 36, 3)), np.array([True, False, True])
+    arrays = [wp.array(mask, dtype=wp.bool, device=device), *(wp.array(places, dtype=wp.float64, device=device),) * 2]
+    stepper.reset(mask, places, places)
+    with wp.ScopedMemoryTracker("resets", print=False) as tracker:
+        assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1, "the tracker sees an allocation"
+        assert allocations(tracker, lambda: [stepper.reset(), stepper.reset(mask, places, places)]) == 0
+        assert allocations(tracker, lambda: stepper.reset(*arrays)) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("pbd", {"mask": [True, False]}, r"mask is .*; it must be an array \(3,\) of truth values"),
+        ("pbd", {"mask": [0, 1, 0]}, "mask is .* of truth values, one for each copy"),
+        ("pbd", {"mask": [[True], [True, False], True]}, "mask is .* of truth values, one for each copy"),
+        ("pbd", {"positions": [[1.0], [1.0, 2.0]]}, r"positions is .* not numeric; it must have shape \(3, 36, 3\)"),
+        ("pbd", {"mask": wp.int32}, r"mask is an array \(3,\) of int32; on the device"),
+        ("pbd", {"positions": np.zeros((36, 3))}, r"positions has shape \(36, 3\); it must be \(3, 36, 3\)"),
+        ("pbd", {"velocities": np.full((3, 36, 3), np.nan)}, "velocities.* must be finite"),
+        ("pbd", {"positions": wp.float32}, r"positions is an array .* of float32; on the device .* \(3, 36, 3\) of float64"),
+        ("newton bdf2", {"positions": np.zeros((3, 36, 3))}, "reset takes no positions or velocities with integrator='bdf2'"),
+    ],
+)
+def test_what_copies_are_put_back_by_is_checked(name, given, message, device):
+    shapes = {"mask": 3, "positions": (3, 36, 3)}
+    given = {
+        each: wp.zeros(shapes[each], dtype=value, device=device) if isinstance(value, type) else value
+        for each, value in given.items()
+    }
+    with pytest.raises(ValueError, match=message):
+        led(SOLVERS[name], device=device).reset(**given)
+
+
+def from_dlpack(module):
+    """The function of an installed package that takes an array over, where it is."""
+    return pytest.importorskip(module).from_dlpack
+
+
+@pytest.mark.parametrize(
+    "shared",
+    [
+        pytest.param(lambda: np.asarray, id="numpy"),
+        pytest.param(lambda: np.from_dlpack, id="dlpack"),
+        pytest.param(lambda: from_dlpack("torch"), id="torch"),
+        pytest.param(lambda: from_dlpack("jax.dlpack"), id="jax"),
+    ],
+)
+def test_the_state_is_shared_without_copies(shared, device):
+    """What steps move is seen by who took it over before, as (B, n, 3) numbers; NumPy sees the memory of the CPU alone."""
+    over = shared()
+    if over in (np.asarray, np.from_dlpack) and not wp.get_device(device).is_cpu:
+        pytest.skip("NumPy has arrays of the host alone")
+    stepper = led(SOLVERS["explicit"], device=device, dtype="float32")  # JAX makes float32 of float64 if not told otherwise
+    points = over(stepper.state.x)
+    before = seen(stepper)[0]
+    stepper.step()
+    wp.synchronize_device(device)
+    points = points.reshape(3, 36, 3)
+    after = np.asarray(points.cpu() if hasattr(points, "cpu") else points)
+    assert np.array_equal(after, seen(stepper)[0])
+    assert not np.array_equal(after, before)
+
+
+def test_the_array_interface_names_the_memory(device):
+    """As (B·n, 3) numbers that may be written, on CUDA as on the CPU."""
+    for array in led(SOLVERS["explicit"], device=device, dtype="float32").state:
+        found = array.__array_interface__ if array.device.is_cpu else array.__cuda_array_interface__
+        assert found["data"] == (array.ptr, False) and found["shape"] == (3 * 36, 3) and found["typestr"] == "<f4"
+
+
+def test_what_numpy_writes_is_the_state(device):
+    """Both ways: the next step starts there."""
+    if not wp.get_device(device).is_cpu:
+        pytest.skip("NumPy has arrays of the host alone")
+    stepper, other = (led(SOLVERS["explicit"], device=device) for _ in range(2))
+    velocities = np.random.default_rng(3).normal(size=(3, 36, 3))
+    np.asarray(stepper.state.v).reshape(3, 36, 3)[...] = velocities
+    other.state.v.assign(velocities.reshape(-1, 3))
+    assert np.array_equal(stepped(stepper, 2), stepped(other, 2))
+
+
+def test_moving_pins_follow_their_keyframes(device):
+    """Linear between keyframes within a frame's steps, at rest after the last, for every solver."""
+    keyframes = np.array([[[0.0, 0, 0]], [[0.1, 0, 0]], [[0.1, 0.2, 0]]])
+    scene = wc.Scene(
+        wc.Mesh.chain(3, direction=(1, 0, 0)),
+        masses=np.ones(3),
+        terms=[wc.Spring(stiffness=10.0)],
+        pins=wc.Pins([0], keyframes),
+        duration=1.0,
+    )
+    solvers = [record(substeps=4) for record in (wc.Newton, wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD)]
+    solvers += [record(substeps=4) for record in (wc.ProjectiveDynamics, wc.ADMM, wc.ConstrainedDynamics)]
+    solvers += [wc.Newton(substeps=4, integrator=integrator) for integrator in ("midpoint", "bdf2")]
+    for solver in solvers:
+        stepper = solver.bind(scene.build(device=device, dtype="float64"))
+        seen = []
+        for _ in range(12):
+            stepper.step()
+            seen.append(stepper.state.x.numpy()[0].copy())
+        exact = [np.interp(np.minimum(np.arange(1, 13) / 4, 2), range(3), keyframes[:, 0, i]) for i in range(3)]
+        assert np.allclose(seen, np.transpose(exact), atol=4 * EPS)
+        assert np.allclose(stepper.state.v.numpy()[0], 0.0)
+
+
+def test_a_host_call_inside_a_captured_segment_raises(device):
+    """A recorded host call would read what nothing has computed and be missing from every replay."""
+    at = wp.get_device(device)
+    with pytest.raises(RuntimeError, match="cannot be part of a captured segment"):
+        Segment(at, lambda: on_host(at, "reading a frame"))
+
+
+def test_a_segment_keeps_what_its_launches_read(device):
+    """A graph holds addresses only: on CUDA an array that nobody else refers to would be freed and its memory used again."""
+    at = wp.get_device(device)
+
+    def recorded():
+        source, target = wp.zeros(4, device=at), wp.zeros(4, device=at)
+        return Segment(at, lambda: wp.copy(target, source)), weakref.ref(source)
+
+    segment, source = recorded()
+    gc.collect()
+    assert source() is not None
+    segment()

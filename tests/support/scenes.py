@@ -1,0 +1,62 @@
+"""The scenes of the package at sizes that take a moment, and some that move a lot."""
+
+from importlib import import_module
+
+import warpcloth as wc
+from support.meshes import PAIR
+
+
+def scene(name, **parameters):
+    return import_module(f"warpcloth.scenes.{name}").scene(**parameters)
+
+
+LIVELY = {
+    "springs shorter than the cloth": (
+        lambda mesh: {
+            "terms": [wc.Spring(stiffness=1e5, rest_lengths=0.9 * mesh.edge_lengths)],
+            "density": 0.1,
+            "pins": [0, 7],
+        },
+        wc.Mesh.grid(8, 8, pattern="alternating"),
+    ),
+    "an attachment far away": (
+        lambda mesh: {
+            "terms": [wc.Attachment(vertices=[1], targets=[[3.0, 0.0, 0.0]], stiffness=1e3)],
+            "masses": [1.0, 1e-3],
+            "pins": [0],
+        },
+        PAIR,
+    ),
+    "a heavy pin": (
+        lambda mesh: {
+            "terms": [wc.Spring(stiffness=1e3)],
+            "masses": [1e6, 1e-3],
+            "pins": [0],
+            "positions": [[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]],
+        },
+        PAIR,
+    ),
+}
+SMALL = {
+    "hanging": {"n": 8},
+    "cantilever": {"elements": 6, "stretching": 1e3},
+    "chain": {"links": 5},
+    "catenary": {"links": 10, "stretching": 50.0},
+    "flag": {"nx": 9, "ny": 6},
+    "usd_cloth": {},
+    "bar_twist": {"cells": 2},
+    "bunny": {"stiffness": 10.0, "bending": 1e-4},
+}
+QUICK = {
+    "newton": wc.Newton(substeps=4),
+    "explicit": wc.Explicit(substeps=256),
+    "pbd": wc.PBD(substeps=4),
+    "pbd plain": wc.PBD(substeps=4, sweep="jacobi", relaxation=0.25),
+    "hierarchical pbd": wc.HierarchicalPBD(substeps=4),
+    "xpbd": wc.XPBD(substeps=16, iterations=4),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=4),
+    "projective dynamics plain": wc.ProjectiveDynamics(substeps=4, acceleration="none"),
+    "admm": wc.ADMM(substeps=4),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=4, iterations=4),
+    "constrained dynamics searching": wc.ConstrainedDynamics(substeps=4, iterations=4, stabilisation="line-search"),
+}

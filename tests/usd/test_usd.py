@@ -1,0 +1,1147 @@
+"""USD files: what is read, what is written, and what is left when the writer is killed."""
+
+import errno
+import gc
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp.examples
+from pxr import Gf, Sdf, Usd, UsdGeom
+
+from support.stages import (
+    CHUNK,
+    FRAMES,
+    PENTAGON,
+    PENTAGON_AND_TRIANGLE,
+    animated_prim,
+    anonymous_memory,
+    artist_stage,
+    define_mesh,
+    measures,
+    motion,
+    net,
+    sphere,
+    write,
+)
+from support.usd_validation import validate
+from warpcloth.analysis.analysis import Analyzer
+from warpcloth.cli.reports import write_report
+from warpcloth.mesh.mesh import Mesh
+from warpcloth.usd import AnimationWriter, FrameSequence, chunks, read_mesh, read_stage_mesh
+
+EPS = np.finfo(np.float32).eps
+SQUARE_CLOTH = os.path.join(warp.examples.get_asset_directory(), "square_cloth.usd")
+SAMPLED = {"points", "velocities", "normals", "extent"}
+
+
+def plain(folder):
+    mesh = Mesh.grid(5, 4, size=(1.0, 0.7))
+    return mesh, {"pins": {"corners": mesh.corners(), "row": [0, 1, 2]}, "metadata": {"solver": "none", "dt": 0.01}}
+
+
+def chain(folder):
+    return Mesh.chain(7, length=1.3), {"pins": {"top": [0]}}
+
+
+def over(folder, **options):
+    source = artist_stage(folder / "artist.usda", **options)
+    return read_mesh(source), {"source": source}
+
+
+def over_animated(folder):
+    return over(folder, animated=True)
+
+
+def over_mirrored(folder):
+    return over(folder, mesh=sphere(), orientation="leftHanded", scale=(-1, 2, 1))
+
+
+def over_package(folder):
+    mesh = Mesh.grid(5, 4)
+    return mesh, {"source": write(folder / "package.usdz", mesh)}
+
+
+def over_result(folder):
+    mesh = Mesh.grid(5, 4)
+    return mesh, {"source": write(folder / "first.usda", mesh, frames=2 * FRAMES, sign=-1.0)}
+
+
+def over_net(folder):
+    mesh, options = net(folder)
+    return mesh, {"source": write(folder / "net.usda", mesh, single_file=True, **options)}
+
+
+def over_square_cloth(folder):
+    return read_mesh(SQUARE_CLOTH), {"source": SQUARE_CLOTH}
+
+
+CASES = [
+    (plain, "usda", False),
+    (plain, "usdc", False),
+    (plain, "usd", False),
+    (plain, "usda", True),
+    (plain, "usdc", True),
+    (plain, "usd", True),
+    (plain, "usdz", True),
+    (chain, "usdc", False),
+    (chain, "usdz", True),
+    (net, "usda", False),
+    (net, "usdc", True),
+    (over, "usda", False),
+    (over, "usdc", True),
+    (over, "usdz", True),
+    (over_animated, "usdc", False),
+    (over_animated, "usdc", True),
+    (over_mirrored, "usdc", False),
+    (over_package, "usda", False),
+    (over_package, "usdc", True),
+    (over_result, "usdc", False),
+    (over_result, "usdc", True),
+    (over_net, "usda", False),
+    (over_square_cloth, "usda", False),
+    (over_square_cloth, "usdc", True),
+]
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case[0].__name__}-{case[1]}-{'one' if case[2] else 'chunks'}")
+def result(request, tmp_path_factory):
+    """A written animation: (path, mesh, options, the file alone)."""
+    make, ending, single_file = request.param
+    folder = tmp_path_factory.mktemp("usd")
+    mesh, options = make(folder)
+    options["primvars"] = {"turn": "vertex", "warpcloth:strain": "uniform"} if len(mesh.triangles) else {"turn": "vertex"}
+    path = write(folder / f"result.{ending}", mesh, single_file=single_file, **options)
+    return path, mesh, options, single_file
+
+
+def test_frames_come_back_in_metres_and_world_space(result):
+    path, mesh, _, _ = result
+    transform = read_stage_mesh(path).transform
+    linear = transform[:3, :3]
+    for attribute, part in (("points", 0), ("velocities", 1)):
+        sequence = FrameSequence(path, attribute=attribute)
+        assert sequence.shape == (FRAMES, len(mesh.points), 3) and sequence.dtype == np.float32
+        for frame, values in enumerate(sequence):
+            expected = motion(mesh, frame)[part]
+            local = (expected - (transform[3, :3] if part == 0 else 0)) @ np.linalg.inv(linear)
+            # Rounded once in the prim's own units, which the transform scales, and once in metres.
+            tolerance = EPS * (np.abs(local).max() * np.linalg.norm(linear, 2) + np.abs(expected).max())
+            np.testing.assert_allclose(values, expected, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(sequence.times, np.arange(FRAMES) / 24, atol=1e-12)
+
+
+def test_primvars_come_back(result):
+    path, mesh, options, _ = result
+    _stage, prim = animated_prim(path)
+    for name, interpolation in options["primvars"].items():
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(name)
+        assert (primvar.GetInterpolation(), primvar.GetTypeName()) == (interpolation, Sdf.ValueTypeNames.FloatArray)
+        assert primvar.GetAttr().GetTimeSamples() == prim.GetAttribute("points").GetTimeSamples()
+        sequence = FrameSequence(path, attribute=f"primvars:{name}", scale=0.5)
+        expected = [0.5 * measures(mesh, frame, options["primvars"])[name] for frame in range(FRAMES)]
+        assert sequence.ndim == 2 and sequence.shape == np.shape(expected)
+        np.testing.assert_array_equal(sequence, np.float32(expected))
+        np.testing.assert_array_equal(sequence[1:3, 4], np.float32(expected)[1:3, 4])
+
+
+def test_primvars_over_polygons_and_over_others_of_their_name(tmp_path):
+    """A face has the mean of its triangles; what the artist has under the same name is not seen, its indices and sizes too."""
+    stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    old = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("strain", Sdf.ValueTypeNames.FloatArray, "faceVarying", 3)
+    old.Set([1.0, 2.0, 3.0])
+    old.SetIndices([0] * 8)
+    stage.SetDefaultPrim(mesh.GetPrim())
+    stage.Save()
+    cloth = read_mesh(tmp_path / "a.usda")
+    primvars = {"strain": "uniform"}
+    for ending in ("usdc", "usdz"):
+        path = write(tmp_path / f"out.{ending}", cloth, source=tmp_path / "a.usda", primvars=primvars)
+        _stage, prim = animated_prim(path)
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("strain")
+        assert primvar.GetInterpolation() == "uniform" and not primvar.IsIndexed() and primvar.Get() is None
+        assert list(primvar.ComputeFlattened(2)) == [201.0, 203.0] and primvar.GetElementSize() == 1
+        assert validate(path, tmp_path / "a.usda") == []
+        assert FrameSequence(path, attribute="primvars:strain")[1].tolist() == [101.0, 103.0]
+
+
+def test_what_a_layer_over_a_prim_cannot_be(tmp_path):
+    """USD takes the type of an attribute from its strongest opinion and calls the others wrong; triangles are the prim's."""
+    stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("strain", Sdf.ValueTypeNames.Double).Set(1.0)
+    stage.Save()
+    cloth = read_mesh(tmp_path / "a.usda")
+    with pytest.raises(ValueError, match=r"primvars:strain has type double, must be float\[\] or not be there"):
+        AnimationWriter(tmp_path / "out.usdc", cloth, 24, source=tmp_path / "a.usda", primvars={"strain": "vertex"})
+    other = Mesh(cloth.points, cloth.triangles[:, ::-1])
+    with pytest.raises(ValueError, match="has other triangles than the mesh"):
+        AnimationWriter(tmp_path / "out.usdc", other, 24, source=tmp_path / "a.usda")
+
+
+@pytest.mark.parametrize("replaced", [2, 3, 4, 5, 6])
+def test_an_interrupted_chunk_is_written_again(tmp_path, monkeypatch, replaced):
+    """Whichever rename of a run is interrupted, closing leaves all frames that were appended."""
+    mesh = Mesh.grid(3, 3)
+    real, calls = os.replace, []
+
+    def replace(*paths):
+        calls.append(paths)
+        if len(calls) == replaced:
+            raise KeyboardInterrupt
+        real(*paths)
+
+    monkeypatch.setattr(os, "replace", replace)
+    writer = AnimationWriter(tmp_path / "out.usdc", mesh, 24, chunk=2)
+    appended = 0
+    with pytest.raises(KeyboardInterrupt):
+        for frame in range(6):
+            appended += 1
+            writer.append(mesh.points + frame, np.zeros_like(mesh.points))
+    writer.close()
+    assert len(FrameSequence(tmp_path / "out.usdc")) == appended
+
+
+@pytest.mark.parametrize(
+    ("attribute", "message"),
+    [
+        ("normals", 'must be "points", "velocities" or a primvar'),
+        ("primvars:turn", "primvars:turn have no time samples"),
+        ("primvars:colour", r"primvars:colour has type color3f\[\], must be float\[\]"),
+    ],
+)
+def test_what_a_sequence_cannot_read(tmp_path, attribute, message):
+    stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("colour", Sdf.ValueTypeNames.Color3fArray).Set([Gf.Vec3f(1)], 3)
+    stage.Save()
+    with pytest.raises(ValueError, match=message):
+        FrameSequence(tmp_path / "a.usda", attribute=attribute)
+
+
+def test_rest_shape_is_the_default(result):
+    path, mesh, options, _ = result
+    again = read_stage_mesh(path)
+    span = max(np.abs(mesh.points).max(), np.linalg.norm(again.transform[3]))
+    np.testing.assert_allclose(again.mesh.points, mesh.points, rtol=0, atol=4 * EPS * span)
+    np.testing.assert_array_equal(again.mesh.triangles, mesh.triangles)
+    np.testing.assert_array_equal(again.mesh.edges, mesh.edges)
+    for name, vertices in options.get("pins", {}).items():
+        np.testing.assert_array_equal(again.pins[name], np.unique(vertices))
+
+
+def test_passes_the_validators(result):
+    path, _, options, _ = result
+    assert validate(path, options.get("source")) == []
+
+
+def test_time_codes_and_samples(result):
+    path, _, options, _ = result
+    stage, prim = animated_prim(path)
+    start = 0.0
+    if "source" in options:
+        source = Sdf.Layer.FindOrOpen(options["source"])
+        start = source.startTimeCode if source.HasStartTimeCode() else 0.0
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (start, start + FRAMES - 1)
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == 24
+    for name in SAMPLED - ({"normals"} if prim.IsA(UsdGeom.BasisCurves) else set()):
+        assert prim.GetAttribute(name).GetTimeSamples() == [start + frame for frame in range(FRAMES)], name
+    # Frames between two samples, those at the seams of chunks too, and the last frame held after the end.
+    points = prim.GetAttribute("points")
+    for frame in range(FRAMES - 1):
+        both = [np.array(points.Get(start + f)) for f in (frame, frame + 1)]
+        size = np.abs(both).max()
+        np.testing.assert_allclose(points.Get(start + frame + 0.5), sum(both) / 2, rtol=0, atol=2 * EPS * size)
+    np.testing.assert_array_equal(points.Get(start + FRAMES + 5), points.Get(start + FRAMES - 1))
+    np.testing.assert_array_equal(points.Get(start - 5), points.Get(start))
+
+
+def test_extent_bounds_the_points(result):
+    path, _, _, _ = result
+    _stage, prim = animated_prim(path)
+    widths = UsdGeom.Curves(prim).GetWidthsAttr().Get() if prim.IsA(UsdGeom.Curves) else [0.0]
+    for code in [Usd.TimeCode.Default(), *prim.GetAttribute("points").GetTimeSamples()]:
+        points = np.array(prim.GetAttribute("points").Get(code))
+        extent = np.array(prim.GetAttribute("extent").Get(code))
+        tolerance = 2 * EPS * np.abs(points).max()
+        np.testing.assert_allclose(extent[0], points.min(0) - max(widths) / 2, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(extent[1], points.max(0) + max(widths) / 2, rtol=0, atol=tolerance)
+
+
+def test_normals_are_unit_at_vertices(result):
+    path, mesh, _, _ = result
+    _stage, prim = animated_prim(path)
+    if prim.IsA(UsdGeom.BasisCurves):
+        assert not prim.GetAttribute("normals").HasAuthoredValue()
+        return
+    assert UsdGeom.PointBased(prim).GetNormalsInterpolation() == "vertex"
+    assert UsdGeom.Mesh(prim).GetSubdivisionSchemeAttr().Get() == "none"
+    assert not UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals").HasValue(), "would be used instead of normals"
+    for code in [Usd.TimeCode.Default(), *prim.GetAttribute("normals").GetTimeSamples()]:
+        normals = np.array(prim.GetAttribute("normals").Get(code))
+        assert len(normals) == len(mesh.points)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=4 * EPS)
+
+
+@pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
+@pytest.mark.parametrize("scale", [(1, 1, 1), (-1, 2, 1)])
+def test_normals_point_to_the_front(tmp_path, orientation, scale):
+    """The faces say which side is the front: a left-handed sphere of the same faces is inside out."""
+    ball = sphere()
+    source = artist_stage(tmp_path / "artist.usda", ball, orientation, scale)
+    path = write(tmp_path / "out.usdc", read_mesh(source), source=source)
+    _stage, prim = animated_prim(path)
+    front = 1 if orientation == "rightHanded" else -1
+    for code in (Usd.TimeCode.Default(), 104):
+        points, normals = (np.array(prim.GetAttribute(name).Get(code)) for name in ("points", "normals"))
+        across = np.cross(
+            points[ball.triangles[:, 1]] - points[ball.triangles[:, 0]],
+            points[ball.triangles[:, 2]] - points[ball.triangles[:, 0]],
+        )
+        assert (front * np.einsum("tki,ti->tk", normals[ball.triangles], across) > 0).all()
+    # Read back, triangle normals are the front in world space, mirrored or not.
+    mesh = read_mesh(path)
+    corners = mesh.points[mesh.triangles] - mesh.points.mean(axis=0)
+    assert np.sign(np.linalg.det(corners)).tolist() == [front] * len(mesh.triangles)
+
+
+def test_scene_has_what_viewers_need(tmp_path):
+    mesh, options = plain(tmp_path)
+    stage, prim = animated_prim(write(tmp_path / "a.usda", mesh, **options))
+    assert stage.GetDefaultPrim().GetPath() == "/World" and prim.GetPath() == "/World/Cloth"
+    assert stage.GetPrimAtPath("/World/Looks").GetTypeName() == "Scope"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert stage.HasAuthoredMetadata("kilogramsPerUnit")
+    cloth = UsdGeom.Mesh(prim)
+    assert cloth.GetDoubleSidedAttr().Get() and cloth.GetOrientationAttr().Get() == "rightHanded"
+    assert cloth.GetDisplayColorAttr().Get() and not cloth.GetFaceVertexIndicesAttr().GetNumTimeSamples()
+    np.testing.assert_allclose(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get(), mesh.texture_coordinates, atol=EPS)
+    assert UsdGeom.Subset(prim.GetChild("row")).GetFamilyNameAttr().Get() == "pins"
+    assert stage.GetRootLayer().customLayerData["warpcloth"] == {"prim": "/World/Cloth", "solver": "none", "dt": 0.01}
+
+
+def test_chain_is_one_curve_in_order(tmp_path):
+    mesh, options = chain(tmp_path)
+    _stage, prim = animated_prim(write(tmp_path / "a.usda", mesh, **options))
+    assert list(UsdGeom.BasisCurves(prim).GetCurveVertexCountsAttr().Get()) == [len(mesh.points)]
+    np.testing.assert_allclose(prim.GetAttribute("points").Get(), mesh.points, atol=EPS * 1.3)
+
+
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+def test_layer_leaves_the_source_alone(tmp_path, single_file):
+    source = artist_stage(tmp_path / "artist.usda", animated=True)
+    before = Path(source).read_bytes()
+    output = tmp_path / "shots" / "shot.usda"
+    output.parent.mkdir()
+    write(output, read_mesh(source), source=source, single_file=single_file)
+    assert Path(source).read_bytes() == before
+    stage = Usd.Stage.Open(str(output))
+    assert stage.GetPrimAtPath("/Set/Ball").GetAttribute("xformOp:translate").Get(149) == Gf.Vec3d(48, 0, 0)
+    assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (0.01, "Z")
+    assert stage.GetDefaultPrim().GetPath() == "/Set"
+    assert str(tmp_path) not in stage.GetRootLayer().ExportToString(), "paths of other files must be relative"
+    if single_file:
+        assert not list(output.parent.glob("*_frames")) and not stage.GetRootLayer().subLayerPaths
+        return
+    own = set()
+    for layer in stage.GetLayerStack(includeSessionLayers=False):
+        if layer.realPath != source:
+            paths = []
+            layer.Traverse("/", paths.append)
+            own |= {str(path) for path in paths if path.IsPropertyPath()}
+    allowed = {*SAMPLED, "subdivisionScheme", "primvars:normals"}
+    assert own <= {f"/Set/Group/Sheet.{name}" for name in allowed}
+    # The whole may be moved, as long as it stays together.
+    shutil.copytree(tmp_path, tmp_path.parent / f"{tmp_path.name}-moved")
+    Path(source).rename(tmp_path / "elsewhere.usda")
+    shutil.rmtree(output.parent)
+    moved = FrameSequence(tmp_path.parent / f"{tmp_path.name}-moved" / "shots" / "shot.usda")
+    assert moved.shape[0] == FRAMES and np.isfinite(moved[-1]).all()
+
+
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+def test_other_rates_stay_in_step_with_the_source(tmp_path, single_file):
+    source = artist_stage(tmp_path / "artist.usda")
+    path = write(tmp_path / "out.usdc", read_mesh(source), fps=48, source=source, single_file=single_file)
+    stage, _ = animated_prim(path)
+    # Time code 101 of 24 a second is the same moment as 202 of 48; the ball is half-way at 125, so at 250.
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (202, 202 + FRAMES - 1)
+    assert stage.GetPrimAtPath("/Set/Ball").GetAttribute("xformOp:translate").Get(250) == Gf.Vec3d(24, 0, 0)
+
+
+def test_nothing_of_an_earlier_run_is_left(tmp_path):
+    mesh = Mesh.grid(5, 4)
+    output = tmp_path / "out.usdc"
+    write(output, mesh, frames=30, sign=-1.0)
+    kept = FrameSequence(output)  # keeps the earlier result's layers in pxr's memory
+    write(tmp_path / "out.usda", mesh, frames=4)  # another output whose folder has the same name
+    with AnimationWriter(output, mesh, 24, chunk=CHUNK) as writer:
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame))
+            earlier = frame < CHUNK - 1
+            now = FrameSequence(output)
+            assert len(now) == (30 if earlier else (frame + 1) // CHUNK * CHUNK)
+            expected = motion(mesh, 2, sign=-1.0 if earlier else 1.0)[0]
+            np.testing.assert_allclose(now[2], expected, atol=4 * EPS)
+    assert len(FrameSequence(output)) == FRAMES and len(kept) == 30
+    assert len(list((tmp_path / "out_frames").glob("usdc-*"))) == 1
+    assert len(FrameSequence(tmp_path / "out.usda")) == 4
+
+
+@pytest.mark.parametrize(
+    ("ending", "single_file"), [("usdc", False), ("usda", False), ("usdc", True), ("usda", True), ("usdz", True)]
+)
+@pytest.mark.parametrize("frames", [FRAMES, 4])
+def test_frames_of_two_runs_are_never_mixed(tmp_path, ending, single_file, frames):
+    mesh, output = Mesh.grid(5, 4), tmp_path / f"out.{ending}"
+    earlier = FrameSequence(write(output, mesh, single_file=single_file))
+    assert len(earlier[:2]) == 2
+    again = write(output, mesh, frames=frames, sign=-1.0, single_file=single_file)
+    for read in (np.asarray, lambda sequence: sequence[0], lambda sequence: next(iter(sequence))):
+        with pytest.raises(RuntimeError, match=f"out.{ending}: has been written again since these frames were opened; open it"):
+            read(earlier)
+    np.testing.assert_allclose(FrameSequence(again)[-1], motion(mesh, frames - 1, sign=-1.0)[0], atol=4 * EPS)
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["to a file", "to no file yet"])
+@pytest.mark.parametrize(
+    ("ending", "single_file"), [("usdc", False), ("usda", False), ("usdc", True), ("usda", True), ("usdz", True)]
+)
+def test_a_link_is_followed(tmp_path, ending, single_file, there):
+    mesh, shelf = Mesh.grid(5, 4), tmp_path / "shelf"
+    shelf.mkdir()
+    target, link, second = shelf / f"real.{ending}", tmp_path / f"link.{ending}", tmp_path / f"second.{ending}"
+    if there:
+        write(target, mesh, sign=-1.0, single_file=single_file)
+    link.symlink_to(target)
+    second.symlink_to(link.name)
+    path = write(second, mesh, single_file=single_file)
+    assert link.is_symlink() and second.is_symlink() and path == str(target)
+    assert sorted(os.listdir(tmp_path)) == sorted(["shelf", link.name, second.name])
+    assert sorted(os.listdir(shelf)) == [target.name] + ([] if single_file else ["real_frames"])
+    for name in (target, link, second):
+        np.testing.assert_allclose(FrameSequence(name)[3], motion(mesh, 3)[0], atol=4 * EPS)
+    assert validate(target) == []
+
+
+def test_frames_that_were_opened_outlive_their_file(tmp_path):
+    mesh = Mesh.grid(5, 4)
+    sequence = FrameSequence(write(tmp_path / "out.usdc", mesh))
+    expected = np.asarray(sequence)
+    for path in tmp_path.iterdir():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    np.testing.assert_array_equal(sequence, expected)
+
+
+@pytest.mark.parametrize("ending", ["usda", "usdz"])
+def test_an_error_keeps_the_frames_before_it(tmp_path, ending):
+    mesh = Mesh.grid(5, 4)
+    with pytest.raises(RuntimeError), AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, chunk=CHUNK) as writer:
+        for frame in range(5):
+            writer.append(*motion(mesh, frame))
+        raise RuntimeError("diverged")
+    assert len(FrameSequence(writer.path)) == 5
+    assert validate(writer.path) == []
+
+
+def test_no_frames_write_nothing(tmp_path):
+    write(tmp_path / "out.usdz", Mesh.grid(3, 3), frames=0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sequence_behaves_as_an_array(tmp_path):
+    mesh = Mesh.grid(5, 4)
+    sequence = FrameSequence(write(tmp_path / "out.usdc", mesh))
+    whole = np.asarray(sequence)
+    assert whole.shape == sequence.shape and whole.dtype == np.float32 and sequence.ndim == 3
+    for key in (
+        (),
+        0,
+        -1,
+        slice(2, 7, 2),
+        slice(None, None, -1),
+        [1, 3],
+        (2, 5),
+        (slice(1, 3), 4, 0),
+        (..., 1),
+        np.int64(3),
+    ):
+        np.testing.assert_array_equal(sequence[key], whole[key])
+    with pytest.raises(IndexError):
+        sequence[FRAMES]
+    assert np.array(sequence, dtype=np.float64).dtype == np.float64
+
+
+# ---------------------------------------------------------------------------------------------------------- reading
+
+
+@pytest.mark.parametrize(
+    ("attributes", "expected"),
+    [
+        ({}, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [1, 5, 2]]),
+        ({"orientation": "leftHanded"}, [[2, 1, 0], [3, 2, 0], [4, 3, 0], [2, 5, 1]]),
+    ],
+)
+def test_polygons_become_fans(tmp_path, attributes, expected):
+    stage, _ = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE, **attributes)
+    stage.Save()
+    mesh = read_mesh(tmp_path / "a.usda")
+    np.testing.assert_array_equal(mesh.triangles, expected)
+    np.testing.assert_array_equal(mesh.points, PENTAGON)
+
+
+def test_stage_is_read_with_its_surroundings(tmp_path):
+    source = artist_stage(tmp_path / "artist.usda")
+    read = read_stage_mesh(source, "Sheet")
+    assert (read.prim, read.meters_per_unit, read.up_axis) == ("/Set/Group/Sheet", 0.01, "Z")
+    assert (read.fps, read.time_codes_per_second, read.start) == (24, 24, 101)
+    assert read.pins["hem"].tolist() == [0, 1, 2]
+    stage = Usd.Stage.Open(source)
+    world = UsdGeom.Imageable(stage.GetPrimAtPath(read.prim)).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+    for point, rest in zip(read.mesh.points, Mesh.grid(5, 4).points, strict=True):
+        expected = 0.01 * np.array(world.Transform(Gf.Vec3d(*map(float, np.float32(100 * rest)))))
+        np.testing.assert_allclose(point, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("seam", [False, True])
+def test_corner_texture_coordinates_are_read_where_each_vertex_has_one(tmp_path, seam):
+    stage, mesh = define_mesh(tmp_path / "a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    st = np.array(PENTAGON)[PENTAGON_AND_TRIANGLE[1], :2] / 10
+    if seam:
+        st[5] += 0.5
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "faceVarying")
+    primvar.Set([Gf.Vec2f(*map(float, pair)) for pair in st])
+    stage.Save()
+    read = read_stage_mesh(tmp_path / "a.usda")
+    if seam:
+        assert read.mesh.texture_coordinates is None
+        corners = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [5, 6, 7]]  # of the fan, and of the triangle
+        np.testing.assert_allclose(read.corner_coordinates, st[corners], atol=EPS)
+    else:
+        np.testing.assert_allclose(read.mesh.texture_coordinates, np.array(PENTAGON)[:, :2] / 10, atol=EPS)
+        assert read.corner_coordinates is None
+
+
+def test_samples_alone_are_read_with_a_warning(tmp_path):
+    stage, mesh = define_mesh(tmp_path / "a.usda", None, *PENTAGON_AND_TRIANGLE)
+    mesh.GetPointsAttr().Set(PENTAGON, 7)
+    stage.Save()
+    with pytest.warns(UserWarning, match="no default value; the sample at time code 7"):
+        mesh = read_mesh(tmp_path / "a.usda")
+    np.testing.assert_array_equal(mesh.points, PENTAGON)
+    with pytest.warns(UserWarning, match="no default value"):
+        path = write(tmp_path / "out.usda", mesh, source=tmp_path / "a.usda")
+    np.testing.assert_array_equal(read_mesh(path).points, PENTAGON)
+
+
+def test_periodic_curves_are_closed(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    curves = UsdGeom.BasisCurves.Define(stage, "/Rope")
+    curves.CreateTypeAttr("linear")
+    curves.CreateWrapAttr("periodic")
+    curves.CreatePointsAttr(PENTAGON)
+    curves.CreateCurveVertexCountsAttr([3, 3])
+    stage.Save()
+    mesh = read_mesh(tmp_path / "a.usda")
+    assert mesh.edges.tolist() == [[0, 1], [0, 2], [1, 2], [3, 4], [3, 5], [4, 5]] and len(mesh.triangles) == 0
+
+
+def test_missing_textures_are_left_out_of_a_package(tmp_path):
+    with pytest.warns(UserWarning, match="the package is made without it"):
+        path = write(tmp_path / "a.usdz", read_mesh(SQUARE_CLOTH), source=SQUARE_CLOTH)
+    assert validate(path, SQUARE_CLOTH) == []
+    assert len(FrameSequence(path)) == FRAMES
+
+
+# ----------------------------------------------------------------------------------------------------------- errors
+
+
+def no_mesh(path):
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.Sphere.Define(stage, "/Set/Ball")
+    stage.Save()
+
+
+def two_meshes(path):
+    stage, _ = define_mesh(path, PENTAGON, *PENTAGON_AND_TRIANGLE)
+    UsdGeom.Mesh.Define(stage, "/Other")
+    stage.Save()
+
+
+def moving(path):
+    stage, mesh = define_mesh(path, PENTAGON, *PENTAGON_AND_TRIANGLE)
+    for code in (0, 1):
+        (mesh.GetTranslateOp() or mesh.AddTranslateOp()).Set(Gf.Vec3d(code), code)
+    stage.Save()
+
+
+def flattened(path):
+    stage, mesh = define_mesh(path, PENTAGON, *PENTAGON_AND_TRIANGLE)
+    mesh.AddScaleOp().Set(Gf.Vec3f(1, 0, 1))
+    stage.Save()
+
+
+def topology(points, counts, indices):
+    return lambda path: define_mesh(path, points, counts, indices)[0].Save()
+
+
+@pytest.mark.parametrize(
+    ("make", "prim", "error", "message"),
+    [
+        (lambda path: None, None, FileNotFoundError, "there is no such file"),
+        (lambda path: path.write_text("solid stl"), None, ValueError, "is no USD stage"),
+        (no_mesh, None, ValueError, r"has no Mesh prim, only /Set.*, /Set/Ball \(Sphere\)"),
+        (no_mesh, "/Set/Ball", ValueError, "prim /Set/Ball: is Sphere, must be a Mesh prim"),
+        (two_meshes, None, ValueError, "several meshes, name one of them as prim: /Sheet, /Other"),
+        (two_meshes, "/Third", ValueError, "prim /Third: there is no such prim, only /Sheet, /Other"),
+        (two_meshes, "/Other", ValueError, "prim /Other: has no points"),
+        (moving, None, ValueError, "prim /Sheet: the transform of /Sheet is animated"),
+        (flattened, None, ValueError, "must be invertible"),
+        (topology(PENTAGON, [2, 3], [0, 1, 2, 3, 4]), None, ValueError, "prim /Sheet: face 0 has 2 corners"),
+        (
+            topology(PENTAGON, [3, 3], [0, 1, 2, 3, 4]),
+            None,
+            ValueError,
+            "add up to 6, must be the number of indices, 5",
+        ),
+        (topology(PENTAGON, [3], [0, 1, 6]), None, ValueError, r"faceVertexIndices\[2\] = 6, must be a vertex, 0 to 5"),
+        (topology(PENTAGON, [3], [0, 1, 1]), None, ValueError, "prim /Sheet: triangles"),
+        (topology(PENTAGON, [], []), None, ValueError, "prim /Sheet: has no faces"),
+    ],
+)
+def test_bad_stages_are_refused(tmp_path, make, prim, error, message):
+    path = tmp_path / "a.usda"
+    make(path)
+    with pytest.raises(error, match=message) as caught:
+        read_mesh(path, prim)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"output": "nowhere/a.usda"}, FileNotFoundError, "nowhere does not exist"),
+        ({"output": "a.abc"}, ValueError, "must end with one of .usd, .usda, .usdc, .usdz"),
+        ({"output": "artist.usda", "source": "artist.usda"}, ValueError, "is a file of the source's stage"),
+        ({"output": "artist.usda", "source": "shot.usda"}, ValueError, "is a file of the source's stage"),
+        ({"source": "missing.usda"}, FileNotFoundError, "missing.usda: there is no such file"),
+        ({"source": "artist.usda", "pins": {"a": [0]}}, ValueError, "pins: a source has its own"),
+        ({"source": "instanced.usda"}, ValueError, "is part of an instance"),
+        ({"source": "artist.usda", "mesh": Mesh.grid(3, 3)}, ValueError, "has 20 vertices, must have as many.* 9"),
+        ({"pins": {"left side": [0]}}, ValueError, "pins: 'left side' must be a name"),
+        ({"pins": {"left": [0, 20]}}, ValueError, "0 to 20, must be whole numbers, 0 to 19"),
+        ({"fps": 0}, ValueError, "fps = 0: must be positive"),
+        ({"chunk": 0}, ValueError, "chunk = 0: must be a whole number, at least 1"),
+        ({"up_axis": "X"}, ValueError, "up_axis = 'X'"),
+        ({"primvars": {"max strain": "vertex"}}, ValueError, "primvars: 'max strain' must be a name such as rotationAngle"),
+        (
+            {"primvars": {"primvars:turn": "vertex"}},
+            ValueError,
+            "'primvars:turn' must be a name .* without primvars: before it",
+        ),
+        ({"primvars": {"turn:indices": "vertex"}}, ValueError, "'turn:indices' must be a name"),
+        ({"primvars": {"st": "vertex"}}, ValueError, "'st' has a meaning already, must be none of normals, st, displayColor"),
+        ({"primvars": {"turn": "varying"}}, ValueError, "primvars.'turn'. = 'varying': must be 'vertex' or 'uniform'"),
+        (
+            {"primvars": {"turn": "uniform"}, "mesh": Mesh.chain(3)},
+            ValueError,
+            "= 'uniform': must be 'vertex' of a mesh of edges",
+        ),
+        ({"prim": "/World/Cloth"}, ValueError, "prim = '/World/Cloth': must be a name"),
+        ({"output": "taken.usda"}, ValueError, "taken_frames: is a file"),
+        ({"output": "link.usdc"}, ValueError, "output = link.usdc: is a link to .*real.usda, must end as that does"),
+        ({"output": "lost.usda"}, FileNotFoundError, "the folder .*lost does not exist"),
+    ],
+)
+def test_bad_options_are_refused(tmp_path, monkeypatch, options, error, message):
+    monkeypatch.chdir(tmp_path)
+    artist_stage("artist.usda")
+    Path("shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@./artist.usda@]\n)\n")
+    Path("instanced.usda").write_text(
+        '#usda 1.0\ndef Xform "Copy" (\n    instanceable = true\n    references = @./artist.usda@\n)\n{\n}\n'
+    )
+    Path("taken_frames").write_text("")
+    Path("link.usdc").symlink_to("real.usda")
+    Path("lost.usda").symlink_to("lost/real.usda")
+    before = sorted(os.listdir())
+    with pytest.raises(error, match=message):
+        AnimationWriter(**{"output": "out.usda", "mesh": Mesh.grid(5, 4), "fps": 24, **options})
+    assert sorted(os.listdir()) == before
+
+
+def with_value(value, vertex):
+    points = Mesh.grid(5, 4).points.copy()
+    points[vertex, 1] = value
+    return points
+
+
+GOOD = Mesh.grid(5, 4).points
+
+
+@pytest.mark.parametrize(
+    ("points", "velocities", "message"),
+    [
+        (GOOD[:-1], GOOD, r"points: shape \(19, 3\) at frame 1, must be \(20, 3\)"),
+        (GOOD, GOOD[:, :2], r"velocities: shape \(20, 2\) at frame 1"),
+        (with_value(np.nan, 7), GOOD, "points: .*nan.* at frame 1, vertex 7, must be finite"),
+        (GOOD, with_value(-np.inf, 3), "velocities: .*-inf.* at frame 1, vertex 3, must be finite"),
+        (with_value(1e39, 0), GOOD, "points: .* at frame 1, vertex 0, must be finite in float32"),
+    ],
+)
+def test_bad_frames_are_refused(tmp_path, points, velocities, message):
+    writer = AnimationWriter(tmp_path / "a.usda", Mesh.grid(5, 4), 24)
+    writer.append(GOOD, GOOD)
+    with pytest.raises(ValueError, match=message):
+        writer.append(points, velocities)
+    writer.close()
+    assert len(FrameSequence(writer.path)) == 1
+    with pytest.raises(ValueError, match="is closed"):
+        writer.append(GOOD, GOOD)
+
+
+@pytest.mark.parametrize(
+    ("primvars", "message"),
+    [
+        (None, "primvars: none at frame 1, must be 'turn', 'strain'"),
+        ({"turn": GOOD[:, 0], "stress": GOOD[:, 0]}, "primvars: 'turn', 'stress' at frame 1, must be 'turn', 'strain'"),
+        ({"turn": GOOD, "strain": np.zeros(24)}, r"primvars\['turn'\]: shape \(20, 3\) at frame 1, must be \(20,\)"),
+        (
+            {"turn": with_value(np.nan, 7)[:, 1], "strain": np.zeros(24)},
+            r"\['turn'\]: nan at frame 1, vertex 7, must be finite",
+        ),
+        ({"turn": GOOD[:, 0], "strain": np.geomspace(1, 1e39, 24)}, r"\['strain'\]: 1e\+39 at frame 1, triangle 23, must be"),
+    ],
+)
+def test_bad_primvars_are_refused(tmp_path, primvars, message):
+    declared = {"turn": "vertex", "strain": "uniform"}
+    writer = AnimationWriter(tmp_path / "a.usda", Mesh.grid(5, 4), 24, primvars=declared)
+    writer.append(GOOD, GOOD, measures(Mesh.grid(5, 4), 0, declared))
+    with pytest.raises(ValueError, match=message):
+        writer.append(GOOD, GOOD, primvars)
+
+
+def test_unanimated_prims_have_no_frames(tmp_path):
+    with pytest.raises(ValueError, match="points have no time samples"):
+        FrameSequence(artist_stage(tmp_path / "a.usda"))
+
+
+def break_default(stage, prim):
+    prim.GetAttribute("points").ClearDefault()
+
+
+def break_extent(stage, prim):
+    prim.GetAttribute("extent").Set([(0, 0, 0), (0.1, 0.1, 0.1)])
+    prim.GetAttribute("extent").Set([(0, 0, 0), (0.1, 0.1, 0.1)], 3)
+
+
+def break_topology(stage, prim):
+    prim.GetAttribute("faceVertexIndices").Set([99] * len(prim.GetAttribute("faceVertexIndices").Get()))
+
+
+def break_units(stage, prim):
+    stage.GetRootLayer().pseudoRoot.ClearInfo("metersPerUnit")
+
+
+def break_material(stage, prim):
+    stage.GetPrimAtPath("/World/Looks/Cloth/Colour").GetAttribute("inputs:varname").Set("")
+    stage.RemovePrim("/World/Looks/Cloth")
+
+
+@pytest.mark.parametrize("damage", [break_default, break_extent, break_topology, break_units, break_material])
+def test_the_validators_can_fail(tmp_path, damage):
+    pytest.importorskip("usd_validation_nvidia", reason="part of the test extra")
+    path = write(tmp_path / "a.usdc", Mesh.grid(5, 4), single_file=True)
+    assert validate(path) == []
+    stage, prim = animated_prim(path)
+    damage(stage, prim)
+    stage.Save()
+    assert validate(path) != []
+
+
+# -------------------------------------------------------------------------------------------------- memory and kills
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="counts memory as Linux does")
+@pytest.mark.parametrize("ending", ["usdc", "usdz"])
+def test_memory_stays_flat(tmp_path, ending):
+    mesh = Mesh.grid(100, 100)
+    points, velocities = (values.astype(np.float32) for values in motion(mesh, 0))
+    frame_bytes = 3 * points.nbytes
+    writer = AnimationWriter(tmp_path / f"a.{ending}", mesh, 24)
+    for frame in range(500):
+        if frame == 50:
+            before = anonymous_memory()
+        writer.append(points + np.float32(1e-3 * frame), velocities)
+    writing = anonymous_memory() - before
+    writer.close(single_file=True)
+    closing = anonymous_memory() - before
+    for values in FrameSequence(writer.path):
+        assert values[0, 0] >= 0
+    reading = anonymous_memory() - before
+    # Kept frames would be 450 · 360 kB = 154 MiB. A chunk of 10, its copy and what malloc keeps stay below 40 frames.
+    for grown in (writing, closing, reading):
+        assert grown < 40 * frame_bytes, (writing, closing, reading)
+
+
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+@pytest.mark.parametrize("step", range(10))
+def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step, single_file):
+    """A disk that is full at any of the steps leaves the earlier result, or the new one as far as it got."""
+    mesh, output = Mesh.grid(5, 4), tmp_path / "out.usdc"
+    write(output, mesh, frames=30, sign=-1.0)
+    steps = iter(range(100))
+    replace = os.replace
+
+    def replace_until_full(*paths):
+        if next(steps) == step:
+            raise OSError("no space left on device")
+        replace(*paths)
+
+    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace_until_full)
+    writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
+    appended = 0
+    try:
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame))
+            appended += 1
+        writer.close(single_file=single_file)
+    except OSError:
+        assert appended < FRAMES or step >= 6
+    else:
+        assert step >= 8 and not single_file, "eight renames, and two more for one file"
+    now = FrameSequence(output)
+    assert len(now) == (30 if step <= 3 else min(FRAMES, (step - 2) // 2 * CHUNK))
+    for frame, points in enumerate(now):
+        np.testing.assert_allclose(points, motion(mesh, frame, -1.0 if step <= 3 else 1.0)[0], atol=4 * EPS)
+
+
+@pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
+@pytest.mark.parametrize("ending", ["usda", "usdc", "usdz"])
+def test_a_reader_finds_a_whole_file_at_any_moment(tmp_path, monkeypatch, ending, single_file):
+    """Before and after each rename, when it opens what was there before or the new frames so far."""
+    mesh, output, seen = Mesh.grid(5, 4), tmp_path / f"out.{ending}", []
+    write(output, mesh, frames=30, sign=-1.0)
+    real = os.replace
+
+    def look():
+        for path in {str(output), writer.path}:
+            if os.path.exists(path):
+                found = FrameSequence(path)
+                sign = -1.0 if len(found) == 30 else 1.0
+                seen.append(len(found))
+                for frame, points in enumerate(found):
+                    np.testing.assert_allclose(points, motion(mesh, frame, sign)[0], atol=4 * EPS)
+
+    def replace(*paths):
+        look()
+        real(*paths)
+        look()
+
+    writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
+    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace)
+    for frame in range(FRAMES):
+        writer.append(*motion(mesh, frame))
+    writer.close(single_file=single_file)
+    assert set(seen) == {30, 3, 6, 8}
+
+
+def test_an_output_has_one_writer_at_a_time(tmp_path):
+    """If two threads begin together, one is refused or starts later; outputs that differ in their ending do not conflict."""
+    mesh, output = Mesh.grid(4, 4), tmp_path / "out.usdc"
+
+    def run(sign):
+        together.wait()
+        try:
+            return write(output, mesh, sign=sign)
+        except BlockingIOError as error:
+            return str(error)
+
+    for _ in range(20):
+        together = threading.Barrier(2, timeout=60.0)
+        with ThreadPoolExecutor(2) as pool:
+            found = list(pool.map(run, (1.0, -1.0)))
+        assert str(output) in found
+        assert all(text == str(output) or f"{output}: is being written by " in text for text in found)
+        points = np.asarray(FrameSequence(output))
+        sign = np.sign(points[1, 0, 2])
+        for frame in range(FRAMES):
+            np.testing.assert_allclose(points[frame], motion(mesh, frame, sign)[0], atol=4 * EPS)
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["out.usdc", "out_frames"]
+    with AnimationWriter(output, mesh, 24) as writer:
+        writer.append(*motion(mesh, 0))
+        write(tmp_path / "out.usdz", mesh)
+    assert len(FrameSequence(output)) == 1 and len(FrameSequence(tmp_path / "out.usdz")) == FRAMES
+
+
+def test_a_writer_that_nobody_closed_or_that_failed_holds_nobody_up(tmp_path):
+    mesh, output = Mesh.grid(4, 4), tmp_path / "out.usdc"
+    writer = AnimationWriter(output, mesh, 24)
+    writer.append(*motion(mesh, 0))
+    with pytest.raises(BlockingIOError):
+        write(output, mesh)
+    del writer
+    gc.collect()
+    with pytest.raises(ValueError, match="velocities"), AnimationWriter(output, mesh, 24) as writer:
+        writer.append(mesh.points, mesh.points[:1])
+    with pytest.raises(ValueError, match="source"), AnimationWriter(output, mesh, 24) as writer:
+        raise ValueError("source")
+    assert len(FrameSequence(write(output, mesh))) == FRAMES
+
+
+HOLDER = """
+import os, sys
+sys.path[:0] = {path!r}
+from support.stages import Mesh, motion
+from warpcloth.usd import AnimationWriter
+writer = AnimationWriter(sys.argv[1], Mesh.grid(4, 4), 24)
+writer.append(*motion(Mesh.grid(4, 4), 0))
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_writer_of_another_process_is_waited_for_until_it_is_killed(tmp_path):
+    mesh, output = Mesh.grid(4, 4), tmp_path / "out.usdc"
+    script = HOLDER.format(path=[str(Path(__file__).parents[1]), *sys.path])
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", script, str(output)], **pipes) as holder:
+        assert holder.stdout.readline() == "ready\n"
+        with pytest.raises(BlockingIOError, match=rf"out\.usdc: is being written by process {holder.pid} on .*; wait"):
+            write(output, mesh)
+        holder.kill()
+        holder.wait()
+    assert (tmp_path / ".out.usdc.lock").exists()
+    assert len(FrameSequence(write(output, mesh))) == FRAMES
+    assert not (tmp_path / ".out.usdc.lock").exists()
+
+
+def test_a_link_in_place_of_a_lock_is_not_written_through(tmp_path):
+    """Anybody may leave one in a shared folder; the file that it stands for was emptied."""
+    (tmp_path / "precious").write_text("text")
+    (tmp_path / ".out.usdc.lock").symlink_to("precious")
+    with pytest.raises(OSError, match=r"\.out\.usdc\.lock"):
+        AnimationWriter(tmp_path / "out.usdc", Mesh.grid(2, 2), 24.0)
+    assert (tmp_path / "precious").read_text() == "text"
+
+
+def test_a_folder_without_locks_warns(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("warpcloth.base.outputs._lock", refuse)
+    with pytest.warns(UserWarning, match=r"out\.usdc: its folder does not support locks; do not start another run to it"):
+        write(tmp_path / "out.usdc", Mesh.grid(4, 4))
+    assert len(FrameSequence(tmp_path / "out.usdc")) == FRAMES
+
+
+def spoil(folder, act):
+    """Changes a source, or the files of an output, during a run."""
+    stage, output = folder / "artist.usda", folder / "out.usdc"
+    if act == "delete":
+        stage.unlink()
+    elif act == "garble":
+        stage.write_text("garbage")
+    elif act == "triangles":
+        artist_stage(stage, Mesh.grid(3, 3))
+    elif act == "touch":
+        stage.write_text(stage.read_text() + "# said later\n")
+    elif act == "frames":
+        shutil.rmtree(folder / "out_frames")
+    elif act == "folder":
+        if output.exists():
+            output.unlink()
+        output.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("act", "ending", "single_file", "message", "kept"),
+    [
+        *(
+            (act, *how, "has changed during the run and no longer fits", FRAMES)
+            for act in ("delete", "garble", "triangles")
+            for how in (("usdc", False), ("usdc", True), ("usdz", True))
+        ),
+        ("frames", "usdc", False, "has been removed during the run, with frames 0 to 2; nothing was saved", 0),
+        ("folder", "usdc", False, "out.usdc: could not be written: Is a directory; frames 0 to 5 are in ", 6),
+    ],
+)
+def test_what_changes_during_a_run_is_noticed(tmp_path, act, ending, single_file, message, kept):
+    """The error is one sentence that says where the frames are, and no later run removes them."""
+    source = artist_stage(tmp_path / "artist.usda", Mesh.grid(5, 4))
+    original, mesh, output = Path(source).read_text(), read_mesh(source), tmp_path / f"out.{ending}"
+    writer = AnimationWriter(output, mesh, 24, source=source, chunk=CHUNK)
+    with pytest.raises((ValueError, OSError), match=message) as caught:
+        try:
+            for frame in range(FRAMES):
+                writer.append(*motion(mesh, frame))
+                if frame == CHUNK:
+                    spoil(tmp_path, act)
+        finally:
+            writer.close(single_file=single_file)
+    assert "\n" not in str(caught.value) and writer.kept == kept
+    assert not output.is_file() or ending != "usdz"
+    Path(source).write_text(original)
+    if kept:
+        assert f"frames 0 to {kept - 1} are in {writer.path}" in str(caught.value)
+        sequence = np.asarray(FrameSequence(writer.path))
+        assert len(sequence) == kept
+        np.testing.assert_allclose(sequence[-1], motion(mesh, kept - 1)[0], rtol=0, atol=1e-5)
+    if output.is_dir():
+        output.rmdir()
+    path = writer.path
+    del writer
+    if path != str(output):
+        with pytest.warns(UserWarning, match="has all frames of an earlier run that was not packed, and is kept"):
+            write(output, mesh, source=source)
+        assert len(FrameSequence(path)) == kept
+
+
+@pytest.mark.parametrize("ending", ["usdc", "usdz"])
+def test_a_source_that_changes_and_fits_is_said(tmp_path, ending):
+    source = artist_stage(tmp_path / "artist.usda", Mesh.grid(5, 4))
+    mesh = read_mesh(source)
+    with (
+        pytest.warns(UserWarning, match=r"artist\.usda: has changed during the run; the frames belong to its earlier version"),
+        AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, source=source, chunk=CHUNK) as writer,
+    ):
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame))
+            spoil(tmp_path, "touch" if frame == CHUNK else None)
+    assert len(FrameSequence(tmp_path / f"out.{ending}")) == FRAMES
+
+
+@pytest.mark.parametrize("cut", [False, True], ids=["ended", "cut-short"])
+def test_a_run_that_was_cut_short_is_recovered_under_its_own_name(tmp_path, cut):
+    """Files that a run reads are not removed, neither by that run nor after it is cut short itself."""
+    mesh, output = Mesh.grid(5, 4), tmp_path / "out.usdz"
+    writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
+    for frame in range(2 * CHUNK):
+        writer.append(*motion(mesh, frame))
+    left = writer.path
+    del writer  # killed: nothing is packed
+    gc.collect()
+    analyzer = Analyzer(None, left)
+    if cut:
+        with pytest.raises(KeyboardInterrupt):
+            write_report(analyzer, usd=output, progress=lambda row, _: interrupt_twice(row == 4))
+    else:
+        write_report(analyzer, usd=output)
+        for frame, points in enumerate(FrameSequence(output)):
+            np.testing.assert_allclose(points, motion(mesh, frame)[0], atol=4 * EPS)
+    again = np.asarray(FrameSequence(left))
+    assert len(again) == 2 * CHUNK
+    np.testing.assert_allclose(again[-1], motion(mesh, 2 * CHUNK - 1)[0], atol=4 * EPS)
+
+
+def interrupt_twice(now):
+    """Of which the second comes while the first has the file packed."""
+    if now:
+        real = chunks.Contents.write
+
+        def write(*_):
+            chunks.Contents.write = real
+            raise KeyboardInterrupt
+
+        chunks.Contents.write = write
+        raise KeyboardInterrupt
+
+
+VICTIM = """
+import itertools, os, sys
+sys.path[:0] = {path!r}
+from support.stages import CHUNK, FRAMES, Mesh, motion
+from warpcloth.usd import read_mesh
+from warpcloth.usd import AnimationWriter
+output, source, single_file, log = sys.argv[1:]
+mesh = read_mesh(source) if source else Mesh.grid(40, 40)
+log = os.open(log, os.O_WRONLY | os.O_CREAT)
+print("ready", flush=True)
+for run in itertools.count():
+    with AnimationWriter(output, mesh, 24, source=source or None, chunk=CHUNK) as writer:
+        for frame in range(FRAMES):
+            writer.append(*motion(mesh, frame, (-1) ** run))
+            os.write(log, b".")
+        writer.close(single_file=bool(single_file))
+        os.write(log, b"|")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ending", "with_source", "single_file"),
+    [("usdc", False, False), ("usda", True, False), ("usdc", True, True), ("usdz", False, True)],
+    ids=["chunks", "layer", "one-file", "package"],
+)
+def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, ending, with_source, single_file):
+    """Five kills of each kind. The victim writes one result over the other for ever, so each kill meets it at work."""
+    mesh = Mesh.grid(40, 40)
+    source = artist_stage(tmp_path / "artist.usda", mesh) if with_source else ""
+    mesh = read_mesh(source) if source else mesh
+    script = VICTIM.format(path=[str(Path(__file__).parents[1]), *sys.path])
+    moments = random.Random(f"{ending} {with_source} {single_file}")
+    for trial in range(5):
+        output, log = tmp_path / f"{trial}.{ending}", tmp_path / f"{trial}.log"
+        arguments = [str(output), source, "yes" if single_file else "", str(log)]
+        victim = subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE, text=True)
+        assert victim.stdout.readline() == "ready\n"
+        time.sleep(moments.uniform(0, 0.1 * trial + 0.02))
+        victim.send_signal(signal.SIGKILL)
+        assert victim.wait() == -signal.SIGKILL
+        check_survivor(output, mesh, log.read_text(), source)
+        # The next run is not disturbed by what is left, and clears it away; but not what was only to be packed.
+        folder = tmp_path / f"{trial}_frames"
+        complete = [path.parent for path in folder.glob("usdz-*/complete")]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            write(output, mesh, source=source or None)
+        assert len(FrameSequence(output)) == FRAMES
+        left = list(folder.glob("*"))
+        assert left == complete if ending == "usdz" else len(left) == 1
+        assert not list(tmp_path.glob(".*.lock"))
+
+
+def check_survivor(output, mesh, log, source):
+    """The result of the run before is left, or frames of the last run, without its last chunk at most.
+
+    Args:
+        output: The output.
+        mesh: Its mesh.
+        log: A point for each append that had returned, a bar for each close.
+        source: The artist's stage, or "".
+    """
+    runs = log.split("|")
+    appended = len(runs[-1])
+    last = (-1) ** (len(runs) - 1)
+    # A package is made at the end; until then its frames can be opened in the folder.
+    partial = [path for path in (output.parent / f"{output.stem}_frames").glob("usdz-*/animation.usdc")]
+    found = [path for path in [output, *partial] if path.exists()]
+    newest = 0
+    for path in found:
+        points, velocities = FrameSequence(path), FrameSequence(path, attribute="velocities")
+        sign = 1 if abs(velocities[1][0, 0] - 1.0) < 0.5 else -1
+        if sign == last:
+            newest = max(newest, len(points))
+        else:
+            assert len(runs) > 1 and len(points) == FRAMES
+        transform = read_stage_mesh(path).transform
+        for frame in range(len(points)):
+            expected = motion(mesh, frame, sign)
+            # As in the round trip, with the transform's condition number 1 and its offset below 2 m.
+            tolerance = 2 * EPS * (np.abs(expected[0]).max() + np.abs(transform[3]).max() + np.abs(expected[1]).max())
+            np.testing.assert_allclose(points[frame], expected[0], rtol=0, atol=tolerance)
+            np.testing.assert_allclose(velocities[frame], expected[1], rtol=0, atol=tolerance)
+        stage, _ = animated_prim(path)
+        assert stage.GetEndTimeCode() - stage.GetStartTimeCode() == len(points) - 1
+        assert validate(path, source or None) == []
+    assert appended // CHUNK * CHUNK <= newest <= FRAMES
+    assert found or appended < CHUNK
+    assert len(runs) == 1 or output.exists()
