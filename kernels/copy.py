@@ -1,4 +1,4 @@
-"""Copies from array to array: rows, to measure what a kernel can move at most, and vertices in another order."""
+"""Copies from array to array: rows, to measure what a kernel can move at most, and chosen vertices."""
 
 from functools import cache
 
@@ -42,3 +42,24 @@ def take_vertices(dtype):
         out[i] = values[i // n * n + places[i % n]]
 
     return take_each_vertex
+
+
+@cache
+def copy_chosen(dtype):
+    """Kernel over chosen vertices: out[targets[k]] = source[sources[k]]."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def copy_each_chosen(
+        # parameters
+        sources: wp.array(dtype=wp.int32),
+        targets: wp.array(dtype=wp.int32),
+        # in
+        source: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        k = wp.tid()
+        out[targets[k]] = source[sources[k]]
+
+    return copy_each_chosen

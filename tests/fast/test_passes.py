@@ -13,11 +13,14 @@ from support.setups import SOLVERS, allocations, square
 from support.sheets import SPRINGS, TERMS, N, declared
 from warpcloth.core.operators import Gradient
 from warpcloth.core.status import Result
-from warpcloth.fast import blocks, incidences, jacobi, passes
-from warpcloth.fast.blocks import in_blocks
-from warpcloth.fast.incidences import gathered
-from warpcloth.fast.jacobi import Scatter
-from warpcloth.fast.passes import Gather, Sweep
+from warpcloth.fast import block_layout as blocks
+from warpcloth.fast import gather_layout as incidences
+from warpcloth.fast import gather_step as passes
+from warpcloth.fast import jacobi_sweeps as jacobi
+from warpcloth.fast.block_layout import in_blocks
+from warpcloth.fast.gather_layout import gathered
+from warpcloth.fast.gather_step import Gather, Sweep
+from warpcloth.fast.jacobi_sweeps import Scatter
 from warpcloth.model.damping import Past, damped_terms
 from warpcloth.numerics import sweeps
 from warpcloth.solvers import explicit, solver

@@ -27,14 +27,14 @@ from support.energies import (
     random_rotation,
 )
 from warpcloth.core.operators import Energy, Gradient, Hessian, Sums
-from warpcloth.fast import quadratic
-from warpcloth.fast.incidences import chain, gathered
+from warpcloth.fast import quadratic_pairs as quadratic
+from warpcloth.fast.gather_layout import chain, gathered
 from warpcloth.kernels import admm as splitting
 from warpcloth.kernels import assemble, project
 from warpcloth.kernels import constraint_rows as constrain
 from warpcloth.kernels import terms as energies
-from warpcloth.kernels.elements import chain_of
-from warpcloth.kernels.fast import gather
+from warpcloth.kernels.fast import gather_forces as gather
+from warpcloth.kernels.fast.parts import chain_of
 from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.model.model import DTYPES
 from warpcloth.terms import needs

@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 
 from ..base.turns import in_turn
-from ..fast.incidences import chain, gathered, lanes
+from ..fast.gather_layout import chain, gathered, lanes
 from ..kernels import assemble, clusters, linear, reduce
-from ..kernels.fast.gather import gather_gradient
+from ..kernels.fast.gather_forces import gather_gradient
 
 # Chunks of a sum per copy: one on the CPU, which runs them in turn; on a GPU enough for it to be busy.
 CHUNKS = 256

@@ -11,7 +11,7 @@ import warp as wp
 
 from ..base.checks import whole
 from ..base.turns import TURN
-from ..kernels.fast import barrier as kernels
+from ..kernels import barrier as kernels
 
 
 def _leave():
@@ -92,7 +92,7 @@ class Team:
     def launch_meeting(self, model):
         """Goes on when all threads have come here; for one thread nothing."""
         if self.threads > 1:
-            model.launch(model.kernel(kernels.meet), 1, [self.threads, self._leave], [self._meeting])
+            model.launch(model.kernel(kernels.wait_at_barrier), 1, [self.threads, self._leave], [self._meeting])
 
     def launch_alone(self, model, *launches):
         """Calls these in the first thread, and goes on when they are done."""

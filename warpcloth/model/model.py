@@ -78,7 +78,7 @@ class DeviceElements:
         origin: :class:`Origin` of a rest state that is set in each step, or None.
         cells: :class:`Cells` that the elements are the vertices of, or None.
         pieces: Of elements in blocks where the pieces of each begin, and the first element and the count of each; or None. See
-            :mod:`warpcloth.kernels.fast.blocks`.
+            :mod:`warpcloth.kernels.fast.block_forces`.
     """
 
     label: str

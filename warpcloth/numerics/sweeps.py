@@ -7,7 +7,7 @@ their order is no matter and they run at once; between colours, and between term
 import numpy as np
 import warp as wp
 
-from ..fast.jacobi import Gather, Scatter
+from ..fast.jacobi_sweeps import Gather, Scatter
 from ..kernels import project as kernels
 from ..kernels.clusters import correct_clusters
 from ..model.damping import refuse_apart

@@ -10,8 +10,8 @@ import numpy as np
 from ..base.checks import choice
 from ..base.turns import in_turn
 from ..core.operators import Hessian
-from ..fast.passes import Gather, Sweep, is_fine
-from ..fast.ranges import Ranges
+from ..fast.gather_step import Gather, Sweep, is_fine
+from ..fast.subdomains import Ranges
 from ..model.damping import Past, dissipations
 from .solver import LaunchedStepper, Step, refuse_hard
 
@@ -218,8 +218,8 @@ class ExplicitStepper(LaunchedStepper):
     """:class:`Explicit` on a model.
 
     Attributes:
-        passes: The :class:`warpcloth.fast.passes.Sweep` or :class:`warpcloth.fast.passes.Gather` that a step is, or for several
-            threads the :class:`warpcloth.fast.ranges.Ranges`.
+        passes: The :class:`Sweep` or :class:`Gather` that a step is, or for several
+            threads the :class:`warpcloth.fast.subdomains.Ranges`.
     """
 
     def __init__(self, options, model):

@@ -4,11 +4,11 @@ import numpy as np
 import warp as wp
 
 from ..core.operators import Gradient, fit_cells
-from ..kernels.elements import Part
-from ..kernels.fast import explicit as kernels
-from .blocks import in_blocks
-from .incidences import chain, gathered, lanes
-from .quadratic import as_pairs
+from ..kernels.fast import gather_step as kernels
+from ..kernels.fast.parts import Part
+from .block_layout import in_blocks
+from .gather_layout import chain, gathered, lanes
+from .quadratic_pairs import as_pairs
 
 # Of a block that is a copy; of 1024 vertices 256 threads take 2.1 times as long, 1024 1.2 times (H200).
 THREADS = 512
@@ -22,10 +22,10 @@ FINER, FARTHER = 2.0**-6, 16.0
 
 
 class Sweep:
-    """Steps of one launch, of one thread a copy, see :func:`warpcloth.kernels.fast.explicit.sweep`. Cells are scattered before.
+    """Steps of one launch, of one thread a copy, see :func:`sweep`. Cells are scattered before.
 
     Elements of a quadratic energy that is not damped are swept as the pairs of their matrix, see
-    :mod:`warpcloth.fast.quadratic`.
+    :mod:`warpcloth.fast.quadratic_pairs`.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -68,7 +68,7 @@ class Sweep:
 
 
 class Gather:
-    """The same by gathering over the incidences of each vertex, see :func:`warpcloth.kernels.fast.explicit.gather`.
+    """The same by gathering over the incidences of each vertex, see :func:`warpcloth.kernels.fast.gather_step.gather`.
 
     x, of what is damped v, and ``low`` go to and fro between two arrays; the last of an odd number of steps is copied back.
     ``low`` is packed where :func:`unit_of` says so, see :mod:`warpcloth.kernels.fast.packed_residual`. Where :func:`block_of`

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .assemble import types
-from .term import Term
+from ..assemble import types
+from ..term import Term
 
 
 class Part(NamedTuple):

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import warp as wp
 
 from ..assemble import types
-from ..elements import Part, chain_of, elements_of, of_corner
 from ..memory import load, load_shared, store
 from ..project import multiplier, multiplier_type
+from .parts import Part, chain_of, elements_of, of_corner
 
 
 def rows_of(slots):

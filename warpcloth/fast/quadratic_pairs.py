@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.assemble import constant_blocks
-from ..kernels.terms.quadratic_pair import QUADRATIC_PAIR
+from ..kernels.fast.quadratic_pair import QUADRATIC_PAIR
 
 CHUNK = 1 << 18  # elements whose blocks are added up at once
 # Pairs an element, up to which they are faster: a hinge takes 5 to 6 ns, a pair of vertices 1.2 (one core).

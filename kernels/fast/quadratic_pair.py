@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from . import spring
-from .quadratic_bending import QUADRATIC_BENDING
+from ..terms import spring
+from ..terms.quadratic_bending import QUADRATIC_BENDING
 
 
 def rest_state(points, stencil):

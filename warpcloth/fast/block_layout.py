@@ -1,13 +1,13 @@
 """Blocks of consecutive vertices and, of each term, the pieces of the elements whose lowest vertices these are.
 
-See :mod:`warpcloth.kernels.fast.blocks` for what is done with them.
+See :mod:`warpcloth.kernels.fast.block_forces` for what is done with them.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from .incidences import indices
+from .gather_layout import indices
 
 NUMBERS = 6144  # of scratch, if no vertex needs more: 2048 springs, which fit into the first cache
 RUN = 8  # elements, from which on a run is faster than looking stencils up

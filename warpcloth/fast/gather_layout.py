@@ -3,9 +3,9 @@
 import numpy as np
 import warp as wp
 
-from ..kernels.elements import Part, chain_of, elements_of
-from ..kernels.fast.jacobi import rows_of
-from .quadratic import entries
+from ..kernels.fast.gather_corrections import rows_of
+from ..kernels.fast.parts import Part, chain_of, elements_of
+from .quadratic_pairs import entries
 
 SLOTS = 16  # of pairs, which are compiled one by one
 # On CUDA so many threads take a vertex of meshes of so many vertices or less: a step of the springs of 64² takes 2.0 µs, not
@@ -14,7 +14,7 @@ LANES, LANED = 4, 50_000
 
 
 def gathered(model, elements, damped=False, rows=True):
-    """The :class:`warpcloth.kernels.elements.Part` of elements and what their struct has, by name, to gather over vertices.
+    """The :class:`warpcloth.kernels.fast.parts.Part` of elements and what their struct has, by name, to gather over vertices.
 
     Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
     than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and what the element has
@@ -44,7 +44,7 @@ def gathered(model, elements, damped=False, rows=True):
 
 
 def gathered_in_rows(elements, count, pairs, **others):
-    """The same for Jacobi sweeps: incidences of pairs in rows, see :func:`warpcloth.kernels.fast.jacobi.rows_of`, or by
+    """The same for Jacobi sweeps: incidences of pairs in rows, see :func:`rows_of`, or by
     element.
 
     Args:

@@ -5,9 +5,9 @@ from functools import cache
 import warp as wp
 
 from ..assemble import types
-from ..elements import Part, chain_of, elements_of, local_gradient, of_corner
 from ..memory import load, load_shared, store
 from .packed_residual import unpack
+from .parts import Part, chain_of, elements_of, local_gradient, of_corner
 
 
 @cache

@@ -10,11 +10,11 @@ from functools import cache
 import warp as wp
 
 from ..assemble import types
-from ..elements import Part, chain_of
 from ..memory import load, store
-from .blocks import add_blocks
-from .gather import move_of, sum_at_vertices
+from .block_forces import add_blocks
+from .gather_forces import move_of, sum_at_vertices
 from .packed_residual import pack
+from .parts import Part, chain_of
 
 
 @cache

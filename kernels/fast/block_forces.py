@@ -10,8 +10,8 @@ from functools import cache
 import warp as wp
 
 from ..assemble import types
-from ..elements import Part, chain_of, elements_of, local_gradient, of_corner
 from ..memory import load, load_shared, store
+from .parts import Part, chain_of, elements_of, local_gradient, of_corner
 
 
 @cache

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..kernels.fast.barrier import carry
-from .passes import Sweep
+from ..kernels.copy import copy_chosen
+from .gather_step import Sweep
 
 
 class Ranges:
@@ -24,7 +24,7 @@ class Ranges:
         h: Step [s].
         symplectic: Whether x moves on by the v after the step.
         count: Of the steps of keyframes (1,), or None.
-        fine: As of :class:`warpcloth.fast.passes.Sweep`.
+        fine: As of :class:`warpcloth.fast.gather_step.Sweep`.
 
     Attributes:
         model: The model.
@@ -70,7 +70,7 @@ class _Range:
     Attributes:
         ghosts: Their vertices.
         model: As of a cloth of the vertices from the lowest to the highest of them, ghosts pinned.
-        sweep: The :class:`warpcloth.fast.passes.Sweep` of it.
+        sweep: The :class:`warpcloth.fast.gather_step.Sweep` of it.
         count: Of the steps of keyframes, of its own.
     """
 
@@ -117,7 +117,7 @@ class _Range:
         self._given = [_indices(self.model, each) for each in (shared[given] - self.low, given)]
         self._taken = [_indices(self.model, each) for each in (taken, self.ghosts - self.low)]
         x, v, *low = self._state
-        self._carry, self._arrays = self.model.kernel(carry, self.model.vec3), [x, *([v] if damped else low)]
+        self._carry, self._arrays = self.model.kernel(copy_chosen, self.model.dtype), [x, *([v] if damped else low)]
 
     def load(self):
         """Takes over the state, which others than steps may have changed."""

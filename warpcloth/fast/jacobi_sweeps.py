@@ -12,9 +12,9 @@ import warp as wp
 
 from ..core.operators import fit_cells
 from ..kernels import project
-from ..kernels.elements import elements_of
-from ..kernels.fast import jacobi
-from .incidences import chain, filled, gathered_in_rows
+from ..kernels.fast import gather_corrections as jacobi
+from ..kernels.fast.parts import elements_of
+from .gather_layout import chain, filled, gathered_in_rows
 
 RUN = 64  # sweeps of a graph, an even number
 
@@ -50,7 +50,7 @@ class Scatter:
 
 
 class Gather:
-    """Sweeps of one launch over vertices, see :mod:`warpcloth.kernels.fast.jacobi`; d and λ go to and fro between two
+    """Sweeps of one launch over vertices, see :mod:`gather_corrections`; d and λ go to and fro between two
     arrays."""
 
     def __init__(self, model, x, h, correction, multipliers, keys, factors, scale, spread):

@@ -1,0 +1,46 @@
+"""A barrier within recorded graphs, on the CPU: threads that replay one each wait there for one another."""
+
+from functools import cache
+
+import warp as wp
+
+# Indices into the state of a barrier, each in a cache line of its own: threads that have arrived, how often all have, whether
+# it is abandoned, so that nobody waits.
+ARRIVED, RELEASED, ABANDONED, NUMBERS = 0, 16, 32, 48
+# Looks before the core is left to others, some microseconds: a thread that is waited for may have none.
+_LOOKS = 4000
+
+
+@wp.func_native(f"""
+int32_t* arrived = barrier.data + {ARRIVED};
+int32_t* released = barrier.data + {RELEASED};
+int32_t* abandoned = barrier.data + {ABANDONED};
+int32_t before = __atomic_load_n(released, __ATOMIC_ACQUIRE);
+if (__atomic_add_fetch(arrived, 1, __ATOMIC_ACQ_REL) == threads) {{
+    __atomic_store_n(arrived, 0, __ATOMIC_RELAXED);
+    __atomic_store_n(released, before + 1, __ATOMIC_RELEASE);
+    return;
+}}
+int32_t looks = 0;
+while (__atomic_load_n(released, __ATOMIC_ACQUIRE) == before && !__atomic_load_n(abandoned, __ATOMIC_RELAXED)) {{
+    if (++looks > {_LOOKS}) ((void (*)())leave)();
+}}
+""")
+def wait_for_all(threads: int, leave: wp.uint64, barrier: wp.array(dtype=wp.int32)): ...
+
+
+@cache
+def wait_at_barrier():
+    """Kernel of one thread: ends when ``threads`` threads have launched it. ``leave`` is a C function that yields the core."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def wait_all(
+        # parameters
+        threads: int,
+        leave: wp.uint64,
+        # in and out
+        barrier: wp.array(dtype=wp.int32),
+    ):
+        wait_for_all(threads, leave, barrier)
+
+    return wait_all
