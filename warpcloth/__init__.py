@@ -19,7 +19,7 @@ from .run.equilibrium import Equilibrium, equilibrium
 from .run.simulate import Animation, simulate
 from .scene.scene import Pins, Scene
 from .solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
-from .terms.terms import (
+from .terms import (
     Attachment,
     CorotatedMembrane,
     DihedralBending,

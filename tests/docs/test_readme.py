@@ -15,7 +15,7 @@ import warpcloth as wc
 from warpcloth.analysis.measures import MEASURES
 from warpcloth.cli import _parser
 from warpcloth.solvers import SOLVERS
-from warpcloth.terms.terms import TERMS
+from warpcloth.terms import TERMS
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

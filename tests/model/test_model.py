@@ -15,7 +15,7 @@ import warpcloth as wc
 from warpcloth.core.operators import Energy, Gradient, RowSums, Sums
 from warpcloth.model.model import DTYPES
 from warpcloth.solvers import SOLVERS
-from warpcloth.terms.terms import TERMS as KINDS
+from warpcloth.terms import TERMS as KINDS
 
 # 35 vertices, 82 edges, 48 triangles, 62 hinges, 4 corners: all counts differ.
 MESH = wc.Mesh.grid(7, 5, pattern="alternating")

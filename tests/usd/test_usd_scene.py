@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 import warpcloth as wc
 from support.usd_validation import validate
-from warpcloth.terms.terms import TERMS
+from warpcloth.terms import TERMS
 from warpcloth.usd import read_scene, read_stage_mesh, write_scene
 from warpcloth.usd.attributes import ATTRIBUTES
 
@@ -464,9 +464,9 @@ def own(name, type_name, value):
         ({}, r"has no mass \(warpcloth:density, .*physics:density\) and no term \(warpcloth:terms:<name>:type, .*\), must"),
         (without("density"), r"has no mass \(.*\), must have"),
         (without("type", "stiffness"), r"has no term \(.*\), must have"),
-        (without("type"), "warpcloth:terms:threads:type is not given, must be one of Spring, "),
+        (without("type"), "warpcloth:terms:threads:type is not given, must be one of Attachment, "),
         (without("stiffness"), "warpcloth:terms:threads:stiffness is not given, must be"),
-        (own("terms:threads:type", "Token", "Rope"), "type is 'Rope', must be one of Spring, "),
+        (own("terms:threads:type", "Token", "Rope"), "type is 'Rope', must be one of Attachment, "),
         (own("terms:threads:vertices", "IntArray", [1]), "threads has vertices, which a Spring has not"),
         (own("terms:threads:stifness", "Double", 1.0), "threads:stifness is no attribute of a cloth, must be"),
         (own("mass", "Double", 1.0), "warpcloth:mass is no attribute of a cloth, must be one of .*density"),

@@ -9,7 +9,8 @@ from ..base.turns import in_turn
 from ..kernels import deformation, rates
 from ..kernels import neighbourhood_fit as fits
 from ..model.model import DTYPES
-from ..terms.terms import CorotatedMembrane, NeoHookeanMembrane, StVKMembrane
+from ..terms import TERMS
+from ..terms.membrane import Membrane
 from .neighbourhoods import neighbourhoods
 
 RATES = {"midpoint": rates.MIDPOINT, "forward": rates.FORWARD, "logarithm": rates.LOGARITHM}
@@ -269,9 +270,8 @@ def material_directions(mesh, chosen, corner_coordinates=None):
 
 def check_material(material):
     """Refuses what is no membrane."""
-    kinds = (CorotatedMembrane, StVKMembrane, NeoHookeanMembrane)
-    if not isinstance(material, kinds):
-        names = ", ".join(kind.__name__ for kind in kinds)
+    if not isinstance(material, Membrane):
+        names = ", ".join(name for name, kind in TERMS.items() if issubclass(kind, Membrane))
         raise ValueError(
             f"material is {shown(material)}; it must be a membrane ({names}), such as "
             "NeoHookeanMembrane(stiffness=1e3, poisson_ratio=0.3)"

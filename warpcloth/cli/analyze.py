@@ -3,6 +3,7 @@
 import time
 from pathlib import Path
 
+from ..base.checks import choice
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..mesh.mesh import UP_AXES
@@ -20,7 +21,6 @@ What cannot be measured is left out and listed, as points that are not finite or
   warpcloth analyze cache.usdc --still turned.png --azimuth 60 --elevation 10 --both-sides --colormap cividis
 """
 _SENTENCES = 8
-_MATERIALS = {"neo-hookean": "NeoHookeanMembrane", "stvk": "StVKMembrane", "corotated": "CorotatedMembrane"}
 
 
 def add_arguments(parser):
@@ -43,7 +43,7 @@ def add_arguments(parser):
     add("--every", type=int, default=1, metavar="K", help="every K-th frame alone")
     add("--rates", choices=("midpoint", "forward", "logarithm"), default="midpoint", help="midpoint where not given")
     add("--directions", metavar="D", help="warp and weft: st, or a vector such as 1,0,0 for the warp")
-    add("--material", choices=tuple(_MATERIALS), help="for energy and stress; neo-hookean where --stiffness is given")
+    add("--material", metavar="M", help="for energy and stress: neo-hookean (where --stiffness is given), stvk or corotated")
     add("--stiffness", type=float, metavar="K", help="of the material: Young's modulus times thickness [N/m]")
     add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material, 0 where not given")
     add("-o", "--output", metavar="FILE", help="a .usd, .usda, .usdc or .usdz file: measures as primvars, one as colour")
@@ -173,9 +173,12 @@ def _analyzer(arguments):
 
 
 def _material(arguments):
-    from ..terms import terms
+    from ..terms import TERMS
+    from ..terms.membrane import Membrane
 
-    kind = arguments.material
+    membranes = {energy.material: energy for energy in TERMS.values() if issubclass(energy, Membrane)}
+    kind = "neo-hookean" if arguments.material is None else arguments.material
+    choice("--material", kind, tuple(membranes))
     if arguments.stiffness is None:
         for name in ("material", "poisson"):
             if getattr(arguments, name) is not None:
@@ -183,10 +186,10 @@ def _material(arguments):
         return None
     options = {"stiffness": arguments.stiffness}
     if arguments.poisson is not None:
-        if kind == "corotated":
-            raise ValueError("--poisson: the corotated membrane has none, leave it out")
+        if "poisson_ratio" not in membranes[kind].quantities():
+            raise ValueError(f"--poisson: the {kind} membrane has none, leave it out")
         options["poisson_ratio"] = arguments.poisson
-    return getattr(terms, _MATERIALS[kind or "neo-hookean"])(**options)
+    return membranes[kind](**options)
 
 
 def _stills(arguments, analyzer):

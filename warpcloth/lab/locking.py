@@ -28,7 +28,7 @@ from ..run.simulate import simulate
 from ..scene.freedom import rank_of
 from ..scene.scene import Scene
 from ..solvers import Newton
-from ..terms.terms import DihedralBending, Spring
+from ..terms import DihedralBending, Spring
 from . import physics
 from .measurements import task
 from .panels import Panel, point

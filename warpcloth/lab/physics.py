@@ -36,7 +36,7 @@ from ..core.status import Result
 from ..run.equilibrium import SETTLED, equilibrium
 from ..scene.scene import Scene
 from ..scenes import catenary, chain
-from ..terms.terms import CorotatedMembrane, DihedralBending, NeoHookeanMembrane, QuadraticBending
+from ..terms import CorotatedMembrane, DihedralBending, NeoHookeanMembrane, QuadraticBending
 from . import elastica
 from .strips import PATTERNS, inner_shares, strip
 

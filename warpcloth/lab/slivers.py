@@ -12,7 +12,7 @@ from ..core.operators import Gradient
 from ..mesh.mesh import Mesh
 from ..scene.scene import Scene
 from ..solvers.explicit import step_limits
-from ..terms.terms import DihedralBending
+from ..terms import DihedralBending
 from .measurements import task
 from .panels import Panel, point
 from .physics import BENDING, energies

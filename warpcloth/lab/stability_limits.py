@@ -12,7 +12,7 @@ from ..numerics.sweeps import colours
 from ..solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
 from ..solvers.admm import best_weights
 from ..solvers.explicit import step_limits
-from ..terms.terms import Spring
+from ..terms import Spring
 
 # Beyond these a run diverges; beyond the others it is wrong, or need not be.
 DIVERGES = ("2/ω_max", "2/√(2 Σk/m)", "forward Euler", "ω λ_max = 2", "Gauss–Seidel, |z| = 1")

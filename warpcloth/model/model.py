@@ -68,7 +68,7 @@ class DeviceElements:
     """The elements of one term in all copies, on the device.
 
     Attributes:
-        label, kind, term: As in :class:`warpcloth.terms.terms.Elements`.
+        label, kind, term: As in :class:`warpcloth.terms.declared.Elements`.
         per_copy: Elements of one copy, E.
         stencil: (B·E, K) int32.
         stiffness: (B·E,); of stride 0 where all elements share one value.
@@ -404,7 +404,7 @@ class Model:
         return found if self.order is None or cells else found.by_lowest()
 
     def _cells(self, elements):
-        """:class:`Cells` of a term's :class:`warpcloth.terms.terms.Elements`, and its rest state with the masses, (B, E, P)."""
+        """:class:`Cells` of :class:`warpcloth.terms.declared.Elements`, and their rest state with the masses, (B, E, P)."""
         vertices, firsts = elements.stencil[:, 0], elements.cells[:-1]
         sizes = np.diff(elements.cells)
         shape = (self.copies, self.per_copy)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..terms.terms import CorotatedMembrane, DihedralBending, NeoHookeanMembrane, QuadraticBending, Spring, StVKMembrane
+from ..terms.bending import Bending
 
 # Most free vertices for which the rank is computed, in a few seconds; time and memory grow faster than their number.
 MOST = 20_000
@@ -103,23 +103,17 @@ def _held(scene):
     """Finds the pairs of vertices whose distance is held (E, 2), each once, and whether some of them are hard."""
     mesh, found, hard = scene.mesh, [np.empty((0, 2), dtype=np.int64)], False
     area, size = mesh.triangle_areas.sum(), np.linalg.norm(np.ptp(mesh.points, axis=0))
-    bending = [term.stiffness for term in scene.terms if isinstance(term, (QuadraticBending, DihedralBending))]
+    bending = [term.stiffness for term in scene.terms if isinstance(term, Bending)]
     D = sum(float(np.max(stiffness)) for stiffness in bending)
     # A mesh of edges alone does not strain in a fold.
     weight = scene.vertex_masses.sum() / area * np.linalg.norm(scene.gravity) * size if area else np.inf
     for term in scene.terms:
-        triangles = isinstance(term, (CorotatedMembrane, StVKMembrane, NeoHookeanMembrane))
-        if not (triangles or isinstance(term, Spring)):
-            continue
-        elements = term.elements(mesh, scene.positions)
-        stiffness = np.broadcast_to(elements.stiffness, len(elements.stencil))
-        pairs = elements.stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2) if triangles else elements.stencil
-        K = np.repeat(stiffness, 3) if triangles else 2.0 / np.sqrt(3.0) * stiffness
+        pairs, K = term.held(mesh, scene.positions)
         radius = FOLD * np.linalg.norm(mesh.points[pairs[:, 1]] - mesh.points[pairs[:, 0]], axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):  # springs between vertices in one position
             stiff = 0.5 * K * (FOLD**-2 / 24.0) ** 2 > 0.5 * D / radius**2 + weight
         found.append(np.sort(pairs[stiff | np.isinf(K)], axis=1))
-        hard |= bool(np.isinf(stiffness).any())
+        hard |= bool(np.isinf(K).any())
     return np.unique(np.concatenate(found), axis=0), hard
 
 

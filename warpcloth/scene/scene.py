@@ -10,7 +10,7 @@ from ..base.checks import array, number, refuse, shown
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 from ..model.model import Model
-from ..terms.terms import Declared
+from ..terms.declared import Declared
 
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
@@ -57,7 +57,7 @@ class Scene:
             :attr:`vertex_masses` has those of both.
         positions: Where the vertices start, (n, 3) [m]; the rest shape if not given.
         velocities: How they start, (n, 3) [m/s]; at rest if not given. What they say of pinned vertices does not matter.
-        terms: The energies, see :mod:`warpcloth.terms.terms`.
+        terms: The energies, see :mod:`warpcloth.terms`.
         pins: :class:`Pins`, or vertices or a selection of fixed ones.
         gravity: Acceleration (3,) [m/s²]; by default 9.81 down the up axis of the mesh, or down y if it has none.
         duration: [s], a whole number of frames.

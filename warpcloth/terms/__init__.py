@@ -1,28 +1,24 @@
-"""The energies that a scene declares, one record each."""
+"""The catalogue of the energies that a scene declares: one file, one record and two lines here for each.
 
-from .terms import (
-    TERMS,
-    Attachment,
-    CorotatedMembrane,
-    Declared,
-    DihedralBending,
-    Elements,
-    NeoHookeanMembrane,
-    QuadraticBending,
-    RigidCluster,
-    Spring,
-    SpringLimit,
-    StrainLimit,
-    StVKMembrane,
-)
+What takes an energy by name, such as a stage, finds those of :data:`TERMS`; :func:`register` adds one from elsewhere.
+"""
+
+from .attachment import Attachment
+from .corotated_membrane import CorotatedMembrane
+from .declared import Declared
+from .dihedral_bending import DihedralBending
+from .neo_hookean_membrane import NeoHookeanMembrane
+from .quadratic_bending import QuadraticBending
+from .rigid_cluster import RigidCluster
+from .spring import Spring
+from .spring_limit import SpringLimit
+from .strain_limit import StrainLimit
+from .stvk_membrane import StVKMembrane
 
 __all__ = [
-    "TERMS",
     "Attachment",
     "CorotatedMembrane",
-    "Declared",
     "DihedralBending",
-    "Elements",
     "NeoHookeanMembrane",
     "QuadraticBending",
     "RigidCluster",
@@ -31,3 +27,26 @@ __all__ = [
     "StVKMembrane",
     "StrainLimit",
 ]
+
+TERMS = {name: globals()[name] for name in __all__}
+
+
+def register(energy):
+    """Adds the record of an energy to :data:`TERMS`, so that stages, charts and tests know it by its name.
+
+    Args:
+        energy: A frozen dataclass that derives from :class:`warpcloth.terms.declared.Declared`.
+
+    Returns:
+        The same class, so that this is a decorator too.
+
+    Raises:
+        ValueError: If it is no such class, or another one of that name is registered.
+    """
+    if not (isinstance(energy, type) and issubclass(energy, Declared)):
+        raise ValueError(f"{energy!r} is no energy; it must be a class that derives from warpcloth.terms.declared.Declared")
+    known = TERMS.get(energy.__name__, energy)
+    if known.__module__ != energy.__module__:
+        raise ValueError(f"{energy.__name__} is the name of an energy of {known.__module__}; it must have another")
+    TERMS[energy.__name__] = energy
+    return energy

@@ -9,7 +9,7 @@ import numpy as np
 from ..base.limits import MOST_FRAMES
 from ..mesh.mesh import Mesh
 from ..scene.scene import DOWN, EARTH, Pins, Scene
-from ..terms.terms import TERMS, QuadraticBending, Spring
+from ..terms import TERMS, QuadraticBending, Spring
 from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
 from .chunks import export
 from .layers import scene_layer

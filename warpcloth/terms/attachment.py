@@ -1,0 +1,38 @@
+"""Attachments."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from ..kernels.term import Term
+from ..kernels.terms import ATTACHMENT
+from .declared import Damped, indices, own_stencil, quantity
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attachment(Damped):
+    """Vertices held by springs of no length, U = Σ ½k‖x − target‖²: a pin that gives way.
+
+    Attributes:
+        vertices: Indices (E,), or a selection such as ``"corners"``.
+        stiffness: k [N/m], one or (E,).
+        targets: Positions (E, 3) [m], or one of all (3,), if not where the vertices start.
+        damping: β [N·s/m], one or (E,): a force −βv. Unlike that of other terms it acts in rigid motion too.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = ATTACHMENT
+
+    vertices: str | Sequence[int] | np.ndarray = field(default=(), metadata=indices(text="selection"))
+    targets: Sequence | np.ndarray | None = field(default=None, metadata=quantity("must be finite", np.isfinite, shape=(3,)))
+
+    def stencil(self, mesh):
+        vertices = mesh.select(self.vertices) if isinstance(self.vertices, str) else self.vertices
+        return own_stencil(self.label, "vertices", vertices, 1, len(mesh.points))
+
+    def rest(self, mesh, positions, stencil):
+        if self.targets is None:
+            return super().rest(mesh, positions, stencil) if positions is None else positions[stencil[:, 0]]
+        return np.broadcast_to(self.of_elements("targets", len(stencil)), (len(stencil), 3)).copy()

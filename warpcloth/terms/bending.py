@@ -1,0 +1,17 @@
+"""What energies of bending share: a hinge is an edge and the two triangles at it."""
+
+from dataclasses import dataclass
+
+from .declared import Damped
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bending(Damped):
+    """An energy of the hinges of a mesh.
+
+    Attributes:
+        stiffness: D, the bending stiffness of the plate [N·m], one or (E,) in the order of ``mesh.hinges``.
+    """
+
+    def stencil(self, mesh):
+        return mesh.hinges

@@ -1,0 +1,30 @@
+"""The corotated membrane."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..kernels.term import Term
+from ..kernels.terms import COROTATED_MEMBRANE
+from .membrane import Membrane, product
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorotatedMembrane(Membrane):
+    """A membrane of triangles without Poisson's effect, U = Σ ½kA‖F − R‖², R the polar rotation of F (Chao et al. 2010).
+
+    F (3×2) is the deformation gradient and A the rest area of a triangle. Linear in the stretch, and has a projection.
+
+    Attributes:
+        stiffness: k = Et = 2μ [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled.
+            One or (T,); ``math.inf`` for solvers that take hard constraints.
+        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = COROTATED_MEMBRANE
+    material: ClassVar[str] = "corotated"
+
+    @classmethod
+    def from_material(cls, youngs_modulus, thickness, **fields):
+        """Of a material with E [Pa] and ν = 0, ``thickness`` t [m] thick."""
+        return cls(stiffness=product(cls, youngs_modulus, thickness), **fields)

@@ -1,0 +1,234 @@
+"""What the records of all energies share: fields that say what they take, checks, and the elements on a mesh."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import ClassVar
+
+import numpy as np
+
+from ..base.checks import numeric, refuse, shown
+from ..kernels.term import Term
+
+
+@dataclass(frozen=True)
+class Elements:
+    """The elements of one term on one mesh, as NumPy arrays.
+
+    Attributes:
+        label: Name of the term within its scene.
+        kind: Class name of the term.
+        term: The energy.
+        stencil: Vertices of each element, (E, K) int32.
+        stiffness: One value or (E,), or (C,) of cells [unit of the term].
+        rest: Rest state (E, P).
+        damping: One value or (E,) [that times s].
+        cells: Of elements that belong to cells, E of them from cells[c] to cells[c+1] to cell c, (C+1,); else None.
+    """
+
+    label: str
+    kind: str
+    term: Term
+    stencil: np.ndarray
+    stiffness: np.ndarray
+    rest: np.ndarray
+    damping: np.ndarray
+    cells: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Metadata of a numeric field: one value for all elements or one for each, in SI.
+
+    Checks, copies that vary and USD follow from it.
+
+    Attributes:
+        rule: What values must be, for the sentence of an error, such as "must be above 0".
+        holds: (values as an array) → which of them are so.
+        shape: Shape of one value, () or (3,).
+    """
+
+    rule: str
+    holds: Callable
+    shape: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Indices:
+    """Metadata of a field that names vertices by their indices.
+
+    Attributes:
+        each: How many an element has.
+        text: What a text is: "selection", one of vertices; "word", one with a meaning of its own; "" where none is allowed.
+    """
+
+    each: int = 1
+    text: str = ""
+
+
+def quantity(rule, holds, shape=()):
+    """The ``metadata`` of a field that is a :class:`Quantity`."""
+    return {"quantity": Quantity(rule, holds, shape)}
+
+
+def indices(each=1, text=""):
+    """The ``metadata`` of a field that is :class:`Indices`."""
+    return {"indices": Indices(each, text)}
+
+
+FROM_0 = quantity("must be 0 or more", lambda values: values >= 0.0)
+FINITE = quantity("must be finite", np.isfinite)
+FINITE_FROM_0 = quantity("must be finite, 0 or more", lambda values: (values >= 0.0) & np.isfinite(values))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Declared:
+    """What all terms have: a stiffness, and a name to tell two terms of one kind apart.
+
+    An energy derives from it, sets ``term`` and defines ``stencil``; its numeric fields have the metadata of :func:`quantity`.
+
+    Attributes:
+        term: The energy, of ``kernels/terms``.
+        stiffness: One or (E,) [unit of the term].
+        name: To tell two terms of one kind apart.
+
+    Raises:
+        ValueError: If a value breaks a rule; lengths are compared with the number of elements when a scene is built.
+    """
+
+    term: ClassVar[Term]
+
+    stiffness: float | Sequence[float] | np.ndarray = field(metadata=FROM_0)
+    name: str | None = None
+
+    def __post_init__(self):
+        if not (self.name is None or isinstance(self.name, str)):
+            raise ValueError(f"{type(self).__name__}.name is {shown(self.name)}; it must be a text or None")
+        for name, of_field in self.quantities().items():
+            if getattr(self, name) is not None or name == "stiffness":
+                values = self._numeric(name)
+                refuse(f"{self.label}.{name}", values, ~of_field.holds(values), of_field.rule)
+
+    @classmethod
+    def quantities(cls):
+        """:class:`Quantity` of each numeric field by its name."""
+        return {field.name: field.metadata["quantity"] for field in fields(cls) if "quantity" in field.metadata}
+
+    @property
+    def label(self):
+        """The name, or else that of the class."""
+        return self.name or type(self).__name__
+
+    def _numeric(self, field):
+        return numeric(f"{self.label}.{field}", getattr(self, field), "be a number or an array of numbers")
+
+    def of_elements(self, field, count):
+        """A numeric field as one value or one for each element (count, …).
+
+        Raises:
+            ValueError: If its shape is neither.
+        """
+        values, shape = self._numeric(field), self.quantities()[field].shape
+        if values.shape not in (shape, (count, *shape)):
+            one = f"of shape {shape}" if shape else "number"
+            raise ValueError(
+                f"{self.label}.{field} has shape {values.shape}; it must be one {one} or one for each of the {count} elements"
+            )
+        return values
+
+    def _stiffness(self, count):
+        return self.of_elements("stiffness", count)
+
+    def stencil(self, mesh):
+        """Vertices of each element on ``mesh``, (E, K) int32."""
+        raise NotImplementedError  # every energy has its own
+
+    def elements(self, mesh, positions):
+        """The elements of this term on a mesh.
+
+        Args:
+            mesh: The :class:`warpcloth.Mesh`; its points are the rest shape.
+            positions: Where the vertices start, (n, 3) [m].
+
+        Returns:
+            :class:`Elements`.
+
+        Raises:
+            ValueError: If the mesh has none, or an array has another length than the elements.
+        """
+        stencil = self.stencil(mesh)
+        if len(stencil) == 0:
+            raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
+        stiffness = self._stiffness(len(stencil))
+        damped = getattr(self, "damping", None) is not None
+        damping = self.of_elements("damping", len(stencil)) if damped else np.zeros(())
+        rest = self.rest(mesh, positions, stencil)
+        return Elements(self.label, type(self).__name__, self.term, stencil, stiffness, rest, damping)
+
+    def rest(self, mesh, positions, stencil):
+        """Rest state (E, P) of the elements, from the rest shape of the mesh."""
+        return self.term.rest_state(mesh.points, stencil)
+
+    def held(self, mesh, positions):
+        """The pairs of vertices that it keeps from stretching, and how stiff, on a mesh as in :meth:`elements`.
+
+        Returns:
+            (pairs (m, 2), K (m,) [N/m]): K is the stiffness of the sheet, force over width and strain. None by default.
+        """
+        return np.empty((0, 2), dtype=np.int32), np.empty(0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Damped(Declared):
+    """What terms have that can be damped: β, of a dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖² a step, s the term's own invariant.
+
+    ``term.dissipation`` says what a damped term becomes.
+
+    Attributes:
+        damping: β, one or (E,) [unit of the term, per unit of s², times s].
+    """
+
+    damping: float | Sequence[float] | np.ndarray | None = field(default=None, metadata=FINITE_FROM_0)
+
+
+def own_indices(name, given):
+    """Indices that a user gave as (E,) int32.
+
+    Raises:
+        ValueError: If they are no whole numbers in a row.
+    """
+    try:
+        found = np.asarray(given)
+    except ValueError:  # rows of different lengths
+        found = np.asarray(None)
+    found = found.astype(np.int32) if found.size == 0 else found
+    if found.ndim != 1 or found.dtype.kind not in "iu":
+        raise ValueError(f"{name} is {shown(given)}; it must be a list of whole numbers")
+    return found.astype(np.int32)
+
+
+def own_stencil(label, parameter, given, vertices, count):
+    """Indices that a user gave, (E, ``vertices``) or (E,) of single ones, as (E, ``vertices``) int32.
+
+    Raises:
+        ValueError: If the shape is another, or an element names a vertex twice or one outside [0, ``count``).
+    """
+    try:
+        stencil = np.asarray(given)
+    except ValueError:  # rows of different lengths
+        stencil = np.asarray(None)
+    if vertices == 1 and stencil.ndim == 1:
+        stencil = stencil[:, None]
+    if stencil.dtype.kind not in "iu" and stencil.size:
+        raise ValueError(f"{label}.{parameter} is {shown(given)}; it must hold integers, {vertices} for each element")
+    if stencil.ndim != 2 or stencil.shape[1] != vertices or len(stencil) == 0 or stencil.dtype.kind not in "iu":
+        raise ValueError(
+            f"{label}.{parameter} has shape {stencil.shape} and type {stencil.dtype}; it must hold integers, "
+            f"{vertices} for each of one or more elements"
+        )
+    wrong = ((stencil < 0) | (stencil >= count)).any(axis=1)
+    if vertices == 2:
+        wrong |= stencil[:, 0] == stencil[:, 1]
+    if wrong.any():
+        e = int(np.flatnonzero(wrong)[0])
+        raise ValueError(f"{label}.{parameter}[{e}] is {stencil[e].tolist()}; indices must differ and lie in 0 … {count - 1}")
+    return stencil.astype(np.int32)

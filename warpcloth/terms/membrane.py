@@ -1,0 +1,70 @@
+"""What membranes share: energies of the deformation gradient F (3×2) of each triangle."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from ..base.checks import numeric, refuse
+from .declared import Damped, quantity
+
+
+@dataclass(frozen=True, kw_only=True)
+class Membrane(Damped):
+    """A membrane of triangles, a material whose energy and stress can be measured too.
+
+    Attributes:
+        material: What the command line calls it.
+        stiffness: k = Et [N/m], Young's modulus times thickness. One or (T,).
+        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
+    """
+
+    material: ClassVar[str]
+
+    def stencil(self, mesh):
+        return mesh.triangles
+
+    def held(self, mesh, positions):
+        """The edges of the triangles, K = Et."""
+        found = self.elements(mesh, positions)
+        pairs = found.stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        return pairs, np.repeat(np.broadcast_to(found.stiffness, len(found.stencil)), 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IsotropicMembrane(Membrane):
+    """An isotropic membrane in plane stress: k = Et, and Poisson's ratio ν.
+
+    In these μ = k/(2(1 + ν)) and λ = kν/(1 − ν²). A stiffness that varies leaves ν as it is.
+    """
+
+    poisson_ratio: float | Sequence[float] | np.ndarray = field(
+        default=0.0,
+        metadata=quantity("must be above -1 and below 1", lambda ratio: (ratio > -1.0) & (ratio < 1.0)),
+    )
+
+    @classmethod
+    def from_material(cls, youngs_modulus, poisson_ratio, thickness, **fields):
+        """Of a material with E [Pa] and ν, ``thickness`` t [m] thick: μ = Et/(2(1 + ν)), λ = Eνt/(1 − ν²) [N/m]."""
+        return cls(stiffness=product(cls, youngs_modulus, thickness), poisson_ratio=poisson_ratio, **fields)
+
+    @classmethod
+    def from_moduli(cls, mu, lam, **fields):
+        """Of Lamé's moduli of the membrane, μ above 0 and λ above −μ [N/m]: ν = λ/(λ + 2μ), k = 2μ(1 + ν)."""
+        mu, lam = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in (("mu", mu), ("lam", lam)))
+        refuse(f"{cls.__name__}.mu", mu, ~(mu > 0.0), "must be above 0")
+        ratio = lam / (lam + 2.0 * mu)
+        return cls(stiffness=2.0 * mu * (1.0 + ratio), poisson_ratio=ratio, **fields)
+
+    def rest(self, mesh, positions, stencil):
+        return self.term.rest_state(mesh.points, stencil, poisson_ratio=self.of_elements("poisson_ratio", len(stencil)))
+
+
+def product(cls, youngs_modulus, thickness):
+    """Et [N/m]."""
+    given = {"youngs_modulus": youngs_modulus, "thickness": thickness}
+    modulus, t = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in given.items())
+    refuse(f"{cls.__name__}.youngs_modulus", modulus, ~(modulus >= 0.0), "must be 0 or more")
+    refuse(f"{cls.__name__}.thickness", t, ~(t > 0.0), "must be above 0")
+    return (modulus * t)[()]

@@ -1,0 +1,26 @@
+"""The stable Neo-Hookean membrane."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..kernels.term import Term
+from ..kernels.terms import NEO_HOOKEAN_MEMBRANE
+from .membrane import IsotropicMembrane
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeoHookeanMembrane(IsotropicMembrane):
+    """A stable Neo-Hookean membrane, U = Σ A(½μ(‖F‖² − 2) − μ(J − 1) + ½(λ + μ)(J − 1)²) (Smith, De Goes and Kim 2018).
+
+    F (3×2) is the deformation gradient, J = ‖f₁×f₂‖, and A the rest area of a triangle. It recovers from any deformation.
+
+    Attributes:
+        stiffness: k = Et [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled a
+            little. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
+        poisson_ratio: ν, above −1 and below 1, one or (T,).
+        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = NEO_HOOKEAN_MEMBRANE
+    material: ClassVar[str] = "neo-hookean"

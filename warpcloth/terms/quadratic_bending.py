@@ -1,0 +1,24 @@
+"""Quadratic bending."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..kernels.term import Term
+from ..kernels.terms import QUADRATIC_BENDING
+from .bending import Bending
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuadraticBending(Bending):
+    """Quadratic bending of a sheet that is flat at rest, U = Σ ½D‖y‖²/(A₁+A₂) (Bergou et al. 2006). Linear forces.
+
+    Attributes:
+        stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh. A grid with one diagonal a
+            cell is 3 times as stiff where it curves along its diagonals, as stiff where it folds about them or curves along
+            its rows, and 0.75 times 15° off the rows away from them; one with alternating diagonals is 1 to 1.5 times.
+            The equilateral mesh has a Poisson's ratio of −1/3; the other meshes are not isotropic plates.
+        damping: β [N·m·s], of the rate of ‖y‖, which for a small angle θ is |e|·|θ|.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = QUADRATIC_BENDING

@@ -1,0 +1,57 @@
+"""Springs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from ..kernels.term import Term
+from ..kernels.terms import SPRING
+from .declared import FINITE_FROM_0, Damped, indices, own_stencil
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spring(Damped):
+    """Springs, U = Σ ½k(l − L)² (Provot 1995).
+
+    Attributes:
+        pairs: Which vertices: ``"edges"`` of the mesh; of a grid ``"structural"`` (along rows and columns), ``"shear"``
+            (both diagonals of each cell), ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge);
+            several of these in a tuple, where a pair that belongs to more than one kind is one spring; or own pairs (E, 2).
+            Arrays of the other fields have one value per pair. Own pairs keep their order. ``"edges"`` (and ``"structural"``
+            without a grid) have the order of ``mesh.edges``, which for an edge mesh is the order in which its edges were given.
+            All other kinds, and several kinds together, are in lexicographic order, the smaller index first.
+        stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
+        rest_lengths: L [m], one or (E,), if not those of the mesh.
+        damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = SPRING
+
+    pairs: str | tuple | np.ndarray = field(default="edges", metadata=indices(each=2, text="word"))
+    rest_lengths: float | Sequence[float] | np.ndarray | None = field(default=None, metadata=FINITE_FROM_0)
+
+    def stencil(self, mesh):
+        return pairs_on(mesh, self.label, self.pairs)
+
+    def rest(self, mesh, positions, stencil):
+        if self.rest_lengths is None:
+            return super().rest(mesh, positions, stencil)
+        lengths = self.of_elements("rest_lengths", len(stencil))
+        return np.broadcast_to(lengths, len(stencil))[:, None].copy()
+
+    def held(self, mesh, positions):
+        """The pairs themselves; a net of them is as stiff as a sheet of K = 2k/√3."""
+        found = self.elements(mesh, positions)
+        return found.stencil, 2.0 / np.sqrt(3.0) * np.broadcast_to(found.stiffness, len(found.stencil))
+
+
+def pairs_on(mesh, label, pairs):
+    """The pairs of :class:`Spring` on a mesh, (E, 2) int32."""
+    kinds = (pairs,) if isinstance(pairs, str) else pairs
+    if isinstance(kinds, (tuple, list)) and kinds and all(isinstance(kind, str) for kind in kinds):
+        found = [mesh.springs(kind) for kind in kinds]
+        return found[0] if len(found) == 1 else np.unique(np.concatenate(found), axis=0)
+    return own_stencil(label, "pairs", pairs, 2, len(mesh.points))

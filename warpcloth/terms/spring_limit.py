@@ -1,0 +1,32 @@
+"""Limits of the lengths of pairs."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from ..kernels.term import Term
+from ..kernels.terms import SPRING_LIMIT
+from .declared import indices
+from .limit import Limit
+from .spring import pairs_on
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringLimit(Limit):
+    """Limits of the lengths of pairs, U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L] (Provot 1995).
+
+    Attributes:
+        least, most: σ_min, σ_max, ratios to the rest length L, one or (E,); at least one of the two.
+        pairs: Which vertices, and in which order, as in :class:`warpcloth.Spring`.
+        stiffness: k [N/m], one or (E,): of the springs that pairs beyond their limits are; infinite for PBD, which takes
+            hard constraints, finite for solvers that need forces.
+        name: To tell two terms of one kind apart.
+    """
+
+    term: ClassVar[Term] = SPRING_LIMIT
+
+    pairs: str | tuple | np.ndarray = field(default="edges", metadata=indices(each=2, text="word"))
+
+    def stencil(self, mesh):
+        return pairs_on(mesh, self.label, self.pairs)
