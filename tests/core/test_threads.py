@@ -18,7 +18,8 @@ from support.setups import SOLVERS, allocations, square
 from support.sheets import SPRINGS, TERMS, declared
 from warpcloth.cli import main
 from warpcloth.core.capture import Segment
-from warpcloth.core.thread_pool import Team
+from warpcloth.core.thread_pool import ThreadPool
+from warpcloth.model.model import threads_on
 from warpcloth.solvers import solver as solvers
 
 pytestmark = pytest.mark.filterwarnings("ignore:threads is . on . cores")
@@ -152,9 +153,9 @@ def test_threads_allocate_nothing(name, device):
             assert allocations(tracker, lambda stepper=stepper: [stepper.frame() for _ in range(2)]) == 0
 
 
-def failing(team, model):
+def failing(pool, model):
     """What waits for all threads, and what fails before it does."""
-    segment = Segment(model.device, lambda: team.launch_meeting(model))
+    segment = Segment(model.device, lambda: pool.launch_barrier(model))
 
     def fail():
         raise ArithmeticError("of a thread")
@@ -165,20 +166,18 @@ def failing(team, model):
 @pytest.mark.parametrize("order", [1, -1])
 def test_what_a_thread_raises_reaches_the_caller(order, device):
     """And whoever waits for it is let go; afterwards all is as before."""
-    model = square().build(device=device, threads=2)
-    team = model.team
-    wait, fail = failing(team, model)
+    pool = ThreadPool(2)
+    wait, fail = failing(pool, square().build(device=device))
     for _ in range(3):
         with pytest.raises(ArithmeticError, match="of a thread"):
-            team.run([wait, fail][::order])
-        team.run([wait, wait])
+            pool.run([wait, fail][::order])
+        pool.run([wait, wait])
 
 
 def test_an_interrupt_waits_for_the_threads(device):
     """It comes when all have ended, whoever waits for whom, and the next frame runs."""
-    model = square().build(device=device, threads=2)
-    team, ended, started = model.team, [], threading.Event()
-    wait, _fail = failing(team, model)
+    pool, ended, started = ThreadPool(2), [], threading.Event()
+    wait, _fail = failing(pool, square().build(device=device))
 
     def late():
         started.wait(10.0)
@@ -193,14 +192,14 @@ def test_an_interrupt_waits_for_the_threads(device):
         ended.append(True)
 
     with pytest.raises(KeyboardInterrupt):
-        team.run([early, late])
+        pool.run([early, late])
     assert len(ended) == 2
-    team.run([wait, wait])
+    pool.run([wait, wait])
 
 
 def test_a_second_interrupt_leaves_the_threads_to_the_next_call(device):
     """It comes at once; what runs then ends before anything else begins."""
-    team, ended, interrupt = Team(3, wp.get_device(device)), [], threading.main_thread().ident
+    pool, ended, interrupt = ThreadPool(3), [], threading.main_thread().ident
 
     def late():
         for _ in range(2):
@@ -210,14 +209,14 @@ def test_a_second_interrupt_leaves_the_threads_to_the_next_call(device):
         ended.append(True)
 
     with pytest.raises(KeyboardInterrupt):
-        team.run([late])
+        pool.run([late])
     left, found = list(ended), []
-    team.run([lambda: found.append(list(ended))])
+    pool.run([lambda: found.append(list(ended))])
     assert not left and found == [[True]]
 
 
 @pytest.mark.parametrize("copies", [1, 2])
-def test_steppers_of_one_model_have_its_threads_in_turn(copies, device):
+def test_steppers_of_one_model_have_threads_of_their_own(copies, device):
     """Whoever calls them."""
     model = declared([SPRINGS], fps=60.0).build(device=device, copies=copies, threads=2)
     steppers = [wc.PBD(substeps=4, iterations=2).bind(model) for _ in range(2)]
@@ -253,7 +252,7 @@ def test_more_threads_than_cores_warn(device):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Team(2, SimpleNamespace(is_cpu=False)), "threads is 2 on .*; more than 1 is for device='cpu'"),
+        (lambda: threads_on(SimpleNamespace(is_cpu=False), 2), "threads is 2 on .*; more than 1 is for device='cpu'"),
         (lambda: square().build(threads=0), "threads is 0; it must be a whole number of 1 or more"),
         (lambda: wc.Newton(substeps=1).bind(square().build(threads=2)), "one copy, whose steps Newton cannot divide"),
         (

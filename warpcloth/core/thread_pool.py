@@ -4,12 +4,10 @@ import ctypes
 import os
 import sys
 import threading
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import warp as wp
 
-from ..base.checks import whole
 from ..base.turns import TURN
 from ..kernels import barrier as kernels
 
@@ -20,60 +18,37 @@ def _leave():
     return ctypes.cast(function, ctypes.c_void_p).value
 
 
-def _cores():
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-class Team:
-    """Threads that share the work on a model.
+class ThreadPool:
+    """Threads of the CPU that share the steps of one stepper: each replays graphs of its own, and they meet at a barrier.
 
     Args:
-        threads: How many.
-        device: The Warp device.
-
-    Warns:
-        UserWarning: If there are fewer cores.
-
-    Raises:
-        ValueError: If ``threads`` is below 1, or above on another device than the CPU or in Warp's debug mode.
+        threads: How many; one thread starts none, and waits for nobody.
     """
 
-    def __init__(self, threads, device):
-        whole("threads", threads, 1)
-        self.threads, self._here = int(threads), threading.local()
-        if self.threads == 1:
-            return
-        if not device.is_cpu:
-            raise ValueError(f"threads is {threads} on {device}, which has its own; more than 1 is for device='cpu'")
-        if wp.config.mode == "debug" and wp.config.enable_tiles_in_stack_memory:
-            raise ValueError(
-                f"threads is {threads} in Warp's debug mode, where threads of one kernel share the pointer to its tiles; "
-                "wp.config.mode='release' or wp.config.enable_tiles_in_stack_memory=False take more than 1"
-            )
-        if self.threads > _cores():
-            warnings.warn(f"threads is {threads} on {_cores()} cores; more threads than cores are slower", stacklevel=5)
-        self._start()
-        self._meeting = wp.zeros(kernels.NUMBERS, dtype=wp.int32, device=device)
-        self._leave = _leave()
+    def __init__(self, threads):
+        self.threads, self._here = threads, threading.local()
+        if threads > 1:
+            self._start()
+            self._barrier = wp.zeros(kernels.NUMBERS, dtype=wp.int32, device="cpu")
+            self._leave = _leave()
 
     def _start(self):
-        """The threads themselves, which a forked process does not take over."""
+        """Starts the threads, which a forked process does not take over."""
         self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth")
         self._busy, self._running, self._process = threading.Lock(), None, os.getpid()
 
     @property
     def thread(self):
-        """Which of the threads what is launched or recorded here is for, from 0."""
+        """The thread that a launch or a recording here is for, from 0."""
         return getattr(self._here, "thread", 0)
 
     @property
     def leads(self):
-        """Whether that is the first, which does what is not shared."""
+        """Whether that is the first thread, which does the work that is not shared."""
         return self.thread == 0
 
     def as_thread(self, thread, launch):
-        """``launch`` as a function that launches what is for that thread."""
+        """Returns a function that calls ``launch`` with :attr:`thread` set to this one."""
 
         def launch_part():
             before, self._here.thread = self.thread, thread
@@ -85,21 +60,21 @@ class Team:
         return launch_part
 
     def part(self, count):
-        """The (first, count) of ``count`` things that are for this thread."""
+        """Returns the (first, count) of ``count`` things that are for this thread."""
         first = count * self.thread // self.threads
         return first, count * (self.thread + 1) // self.threads - first
 
-    def launch_meeting(self, model):
-        """Goes on when all threads have come here; for one thread nothing."""
+    def launch_barrier(self, model):
+        """Launches a barrier: a thread goes on when all have arrived. One thread needs none."""
         if self.threads > 1:
-            model.launch(model.kernel(kernels.wait_at_barrier), 1, [self.threads, self._leave], [self._meeting])
+            model.launch(model.kernel(kernels.wait_at_barrier), 1, [self.threads, self._leave], [self._barrier])
 
     def launch_alone(self, model, *launches):
-        """Calls these in the first thread, and goes on when they are done."""
+        """Calls these in the first thread; the others wait until they are done."""
         if self.leads:
             for launch in launches:
                 launch()
-        self.launch_meeting(model)
+        self.launch_barrier(model)
 
     def run(self, functions):
         """Calls one function in each thread, as many as there are or fewer, and returns when all have ended.
@@ -127,7 +102,7 @@ class Team:
                 raise
 
     def _run(self, functions):
-        self._meeting.numpy()[:] = 0
+        self._barrier.numpy()[:] = 0
         others = [self._pool.submit(self._guard, function) for function in functions[1:]]
         failures = [self._guard(functions[0]), *(other.result() for other in others)]
         for failure in failures:
@@ -135,11 +110,11 @@ class Team:
                 raise failure
 
     def _guard(self, function):
-        """What the function raises, or None."""
+        """Calls the function; returns the exception that it raises, or None."""
         try:
             with TURN.shared():  # the turn of the thread that called run
                 function()
         except BaseException as error:
-            self._meeting.numpy()[kernels.ABANDONED] = 1
+            self._barrier.numpy()[kernels.ABANDONED] = 1
             return error
         return None

@@ -12,13 +12,14 @@ from .gather_step import Sweep
 
 
 class Ranges:
-    """Steps in which each thread of a team moves its range on, in memory of its own, by a sweep as of a whole cloth.
+    """Steps in which each thread of a pool moves its range on, in memory of its own, by a sweep as of a whole cloth.
 
     Elements that touch two ranges are taken by both, so that threads exchange places alone, through arrays that they fill and
     read in turns, and meet once a step. Sums are taken in another order than of one range, the same in every run. Neighbours
     that are far apart in number make a range take more elements, at worst all of them.
 
     Args:
+        pool: The :class:`warpcloth.core.thread_pool.ThreadPool`.
         model: The :class:`warpcloth.model.model.Model`, of one copy and without cells.
         state: x and v (N,), which steps move on.
         h: Step [s].
@@ -31,8 +32,8 @@ class Ranges:
         low: What places are rounded by (N,) [m], or None.
     """
 
-    def __init__(self, model, state, h, symplectic, count, fine=False):
-        self.model, threads = model, model.team.threads
+    def __init__(self, pool, model, state, h, symplectic, count, fine=False):
+        self.model, self._pool, threads = model, pool, pool.threads
         self.low = model.vectors() if fine else None
         state = (*state, self.low) if fine else state
         ends = [model.count * thread // threads for thread in range(threads + 1)]
@@ -50,18 +51,18 @@ class Ranges:
 
     def launch(self, steps, move_pins):
         """So many steps of the range of this thread, with a call of ``move_pins`` (model, count, x, v) after each."""
-        model, team = self.model, self.model.team
-        own = self._ranges[team.thread]
+        model, pool = self.model, self._pool
+        own = self._ranges[pool.thread]
         own.load()
-        team.launch_meeting(model)
+        pool.launch_barrier(model)
         for step in range(steps):
             own.sweep.launch(1, lambda x, v: move_pins(own.model, own.count, x, v))
             if step < steps - 1:
                 own.give(self._places[step % 2])
-                team.launch_meeting(model)
+                pool.launch_barrier(model)
                 own.take(self._places[step % 2])
         own.store(own is self._counting)
-        team.launch_meeting(model)
+        pool.launch_barrier(model)
 
 
 class _Range:

@@ -1,6 +1,8 @@
 """What is built from a scene on a device: arrays of one or more copies laid out one after another, and nothing undeclared."""
 
 import inspect
+import os
+import warnings
 from collections.abc import Mapping
 from copy import copy as shallow_copy
 from dataclasses import dataclass, replace
@@ -12,7 +14,6 @@ import warp as wp
 from ..base.checks import array, choice, numeric, shown, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
-from ..core.thread_pool import Team
 from ..kernels.assemble import types
 from ..kernels.term import Term
 from ..mesh.selection import distinct_vertices
@@ -201,7 +202,7 @@ class Model:
             :func:`warpcloth.mesh.ordering.near_order` gives; elements are then in the order of their lowest vertices there. All
             arguments here, and what is said of them, have the scene's own order, and all attributes and what solvers make of
             them have this one; :meth:`in_scene_order` leads back. None keeps the scene's, of vertices and elements.
-        threads: Of this process that share the steps, on the CPU.
+        threads: Threads of the CPU that share the steps, see :class:`warpcloth.core.thread_pool.ThreadPool`.
 
     Attributes:
         positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
@@ -214,11 +215,14 @@ class Model:
         places: Where each vertex of the scene is in a copy, (n,) int32; None without an order.
         kernels: Names of the kernels that solvers asked for.
         launches: How many launches there have been, a list of one that models of other terms share.
-        team: The :class:`warpcloth.core.thread_pool.Team` of its threads.
+        threads: As given.
         state: x and v that steps move on, if not arrays of their own; or None.
 
     Raises:
         ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
+
+    Warns:
+        UserWarning: If there are more threads than cores.
     """
 
     @in_turn
@@ -228,7 +232,7 @@ class Model:
         copies = int(copies)
         self.scene, self.copies = scene, copies
         self.device = find_device(device)
-        self.team, self.state = Team(threads, self.device), None
+        self.threads, self.state = threads_on(self.device, threads), None
         self.dtype, self.numpy_dtype = DTYPES[dtype]
         self.vec3, self.mat33 = types(self.dtype)
         self.per_copy = len(scene.mesh.points)
@@ -298,7 +302,7 @@ class Model:
         """A model of ``count`` of the copies from ``first`` on, for one thread; x and v are theirs of ``state``, if given."""
         n = self.per_copy
         other, of_copies, of_vertices = shallow_copy(self), slice(first, first + count), slice(first * n, (first + count) * n)
-        other.copies, other.count, other.team = count, count * n, Team(1, self.device)
+        other.copies, other.count, other.threads = count, count * n, 1
         for name in ("positions", "velocities", "mass", "inverse_mass"):
             setattr(other, name, getattr(self, name)[of_vertices])
         other.gravity = self.gravity[of_copies]
@@ -470,6 +474,22 @@ class Model:
             "terms": terms,
             "kernels": sorted(self.kernels),
         }
+
+
+def threads_on(device, threads):
+    """The number of threads, refused where one device or mode cannot have it."""
+    whole("threads", threads, 1)
+    if threads > 1 and not device.is_cpu:
+        raise ValueError(f"threads is {threads} on {device}, which has its own; more than 1 is for device='cpu'")
+    if threads > 1 and wp.config.mode == "debug" and wp.config.enable_tiles_in_stack_memory:
+        raise ValueError(
+            f"threads is {threads} in Warp's debug mode, where threads of one kernel share the pointer to its tiles; "
+            "wp.config.mode='release' or wp.config.enable_tiles_in_stack_memory=False take more than 1"
+        )
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if threads > cores:
+        warnings.warn(f"threads is {threads} on {cores} cores; more threads than cores are slower", stacklevel=5)
+    return int(threads)
 
 
 def _bytes(array):

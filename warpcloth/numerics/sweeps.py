@@ -7,6 +7,7 @@ their order is no matter and they run at once; between colours, and between term
 import numpy as np
 import warp as wp
 
+from ..core.thread_pool import ThreadPool
 from ..fast.jacobi_sweeps import Gather, Scatter
 from ..kernels import project as kernels
 from ..kernels.clusters import correct_clusters
@@ -74,6 +75,7 @@ class Sweep:
         multipliers: Whether λ adds up over the sweeps of a step (XPBD).
         spread: The number of sweeps that finite stiffness is spread over, or None.
         correction: The d to move on, if not one of its own.
+        pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares Gauss–Seidel sweeps by colour; None for one thread.
 
     Attributes:
         correction: d (N,) [m].
@@ -82,8 +84,21 @@ class Sweep:
         ranges: Of each term what one launch takes, as (first, count).
     """
 
-    def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None, correction=None):
-        self.model, self.x, self.h, self.relaxation = model, x, h, relaxation
+    def __init__(
+        self,
+        model,
+        x,
+        h,
+        kind,
+        relaxation,
+        alpha=0.0,
+        scalar=False,
+        multipliers=False,
+        spread=None,
+        correction=None,
+        pool=None,
+    ):
+        self.model, self.x, self.h, self.relaxation, self.pool = model, x, h, relaxation, pool or ThreadPool(1)
         self.spread = spread or 1
         self.in_place, self.ordered = kind in IN_PLACE, kind == "sequential"
         self.correction = model.vectors() if correction is None else correction
@@ -160,7 +175,7 @@ class Sweep:
         return [(self.launch, sweeps)] if self.in_place else self._jacobi.parts(sweeps)
 
     def _launch_in_place(self, backward):
-        model, team = self.model, self.model.team
+        model, pool = self.model, self.pool
         way = -1 if backward else 1
         for i in range(len(self.elements))[::way]:
             elements = self.elements[i]
@@ -168,7 +183,7 @@ class Sweep:
             of_cells = [cells.offsets, cells.shape] if cells else []
             each = (cells or elements).per_copy if self.ordered else 1
             for first, count in self.ranges[i][::way]:
-                before, part = team.part(count // each)
+                before, part = pool.part(count // each)
                 # A thread of the CPU goes through what it has in a loop, in half of the time that as many threads take.
                 threads, each_thread = (1, part * each) if model.device.is_cpu else (part, each)
                 given = [
@@ -184,4 +199,4 @@ class Sweep:
                 ]
                 if part:
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
-                team.launch_meeting(model)
+                pool.launch_barrier(model)

@@ -225,9 +225,9 @@ class ExplicitStepper(LaunchedStepper):
     def __init__(self, options, model):
         super().__init__(options, model)
         symplectic = options.scheme == "symplectic"
-        if model.team.threads > 1:
+        if self.pool.threads > 1:
             _refuse_undivided(model)
-            self.passes = Ranges(model, self.state, self.h, symplectic, self.count, is_fine(model))
+            self.passes = Ranges(self.pool, model, self.state, self.h, symplectic, self.count, is_fine(model))
         else:
             self.passes = (Gather if model.device.is_cuda else Sweep)(model, self.state, self.h, symplectic, is_fine(model))
         self.model, self.low = self.passes.model, self.passes.low
@@ -247,7 +247,7 @@ def _refuse_undivided(model):
     Raises:
         ValueError: Naming the term.
     """
-    threads = model.team.threads
+    threads = model.threads
     for elements in model.terms:
         if elements.cells:
             raise ValueError(

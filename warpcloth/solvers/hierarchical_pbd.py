@@ -87,7 +87,7 @@ class HierarchicalPBDStepper(LaunchedStepper):
         super().__init__(options, model)
         self.iterations = options.iterations
         self.levels = levels(model, options.levels)
-        self.sweep = Sweep(self.model, self.state.x, self.h, "coloured", options.relaxation)
+        self.sweep = Sweep(self.model, self.state.x, self.h, "coloured", options.relaxation, pool=self.pool)
         self.past = Past(model, self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
         self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
@@ -95,7 +95,9 @@ class HierarchicalPBDStepper(LaunchedStepper):
     def _on_level(self, level):
         """The sweep over a level, and the launch by which the vertices that it drops follow it."""
         model, d = self.model, self.sweep.correction
-        sweep = Sweep(on_device(model, level), self.state.x, self.h, "coloured", self.options.relaxation, correction=d)
+        sweep = Sweep(
+            on_device(model, level), self.state.x, self.h, "coloured", self.options.relaxation, correction=d, pool=self.pool
+        )
         dropped, offsets, parents = (
             wp.array(each, dtype=wp.int32, device=model.device) for each in (level.dropped, level.offsets, level.parents)
         )
@@ -104,13 +106,13 @@ class HierarchicalPBDStepper(LaunchedStepper):
 
     def _launch_start(self):
         """The prediction, and the levels from the coarsest on."""
-        team = self.model.team
-        team.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        pool = self.pool
+        pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
         for sweep, followers in reversed(self._coarse):
             for _ in range(self.options.coarse_iterations):
                 sweep.launch()
-            team.launch_alone(self.model, partial(self.model.launch, *followers))
+            pool.launch_alone(self.model, partial(self.model.launch, *followers))
 
     def _launch_last(self):
-        if self.model.team.leads:
+        if self.pool.leads:
             self.launch_finish(self.sweep.correction)

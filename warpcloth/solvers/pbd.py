@@ -87,13 +87,15 @@ class PBDStepper(LaunchedStepper):
         model = self.model
         # Spread over one sweep it is what it is.
         spread = options.iterations if options.stiffness == "per-step" and options.iterations > 1 else None
-        self.sweep = Sweep(model, self.state.x, self.h, options.sweep, options.relaxation, alpha=options.alpha, spread=spread)
+        self.sweep = Sweep(
+            model, self.state.x, self.h, options.sweep, options.relaxation, options.alpha, spread=spread, pool=self.pool
+        )
         self.past = Past(model, self.sweep.elements)
         self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
 
     def _launch_start(self):
-        self.model.team.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        self.pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
 
     def _launch_last(self):
-        if self.model.team.leads:
+        if self.pool.leads:
             self.launch_finish(self.sweep.correction)

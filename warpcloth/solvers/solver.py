@@ -13,6 +13,7 @@ from ..base.turns import in_turn, methods_in_turn
 from ..core.capture import Segment
 from ..core.reset import Reset
 from ..core.status import Result
+from ..core.thread_pool import ThreadPool
 from ..kernels import step as kernels
 from ..model.damping import Past, damped_terms, refuse_apart
 from ..model.model import Model
@@ -68,7 +69,7 @@ class Step:
         Raises:
             ValueError: If several threads are to share one cloth, and cannot, or are more than its vertices.
         """
-        threads = model.team.threads
+        threads = model.threads
         if threads > 1 and model.copies > 1:
             from .threaded import ThreadedStepper
 
@@ -243,15 +244,22 @@ class LaunchedStepper(Stepper):
     """A solver whose steps are launches alone, so that a frame is few graphs of several steps each.
 
     The constructor ends with `record`, and ``integrator.start()`` if it takes an integrator.
+
+    Attributes:
+        pool: The :class:`warpcloth.core.thread_pool.ThreadPool` of the model's threads, which share each step.
     """
 
     uniform = True
+
+    def __init__(self, options, model, integrator="euler"):
+        super().__init__(options, model, integrator)
+        self.pool = ThreadPool(model.threads)
 
     def record(self, *parts):
         """Records a step.
 
         Args:
-            parts: Pairs of a function that launches, what is for the thread of the team that it is called as, and of how many
+            parts: Pairs of a function that launches, what is for the thread of the pool that it is called as, and of how many
                 times it runs.
         """
         launches = self.model.launches
@@ -260,12 +268,12 @@ class LaunchedStepper(Stepper):
         for launch, times in self._parts:
             before = launches[0]
             self._step.append((self._segments(launch), times))
-            self._size += (launches[0] - before) // self.model.team.threads * times
+            self._size += (launches[0] - before) // self.pool.threads * times
 
     def _segments(self, launch):
         """The segment of each thread."""
-        team = self.model.team
-        return [Segment(self.model.device, team.as_thread(thread, launch)) for thread in range(team.threads)]
+        pool = self.pool
+        return [Segment(self.model.device, pool.as_thread(thread, launch)) for thread in range(pool.threads)]
 
     def launch_steps(self, steps):
         """So many steps."""
@@ -285,8 +293,7 @@ class LaunchedStepper(Stepper):
         return frame + ([(self._segments(lambda: self.launch_steps(rest)), 1)] if rest else [])
 
     def _replay(self, segments):
-        team = self.model.team
-        team.run([partial(self._replay_part, segments, thread) for thread in range(team.threads)])
+        self.pool.run([partial(self._replay_part, segments, thread) for thread in range(self.pool.threads)])
         self.note()
 
     def _replay_part(self, segments, thread):

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ..core.reset import Reset
+from ..core.thread_pool import ThreadPool
 from .solver import State, Stepper
 
 
@@ -24,7 +25,8 @@ class ThreadedStepper(Stepper):
     def __init__(self, options, stepper, model):
         self.options, self.model, self._reset = options, model, None
         self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
-        shares = min(model.team.threads, model.copies)
+        self.pool = ThreadPool(min(model.threads, model.copies))
+        shares = self.pool.threads
         ends = [model.copies * share // shares for share in range(shares + 1)]
         self._copies = list(pairwise(ends))
         self.shares = [stepper(options, model.share(first, end - first, self.state)) for first, end in self._copies]
@@ -45,12 +47,12 @@ class ThreadedStepper(Stepper):
         return max(share.iterations for share in self.shares)
 
     def step(self):
-        self.model.team.run([share.step for share in self.shares])
+        self.pool.run([share.step for share in self.shares])
 
     def frame(self):
         for share in self.shares:
             share.prepare_frame()
-        self.model.team.run([share.frame for share in self.shares])
+        self.pool.run([share.frame for share in self.shares])
 
     def reset(self, mask=None, positions=None, velocities=None):
         if self._reset is None:

@@ -119,6 +119,7 @@ class XPBDStepper(LaunchedStepper):
             options.relaxation,
             scalar=options.form == "scalar",
             multipliers=True,
+            pool=self.pool,
         )
         self.past = Past(model, self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
@@ -137,7 +138,7 @@ class XPBDStepper(LaunchedStepper):
         self.integrator.start()
 
     def _launch_start(self):
-        self.model.team.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        self.pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
 
     def _launch_to_and_fro(self):
         """One sweep forward and one backward."""
@@ -146,11 +147,10 @@ class XPBDStepper(LaunchedStepper):
 
     def _launch_last(self):
         """The force that the sweeps leave unbalanced, or of hard constraints the last sweep and its move; the end of a step."""
-        team = self.model.team
         if self._gradient is None:
-            team.launch_alone(self.model, self._force.zero_, lambda: self._launch_momentum(-1.0))
+            self.pool.launch_alone(self.model, self._force.zero_, lambda: self._launch_momentum(-1.0))
             self.sweep.launch()
-        if team.leads:
+        if self.pool.leads:
             self._launch_end()
 
     def _launch_end(self):
