@@ -23,10 +23,11 @@ What else a stage says:
 - Gravity: `warpcloth:gravity`, else the PhysicsScene's, else 9.81 m/s² down the stage's up axis.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ..terms import TERMS
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from .values import refuse_unknown, value_of
 
@@ -72,21 +73,8 @@ ATTRIBUTES = (
     Attribute("velocities", "warpcloth:velocities", "cloth", ("double3[]",)),
     Attribute("gravity", "warpcloth:gravity", "cloth", ("double3",)),
     Attribute("duration", "warpcloth:duration", "cloth", ("double",)),
-    # Places of the pinned vertices, those of lower index first, a time sample for each frame.
+    # Positions of the pinned vertices, those of lower index first, a time sample for each frame.
     Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", ("double3[]",)),
-    Attribute("terms.type", "warpcloth:terms:<name>:type", "cloth", ("token",)),
-    # Only where <name> is not the name of the term; empty where it has none.
-    Attribute("terms.name", "warpcloth:terms:<name>:name", "cloth", ("string",)),
-    Attribute("terms.stiffness", "warpcloth:terms:<name>:stiffness", "cloth", ("double", "double[]")),
-    Attribute("terms.damping", "warpcloth:terms:<name>:damping", "cloth", ("double", "double[]")),
-    Attribute("terms.pairs", "warpcloth:terms:<name>:pairs", "cloth", ("token", "token[]", "int2[]")),
-    Attribute("terms.rest_lengths", "warpcloth:terms:<name>:restLengths", "cloth", ("double", "double[]")),
-    Attribute("terms.poisson_ratio", "warpcloth:terms:<name>:poissonRatio", "cloth", ("double", "double[]")),
-    Attribute("terms.least", "warpcloth:terms:<name>:least", "cloth", ("double", "double[]")),
-    Attribute("terms.most", "warpcloth:terms:<name>:most", "cloth", ("double", "double[]")),
-    Attribute("terms.vertices", "warpcloth:terms:<name>:vertices", "cloth", ("string", "token[]", "int[]")),
-    Attribute("terms.sizes", "warpcloth:terms:<name>:sizes", "cloth", ("int[]",)),
-    Attribute("terms.targets", "warpcloth:terms:<name>:targets", "cloth", ("double3[]",)),
     # What the prim's own points and curves lose. Used while they agree with these: an artist's edit wins.
     Attribute("mesh.points", "warpcloth:points", "cloth", ("double3[]",)),  # in the prim's own space
     Attribute("mesh.edges", "warpcloth:edges", "cloth", ("int2[]",)),  # of curves, in order
@@ -106,6 +94,37 @@ ATTRIBUTES = (
 # Attributes of a term, whose names say which it is.
 TERMS_NAMESPACE = "warpcloth:terms"
 
+_OF_TEXT = {"": (), "word": ("token", "token[]"), "selection": ("string", "token[]")}
+_OF_NUMBERS = {(): ("double", "double[]"), (3,): ("double3", "double3[]")}
+_OF_INDICES = {1: "int[]", 2: "int2[]", 3: "int3[]", 4: "int4[]"}
+
+
+def attributes():
+    """All rows of the table: those above, and one for each field of the energies that are registered."""
+    rows = {
+        "type": ("token",),
+        "name": ("string",),  # only where <name> is not the name of the term; empty where it has none
+    }
+    for energy in TERMS.values():
+        for field in fields(energy):
+            if "quantity" in field.metadata:
+                types = _OF_NUMBERS[field.metadata["quantity"].shape]
+            elif "indices" in field.metadata:
+                indices = field.metadata["indices"]
+                types = (*_OF_TEXT[indices.text], _OF_INDICES[indices.each])
+            else:
+                continue
+            rows[field.name] = tuple(dict.fromkeys((*rows.get(field.name, ()), *types)))
+    return *ATTRIBUTES, *(
+        Attribute(f"terms.{name}", f"{TERMS_NAMESPACE}:<name>:{_in_camel_case(name)}", "cloth", types)
+        for name, types in rows.items()
+    )
+
+
+def _in_camel_case(name):
+    first, *others = name.split("_")
+    return first + "".join(word.capitalize() for word in others)
+
 
 class Values:
     """The attributes of a cloth by their field, in SI.
@@ -122,10 +141,10 @@ class Values:
         names = [attribute.GetName() for attribute in cloth.GetAuthoredPropertiesInNamespace("warpcloth")]
         # In the order of the prim's properties, which is that of their names where nothing else is said.
         self.terms = list(dict.fromkeys(name.split(":")[2] for name in names if name.startswith(f"{TERMS_NAMESPACE}:")))
-        known = {row.name.replace("<name>", key) for row in ATTRIBUTES for key in self.terms or [""]}
+        known = {row.name.replace("<name>", key) for row in attributes() for key in self.terms or [""]}
         unknown = sorted(set(names) - known)
         if unknown:
-            allowed = ", ".join(row.name for row in ATTRIBUTES if row.name.startswith("warpcloth:"))
+            allowed = ", ".join(row.name for row in attributes() if row.name.startswith("warpcloth:"))
             raise ValueError(f"{unknown[0]} is no attribute of a cloth, must be one of {allowed}")
 
     def authored(self, field, key=None):
@@ -134,7 +153,7 @@ class Values:
         Raises:
             ValueError: An attribute has another type than its row.
         """
-        for row in ATTRIBUTES:
+        for row in attributes():
             prim = self.places.get(row.place) if row.field == field else None
             attribute = prim and prim.GetAttribute(row.name.replace("<name>", str(key)))
             if attribute and attribute.HasAuthoredValue():
@@ -172,6 +191,12 @@ def _kind(type_name):
     return default is None, isinstance(default, str), type_name.isArray, np.shape(default)
 
 
+def _rank(type_name):
+    """The number of dimensions of an array of numbers that has a type; -1 of texts."""
+    default = type_name.scalarType.defaultValue
+    return -1 if isinstance(default, str) else np.ndim(default) + type_name.isArray
+
+
 def has_api(prim, name):
     """Whether an API schema is applied, by name: the deformable ones need not be registered."""
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
@@ -186,14 +211,16 @@ def _body(cloth):
 
 def author(cloth, field, value, key=None, time=None):
     """Writes a value under the name and as the type that the table has for its field."""
-    row = next(row for row in ATTRIBUTES if row.field == field)
+    row = next((row for row in attributes() if row.field == field), None)
+    if row is None:
+        raise ValueError(f"{field} has no attribute; its field must have the metadata of a quantity or of indices")
     if isinstance(value, str) or np.ndim(value) == 0:
         type_name = row.types[0]
         value = value if isinstance(value, str) else float(value)
     elif isinstance(value[0], str):
         type_name, value = Sdf.ValueTypeNames.TokenArray, Vt.TokenArray([str(text) for text in value])
     else:
-        type_name = row.types[-1]
+        type_name = next((each for each in row.types if _rank(each) == np.ndim(value)), row.types[-1])
         whole = np.asarray(type_name.scalarType.defaultValue).dtype.kind == "i"
         shape = np.shape(type_name.scalarType.defaultValue)
         array = np.ascontiguousarray(value, np.int32 if whole else np.float64)

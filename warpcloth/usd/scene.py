@@ -10,7 +10,7 @@ from ..base.limits import MOST_FRAMES
 from ..mesh.mesh import Mesh
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
-from .attributes import ATTRIBUTES, TERMS_NAMESPACE, Values, author, has_api
+from .attributes import TERMS_NAMESPACE, Values, attributes, author, has_api
 from .chunks import export
 from .layers import scene_layer
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics
@@ -85,7 +85,7 @@ def _refuse_missing(mass, term):
         "term": (term, ("terms.type", "(stretch stiffness)", "(bend stiffness)")),
     }
     missing = [
-        f"{what} ({', '.join(dict.fromkeys(row.name for row in ATTRIBUTES if row.field in read_from))})"
+        f"{what} ({', '.join(dict.fromkeys(row.name for row in attributes() if row.field in read_from))})"
         for what, (given, read_from) in wanted.items()
         if not given
     ]
@@ -169,7 +169,7 @@ def _terms(values, mesh):
 def _term(values, key):
     prefix = f"{TERMS_NAMESPACE}:{key}"
     given = {}
-    for row in ATTRIBUTES:
+    for row in attributes():
         if row.name.startswith(f"{TERMS_NAMESPACE}:"):
             value = values.get(row.field, key)
             given |= {} if value is None else {row.field.removeprefix("terms."): value}
