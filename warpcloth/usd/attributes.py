@@ -100,7 +100,7 @@ _OF_INDICES = {1: "int[]", 2: "int2[]", 3: "int3[]", 4: "int4[]"}
 
 
 def attributes():
-    """All rows of the table: those above, and one for each field of the energies that are registered."""
+    """All rows of the table: one for each field of the energies that are registered, and those above."""
     rows = {
         "type": ("token",),
         "name": ("string",),  # only where <name> is not the name of the term; empty where it has none
@@ -115,10 +115,11 @@ def attributes():
             else:
                 continue
             rows[field.name] = tuple(dict.fromkeys((*rows.get(field.name, ()), *types)))
-    return *ATTRIBUTES, *(
+    of_terms = [
         Attribute(f"terms.{name}", f"{TERMS_NAMESPACE}:<name>:{_in_camel_case(name)}", "cloth", types)
         for name, types in rows.items()
-    )
+    ]
+    return *of_terms, *ATTRIBUTES
 
 
 def _in_camel_case(name):
