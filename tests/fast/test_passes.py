@@ -21,10 +21,11 @@ from warpcloth.fast.block_layout import in_blocks
 from warpcloth.fast.gather_layout import gathered
 from warpcloth.fast.gather_step import Gather, Sweep
 from warpcloth.fast.jacobi_sweeps import Scatter
-from warpcloth.model.damping import Past, damped_terms
+from warpcloth.model.damping import damped_terms
 from warpcloth.numerics import sweeps
 from warpcloth.solvers import explicit, solver
 from warpcloth.solvers.explicit import step_limits
+from warpcloth.terms.refresh import STEP, Moment
 
 
 def apart(model, stepper, scheme, steps):
@@ -209,7 +210,7 @@ def test_jacobi_sweeps_gather_what_they_scatter(name, options, dtype, device, mo
         # Scattering is for one thread, of the CPU.
         model = scene.build(device="cpu" if way is Scatter else device, dtype=dtype, copies=2)
         model = model.with_terms(damped_terms(model, h))
-        Past(model, model.terms).launch(model.positions)  # sets the rest state of what is damped, by element
+        model.refresh(STEP, Moment(model.positions))  # sets the rest state of what is damped, by element
         d = model.array(moves, model.vec3)
         monkeypatch.setattr(sweeps, "Scatter", way)
         monkeypatch.setattr(sweeps, "Gather", way)

@@ -10,8 +10,9 @@ import warpcloth as wc
 from support.energies import damping_forces
 from support.nets import net
 from warpcloth.core.operators import Energy, Gradient, Sums
-from warpcloth.model.damping import Past, damped_terms, dissipations
+from warpcloth.model.damping import damped_terms, dissipations
 from warpcloth.solvers.explicit import step_limits
+from warpcloth.terms.refresh import STEP, Moment
 
 EPS = np.finfo(np.float64).eps
 DAMPED = {
@@ -47,7 +48,7 @@ class Dissipation:
         self.model = scene.build(device=device, dtype="float64")
         terms = dissipations(self.model, he)
         move = None if move is None else self.model.array(move, self.model.vec3)
-        Past(self.model, terms).launch(self.model.positions, move, **knows)
+        self.model.refresh(STEP, Moment(self.model.positions, move=move, **knows), terms)
         self.energy_of = Energy(self.model, Sums(self.model), terms=terms)
         self.gradient_of = Gradient(self.model, terms=terms)
 
@@ -123,10 +124,10 @@ def test_the_rate_has_the_order_of_the_integrator(name, integrator, order, devic
         if integrator == "euler":
             x, rate, D = at(h), v + h * a, Dissipation(scene, h, device)
         elif integrator == "bdf2":
-            x, rate, D = at(h), v + h * a, Dissipation(scene, 2.0 * h / 3.0, device, at(0.0) - at(-h), bdf2=True)
+            x, rate, D = at(h), v + h * a, Dissipation(scene, 2.0 * h / 3.0, device, at(0.0) - at(-h), integrator="bdf2")
         else:
             x, rate = 0.5 * (at(0.0) + at(h)), v + 0.5 * h * a
-            D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, midpoint=True)
+            D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, integrator="midpoint")
         exact = viscous(name, x, rate, device)
         errors.append(np.linalg.norm(D.gradient(x) - exact) / np.linalg.norm(exact))
     if name == "Attachment" and errors[-1] < 1e-9:  # s is linear, and so exact: BDF2 of this motion and midpoint
@@ -143,7 +144,7 @@ def test_midpoint_brakes_a_turning_body_by_the_cube_of_the_step(name, device):
         h, turn = angle, [rotation((1.0, 2.0, 3.0), part * angle) for part in (0.0, 1.0)]
         x0, x1 = (scene.positions @ R.T for R in turn)
         v = np.cross(np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0), x0)
-        D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, midpoint=True)
+        D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, integrator="midpoint")
         forces.append(np.abs(D.gradient(0.5 * (x0 + x1))).max())
     assert forces[0] > 1e6 * EPS
     assert np.log2(forces[0] / forces[1]) == pytest.approx(3.0, abs=0.2)
@@ -174,7 +175,7 @@ def test_merged_is_the_sum(name, device):
     for before in (None, move):
         found = []
         for terms in (merged, apart):
-            Past(model, terms).launch(model.positions, before)
+            model.refresh(STEP, Moment(model.positions, move=before), terms)
             found.append(model.vectors())
             Gradient(model, terms=terms).add(x, found[-1])
         merged_force, force = (array.numpy() for array in found)
@@ -189,16 +190,17 @@ def test_merging_is_element_by_element(device):
     (merged,) = damped_terms(scene.build(device=device, dtype="float64"), he)
     both = stiffness + damping / he
     assert np.array_equal(merged.stiffness.numpy(), both)
-    assert np.abs(merged.origin.share.numpy() - damping / he / np.where(both > 0.0, both, 1.0)).max() < 4 * EPS
+    assert np.abs(merged.refresh.arrays[1].numpy() - damping / he / np.where(both > 0.0, both, 1.0)).max() < 4 * EPS
 
 
 def test_lengths_to_come_are_none_below_nought(device):
     """A spring that shrank to less than a quarter in the last step of BDF2 has s̃ = (4s₀ − s₋₁)/3 < 0, which no length is."""
     scene, rests = crumpled("Spring"), []
     for scale in (-1.0, -4.0):  # x₀ − x₋₁ = scale·x₀: from 2 and from 5 times the size
-        D = Dissipation(scene, 0.1, device, scale * scene.positions, bdf2=True)
+        D = Dissipation(scene, 0.1, device, scale * scene.positions, integrator="bdf2")
         (elements,) = dissipations(D.model, 0.1)
-        Past(D.model, [elements]).launch(D.model.positions, D.model.array(scale * scene.positions, D.model.vec3), bdf2=True)
+        move = D.model.array(scale * scene.positions, D.model.vec3)
+        D.model.refresh(STEP, Moment(D.model.positions, integrator="bdf2", move=move), [elements])
         rests.append(elements.rest.numpy()[:, 0])
     y = np.diff(scene.positions[scene.terms[0].stencil(scene.mesh)], axis=1)[:, 0]
     assert np.abs(rests[0] - (4.0 - 2.0) / 3.0 * np.linalg.norm(y, axis=1)).max() < 100 * EPS
@@ -221,7 +223,7 @@ def test_a_hinge_is_damped_through_folded_flat(integrator, device):
             before, now, after = (at(sign * (first + part * turn)) for part in (-1.0, 0.0, 1.0))
             terms = [wc.DihedralBending(stiffness=0.0, damping=beta)]
             scene = wc.Scene(mesh, masses=np.ones(4), positions=now, terms=terms, gravity=(0.0, 0.0, 0.0))
-            knows = {"euler": {}, "midpoint": {"midpoint": True}, "bdf2": {"bdf2": True}}[integrator]
+            knows = {} if integrator == "euler" else {"integrator": integrator}
             D = Dissipation(scene, he, device, now - before if knows else None, **knows)
             found.append(D.energy(after))
     assert found == pytest.approx([found[0]] * len(found), rel=1e-9)

@@ -6,8 +6,9 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.core.operators import Energy, Gradient, Sums
-from warpcloth.model.damping import Past, dissipations
+from warpcloth.model.damping import dissipations
 from warpcloth.model.model import DTYPES
+from warpcloth.terms.refresh import STEP, Moment
 
 # A few roundings in a row: no sum here has more than a dozen addends that matter.
 FEW = 16
@@ -94,7 +95,7 @@ def bending_density(name, pattern, shape, device):
 
 def damping_forces(model, h, x, v):
     """∂D/∂x at x + h v (N, 3), as explicit steps have it, by kernels of one term each."""
-    damped, out = Past(model, dissipations(model, h)), model.vectors()
-    damped.launch(x)
-    Gradient(model, corrected=True, terms=damped.terms).add(x, out, model.array(h * v, model.vec3))
+    damped, out = dissipations(model, h), model.vectors()
+    model.refresh(STEP, Moment(x), damped)
+    Gradient(model, corrected=True, terms=damped).add(x, out, model.array(h * v, model.vec3))
     return out.numpy()

@@ -5,20 +5,12 @@ import warp as wp
 
 from ..base.turns import in_turn
 from ..fast.gather_layout import chain, gathered, lanes
-from ..kernels import assemble, clusters, linear, reduce
+from ..kernels import assemble, linear, reduce
 from ..kernels.fast.gather_forces import gather_gradient
+from ..terms.refresh import EVALUATION, Moment
 
 # Chunks of a sum per copy: one on the CPU, which runs them in turn; on a GPU enough for it to be busy.
 CHUNKS = 256
-
-
-def fit_cells(model, terms, x, correction):
-    """Sets the targets of cells at x, or x + correction if that is not None."""
-    for elements in terms:
-        if elements.cells:
-            kernel = model.kernel(clusters.fit_targets, model.dtype, correction is not None)
-            given = [elements.cells.offsets, elements.stencil, elements.cells.shape, x, correction]
-            model.launch(kernel, elements.cells.count, given, [elements.rest])
 
 
 class Sums:
@@ -97,7 +89,7 @@ class Gradient:
     def add(self, x, out, correction=None):
         """out += ∂U/∂x at x, or at x + correction of operators built ``corrected``."""
         model = self.model
-        fit_cells(model, self.terms, x, correction)
+        model.refresh(EVALUATION, Moment(x, correction), self.terms)
         if not model.device.is_cuda:
             for elements, kernel in zip(self.terms, self._scatters, strict=True):
                 model.launch(kernel, elements.count, [*elements.arguments, x, correction], [out])
@@ -116,7 +108,7 @@ class Energy:
 
     def add(self, x, out, correction=None):
         """out (B,) += U(x), or U(x + correction)."""
-        fit_cells(self.model, self.terms, x, correction)
+        self.model.refresh(EVALUATION, Moment(x, correction), self.terms)
         for elements, kernel, values in zip(self.terms, self.kernels, self.of_elements, strict=True):
             self.model.launch(kernel, elements.count, [*elements.arguments, x, correction], [values])
             self.sums.sum(values, elements.per_copy, out, accumulate=1)

@@ -25,16 +25,18 @@ class Reset:
 
     def __call__(self, mask, positions, velocities):
         stepper, model, integrator = self.stepper, self.model, self.stepper.integrator
-        if integrator.started[0] is not None and not (positions is None and velocities is None):
+        started = integrator.started if integrator else (None, None)
+        past = integrator.past if integrator else (None, None)
+        if started[0] is not None and not (positions is None and velocities is None):
             raise ValueError(
                 "reset takes no positions or velocities with integrator='bdf2', which knows what was before the start of the "
                 "model alone; 'euler' and 'midpoint' take them"
             )
         mask, x, v = self.on_device(mask, positions, velocities)
         x, v = model.positions if x is None else x, model.velocities if v is None else v
-        given = [mask, model.inverse_mass, model.per_copy, model.positions, x, v, *integrator.started]
+        given = [mask, model.inverse_mass, model.per_copy, model.positions, x, v, *started]
         worst = stepper.worst and stepper.worst.array
-        model.launch(self._kernel, model.count, given, [*stepper.state, *integrator.past, stepper.low, stepper.count, worst])
+        model.launch(self._kernel, model.count, given, [*stepper.state, *past, stepper.low, stepper.count, worst])
         if stepper.residual.any() or any(result is not Result.COMPLETED for result in stepper.results):
             chosen = mask.numpy()
             stepper.residual = np.where(chosen, 0.0, stepper.residual)

@@ -18,7 +18,7 @@ def gathered(model, elements, damped=False, rows=True):
 
     Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
     than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and what the element has
-    beside it at hand, unless the rest state is set, by element, in each step. A stiffness that all pairs of a copy share is
+    beside it at hand, unless elements are refreshed. A stiffness that all pairs of a copy share is
     stored once per vertex, so that a copy gets the same bits as a model of its own. For a quadratic energy without damping the
     incidences are the rows of its matrix, if ``rows`` allows it. Rows take a third of the time, but their rounding errors do
     not cancel between vertices: in float32 this noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as
@@ -37,7 +37,7 @@ def gathered(model, elements, damped=False, rows=True):
             part = part._replace(shared=True)
             others["stiffness"] = model.array(np.repeat(own, model.per_copy), model.dtype)
         return part._replace(pairs=slots), {**others, "codes": indices(elements, codes.ravel())}
-    if rows and elements.term.quadratic and not damped and (found := _of_matrix(model, elements)):
+    if rows and elements.term.quadratic and not (damped or elements.refresh) and (found := _of_matrix(model, elements)):
         slots, numbers = found
         return part._replace(rows=slots), numbers
     return _by_element(elements, model.count, part, arrays)
@@ -89,7 +89,7 @@ def _pairs(elements, count):
     many slots.
     """
     stencil = elements.stencil.numpy()
-    if stencil.shape[1] != 2 or elements.origin is not None:
+    if stencil.shape[1] != 2 or elements.refresh is not None:
         return None
     columns = [_rows(stencil[:, corner], count) for corner in range(2)]
     slots = tuple(int(np.diff(offsets).max(initial=0)) for _order, _vertices, offsets in columns)

@@ -3,9 +3,10 @@
 import numpy as np
 import warp as wp
 
-from ..core.operators import Gradient, fit_cells
+from ..core.operators import Gradient
 from ..kernels.fast import gather_step as kernels
 from ..kernels.fast.parts import Part
+from ..terms.refresh import EVALUATION, STEP, Moment
 from .block_layout import in_blocks
 from .gather_layout import chain, gathered, lanes
 from .quadratic_pairs import as_pairs
@@ -22,7 +23,7 @@ FINER, FARTHER = 2.0**-6, 16.0
 
 
 class Sweep:
-    """Steps of one launch, of one thread a copy, see :func:`sweep`. Cells are scattered before.
+    """Steps of one launch, of one thread a copy, see :func:`sweep`. What is refreshed is scattered before.
 
     Elements of a quadratic energy that is not damped are swept as the pairs of their matrix, see
     :mod:`warpcloth.fast.quadratic_pairs`.
@@ -40,12 +41,14 @@ class Sweep:
     """
 
     def __init__(self, model, state, h, symplectic, fine=False):
-        cells, others = ([elements for elements in model.terms if (elements.cells is None) == apart] for apart in (False, True))
-        self._cells, self._gradient = Gradient(model, terms=cells), model.vectors()
+        fresh, others = (
+            [elements for elements in model.terms if (elements.refresh is None) == apart] for apart in (False, True)
+        )
+        self._fresh, self._gradient = Gradient(model, terms=fresh), model.vectors()
         swept = [as_pairs(model, elements) for elements in others]
         vertices, swept, numbers = in_blocks(swept, model.per_copy, model.copies)
         kept = [after if after.term is before.term else before for before, after in zip(others, swept, strict=True)]
-        self.model, self.state = model.with_terms([*cells, *kept]), state
+        self.model, self.state = model.with_terms([*fresh, *kept]), state
         damped = [elements.damping is not None for elements in swept]
         parts = [Part(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
         # Contracted as on CUDA, where a product is added without being rounded: springs then take 0.8 of the time.
@@ -62,7 +65,8 @@ class Sweep:
     def launch(self, steps, after_step):
         """So many steps, with a call of ``after_step`` (x, v) after each."""
         for _ in range(steps):
-            self._cells.add(self.state[0], self._gradient)
+            self.model.refresh(STEP, Moment(self.state[0]))
+            self._fresh.add(self.state[0], self._gradient)
             self.model.launch(self._kernel, self.model.copies, self._given, [self._gradient, *self.state, self.low])
             after_step(*self.state)
 
@@ -104,7 +108,8 @@ class Gather:
             return
         for step in range(steps):
             before, after = self._states[step % 2], self._states[1 - step % 2]
-            fit_cells(model, model.terms, before[0], None)
+            for when in (STEP, EVALUATION):
+                model.refresh(when, Moment(before[0]))
             model.launch(self._kernel, model.count * self._lanes, [*self._given, self._unit, *before], [*after])
             after_step(*after[:2])
         if steps % 2:
@@ -118,10 +123,10 @@ def is_fine(model):
 
     In float32 places are rounded by about the strain that a step makes, and nothing damps the noise: after a second 1 % of the
     springs of ``hanging`` with 512 × 512 vertices are 0.81 percentage points off, with ``low`` 0.31, as in float64; of 256 ×
-    256 vertices 0.33. Rounding at the farthest vertex is then above 4e-5 of the mean edge. Steps of what is damped or of cells
+    256 vertices 0.33. Rounding at the farthest vertex is then above 4e-5 of the mean edge. Steps of what is damped or refreshed
     take forces at x alone and keep nothing; how far off these are has not been measured.
     """
-    if model.dtype is not wp.float32 or any(elements.damping is not None or elements.cells for elements in model.terms):
+    if model.dtype is not wp.float32 or any(elements.damping is not None or elements.refresh for elements in model.terms):
         return False
     lengths = model.scene.mesh.edge_lengths
     if not lengths.size or not lengths.any():
@@ -161,7 +166,7 @@ def block_of(model, parts):
     What a copy reads can then stay in the cache of its multiprocessor: springs of 132 copies of 32² vertices take 0.53 of the
     time of launches, of 4096 copies 0.47. Few copies are as fast by several threads a vertex, and leave multiprocessors idle.
     """
-    between = model.pins is not None or any(elements.cells for elements in model.terms)
+    between = model.pins is not None or any(elements.refresh for elements in model.terms)
     if between or lanes(model) > 1 or model.per_copy > VERTICES or not all(part.pairs for part in parts):
         return 0
     return min(THREADS, -(-model.per_copy // 32) * 32) if model.device.is_cuda else 1

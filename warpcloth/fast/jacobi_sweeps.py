@@ -10,10 +10,10 @@ Both take
 
 import warp as wp
 
-from ..core.operators import fit_cells
 from ..kernels import project
 from ..kernels.fast import gather_corrections as jacobi
 from ..kernels.fast.parts import elements_of
+from ..terms.refresh import EVALUATION, Moment
 from .gather_layout import chain, filled, gathered_in_rows
 
 RUN = 64  # sweeps of a graph, an even number
@@ -38,7 +38,7 @@ class Scatter:
     def launch(self):
         """One sweep."""
         model, d = self.model, self.correction
-        fit_cells(model, model.terms, self.x, d)
+        model.refresh(EVALUATION, Moment(self.x, d))
         for elements, kernel, factor, lambdas in zip(model.terms, self._kernels, self._factors, self.multipliers, strict=True):
             given = [*elements.arguments, model.inverse_mass, self.x, d, *self._given, factor]
             model.launch(kernel, elements.count, given, [lambdas, self._total])
@@ -87,7 +87,7 @@ class Gather:
         model = self.model
         for sweep in range(sweeps):
             (before, *_), (after, *_) = self._places[sweep % 2], self._places[1 - sweep % 2]
-            fit_cells(model, model.terms, self.x, before)
+            model.refresh(EVALUATION, Moment(self.x, before))
             model.launch(self._kernel, model.count, [self._chains[sweep % 2], *self._given, before], [after], block_dim=128)
         if sweeps % 2:
             for array, last in zip(*self._places, strict=True):

@@ -66,7 +66,7 @@ def _without_zeros(blocks, K):
 
 def as_pairs(model, elements):
     """The pairs of vertices that have the same forces as elements of a quadratic energy, or these where they are no faster."""
-    if not elements.term.quadratic or elements.damping is not None:
+    if not elements.term.quadratic or elements.damping is not None or elements.refresh:
         return elements
     rows, columns, numbers = entries(model, elements)
     upper = rows < columns

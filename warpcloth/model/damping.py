@@ -1,12 +1,13 @@
 """Damping: within a step an energy whose rest state is set where the step begins."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import warp as wp
 
 from ..kernels import damping as kernels
-from .model import Origin
+from ..terms.refresh import STEP, Moment, Refresh
 
 
 def damped_terms(model, he):
@@ -54,9 +55,9 @@ def _dissipation(model, elements, he, stiffness):
         stiffness=_put(model, both),
         rest=wp.zeros(count, dtype=wp.types.vector(term.parameters, model.dtype), device=model.device),
         damping=None,
-        origin=Origin(elements.term, elements.rest, _put(model, share)),
+        refresh=Refresh(STEP, partial(_set_rest, elements.term), (elements.rest, _put(model, share))),
     )
-    Past(model, [damped]).launch(model.positions)  # for those who ask for weights and measures before the first step
+    model.refresh(STEP, Moment(model.positions), [damped])  # for those who ask for weights and measures before the first step
     return damped
 
 
@@ -65,23 +66,10 @@ def _put(model, values):
     return model.constant(values[0], len(values)) if same else model.array(values, model.dtype)
 
 
-class Past:
-    """Sets what damped elements know of where a step begins.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        terms: :class:`warpcloth.model.model.DeviceElements`; those without an origin are left out.
-    """
-
-    def __init__(self, model, terms):
-        self.model = model
-        self.terms = [elements for elements in terms if elements.origin]
-
-    def launch(self, x, move=None, scale=1.0, bdf2=False, midpoint=False):
-        """For the state x (N,), and what else :func:`warpcloth.kernels.damping.set_damped_rest` takes of an integrator."""
-        model = self.model
-        for elements in self.terms:
-            origin = elements.origin
-            kernel = model.kernel(kernels.set_damped_rest, origin.term, model.dtype, bdf2, midpoint)
-            given = [elements.stencil, origin.rest, origin.share, x, move, scale]
-            model.launch(kernel, elements.count, given, [elements.rest])
+def _set_rest(damped, model, elements, moment):
+    """Sets the rest state of elements where a step begins, from that of the term that is ``damped`` and from its share."""
+    rule = moment.integrator
+    kernel = model.kernel(kernels.set_damped_rest, damped, model.dtype, rule == "bdf2", rule == "midpoint")
+    rest, share = elements.refresh.arrays
+    given = [elements.stencil, rest, share, moment.x, moment.move, moment.scale]
+    model.launch(kernel, elements.count, given, [elements.rest])

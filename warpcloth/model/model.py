@@ -17,26 +17,12 @@ from ..base.turns import in_turn
 from ..kernels.assemble import types
 from ..kernels.term import Term
 from ..mesh.selection import distinct_vertices
+from ..terms.refresh import Refresh
 from .precision import cast, refuse_coarse
 
 _PINNED = 1e3  # what a pinned vertex of a cell counts, in masses of the rest of the cell: it does not move, so the cell must
 
 DTYPES = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
-
-
-@dataclass(frozen=True, eq=False)
-class Origin:
-    """What the rest state of damped elements is set from, see :class:`warpcloth.kernels.term.Dissipation`.
-
-    Attributes:
-        term: The term that is damped.
-        rest: Its rest state (B·E,).
-        share: (B·E,).
-    """
-
-    term: Term
-    rest: wp.array
-    share: wp.array
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +62,7 @@ class DeviceElements:
         rest: (B·E,) vectors of P.
         hard: Whether any stiffness is infinite.
         damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
-        origin: :class:`Origin` of a rest state that is set in each step, or None.
+        refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
         cells: :class:`Cells` that the elements are the vertices of, or None.
         pieces: Of elements in blocks where the pieces of each begin, and the first element and the count of each; or None. See
             :mod:`warpcloth.kernels.fast.block_forces`.
@@ -91,7 +77,7 @@ class DeviceElements:
     rest: wp.array
     hard: bool
     damping: wp.array | None = None
-    origin: Origin | None = None
+    refresh: Refresh | None = None
     cells: Cells | None = None
     pieces: tuple[wp.array, wp.array] | None = None
 
@@ -148,8 +134,7 @@ class DeviceElements:
         changed = {name: put(getattr(self, name)) for name in ("stencil", "stiffness", "rest")}
         if self.damping is not None:
             changed["damping"] = put(self.damping)
-        origin = self.origin and replace(self.origin, rest=put(self.origin.rest), share=put(self.origin.share))
-        return replace(self, **changed, origin=origin, cells=cells)
+        return replace(self, **changed, refresh=self.refresh and self.refresh.with_arrays(put), cells=cells)
 
     def by_lowest(self):
         """The same elements in the order of their lowest vertices; themselves where that is theirs."""
@@ -166,7 +151,8 @@ class DeviceElements:
         cells = self.cells
         if cells:
             cells = replace(cells, offsets=cells.offsets[: count * cells.per_copy + 1], shape=cells.shape[chosen])
-        return replace(self, **changed, stencil=self.stencil[: count * E], cells=cells)
+        refresh = self.refresh and self.refresh.with_arrays(lambda array: array[chosen])
+        return replace(self, **changed, stencil=self.stencil[: count * E], cells=cells, refresh=refresh)
 
     def taut(self, points):
         """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
@@ -294,6 +280,18 @@ class Model:
         other.terms = tuple(terms)
         return other
 
+    def refresh(self, when, moment, terms=None):
+        """Launches what its terms, or the ``terms`` given, have set anew.
+
+        Args:
+            when: :data:`warpcloth.terms.refresh.STEP` or :data:`warpcloth.terms.refresh.EVALUATION`.
+            moment: The :class:`warpcloth.terms.refresh.Moment`.
+            terms: :class:`DeviceElements`.
+        """
+        for elements in self.terms if terms is None else terms:
+            if elements.refresh and elements.refresh.when == when:
+                elements.refresh.launch(self, elements, moment)
+
     def alone(self, copy):
         """A model of one copy, whose arrays are parts of those of this one."""
         return self if self.copies == 1 else self.share(copy, 1)
@@ -404,6 +402,7 @@ class Model:
             hard=bool(np.isinf(stiffness).any()),
             damping=self._broadcast(f"{one.label}.damping", damping, E) if damping.any() else None,
             cells=cells,
+            refresh=one.refresh,
         )
         return found if self.order is None or cells else found.by_lowest()
 

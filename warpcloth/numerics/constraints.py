@@ -10,6 +10,7 @@ import warp as wp
 
 from ..core.capture import Mirror
 from ..kernels import constraint_rows as kernels
+from ..terms.refresh import EVALUATION, Moment
 from .cluster_rows import ClusterRows
 
 
@@ -99,6 +100,7 @@ class Constraints:
         self.parts = [
             ClusterRows(model, elements) if elements.cells else TermRows(model, elements, curved) for elements in model.terms
         ]
+        self._fresh = [elements for elements in model.terms if not elements.cells]  # whose rows fit themselves
         self.per_copy = sum(part.count for part in self.parts)
         self.count = self.per_copy * model.copies
         first = 0
@@ -119,6 +121,7 @@ class Constraints:
 
     def launch_linearise(self, x, d):
         """All rows at x + d, with λ as it is."""
+        self.model.refresh(EVALUATION, Moment(x, d), self._fresh)
         out = [self.multipliers, self.gap, self._compliance, self._inverse, self.residual, self.rounding, self.carried]
         for part in self.parts:
             part.launch_linearise(x, d, self.h, self.least, *out)

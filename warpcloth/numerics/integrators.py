@@ -8,6 +8,7 @@ correction d = x − x̃, velocities follow from d/hₑ = hₑ a with a = −∇
 import warp as wp
 
 from ..kernels import step as kernels
+from ..terms.refresh import Moment
 
 
 class Euler:
@@ -29,9 +30,10 @@ class Euler:
     def start(self):
         """Before the first step: what a method needs that looks back."""
 
-    def launch_past(self, past):
-        """Where a step begins, what its damping needs: (s − s̃)/hₑ is the rate of s then."""
-        past.launch(self.stepper.state.x)
+    @property
+    def moment(self):
+        """The :class:`warpcloth.terms.refresh.Moment` where a step begins; (s − s̃)/hₑ is then the rate of damped s."""
+        return Moment(self.stepper.state.x)
 
     def launch_prediction(self):
         """x = x̃, v = (x̃ − x₀)/hₑ; pins where they are then."""
@@ -60,9 +62,10 @@ class Midpoint(Euler):
 
     part = 0.5
 
-    def launch_past(self, past):
+    @property
+    def moment(self):
         x, v = self.stepper.state
-        past.launch(x, v, self.he, midpoint=True)
+        return Moment(x, integrator="midpoint", move=v, scale=self.he)
 
     def launch_prediction(self):
         self._launch(kernels.predict, [self._gravity, self._n, self.he], list(self.stepper.state))
@@ -114,8 +117,9 @@ class BDF2(Euler):
         wp.copy(x, model.positions)
         wp.copy(v, model.velocities)
 
-    def launch_past(self, past):
-        past.launch(self.stepper.state.x, self.move, bdf2=True)
+    @property
+    def moment(self):
+        return Moment(self.stepper.state.x, integrator="bdf2", move=self.move)
 
     def launch_prediction(self):
         given = [self._gravity, self._n, self.he]

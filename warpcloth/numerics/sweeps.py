@@ -12,6 +12,7 @@ from ..fast.jacobi_sweeps import Gather, Scatter
 from ..kernels import project as kernels
 from ..kernels.clusters import correct_clusters
 from ..model.damping import refuse_apart
+from ..terms.refresh import EVALUATION, Moment
 
 # By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
 # the largest n of its vertices. Jacobi: the plain sum.
@@ -117,6 +118,8 @@ class Sweep:
             way = Gather if model.device.is_cuda else Scatter
             self._jacobi = way(model, x, h, self.correction, self.multipliers, keys, *self._weights(kind, alpha), spread)
             return
+        # Cells fit themselves as they are swept.
+        self._fresh = [elements for elements in self.elements if elements.refresh and not elements.cells]
         more = multipliers, spread is not None
         self._kernels = [
             model.kernel(correct_clusters, model.dtype, *more)
@@ -176,6 +179,8 @@ class Sweep:
 
     def _launch_in_place(self, backward):
         model, pool = self.model, self.pool
+        if self._fresh:
+            pool.launch_alone(model, lambda: model.refresh(EVALUATION, Moment(self.x, self.correction), self._fresh))
         way = -1 if backward else 1
         for i in range(len(self.elements))[::way]:
             elements = self.elements[i]

@@ -13,6 +13,7 @@ from ..kernels import admm as kernels
 from ..kernels.accelerate import plain_step
 from ..kernels.minimise import add_inertia
 from ..numerics.linear import CopyFactors
+from ..terms.refresh import EVALUATION, Moment
 from .solver import ImplicitStep, Stepper, refuse_cells, refuse_hard
 
 # n times the smallest r for n iterations. A small weight needs many iterations, and what a step leaves unfinished becomes a
@@ -193,6 +194,7 @@ class ADMMStepper(Stepper):
         sums = [self._gaps, self._changes, self._force]
         for array in sums:
             array.zero_()
+        model.refresh(EVALUATION, Moment(self.state.x, self.correction))
         for i, (elements, (z, u, gap, change), (_start, split, sum_of)) in enumerate(self._each()):
             ratio, scale = self._ratios[i], self._scales[i]
             given = [*elements.arguments, self.state.x, self.correction, ratio, scale, kernels.STEPS]

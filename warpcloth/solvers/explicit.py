@@ -12,7 +12,8 @@ from ..base.turns import in_turn
 from ..core.operators import Hessian
 from ..fast.gather_step import Gather, Sweep, is_fine
 from ..fast.subdomains import Ranges
-from ..model.damping import Past, dissipations
+from ..model.damping import dissipations
+from ..terms.refresh import STEP, Moment
 from .solver import LaunchedStepper, Step, refuse_hard
 
 
@@ -138,7 +139,7 @@ def _linearised(model):
     found = [Hessian(model, terms=[elements.taut(model.rest_points) for elements in model.terms]), None]
     damping = dissipations(model, 1.0)  # of stiffness β, and at rest the Hessian is that of a linear damper
     if damping:
-        Past(model, damping).launch(x)
+        model.refresh(STEP, Moment(x), damping)
         found[1] = Hessian(model, terms=damping)
     for hessian in filter(None, found):
         hessian.assemble(x, 0.0)
@@ -231,7 +232,6 @@ class ExplicitStepper(LaunchedStepper):
         else:
             self.passes = (Gather if model.device.is_cuda else Sweep)(model, self.state, self.h, symplectic, is_fine(model))
         self.model, self.low = self.passes.model, self.passes.low
-        self.past = Past(self.model, self.model.terms)  # none: what is damped is so within the pass
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):

@@ -7,7 +7,6 @@ import warp as wp
 
 from ..base.checks import number, whole
 from ..kernels.hierarchy import follow
-from ..model.damping import Past
 from ..numerics.hierarchy import levels, on_device
 from ..numerics.sweeps import Sweep, refuse_unprojectable
 from .solver import LaunchedStepper, Step, require_model
@@ -84,11 +83,11 @@ class HierarchicalPBDStepper(LaunchedStepper):
     """
 
     def __init__(self, options, model):
-        super().__init__(options, model)
+        super().__init__(options, model, "euler")
         self.iterations = options.iterations
         self.levels = levels(model, options.levels)
         self.sweep = Sweep(self.model, self.state.x, self.h, "coloured", options.relaxation, pool=self.pool)
-        self.past = Past(model, self.sweep.elements)
+        self.model = self.model.with_terms(self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
         self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
 

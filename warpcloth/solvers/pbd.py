@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 from ..base.checks import choice, number, whole
-from ..model.damping import Past
 from ..numerics.sweeps import IN_PLACE, SWEEPS, Sweep, refuse_unprojectable
 from .solver import LaunchedStepper, Step, require_model
 
@@ -82,7 +81,7 @@ class PBDStepper(LaunchedStepper):
     """
 
     def __init__(self, options, model):
-        super().__init__(options, model)
+        super().__init__(options, model, "euler")
         self.iterations = options.iterations
         model = self.model
         # Spread over one sweep it is what it is.
@@ -90,7 +89,7 @@ class PBDStepper(LaunchedStepper):
         self.sweep = Sweep(
             model, self.state.x, self.h, options.sweep, options.relaxation, options.alpha, spread=spread, pool=self.pool
         )
-        self.past = Past(model, self.sweep.elements)
+        self.model = model.with_terms(self.sweep.elements)
         self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
 
     def _launch_start(self):

@@ -15,10 +15,11 @@ from ..core.reset import Reset
 from ..core.status import Result
 from ..core.thread_pool import ThreadPool
 from ..kernels import step as kernels
-from ..model.damping import Past, damped_terms, refuse_apart
+from ..model.damping import damped_terms, refuse_apart
 from ..model.model import Model
 from ..numerics.integrators import INTEGRATORS
 from ..scene.scene import Scene
+from ..terms.refresh import STEP
 
 
 class State(NamedTuple):
@@ -138,10 +139,10 @@ class Stepper:
     Attributes:
         state: :class:`State`.
         h: Step [s].
-        model: The model, its terms damped as a step has it.
-        past: What they know of the state before, see :class:`warpcloth.model.damping.Past`.
-        integrator: What leads to x̃ and away from the minimiser, see :mod:`warpcloth.numerics.integrators`.
-        he: Its hₑ [s].
+        model: The model; with an integrator its terms are damped as a step has it, and its terms are those that are refreshed.
+        integrator: What leads to x̃ and away from the minimiser, see :mod:`warpcloth.numerics.integrators`; None of steps that
+            have no x̃.
+        he: Its hₑ [s], else h.
         steps_per_frame: Steps a frame.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 of methods that have none.
@@ -159,7 +160,7 @@ class Stepper:
         super().__init_subclass__(**options)
         methods_in_turn(cls, "__init__", "step", "frame", "prepare_frame", "reset")
 
-    def __init__(self, options, model, integrator="euler"):
+    def __init__(self, options, model, integrator=None):
         require_model(model)
         fps = model.scene.fps
         self.options, self.model = options, model
@@ -169,10 +170,11 @@ class Stepper:
         self.results, self.residual = [Result.COMPLETED] * model.copies, np.zeros(model.copies)
         self.count = None if model.pins is None else wp.zeros(model.copies, dtype=wp.int32, device=model.device)
         self._reset = None
-        self.integrator = INTEGRATORS[integrator](self)
-        self.he = self.integrator.he
-        self.model = model.with_terms(damped_terms(model, self.he))
-        self.past = Past(model, self.model.terms)
+        self.integrator, self.he = None, self.h
+        if integrator is not None:
+            self.integrator = INTEGRATORS[integrator](self)
+            self.he = self.integrator.he
+            self.model = model.with_terms(damped_terms(model, self.he))
 
     def launch_pins(self, parts=1, x=None, v=None):
         """Moves the pins that have keyframes on by h/``parts``, the same in all calls, in x and v if not in the state."""
@@ -190,8 +192,8 @@ class Stepper:
         model.launch(add_one, model.copies, [], [count])
 
     def launch_prediction(self):
-        """x = x̃, and the pins where they are then."""
-        self.integrator.launch_past(self.past)
+        """Refreshes what a step begins with; then x = x̃, and the pins where they are then."""
+        self.model.refresh(STEP, self.integrator.moment)
         self.integrator.launch_prediction()
 
     def launch_finish(self, correction):

@@ -11,7 +11,6 @@ from ..core.operators import Gradient, Sums
 from ..core.status import UNBALANCED, Residual, Result
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
-from ..model.damping import Past
 from ..numerics.sweeps import IN_PLACE, Sweep, refuse_unprojectable
 from .solver import ImplicitStep, LaunchedStepper, refuse_hard, require_model
 
@@ -121,7 +120,7 @@ class XPBDStepper(LaunchedStepper):
             multipliers=True,
             pool=self.pool,
         )
-        self.past = Past(model, self.sweep.elements)
+        self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
         self._gradient = Gradient(model, corrected=True, terms=self.sweep.elements) if soft else None

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..base.checks import numeric, refuse, shown
 from ..kernels.term import Term
+from .refresh import Refresh
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Elements:
         rest: Rest state (E, P).
         damping: One value or (E,) [that times s].
         cells: Of elements that belong to cells, E of them from cells[c] to cells[c+1] to cell c, (C+1,); else None.
+        refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
     """
 
     label: str
@@ -33,6 +35,7 @@ class Elements:
     rest: np.ndarray
     damping: np.ndarray
     cells: np.ndarray | None = None
+    refresh: Refresh | None = None
 
 
 @dataclass(frozen=True)

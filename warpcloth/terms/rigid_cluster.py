@@ -8,10 +8,12 @@ from typing import ClassVar
 import numpy as np
 
 from ..base.checks import shown
+from ..kernels.clusters import fit_targets
 from ..kernels.term import Term
 from ..kernels.terms import RIGID_CLUSTER
 from ..mesh.selection import distinct_vertices
 from .declared import FROM_0, Declared, indices, own_indices
+from .refresh import EVALUATION, Refresh
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,4 +98,13 @@ class RigidCluster(Declared):
 
     def elements(self, mesh, positions):
         found = super().elements(mesh, positions)
-        return replace(found, cells=np.cumsum([0, *(len(body) for body in self._bodies(mesh))]))
+        cells = np.cumsum([0, *(len(body) for body in self._bodies(mesh))])
+        return replace(found, cells=cells, refresh=Refresh(EVALUATION, _fit))
+
+
+def _fit(model, elements, moment):
+    """Sets the targets of the clusters at x, or at x + d."""
+    cells, d = elements.cells, moment.correction
+    kernel = model.kernel(fit_targets, model.dtype, d is not None)
+    given = [cells.offsets, elements.stencil, cells.shape, moment.x, d]
+    model.launch(kernel, cells.count, given, [elements.rest])
