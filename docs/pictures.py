@@ -1,5 +1,6 @@
-"""Makes the pictures of the README from animations and rest shapes: python docs/pictures.py"""
+"""Makes the pictures of the README and of docs/ from animations and rest shapes: python docs/pictures.py"""
 
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -9,6 +10,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from PIL import Image
 
 import warpcloth as wc
 from warpcloth.cli.reports import write_report
@@ -59,26 +61,35 @@ def finish(figure, axes, colours, norm, ticks, label, extend="neither"):
     bar.outline.set_visible(False)
 
 
-def picture_hanging(moments=(0.0, 0.25, 0.4, 0.5, 0.75, 1.0, 1.25), least=1e-4):
-    """Draws the hanging cloth at some times [s] side by side, coloured by strain from ``least`` to the largest of the run."""
-    scene = hanging.scene(n=64, duration=1.25)
-    animation = wc.simulate(scene, wc.Newton(dt=1 / 240))
+def picture_hanging(fps=25, colours=256, least=1e-4):
+    """Makes a GIF of the hanging cloth in real time, coloured by strain from ``least`` to the largest of the run."""
+    scene = replace(hanging.scene(n=64, duration=2.4), fps=fps)
+    animation = wc.simulate(scene, wc.Newton(substeps=10))
     assert animation.status.ok, animation.status
-    most = max(strain(scene.mesh, np.asarray(points, dtype=float)).max() for points in animation.points)
+    frames = np.asarray(animation.points, dtype=float)
+    most = max(strain(scene.mesh, points).max() for points in frames)
     norm = LogNorm(100.0 * least, 100.0 * most)  # the strain at the pins is a hundred times that of the rest
-    figure, axes = plt.subplots(figsize=(11.0, 2.6))
-    left = 0.0
-    for time in moments:
-        points = np.asarray(animation.points[round(time * scene.fps)], dtype=float)
-        seen = View().project(points)
-        seen[:, 0] += left - seen[:, 0].min()
-        draw(axes, scene.mesh, seen, norm(100.0 * np.maximum(strain(scene.mesh, points), least)), COLOURS)
-        axes.plot(*seen[scene.pins.vertices, :2].T, "o", color="black", markersize=3.5)
-        right = seen[:, 0].max()
-        axes.text((left + right) / 2, 0.47, f"{time:g} s", ha="center", color=GREY)
-        left = right + 0.15
+    view = View(elevation=18.0)
+    left, right, bottom, top = view.fit(frames).window
+    figure, axes = plt.subplots(figsize=(5.2, 3.2), layout="constrained", dpi=110)
     finish(figure, axes, COLOURS, norm, [0.01, 0.1, 1.0, 100.0 * most], "strain [%]", "min")
-    save(figure, "hanging.png")
+    images = []
+    for k, points in enumerate(frames):
+        seen = view.project(points)
+        draw(axes, scene.mesh, seen, norm(100.0 * np.maximum(strain(scene.mesh, points), least)), COLOURS)
+        axes.plot(*seen[scene.pins.vertices, :2].T, "o", color="black", markersize=4.0)
+        axes.text(left, bottom, f"{k / fps:.2f} s", color=GREY, fontsize=8)
+        axes.set(xlim=(left, right), ylim=(bottom, top))
+        figure.canvas.draw()
+        images.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
+        for artist in [*axes.collections, *axes.lines, *axes.texts]:
+            artist.remove()
+    plt.close(figure)
+    # One palette for all frames, so that what stands still is stored once.
+    sample = Image.fromarray(np.concatenate([np.asarray(image) for image in images[::6]]))
+    palette = sample.quantize(colours)
+    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    images[0].save(DOCS / "hanging.gif", save_all=True, append_images=images[1:], duration=1000 // fps, loop=0, optimize=True)
 
 
 def picture_cantilever(gammas=(1.0, 5.0, 20.0), elements=40):

@@ -24,7 +24,7 @@ from warpcloth.lab.strips import PATTERNS, inner_shares, plate, rolled, strip
 
 ANGLES = (0.0, 13.0, 30.0, 45.0, -15.0, -45.0)
 BENDING = ("dihedral", "quadratic")
-PAGE = (Path(__file__).parents[2] / "docs" / "solvers.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "physics.md").read_text(encoding="utf-8")
 POISSON = -1.0 / 3.0  # of the equilateral net
 
 
@@ -111,7 +111,7 @@ def test_an_irregular_net_that_is_rolled_is_too_stiff(bending, device):
     assert min(found) > 1.2 and max(found) < 1.4, found
 
 
-# Curvatures (κ_xx, κ_zz, κ_xz) by the first word of their rows in docs/solvers.md, but for their size.
+# Curvatures (κ_xx, κ_zz, κ_xz) by the first word of their rows in docs/physics.md, but for their size.
 CURVED = {
     "cylinder along a row": (1.0, 0.0, 0.0),
     "cylinder at 45°": (0.5, 0.5, 0.5),

@@ -1,0 +1,72 @@
+"""Writes the tables of README.md and docs/ that follow from the code, between their markers: python docs/tables.py"""
+
+import argparse
+import re
+from pathlib import Path
+
+from warpcloth.cli import _parser
+from warpcloth.usd.attributes import ATTRIBUTES
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+
+
+def table(head, rows):
+    """A table of Markdown, of one line a row."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n".replace("|  |", "| |") for cells in lines)
+
+
+def attributes():
+    """Lists the attributes of a stage that say what a cloth is."""
+    rows = [[f"`{row.name}`", " or ".join(f"`{kind}`" for kind in row.types), row.place, row.field] for row in ATTRIBUTES]
+    return table(("Attribute", "Type", "On", "Field"), rows)
+
+
+def commands(parser):
+    """Yields (name, parser) of each command, those of ``chart`` by themselves."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, command in action.choices.items():
+                inner = list(commands(command))
+                yield from [(f"{name} {part}", one) for part, one in inner] or [(name, command)]
+
+
+def options():
+    """Lists the arguments and options of each command."""
+    parts = []
+    for name, command in commands(_parser()):
+        rows = []
+        for action in command._actions:
+            if isinstance(action, argparse._HelpAction) or "--debug" in action.option_strings:
+                continue
+            values = action.metavar or (
+                "" if action.nargs == 0 else (action.dest.upper() if action.choices is None else "NAME")
+            )
+            values = " ".join(values) if isinstance(values, tuple) else values
+            flags = ", ".join(action.option_strings) or values
+            said = (action.help or "") % vars(action) if action.help else ""
+            allowed = f"one of {', '.join(map(str, action.choices))}" if action.choices else ""
+            default = f"default {action.default}" if action.choices and isinstance(action.default, str) else ""
+            meaning = "; ".join(part for part in (said, allowed, default) if part)
+            more = f" {values}" if action.option_strings and values else ""
+            rows.append([f"`{flags}{more}`", meaning.replace("|", "\\|")])
+        parts.append(f"\n### {name}\n\n{command.description}\n\n{table(('Option', 'Meaning'), rows)}")
+    return "".join(parts) + "\n"
+
+
+TABLES = {"attributes": attributes, "options": options}
+
+
+def filled(text):
+    """The text of a page with its tables as the code has them now."""
+    for name, made in TABLES.items():
+        marked = f"<!-- {name} -->\n"
+        if marked in text:
+            text = re.sub(rf"(?s)({marked}).*?(<!-- end -->)", lambda m, made=made: m[1] + made() + m[2], text)
+    return text
+
+
+if __name__ == "__main__":
+    for page in PAGES:
+        page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,282 @@
+"""What README.md and docs/ show works as it stands there: blocks, links, tables and names."""
+
+import importlib.util
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.analysis.measures import MEASURES
+from warpcloth.cli import _parser
+from warpcloth.solvers import SOLVERS
+from warpcloth.terms import TERMS
+
+ROOT = Path(__file__).parents[2]
+_spec = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "tables.py")
+tables = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(tables)
+PAGES = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in tables.PAGES}
+ALL = PAGES | {"CHANGELOG.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")}
+
+
+def blocks(text):
+    """(language, text) of each block."""
+    return [(m[1], m[2]) for m in re.finditer(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)]
+
+
+def files(text):
+    """Text of each file that a page shows, by name."""
+    return {m[1]: m[2] for m in re.finditer(r"`([\w.]+)`:\n\n```\w+\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)}
+
+
+def python(page):
+    """All Python of a page, but for files."""
+    text = PAGES[page]
+    return "\n".join(
+        text for language, text in blocks(text) if language == "python" and text not in files(PAGES[page]).values()
+    )
+
+
+COMMANDS = [
+    line
+    for text in PAGES.values()
+    for language, block in blocks(text)
+    if language == "sh"
+    for line in block.splitlines()
+    if line.startswith("warpcloth ")
+]
+# Packages by extra.
+OPTIONAL = (ROOT / "pyproject.toml").read_text(encoding="utf-8").partition("[project.optional-dependencies]")[2]
+EXTRAS = {
+    name: re.findall(r'"(\w+)', packages)
+    for name, packages in re.findall(r"^(\w+) = \[(.*)\]$", OPTIONAL.partition("\n[")[0], re.MULTILINE)
+}
+
+
+def test_the_readme_is_short_and_has_two_commands():
+    text = PAGES["README.md"]
+    assert len(text.split()) <= 900
+    assert len(re.findall(r"^python3 -m venv", text, re.MULTILINE)) == 2  # as .ci/run takes them
+    assert len([line for line in python("README.md").splitlines() if line]) == 5
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_generated_tables_are_those_of_the_code(page):
+    assert tables.filled(PAGES[page]) == PAGES[page], "run python docs/tables.py"
+
+
+def slug(heading):
+    """The anchor of a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", ALL)
+def test_links_lead_somewhere(page):
+    """To a file of the checkout, and to a heading in it."""
+    for link in re.findall(r"\]\((?!https?:)([^)]+)\)", ALL[page]):
+        path, _, anchor = link.partition("#")
+        target = (ROOT / page).parent / path if path else ROOT / page
+        assert target.is_file(), link
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in map(slug, headings), link
+
+
+def test_every_page_is_linked_and_every_picture_shown():
+    linked = {
+        str(((ROOT / page).parent / link.partition("#")[0]).resolve().relative_to(ROOT))
+        for page, text in PAGES.items()
+        for link in re.findall(r"\]\((?!https?:)([^)#]+)", text)
+    }
+    shown = [path for path in (ROOT / "docs").iterdir() if path.suffix in (".png", ".gif", ".svg", ".md")]
+    assert {str(path.relative_to(ROOT)) for path in shown} <= linked
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_name_of_the_api_exists(page):
+    for name in re.findall(r"\bwc\.(\w+)", PAGES[page]):
+        assert hasattr(wc, name), name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_files_that_are_named_exist(page):
+    """Paths of the checkout and the modules of the package, in code."""
+    for path in re.findall(r"[ `]((?:warpcloth|kernels|scenes|tests|benchmarks|docs|\.ci)/[\w./-]*\w)`?", PAGES[page]):
+        assert (ROOT / path).exists(), path
+    for name in re.findall(r"`(warpcloth(?:\.\w+)+)", PAGES[page]):
+        parts = name.split(".")
+        found = next(k for k in range(len(parts), 0, -1) if _exists(".".join(parts[:k])))
+        value = importlib.import_module(".".join(parts[:found]))
+        for part in parts[found:]:
+            value = getattr(value, part)
+
+
+def _exists(module):
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_is_one(command):
+    assert _parser().parse_args(shlex.split(command, comments=True)[1:]).command
+
+
+@pytest.mark.parametrize("page", ALL)
+def test_extras_that_are_to_be_installed_exist(page):
+    """Extras are installed from a checkout, because warpcloth is on no index."""
+    assert "warpcloth[" not in ALL[page]
+    for given in re.findall(r"pip install ([^`&#\n]*)", ALL[page]):
+        assert (given.strip() == "-e .") or re.fullmatch(r"-e '\.\[(\w+)\]'", given.strip()), given
+    assert set(re.findall(r"'\.\[(\w+)\]'", ALL[page])) <= set(EXTRAS)
+
+
+def test_extras_that_refusals_name_exist():
+    said = []
+    for path in (ROOT / "warpcloth").rglob("*.py"):
+        said += re.findall(r"pip install [^\n]*", path.read_text(encoding="utf-8"))
+    assert len(said) > 3
+    for line in said:
+        assert re.match(r"pip install -e (['\"])\.\[(\w+)\]\1(``)? in the checkout", line)[2] in EXTRAS, line
+
+
+@pytest.mark.parametrize(
+    ("page", "head", "names"),
+    [
+        ("README.md", "Term", set(TERMS)),
+        ("README.md", "Solver", {record.__name__ for record in SOLVERS.values()}),
+        ("docs/scenes.md", "Scene", {path.stem for path in (ROOT / "scenes").glob("*.py")}),
+        ("docs/solvers.md", "Method", {record.__name__ for record in SOLVERS.values()}),
+    ],
+)
+def test_tables_are_whole(page, head, names):
+    table = re.search(rf"^\| {head} \|.*?(?=\n\n|\n<)", PAGES[page], re.MULTILINE | re.DOTALL)[0]
+    assert set(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) == names
+
+
+def test_every_measure_is_in_the_docs():
+    text = PAGES["docs/measuring.md"]
+    for on, part in zip(MEASURES.values(), re.split(r"^## Measures of vertices", text, flags=re.MULTILINE), strict=True):
+        rates = text[text.index("## Rates") :]
+        for measure in on.values():
+            row = re.search(rf"^\| `{measure.name}` \| (.*?) \| (.*?) \|", rates if measure.rate else part, re.MULTILINE)
+            assert row, measure.name
+            assert row[1] == ("×".join(map(str, measure.shape)) or "–") and row[2] == measure.unit, measure.name
+
+
+def test_the_table_of_residuals_is_that_of_the_solvers():
+    section = PAGES["docs/solvers.md"].split("## The residual of a run")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (.+) \| (.+) \| (.+) \| (.+) \|$", section, re.MULTILINE)
+    found = {name: (measure, weightless, unit, held == "`tolerance`") for name, measure, unit, weightless, held in rows}
+    solvers = {record.__name__: record for record in SOLVERS.values() if record.residual is not None}
+    assert found == {name: (*record.residual, hasattr(record, "tolerance")) for name, record in solvers.items()}
+
+
+# --- Results of the Python that pages show.
+
+
+def run(page, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    names = {}
+    exec(compile(python(page), page, "exec"), names)
+    return names
+
+
+def test_the_scene(tmp_path, monkeypatch, capsys):
+    animation = run("docs/scenes.md", tmp_path, monkeypatch)["animation"]
+    assert animation.status.ok and len(animation.points) == 61 and (tmp_path / "hanging.usdc").is_file()
+    assert "converged" in capsys.readouterr().out
+    assert np.asarray(animation.points[-1]).shape == (1024, 3)
+
+
+def test_the_deformation(tmp_path, monkeypatch, capsys):
+    run("docs/deformation.md", tmp_path, monkeypatch)
+    converged, angle = capsys.readouterr().out.splitlines()[-2:]
+    assert converged.startswith("True ") and np.radians(115.0) < float(angle) < np.radians(125.0)
+    assert (tmp_path / "twisted.usdc").is_file()
+
+
+def test_the_measures(tmp_path, monkeypatch, capsys):
+    names = run("docs/measuring.md", tmp_path, monkeypatch)
+    measured, around = names["measured"], names["around"]
+    np.testing.assert_array_equal(names["rolled"][0], names["mesh"].points)
+    np.testing.assert_allclose(measured["stretch"][-1, :, 0], 1.15, rtol=1e-12)
+    # A chord is shorter than its arc, by (κ/19)²/24.
+    np.testing.assert_allclose(measured["stretch"][-1, :, 1], 1.0, atol=(1.5 / 19) ** 2 / 24 * 1.01)
+    assert measured["rate_of_strain"].shape == (25, 722, 3, 3) and around["residual"].shape == (25, 400)
+    assert "frame 0 has none before it" in capsys.readouterr().out
+
+
+def test_the_batch(tmp_path, monkeypatch, capsys):
+    run("docs/batches.md", tmp_path, monkeypatch)
+    assert int(capsys.readouterr().out.split()[-1]) == 2 * 64
+
+
+def test_the_rotations(tmp_path, monkeypatch):
+    names = run("docs/rotations.md", tmp_path, monkeypatch)
+    assert np.abs(names["turned"] - names["R"][0]).max() < 1e-5
+    assert np.abs(names["R"] @ names["P"] - names["A"]).max() < 1e-5
+
+
+# --- All blocks of a page, as they stand there.
+
+# Modules whose names differ from those of their packages.
+MODULES = {"libigl": "igl", "pillow": "PIL"}
+# Runs the blocks of a page one after the other, commands by the function behind them. Packages that the page does not say to
+# install are not found. Other commands are left out: .ci/run runs those of the README, and a cluster needs several machines.
+RUN = """
+import json, shlex, sys
+from importlib.machinery import PathFinder
+
+blocks, absent = json.load(sys.stdin)
+find = PathFinder.find_spec
+PathFinder.find_spec = lambda name, *more: None if name.partition(".")[0] in absent else find(name, *more)
+
+from warpcloth.cli import main
+
+names = {"__name__": "page"}
+for language, text in blocks:
+    if language == "python":
+        exec(compile(text, "page", "exec"), names)
+    for line in text.splitlines() if language == "sh" else ():
+        if line.startswith("warpcloth "):
+            print("+", line, flush=True)
+            code = main(shlex.split(line, comments=True)[1:])
+            assert code == 0, f"{line}: {code}"
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page, text in PAGES.items() if {"python", "sh"} & dict(blocks(text)).keys()])
+def test_a_page_as_it_stands(page, tmp_path):
+    """All of its blocks in one process, in a folder with the files that it shows."""
+    text = PAGES[page]
+    named = set(re.findall(r"'\.\[(\w+)\]'", text)) - {"test"}
+    there = {package for extra in named for package in EXTRAS[extra]}
+    absent = {package for extra in set(EXTRAS) - {"test"} for package in EXTRAS[extra]} - there
+    for name, content in files(text).items():
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    shown = [block for block in blocks(text) if block[1] not in files(text).values()]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "WARPCLOTH_CACHE": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-c", RUN],
+        input=json.dumps((shown, [MODULES.get(package, package) for package in absent])),
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0 and "Traceback" not in done.stderr, f"{done.stdout}\n{done.stderr}"
+    commands = [line for language, block in shown if language == "sh" for line in block.splitlines() if line[:9] == "warpcloth"]
+    for option, name in pairwise(shlex.split("\n".join(commands), comments=True)):
+        if option in ("-o", "--csv", "--plot", "--npz", "--report"):
+            assert (tmp_path / name).is_file(), name
