@@ -5,7 +5,8 @@ import re
 from pathlib import Path
 
 from warpcloth.cli import _parser
-from warpcloth.usd.attributes import ATTRIBUTES
+from warpcloth.terms import TERMS
+from warpcloth.usd.attributes import attributes as every_attribute
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -19,8 +20,24 @@ def table(head, rows):
 
 def attributes():
     """Lists the attributes of a stage that say what a cloth is."""
-    rows = [[f"`{row.name}`", " or ".join(f"`{kind}`" for kind in row.types), row.place, row.field] for row in ATTRIBUTES]
-    return table(("Attribute", "Type", "On", "Field"), rows)
+    rows = [(row.name, row.type_names, row.place, row.field) for row in every_attribute() if row.field[:6] != "terms."]
+    return table(("Attribute", "Type", "On", "Field"), [[f"`{name}`", kinds(types), *more] for name, types, *more in rows])
+
+
+def term_attributes():
+    """Lists the attributes of a term, with the energies that have them."""
+    rows = []
+    for row in every_attribute():
+        field = row.field.removeprefix("terms.")
+        if field != row.field:
+            having = [f"`{name}`" for name, energy in TERMS.items() if field in energy.__dataclass_fields__]
+            all_have = field == "type" or len(having) == len(TERMS)
+            rows.append([f"`{row.name}`", kinds(row.type_names), "all" if all_have else ", ".join(having)])
+    return table(("Attribute", "Type", "Energies"), rows)
+
+
+def kinds(names):
+    return " or ".join(f"`{name}`" for name in names)
 
 
 def commands(parser):
@@ -55,7 +72,7 @@ def options():
     return "".join(parts) + "\n"
 
 
-TABLES = {"attributes": attributes, "options": options}
+TABLES = {"attributes": attributes, "term attributes": term_attributes, "options": options}
 
 
 def filled(text):
