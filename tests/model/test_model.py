@@ -12,6 +12,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.energies import DECLARED
 from warpcloth.core.operators import Energy, Gradient, RowSums, Sums
 from warpcloth.model.model import DTYPES
 from warpcloth.solvers import SOLVERS
@@ -191,6 +192,7 @@ BAD_BUILDS = {
     "unknown": ({"vary": {"wind": [1.0]}}, "vary['wind'] names nothing in this scene"),
     "term that is not there": ({"vary": {"DihedralBending.stiffness": [1.0]}}, "names nothing in this scene"),
     "parameter that is not there": ({"vary": {"Spring.colour": [1.0]}}, "names nothing in this scene"),
+    "rest length below 0": ({"copies": 2, "vary": {"Spring.rest_lengths": [1.0, -1.0]}}, "rest_lengths is -1.0 in copy 1; it"),
     "gravity of one": ({"copies": 2, "vary": {"gravity": [[0, 0, 0]]}}, "vary['gravity'] has shape (1, 3)"),
     "gravity NaN": ({"vary": {"gravity": [[0, np.nan, 0]]}}, "vary['gravity'][0, 1] is nan; it must be finite"),
     "density of three": ({"copies": 2, "vary": {"density": [1.0, 1.0, 1.0]}}, "vary['density'] has shape (3,)"),
@@ -238,6 +240,11 @@ BAD_PAIRS = {
         {"pins": MOVED},
         {"copies": 2, "vary": {"positions": [MESH.points, MESH.points + np.array([0, 0, 2.0])]}},
         "pins.keyframes[0] is 2 m from where the pinned vertices start in copy 1; it must be there",
+    ),
+    "a limit that is none": (
+        {"terms": [wc.SpringLimit(most=1.1)]},
+        {"copies": 2, "vary": {"SpringLimit.least": [1.0, 1.2]}},
+        "SpringLimit.least is 1.2; it must be no more than most, in copy 1",
     ),
 }
 
@@ -676,6 +683,26 @@ def test_a_copy_is_a_scene_of_its_own(names, dtype, device):
         assert energy[b] == energy_alone[0] > 0.0 and (gradient[b] == gradient_alone[0]).all()
         differs.append([energy_alone[0], *single.mass.numpy(), *single.velocities.numpy().ravel(), *single.gravity.numpy()[0]])
     assert (np.ptp(differs, axis=0) > 0.0).any(), "the copies are not alike"
+
+
+NUMBERS = [(kind, field) for kind, energy in KINDS.items() if kind in DECLARED for field in energy.quantities()]
+
+
+@pytest.mark.parametrize("by_element", [False, True], ids=["one number", "one an element"])
+@pytest.mark.parametrize(("kind", "field"), NUMBERS, ids=map(".".join, NUMBERS))
+def test_any_number_of_a_term_varies(kind, field, by_element):
+    """Each copy has the arrays of a scene with its numbers, to the bit."""
+    term, random = DECLARED[kind](MESH), np.random.default_rng(7)
+    count = len(term.stencil(MESH)) if by_element else None
+    shape = (COPIES, *([count] if by_element else []), *term.quantities()[field].shape)
+    values = random.uniform(0.5, 0.9, shape) + (0.5 if field == "most" else 0.0)
+    batch = scene(terms=[term]).build(copies=COPIES, dtype="float64", vary={f"{kind}.{field}": values}).terms[0]
+    for b in range(COPIES):
+        alone = scene(terms=[replace(term, **{field: values[b]})]).build(dtype="float64").terms[0]
+        for name in ("stiffness", "rest", "damping"):
+            of_batch, of_one = (getattr(elements, name) for elements in (batch, alone))
+            if of_one is not None:
+                assert (of_batch.numpy().reshape(COPIES, alone.count, -1)[b] == of_one.numpy().reshape(alone.count, -1)).all()
 
 
 def test_copies_without_differences_are_alike(device):

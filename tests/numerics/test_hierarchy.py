@@ -222,6 +222,16 @@ def test_copies_of_unlike_stiffness_are_as_alone(device):
         assert np.abs(batch[:, copy] - points).max() < 1e-9
 
 
+def test_the_longest_bound_of_the_copies_holds_for_all():
+    """Of copies with other rest lengths; those of each meet in the sweeps over all terms."""
+    mesh = wc.Mesh.chain(9)
+    scene = wc.Scene(mesh, density=0.2, terms=[wc.Spring(stiffness=np.inf)], pins=[0])
+    batch = scene.build(dtype="float64", copies=2, vary={"Spring.rest_lengths": [0.1, 0.2]})
+    alone = replace(scene, terms=[wc.Spring(stiffness=np.inf, rest_lengths=0.2)]).build(dtype="float64")
+    for one, other in zip(levels(batch), levels(alone), strict=True):
+        assert all(np.array_equal(a.lengths, b.lengths) for a, b in zip(one.bounds, other.bounds, strict=True))
+
+
 def test_stretch_grows_with_resolution_only_without_levels(device):
     """Information moves one link a sweep: 10 sweeps a step stretch a chain of 1 m with hard links the more the finer it is."""
     stretch = {}

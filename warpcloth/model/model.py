@@ -3,7 +3,6 @@
 import inspect
 import os
 import warnings
-from collections.abc import Mapping
 from copy import copy as shallow_copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ..base.checks import array, choice, numeric, shown, whole
+from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..kernels.assemble import types
@@ -19,6 +18,7 @@ from ..kernels.term import Term
 from ..mesh.selection import distinct_vertices
 from ..terms.refresh import Refresh
 from .precision import cast, refuse_coarse
+from .vary import Vary
 
 _PINNED = 1e3  # what a pinned vertex of a cell counts, in masses of the rest of the cell: it does not move, so the cell must
 
@@ -182,8 +182,8 @@ class Model:
         dtype: ``"float32"`` or ``"float64"``.
         copies: B.
         vary: What differs between the copies, by name, each with B entries: ``"gravity"`` (B, 3), ``"density"`` (B,),
-            ``"masses"`` (B, n), ``"positions"`` and ``"velocities"`` (B, n, 3), and of terms, by their name or class,
-            ``"Spring.stiffness"`` and ``"Spring.damping"``, (B,) or (B, E).
+            ``"masses"`` (B, n), ``"positions"`` and ``"velocities"`` (B, n, 3), and any numeric field of a term, by its name or
+            class, such as ``"Spring.stiffness"`` and ``"Spring.rest_lengths"``, (B,) or (B, E).
         order: The scene's vertices in the order that the model has them in, (n,), such as
             :func:`warpcloth.mesh.ordering.near_order` gives; elements are then in the order of their lowest vertices there. All
             arguments here, and what is said of them, have the scene's own order, and all attributes and what solvers make of
@@ -228,7 +228,7 @@ class Model:
         self.rest_points = scene.mesh.points
         if order is not None:
             self._set_order(order)
-        vary = _Varied({} if vary is None else vary, copies)
+        vary = Vary({} if vary is None else vary, copies)
 
         masses = self._varied_masses(vary)
         with np.errstate(over="ignore"):  # an inverse that no precision holds is refused below
@@ -369,22 +369,12 @@ class Model:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
     def _on_device(self, term, positions, vary):
-        copies = [term.elements(self.scene.mesh, start) for start in (positions if vary.has("positions") else positions[:1])]
-        one = copies[0]
+        one, rest, stiffness, damping = vary.elements(term, self.scene.mesh, positions)
         E = len(one.stencil)
         vertices = self._placed(one.stencil)
         if self.order is not None and vertices.shape[1] == 2:
             vertices = np.sort(vertices, axis=1)  # a pair has no direction, and those of one are faster
         stencil = vertices[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
-        rest = np.stack([copy.rest for copy in copies] * (self.copies // len(copies)))
-        stiffness = vary.take_of_elements("stiffness", one, E if one.cells is None else len(one.cells) - 1)
-        for copy, e in np.argwhere(~(stiffness >= 0.0))[:1]:
-            raise ValueError(f"{one.label}.stiffness is {stiffness[copy, e]} in copy {copy}; it must be 0 or more")
-        damping = vary.take_of_elements("damping", one, E)
-        for copy, e in np.argwhere(~((damping >= 0.0) & np.isfinite(damping)))[:1]:
-            raise ValueError(f"{one.label}.damping is {damping[copy, e]} in copy {copy}; it must be finite, 0 or more")
-        if damping.any() and one.term.dissipation is None:
-            raise ValueError(f"{one.label} cannot be damped; leave its damping out of vary")
         rest_type = wp.types.vector(one.term.parameters, self.dtype)
         cells = None
         if one.cells is not None:
@@ -493,42 +483,3 @@ def threads_on(device, threads):
 
 def _bytes(array):
     return wp.types.type_size_in_bytes(array.dtype) if 0 in array.strides else array.size * array.strides[-1]
-
-
-class _Varied:
-    """The values of ``vary``, taken by name; what nobody takes is refused."""
-
-    def __init__(self, values, copies):
-        if not isinstance(values, Mapping):
-            raise ValueError(f"vary is {shown(values)}; it must be a dict of names and arrays, such as {{'gravity': …}}")
-        self.values, self.copies, self.taken = dict(values), copies, set()
-
-    def has(self, name):
-        return name in self.values
-
-    def take(self, name, default):
-        """``values[name]`` as (B, *shape of default), or the default B times."""
-        if name not in self.values:
-            return np.repeat(np.asarray(default, dtype=np.float64)[None], self.copies, axis=0)
-        self.taken.add(name)
-        return array(f"vary[{name!r}]", self.values[name], (self.copies, *np.shape(default))).copy()
-
-    def take_of_elements(self, field, elements, E):
-        """Stiffness or damping of a term as (B, 1) or (B, E)."""
-        for name in (f"{elements.label}.{field}", f"{elements.kind}.{field}"):
-            if name in self.values:
-                self.taken.add(name)
-                rule = f"({self.copies},) or ({self.copies}, {E})"
-                values = numeric(f"vary[{name!r}]", self.values[name], f"have shape {rule}")
-                if values.shape not in ((self.copies,), (self.copies, E)):
-                    raise ValueError(f"vary[{name!r}] has shape {values.shape}; it must be {rule}")
-                return values.reshape(self.copies, -1)
-        return np.repeat(np.atleast_1d(getattr(elements, field))[None], self.copies, axis=0)
-
-    def refuse_rest(self):
-        rest = sorted(set(self.values) - self.taken, key=str)
-        if rest:
-            raise ValueError(
-                f"vary[{rest[0]!r}] names nothing in this scene; allowed are gravity, density or masses, positions, "
-                "velocities, <term>.stiffness and <term>.damping"
-            )

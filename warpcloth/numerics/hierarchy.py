@@ -110,7 +110,11 @@ def _finest(model, free):
         stiffness = elements.stiffness.numpy().reshape(model.copies, E).astype(np.float64).T
         if (stiffness == stiffness[:, :1]).all():
             stiffness = stiffness[:, :1]
-        pairs, lengths, factors = elements.term.reach(points, elements.stencil.numpy()[:E], elements.rest.numpy()[:E])
+        # What bounds all copies is the longest of their lengths; the last sweeps have each its own.
+        stencil, rest = elements.stencil.numpy()[:E], elements.rest.numpy().reshape(model.copies, E, -1)
+        found = [elements.term.reach(points, stencil, each) for each in (rest if (rest != rest[:1]).any() else rest[:1])]
+        pairs, _, factors = found[0]
+        lengths = np.max([lengths for _, lengths, _ in found], axis=0)
         each = len(pairs) // E
         with np.errstate(divide="ignore"):
             compliance = 1.0 / (np.repeat(stiffness, each, axis=0) * factors[:, None])

@@ -1,0 +1,94 @@
+"""What differs between the copies of a model: any number that a scene or one of its terms holds."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ..base.checks import array, numeric, shown
+
+
+class Vary:
+    """The values of ``vary``, taken by name; what nobody takes is refused.
+
+    Args:
+        values: Arrays by name, the first axis of each the copies, see :class:`warpcloth.model.model.Model`.
+        copies: B.
+
+    Raises:
+        ValueError: If it is no mapping.
+    """
+
+    def __init__(self, values, copies):
+        if not isinstance(values, Mapping):
+            raise ValueError(f"vary is {shown(values)}; it must be a dict of names and arrays, such as {{'gravity': …}}")
+        self.values, self.copies, self.taken, self.fields = dict(values), copies, set(), []
+
+    def has(self, name):
+        """Whether a name is given."""
+        return name in self.values
+
+    def take(self, name, default):
+        """``values[name]`` as (B, *shape of default), or the default B times."""
+        if name not in self.values:
+            return np.repeat(np.asarray(default, dtype=np.float64)[None], self.copies, axis=0)
+        self.taken.add(name)
+        return array(f"vary[{name!r}]", self.values[name], (self.copies, *np.shape(default))).copy()
+
+    def elements(self, term, mesh, positions):
+        """The elements of a term, and what differs between their copies.
+
+        Args:
+            term: A :class:`warpcloth.terms.declared.Declared`.
+            mesh: The :class:`warpcloth.Mesh`.
+            positions: Where the vertices of each copy start, (B, n, 3) [m].
+
+        Returns:
+            (elements, rest, stiffness, damping): :class:`warpcloth.terms.declared.Elements` of the first copy, rest states
+            (B, E, P), stiffness and damping (B, 1) or (B, E), of cells (B, C).
+        """
+        one = term.elements(mesh, positions[0])
+        count = len(one.stencil) if one.cells is None else len(one.cells) - 1
+        given = {name: self._of_term(term, name, count) for name in term.quantities()}
+        given = {name: values for name, values in given.items() if values is not None}
+        found = [given.pop(name, None) for name in ("stiffness", "damping")]
+        stiffness, damping = (
+            np.repeat(np.atleast_1d(default)[None], self.copies, axis=0) if values is None else values.reshape(self.copies, -1)
+            for values, default in zip(found, (one.stiffness, one.damping), strict=True)
+        )
+        if damping.any() and one.term.dissipation is None:
+            raise ValueError(f"{one.label} cannot be damped; leave its damping out")
+        if not (given or self.has("positions")):
+            return one, np.repeat(one.rest[None], self.copies, axis=0), stiffness, damping
+        rest = []
+        for copy in range(self.copies):
+            try:
+                declared = replace(term, **{name: values[copy] for name, values in given.items()})
+                rest.append(declared.rest(mesh, positions[copy], one.stencil))
+            except ValueError as error:
+                raise ValueError(f"{error}, in copy {copy}") from error
+        return one, np.stack(rest), stiffness, damping
+
+    def _of_term(self, term, field, count):
+        """A field of a term, (B, *shape) or (B, count, *shape), or None where it does not vary."""
+        quantity = term.quantities()[field]
+        self.fields.append(f"{type(term).__name__}.{field}")
+        for name in (f"{term.label}.{field}", f"{type(term).__name__}.{field}"):
+            if name in self.values:
+                self.taken.add(name)
+                one, each = (self.copies, *quantity.shape), (self.copies, count, *quantity.shape)
+                values = numeric(f"vary[{name!r}]", self.values[name], f"have shape {one} or {each}")
+                if values.shape not in (one, each):
+                    raise ValueError(f"vary[{name!r}] has shape {values.shape}; it must be {one} or {each}")
+                for copy, *index in np.argwhere(~quantity.holds(values))[:1].tolist():
+                    value = values[(copy, *index)]
+                    raise ValueError(f"{term.label}.{field} is {value} in copy {copy}; it {quantity.rule}")
+                return values
+        return None
+
+    def refuse_rest(self):
+        """Refuses names that nobody took."""
+        rest = sorted(set(self.values) - self.taken, key=str)
+        if rest:
+            allowed = ["gravity", "density or masses", "positions", "velocities", *dict.fromkeys(self.fields)]
+            raise ValueError(f"vary[{rest[0]!r}] names nothing in this scene; allowed are {', '.join(allowed)}")
