@@ -1,14 +1,16 @@
-"""Factories of the kernels of ADMM: implicit Euler split into elements, with copies z of their y, and vertices."""
+"""Factories of the kernels of ADMM: implicit Euler split into elements, each with a z of its own for y, and vertices."""
 
 from functools import cache
 from typing import Any
 
 import warp as wp
 
-from .assemble import local_coordinate, types
+from .local import local_coordinate
 from .memory import load, load_shared, store
 from .rotation import epsilon
 from .term import HessianPolicy, Term
+from .transpose import to_corner
+from .vectors import types
 
 CLAMP = wp.constant(int(HessianPolicy.CLAMP))
 # The most Newton steps of a local problem, and the most halvings of each.
@@ -133,6 +135,24 @@ def stiffness_scale(term: Term, dtype):
 
 
 @cache
+def splitting(term: Term, dtype):
+    """The struct of the elements of a term as ADMM has them: W² = r s k A, and z, u, gap = W²(y − z), change of W²z [N]."""
+    y_type = wp.types.matrix((term.rows, 3), dtype)
+
+    @wp.struct
+    class Splitting:
+        stiffness: wp.array(dtype=dtype)
+        ratio: wp.array(dtype=dtype)
+        scale: wp.array(dtype=dtype)
+        z: wp.array(dtype=y_type)
+        u: wp.array(dtype=y_type)
+        gap: wp.array(dtype=y_type)
+        change: wp.array(dtype=y_type)
+
+    return Splitting
+
+
+@cache
 def start_splitting(term: Term, dtype):
     """Kernel over elements: z = y at x̃, u = 0."""
     vec3, _ = types(dtype)
@@ -141,27 +161,24 @@ def start_splitting(term: Term, dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def start(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # state in
         x: wp.array(dtype=vec3),
         # out
-        z: wp.array(dtype=y_type),
-        u: wp.array(dtype=y_type),
+        of: splitting(term, dtype),
     ):
         e = wp.tid()
-        z[e] = y_of(stencil, e, rest[e], x, x)
-        u[e] = y_type()
+        of.z[e] = y_of(stencil, e, rest[e], x, x)
+        of.u[e] = y_type()
 
     return start
 
 
 @cache
 def split(term: Term, dtype):
-    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², then u += y − z, with W² = r s k A.
-
-    gap = W²(y − z), change = W²(z − z before) [N].
-    """
+    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², then u += y − z; gap and change."""
     vec3, _ = types(dtype)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     y_of, measure, minimise = local_coordinate(term, dtype, True), term.measure, local_minimiser(term, dtype)
@@ -169,35 +186,50 @@ def split(term: Term, dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def split_elements(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
-        ratio: wp.array(dtype=dtype),
-        scale: wp.array(dtype=dtype),
+        # parameters
         steps: int,
         # in and out
-        z: wp.array(dtype=y_type),
-        u: wp.array(dtype=y_type),
-        # out
-        gap: wp.array(dtype=y_type),
-        change: wp.array(dtype=y_type),
+        of: splitting(term, dtype),
     ):
         e = wp.tid()
         r = rest_of(rest, e)
-        part = shared(ratio, e) * shared(scale, e)
-        w2 = part * shared(stiffness, e) * measure(r)
+        part = shared(of.ratio, e) * shared(of.scale, e)
+        w2 = part * shared(of.stiffness, e) * measure(r)
         y = y_of(stencil, e, r, x, d)
-        v = y + take(u, e)
-        before = take(z, e)
+        v = y + take(of.u, e)
+        before = take(of.z, e)
         after = minimise(v, before, r, part, steps)
-        put(gap, e, w2 * (y - after))
-        put(change, e, w2 * (after - before))
-        put(z, e, after)
-        put(u, e, v - after)
+        put(of.gap, e, w2 * (y - after))
+        put(of.change, e, w2 * (after - before))
+        put(of.z, e, after)
+        put(of.u, e, v - after)
 
     return split_elements
+
+
+@cache
+def splitting_forces(term: Term, dtype):
+    """The device functions (elements, e) → max(1, 1/r) and (elements, e, rest) → gap + W²u, see :func:`scatter_splitting`."""
+    rest_type = wp.types.vector(term.parameters, dtype)
+    measure, shared, take = term.measure, load_shared(dtype), load(wp.types.matrix((term.rows, 3), dtype))
+
+    @wp.func
+    def weight_of(of: splitting(term, dtype), e: int):
+        part = shared(of.ratio, e)
+        return wp.max(part, dtype(1.0)) / part
+
+    @wp.func
+    def pull_of(of: splitting(term, dtype), e: int, r: rest_type):
+        w2 = shared(of.ratio, e) * shared(of.scale, e) * shared(of.stiffness, e) * measure(r)
+        return take(of.gap, e) + w2 * take(of.u, e)
+
+    return weight_of, pull_of
 
 
 @cache
@@ -207,22 +239,18 @@ def scatter_splitting(term: Term, dtype):
     For the CPU, in order: nothing is atomic.
     """
     vec3, _ = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    K = wp.constant(term.vertices)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    weight, measure = term.weight, term.measure
-    rest_of, shared, take = load(rest_type), load_shared(dtype), load(y_type)
-    vector, vertex, put = load(vec3), load(wp.int32, 2), store(vec3)
+    (weight_of, pull_of), share_of = splitting_forces(term, dtype), to_corner(term, dtype)
+    rest_of, take, vector, vertex, put = load(rest_type), load(y_type), load(vec3), load(wp.int32, 2), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
-        ratio: wp.array(dtype=dtype),
-        scale: wp.array(dtype=dtype),
-        u: wp.array(dtype=y_type),
-        gap: wp.array(dtype=y_type),
-        change: wp.array(dtype=y_type),
+        # state in
+        of: splitting(term, dtype),
         # in and out
         primal: wp.array(dtype=vec3),
         dual: wp.array(dtype=vec3),
@@ -230,48 +258,34 @@ def scatter_splitting(term: Term, dtype):
     ):
         e = wp.tid()
         r = rest_of(rest, e)
-        apart = take(gap, e)
-        moved = take(change, e)
-        part = shared(ratio, e)
-        most = wp.max(part, dtype(1.0)) / part
-        pull = apart + (part * shared(scale, e) * shared(stiffness, e) * measure(r)) * take(u, e)
+        gap = take(of.gap, e)
+        change = take(of.change, e)
+        most = weight_of(of, e)
+        pull = pull_of(of, e, r)
         for i in range(K):
-            w = weight(r, i)
-            a = w[0] * apart[0]
-            b = w[0] * moved[0]
-            c = w[0] * pull[0]
-            for m in range(1, M):
-                a += w[m] * apart[m]
-                b += w[m] * moved[m]
-                c += w[m] * pull[m]
             v = vertex(stencil, K * e + i)
-            put(primal, v, vector(primal, v) + most * a)
-            put(dual, v, vector(dual, v) + b)
-            put(force, v, vector(force, v) + c)
+            put(primal, v, vector(primal, v) + most * share_of(r, i, gap))
+            put(dual, v, vector(dual, v) + share_of(r, i, change))
+            put(force, v, vector(force, v) + share_of(r, i, pull))
 
     return scatter
 
 
 @cache
 def gather_splitting(term: Term, dtype):
-    """Kernel over vertices: the same sums in a fixed order, through :attr:`warpcloth.model.model.DeviceElements.incidences`."""
+    """Kernel over vertices: the sums of :func:`scatter_splitting` in a fixed order, as :func:`.transpose.gather` makes one."""
     vec3, _ = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
-    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    weight, measure = term.weight, term.measure
+    K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
+    (weight_of, pull_of), share_of = splitting_forces(term, dtype), to_corner(term, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather(
+        # elements
         offsets: wp.array(dtype=wp.int32),
-        incidences: wp.array(dtype=wp.int32),
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
+        codes: wp.array(dtype=wp.int32),
         rest: wp.array(dtype=rest_type),
-        ratio: wp.array(dtype=dtype),
-        scale: wp.array(dtype=dtype),
-        u: wp.array(dtype=y_type),
-        gap: wp.array(dtype=y_type),
-        change: wp.array(dtype=y_type),
+        # state in
+        of: splitting(term, dtype),
         # in and out
         primal: wp.array(dtype=vec3),
         dual: wp.array(dtype=vec3),
@@ -282,16 +296,12 @@ def gather_splitting(term: Term, dtype):
         b = vec3()
         c = vec3()
         for n in range(offsets[v], offsets[v + 1]):
-            e = incidences[n] // K
+            e = codes[n] // K
+            i = codes[n] - e * K
             r = rest[e]
-            w = weight(r, incidences[n] - e * K)
-            part = ratio[e]
-            most = wp.max(part, dtype(1.0)) / part
-            pull = gap[e] + (part * scale[e] * stiffness[e] * measure(r)) * u[e]
-            for m in range(M):
-                a += (most * w[m]) * gap[e][m]
-                b += w[m] * change[e][m]
-                c += w[m] * pull[m]
+            a += weight_of(of, e) * share_of(r, i, of.gap[e])
+            b += share_of(r, i, of.change[e])
+            c += share_of(r, i, pull_of(of, e, r))
         primal[v] = primal[v] + a
         dual[v] = dual[v] + b
         force[v] = force[v] + c

@@ -10,8 +10,8 @@ from functools import cache
 
 import warp as wp
 
-from .assemble import types
 from .rotation import nearest_rotation
+from .vectors import types
 
 
 @cache

@@ -1,53 +1,17 @@
 """Factories of the kernels that turn a term into sums over vertices and copies: energy, gradient, Hessian blocks.
 
-With ``project`` the only kernels that know stencils; none of them knows a material. Each kernel is compiled only when a
-solver asks for it. Signatures: elements, state in, parameters, out.
+None of them knows a material, and each is compiled only when a solver asks for it.
 """
 
 from functools import cache
 
 import warp as wp
 
-from .memory import load, load_shared, store
+from .local import local_coordinate
+from .memory import load, load_shared
 from .term import Term
-
-
-@cache
-def types(dtype):
-    """The vector and 3×3 matrix types of a scalar type: (vec3, mat33)."""
-    return wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
-
-
-@cache
-def local_coordinate(term: Term, dtype, corrected: bool):
-    """The device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ of a term, or with ``corrected`` Σᵢ wᵢ ⊗ (xᵢ + dᵢ).
-
-    In float32 the sum x + d would lose the digits of d to the size of x; the difference of neighbouring x is nearly exact.
-    """
-    vec3, _ = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
-    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    weight, vector, vertex = term.weight, load(vec3), load(wp.int32, 2)
-
-    @wp.func
-    def part_of(rest: rest_type, corner: int, place: vec3):
-        w = weight(rest, corner)
-        y = y_type()
-        for m in range(M):
-            y[m] = w[m] * place
-        return y
-
-    @wp.func
-    def y_of(stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        y = part_of(rest, 0, vector(x, vertex(stencil, K * e)))
-        for i in range(1, K):
-            y += part_of(rest, i, vector(x, vertex(stencil, K * e + i)))
-        if wp.static(corrected):
-            for i in range(K):
-                y += part_of(rest, i, vector(d, vertex(stencil, K * e + i)))
-        return y
-
-    return y_of
+from .transpose import Source, gather, scatter
+from .vectors import types
 
 
 @cache
@@ -60,11 +24,14 @@ def energy(term: Term, dtype, corrected: bool = False):
 
     @wp.kernel(module="unique", enable_backward=False)
     def energy_of_elements(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
+        # out
         out: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
@@ -75,35 +42,42 @@ def energy(term: Term, dtype, corrected: bool = False):
 
 
 @cache
-def scatter_gradient(term: Term, dtype, corrected: bool = False):
-    """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i]. For the CPU, in order: nothing is atomic."""
+def elastic(term: Term, dtype):
+    """The struct of what the forces of a term are computed from: its elements, and the state x, d."""
     vec3, _ = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
-    rest_type = wp.types.vector(term.parameters, dtype)
-    y_of, weight, gradient, measure = local_coordinate(term, dtype, corrected), term.weight, term.gradient, term.measure
-    vector, vertex, rest_of, number, put = load(vec3), load(wp.int32, 2), load(rest_type), load_shared(dtype), store(vec3)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def scatter(
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
-        rest: wp.array(dtype=rest_type),
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        out: wp.array(dtype=vec3),
-    ):
-        e = wp.tid()
-        r = rest_of(rest, e)
-        g = (number(stiffness, e) * measure(r)) * gradient(y_of(stencil, e, r, x, d), r)
-        for i in range(K):
-            w = weight(r, i)
-            force = w[0] * g[0]
-            for m in range(1, M):
-                force += w[m] * g[m]
-            v = vertex(stencil, K * e + i)
-            put(out, v, vector(out, v) + force)
+    @wp.struct
+    class Elastic:
+        stencil: wp.array2d(dtype=wp.int32)
+        stiffness: wp.array(dtype=dtype)
+        x: wp.array(dtype=vec3)
+        d: wp.array(dtype=vec3)
 
-    return scatter
+    return Elastic
+
+
+@cache
+def forces(term: Term, dtype, corrected: bool = False):
+    """The :class:`.transpose.Source` of kₑ Aₑ ∂u/∂y."""
+    data, rest_type = elastic(term, dtype), wp.types.vector(term.parameters, dtype)
+    y_of, gradient, measure = local_coordinate(term, dtype, corrected), term.gradient, term.measure
+    number = load_shared(dtype)
+
+    @wp.func
+    def force(data: data, e: int, r: rest_type):
+        return (number(data.stiffness, e) * measure(r)) * gradient(y_of(data.stencil, e, r, data.x, data.d), r)
+
+    return Source(data, force)
+
+
+def scatter_gradient(term: Term, dtype, corrected: bool = False):
+    """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i], see :func:`.transpose.scatter`."""
+    return scatter(term, dtype, forces(term, dtype, corrected))
+
+
+def gather_gradient(term: Term, dtype, corrected: bool = False):
+    """Kernel over vertices: the sum that :func:`scatter_gradient` makes, see :func:`.transpose.gather`."""
+    return gather(term, dtype, forces(term, dtype, corrected))
 
 
 @cache
@@ -116,13 +90,17 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
 
     @wp.kernel(module="unique", enable_backward=False)
     def blocks_of_elements(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
+        # parameters
         elements_per_copy: int,
         policy: wp.array(dtype=wp.int32),
+        # out
         out: wp.array2d(dtype=mat33),
     ):
         e = wp.tid()
@@ -154,9 +132,11 @@ def constant_blocks(term: Term, dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def blocks_of_weights(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # out
         out: wp.array2d(dtype=wp.float64),
     ):
         e = wp.tid()

@@ -5,56 +5,52 @@ What the best motion (c, R) cannot take up is what is left of a change of x when
     J = (I − Q)√M,    Q v = √mᵢ(V + Ω × rᵢ),    V = Σ √mᵢ vᵢ/Σ mᵢ,    Ω = (Σ mᵢ(rᵢ²I − rᵢrᵢᵀ))⁻¹ Σ √mᵢ rᵢ × vᵢ,    rᵢ = R qᵢ,
 
 Q being the projection onto translations and turns, of a body on a line without those about it (pseudo-inverse). Six of the
-rows are redundant. For rows, see :mod:`.constrain`; kernels are over clusters, of which each has a thread.
+rows are redundant. For rows, see :mod:`.constraint_rows`; kernels are over clusters, of which each has a thread.
 """
 
 from functools import cache
 
 import warp as wp
 
-from .assemble import types
 from .clusters import fit
-from .constraint_rows import ROUNDINGS, first_row
+from .constraint_rows import ROUNDINGS, RowLayout, first_row, row_values
 from .rotation import epsilon
+from .term import Term
+from .transpose import gather, stored
+from .vectors import types
 
 
 @cache
 def linearise_clusters(dtype):
-    """Kernel over clusters: as :func:`.constrain.linearise`, and the rotation R; 0 of a cluster without stiffness."""
+    """Kernel over clusters: as :func:`.constraint_rows.linearise`, and the rotation R; 0 of a cluster without stiffness."""
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(4, dtype)
     fit_cluster = fit(dtype, True)
 
     @wp.kernel(module="unique", enable_backward=False)
     def linearise(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         shape: wp.array(dtype=vec3),
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
+        # parameters
         h: dtype,
         least: dtype,
-        per_copy: int,
-        first: int,
-        rows_per_copy: int,
-        # in and out
-        lambdas: wp.array(dtype=dtype),
-        # out
+        layout: RowLayout,
+        # out, and the multipliers in and out
         rotations: wp.array(dtype=mat33),
-        gap: wp.array(dtype=dtype),
-        compliance: wp.array(dtype=dtype),
-        inverse: wp.array(dtype=dtype),
-        residual: wp.array(dtype=wp.float64),
-        rounding: wp.array(dtype=wp.float64),
-        carried: wp.array(dtype=wp.float64),
+        rows: row_values(dtype),
     ):
         c = wp.tid()
         R = fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
         o = stencil[offsets[c], 0]
         for e in range(offsets[c], offsets[c + 1]):
-            s = first_row(e, per_copy, first, rows_per_copy, 3)
+            s = first_row(e, layout, 3)
             v = stencil[e, 0]
             root = wp.sqrt(rest[e][3])
             alpha = dtype(1.0) / (stiffness[e] * h * h)
@@ -68,18 +64,18 @@ def linearise_clusters(dtype):
             force = vec3()
             for a in range(3):
                 if not active:
-                    lambdas[s + a] = dtype(0.0)
+                    rows.multipliers[s + a] = dtype(0.0)
                     rest[e][a] = dtype(0.0)
-                force[a] = lambdas[s + a]
+                force[a] = rows.multipliers[s + a]
                 row[a] = alpha * force[a] - root * rest[e][a]
-                gap[s + a] = row[a]
-                compliance[s + a] = alpha
-                inverse[s + a] = dtype(1.0) / (dtype(1.0) + alpha)
+                rows.gap[s + a] = row[a]
+                rows.compliance[s + a] = alpha
+                rows.inverse[s + a] = dtype(1.0) / (dtype(1.0) + alpha)
             move = dtype(1.0) / (root * (dtype(1.0) + alpha))
-            carried[s] = wp.float64(excess * wp.length(force) * move)
-            residual[s] = wp.float64(wp.length(row) * move)
+            rows.carried[s] = wp.float64(excess * wp.length(force) * move)
+            rows.residual[s] = wp.float64(wp.length(row) * move)
             lost = wp.length(x[v] - x[o]) + wp.length(d[v]) + wp.length(shape[e]) + wp.length(force) / root
-            rounding[s] = wp.float64(dtype(ROUNDINGS) * epsilon(lost) * lost)
+            rows.rounding[s] = wp.float64(dtype(ROUNDINGS) * epsilon(lost) * lost)
         rotations[c] = R
 
     return linearise
@@ -106,16 +102,17 @@ def apply_cluster_rows(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def apply(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         shape: wp.array(dtype=vec3),
         inertia: wp.array(dtype=mat33),
         rotations: wp.array(dtype=mat33),
         stencil: wp.array2d(dtype=wp.int32),
         rest: wp.array(dtype=rest_type),
+        # state in
         v: wp.array(dtype=vec3),
-        per_copy: int,
-        first: int,
-        rows_per_copy: int,
+        # parameters
+        layout: RowLayout,
         # in and out
         rows: wp.array(dtype=dtype),
     ):
@@ -135,7 +132,7 @@ def apply_cluster_rows(dtype):
         rigid = rigid_part(linear, angular, total, R, inertia[c])
         for e in range(offsets[c], offsets[c + 1]):
             left = wp.sqrt(rest[e][3]) * (v[stencil[e, 0]] - (rigid[0] + wp.cross(rigid[1], R * shape[e])))
-            s = first_row(e, per_copy, first, rows_per_copy, 3)
+            s = first_row(e, layout, 3)
             for a in range(3):
                 rows[s + a] = rows[s + a] + left[a]
 
@@ -144,24 +141,26 @@ def apply_cluster_rows(dtype):
 
 @cache
 def pull_clusters(dtype):
-    """Kernel over clusters: of Jᵀ λ the part of each element, (B·E,) vectors."""
+    """Kernel over clusters: of Jᵀ λ the part of each element, (B·E,) matrices of one row."""
     vec3, mat33 = types(dtype)
+    y_type = wp.types.matrix((1, 3), dtype)
     rest_type = wp.types.vector(4, dtype)
     rigid_part = motion(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def pull(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         shape: wp.array(dtype=vec3),
         inertia: wp.array(dtype=mat33),
         rotations: wp.array(dtype=mat33),
         rest: wp.array(dtype=rest_type),
+        # state in
         lambdas: wp.array(dtype=dtype),
-        per_copy: int,
-        first: int,
-        rows_per_copy: int,
+        # parameters
+        layout: RowLayout,
         # out
-        pulls: wp.array(dtype=vec3),
+        pulls: wp.array(dtype=y_type),
     ):
         c = wp.tid()
         R = rotations[c]
@@ -169,7 +168,7 @@ def pull_clusters(dtype):
         angular = vec3()
         total = dtype(0.0)
         for e in range(offsets[c], offsets[c + 1]):
-            s = first_row(e, per_copy, first, rows_per_copy, 3)
+            s = first_row(e, layout, 3)
             part = wp.sqrt(rest[e][3]) * vec3(lambdas[s], lambdas[s + 1], lambdas[s + 2])
             linear += part
             angular += wp.cross(R * shape[e], part)
@@ -177,32 +176,16 @@ def pull_clusters(dtype):
         rigid = rigid_part(linear, angular, total, R, inertia[c])
         held = wp.ddot(R, R) != dtype(0.0)
         for e in range(offsets[c], offsets[c + 1]):
-            s = first_row(e, per_copy, first, rows_per_copy, 3)
+            s = first_row(e, layout, 3)
             part = wp.sqrt(rest[e][3]) * vec3(lambdas[s], lambdas[s + 1], lambdas[s + 2])
-            pulls[e] = part - rest[e][3] * (rigid[0] + wp.cross(rigid[1], R * shape[e]))
-            if not held:
-                pulls[e] = vec3()
+            z = y_type()
+            if held:
+                z[0] = part - rest[e][3] * (rigid[0] + wp.cross(rigid[1], R * shape[e]))
+            pulls[e] = z
 
     return pull
 
 
-@cache
-def gather_pulls(dtype):
-    """Kernel over vertices: out += the parts of the elements of a vertex, in a fixed order."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def gather(
-        offsets: wp.array(dtype=wp.int32),
-        incidences: wp.array(dtype=wp.int32),
-        pulls: wp.array(dtype=vec3),
-        # in and out
-        out: wp.array(dtype=vec3),
-    ):
-        v = wp.tid()
-        total = vec3()
-        for n in range(offsets[v], offsets[v + 1]):
-            total += pulls[incidences[n]]
-        out[v] = out[v] + total
-
-    return gather
+def gather_pulls(term: Term, dtype):
+    """Kernel over vertices: adds the parts of the elements of a vertex to out, see :func:`.transpose.gather`."""
+    return gather(term, dtype, stored(term, dtype))

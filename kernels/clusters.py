@@ -8,9 +8,9 @@ from functools import cache
 
 import warp as wp
 
-from .assemble import types
 from .project import place, spread_compliance
 from .rotation import nearest_rotation
+from .vectors import types
 
 
 @cache

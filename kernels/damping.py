@@ -4,8 +4,9 @@ from functools import cache
 
 import warp as wp
 
-from .assemble import local_coordinate, types
+from .local import local_coordinate
 from .term import Term
+from .vectors import types
 
 
 @cache

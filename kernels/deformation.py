@@ -14,8 +14,8 @@ from typing import Any
 
 import warp as wp
 
-from .assemble import types
 from .rotation import epsilon, svd3x2
+from .vectors import types
 
 # A float32 coordinate is rounded by 6e-8 of its size, so a triangle flatter than this has an area made of rounding.
 FLATTEST = 1e-7

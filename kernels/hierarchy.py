@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .assemble import types
+from .vectors import types
 
 
 @cache

@@ -5,9 +5,9 @@ from typing import Any
 
 import warp as wp
 
-from .assemble import types
 from .deformation import angle_of, inverse_beside, undefined
 from .rotation import complement, epsilon, nearest_rotation, scaled3, svd3
+from .vectors import types
 
 
 @cache

@@ -22,10 +22,12 @@ from typing import Any
 
 import warp as wp
 
-from .assemble import local_coordinate, types
+from .local import local_coordinate
 from .memory import load, load_shared, store
 from .rotation import epsilon
 from .term import Term
+from .transpose import to_corner
+from .vectors import types
 
 
 def multiplier_type(term: Term, dtype, scalar: bool):
@@ -72,7 +74,7 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
     corners = wp.types.vector(term.vertices, dtype)
     weight, project = term.weight, term.project
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
-    spread = spread_compliance(dtype)
+    spread, share_of = spread_compliance(dtype), to_corner(term, dtype)
     if project is not None and term.rows > 2:
         raise NotImplementedError(f"{term.name} projects {term.rows} rows; two at most")
 
@@ -103,9 +105,7 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
 
     @wp.func
     def square_of(r: rest_type, corner: int, g: y_type):
-        direction = weight(r, corner)[0] * g[0]
-        for m in range(1, M):
-            direction += weight(r, corner)[m] * g[m]
+        direction = share_of(r, corner, g)
         return wp.dot(direction, direction)
 
     @wp.func
@@ -161,9 +161,9 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
     For the CPU, in order: nothing is atomic. One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
     """
     vec3, _ = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    K = wp.constant(term.vertices)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
-    change, weight = element_change(term, dtype, scalar, per_step), term.weight
+    change, share_of = element_change(term, dtype, scalar, per_step), to_corner(term, dtype)
     number, shared, vector, vertex = load(dtype), load_shared(dtype), load(vec3), load(wp.int32, 2)
     rest_of, put = load(rest_type), store(vec3)
 
@@ -191,12 +191,8 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
         if wp.static(multipliers):
             lambdas[e] = before + factor[e] * more
         for i in range(K):
-            w = weight(r, i)
-            move = w[0] * rows[0]
-            for m in range(1, M):
-                move += w[m] * rows[m]
             v = vertex(stencil, K * e + i)
-            put(out, v, vector(out, v) + (number(inverse_mass, v) * shared(factor, e)) * move)
+            put(out, v, vector(out, v) + (number(inverse_mass, v) * shared(factor, e)) * share_of(r, i, rows))
 
     return scatter
 
@@ -219,9 +215,9 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
     Pins are never written, so elements may share them.
     """
     vec3, _ = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    K = wp.constant(term.vertices)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
-    change, weight = element_change(term, dtype, scalar, per_step), term.weight
+    change, share_of = element_change(term, dtype, scalar, per_step), to_corner(term, dtype)
     number, shared, vector, vertex = load(dtype), load_shared(dtype), load(vec3), load(wp.int32, 2)
     rest_of, put = load(rest_type), store(vec3)
 
@@ -254,11 +250,7 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
                 v = vertex(stencil, K * e + i)
                 mobility = number(inverse_mass, v)
                 if mobility > dtype(0.0):
-                    w = weight(r, i)
-                    move = w[0] * rows[0]
-                    for m in range(1, M):
-                        move += w[m] * rows[m]
-                    put(d, v, vector(d, v) + (mobility * relaxation) * move)
+                    put(d, v, vector(d, v) + (mobility * relaxation) * share_of(r, i, rows))
 
     return correct
 

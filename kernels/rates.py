@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .assemble import types
 from .deformation import angle_of_threads, column, inverse_beside, lengths, surface_part, undefined
 from .rotation import epsilon, svd3x2
+from .vectors import types
 
 MIDPOINT, FORWARD, LOGARITHM = (wp.constant(k) for k in range(3))
 

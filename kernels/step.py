@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from .assemble import types
+from .vectors import types
 
 
 @cache

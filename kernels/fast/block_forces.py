@@ -9,9 +9,11 @@ from functools import cache
 
 import warp as wp
 
-from ..assemble import types
+from ..local import from_corner
 from ..memory import load, load_shared, store
-from .parts import Part, chain_of, elements_of, local_gradient, of_corner
+from ..transpose import to_corner
+from ..vectors import types
+from .parts import Part, chain_of, elements_of, local_gradient
 
 
 @cache
@@ -26,7 +28,7 @@ def gather_piece(part: Part, dtype, corrected: bool = False):
     term = part.term
     K, moved = wp.constant(term.vertices), part.damped or corrected
     y_type = wp.types.matrix((term.rows, 3), dtype)
-    part_of, _force_of = of_corner(term, dtype)
+    part_of = from_corner(term, dtype)
     vector, vertex, rest_of = load(vec3), load(wp.int32, 2), load(wp.types.vector(term.parameters, dtype))
     put = store(y_type, dtype)
 
@@ -122,7 +124,7 @@ def scatter_piece(part: Part, dtype):
     term = part.term
     K = wp.constant(term.vertices)
     y_type = wp.types.matrix((term.rows, 3), dtype)
-    _part_of, force_of = of_corner(term, dtype)
+    share_of = to_corner(term, dtype)
     vector, vertex, rest_of = load(vec3), load(wp.int32, 2), load(wp.types.vector(term.parameters, dtype))
     take, put = load(y_type, stored=dtype), store(vec3)
 
@@ -140,7 +142,7 @@ def scatter_piece(part: Part, dtype):
                 ahead = vertex(elements.stencil, K * first + corner) - first
                 e = first
                 while e < first + count:
-                    force = force_of(rest_of(elements.rest, e), corner, take(forces, e - base))
+                    force = share_of(rest_of(elements.rest, e), corner, take(forces, e - base))
                     put(out, e + ahead, vector(out, e + ahead) + force)
                     e += 1
         other = first
@@ -149,7 +151,7 @@ def scatter_piece(part: Part, dtype):
             g = take(forces, other - base)
             for corner in range(K):
                 i = vertex(elements.stencil, K * other + corner)
-                put(out, i, vector(out, i) + force_of(r, corner, g))
+                put(out, i, vector(out, i) + share_of(r, corner, g))
             other += 1
 
     return scatter

@@ -9,10 +9,12 @@ from typing import NamedTuple
 
 import warp as wp
 
-from ..assemble import types
+from ..local import from_corner
 from ..memory import load, load_shared, store
 from ..project import multiplier, multiplier_type
-from .parts import Part, chain_of, elements_of, of_corner
+from ..transpose import to_corner
+from ..vectors import types
+from .parts import Part, chain_of, elements_of
 
 
 def rows_of(slots):
@@ -138,7 +140,7 @@ def correct_elements(of: Projected, dtype):
     K, measure, change = wp.constant(term.vertices), term.measure, multiplier(term, dtype, of.scalar, of.per_step, multipliers)
     y_type, corners = wp.types.matrix((term.rows, 3), dtype), wp.types.vector(term.vertices, dtype)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, of.scalar)
-    part_of, sum_of = of_corner(term, dtype)
+    part_of, share_of = from_corner(term, dtype), to_corner(term, dtype)
     vector, quad, whole, vertex = load(vec3), load_row(vec4, dtype, 4), load(wp.int32), load(wp.int32, 2)
     rest_of, lambda_of, number, put = load(rest_type), load(lambda_type), load_shared(dtype), store(lambda_type)
 
@@ -185,7 +187,7 @@ def correct_elements(of: Projected, dtype):
             if wp.static(multipliers):
                 if code == K * e:
                     put(constraints.after, e, before + factor * more)
-            total += factor * sum_of(r, code - K * e, moves)
+            total += factor * share_of(r, code - K * e, moves)
             if wp.static(padded):
                 slot += count
             else:
@@ -205,7 +207,7 @@ def correct_pairs(of: Projected, dtype):
     measure, change = term.measure, multiplier(term, dtype, of.scalar, of.per_step, False)
     shared, even, row_type = of.part.shared, of.even, wp.types.vector(int(width), dtype)
     corners, lambda_type = wp.types.vector(2, dtype), multiplier_type(term, dtype, of.scalar)
-    part_of, sum_of = of_corner(term, dtype)
+    part_of, share_of = from_corner(term, dtype), to_corner(term, dtype)
     vector, quad, number = load(vec3), load_row(vec4, dtype, 4), load_shared(dtype)
     codes_of, numbers_of, rests_of, rest_of = row_functions(of.part, dtype)
 
@@ -248,7 +250,7 @@ def correct_pairs(of: Projected, dtype):
                 w[1 - corner] = there[3]
                 compliance = dtype(1.0) / (k[n] * measure(r) * h * h)
                 _more, moves = change(y + dy, r, w, compliance, lambda_type(dtype(0.0)), sweeps)
-                total += wp.where(codes[n] >= 0, factor[n] * sum_of(r, corner, moves), vec3())
+                total += wp.where(codes[n] >= 0, factor[n] * share_of(r, corner, moves), vec3())
         if wp.static(even):
             total = number(constraints.factor, 0) * total
         return total

@@ -4,10 +4,12 @@ from functools import cache
 
 import warp as wp
 
-from ..assemble import types
+from ..local import from_corner
 from ..memory import load, load_shared, store
+from ..transpose import to_corner
+from ..vectors import types
 from .packed_residual import unpack
-from .parts import Part, chain_of, elements_of, local_gradient, of_corner
+from .parts import Part, chain_of, elements_of, local_gradient
 
 
 @cache
@@ -63,7 +65,7 @@ def gather_term(part: Part, dtype, ahead=None, lanes: int = 1):
     K, damped, shared, padded = wp.constant(term.vertices), part.damped, part.shared, part.padded
     moved = damped or ahead is not None
     y_type = wp.types.matrix((term.rows, 3), dtype)
-    (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype, ahead is not None)
+    part_of, share_of, local = from_corner(term, dtype), to_corner(term, dtype), local_gradient(part, dtype, ahead is not None)
     vector, whole, vertex, number = load(vec3), load(wp.int32), load(wp.int32, 2), load_shared(dtype)
     moves = move_of(dtype, ahead)
     rest_of = load(wp.types.vector(term.parameters, dtype))
@@ -104,7 +106,7 @@ def gather_term(part: Part, dtype, ahead=None, lanes: int = 1):
                 beta = number(elements.damping, e)
             if wp.static(not shared):
                 k = number(elements.stiffness, e)
-            total += force_of(r, code - K * e, local(k, beta, r, y, dy, h))
+            total += share_of(r, code - K * e, local(k, beta, r, y, dy, h))
             if wp.static(padded):
                 slot += lanes * count
             else:
@@ -130,7 +132,7 @@ def gather_pairs(part: Part, dtype, ahead, lanes: int):
     ragged, each, firsts, slots = slots % lanes > 0, wp.constant(-(-slots // lanes)), wp.constant(firsts), wp.constant(slots)
     moved = damped or ahead is not None
     y_type = wp.types.matrix((term.rows, 3), dtype)
-    (part_of, force_of), local = of_corner(term, dtype), local_gradient(part, dtype, ahead is not None)
+    part_of, share_of, local = from_corner(term, dtype), to_corner(term, dtype), local_gradient(part, dtype, ahead is not None)
     vector, whole, number, moves = load(vec3), load(wp.int32), load_shared(dtype), move_of(dtype, ahead)
     rest_of = load(wp.types.vector(term.parameters, dtype))
 
@@ -169,7 +171,7 @@ def gather_pairs(part: Part, dtype, ahead, lanes: int):
                 beta = number(elements.damping, slot)
             if wp.static(not apart):
                 k = number(elements.stiffness, slot)
-            total += force_of(r, corner, local(k, beta, r, y, dy, h))
+            total += share_of(r, corner, local(k, beta, r, y, dy, h))
         if wp.static(apart):
             total *= number(elements.stiffness, i)
         return total

@@ -9,8 +9,8 @@ from functools import cache
 
 import warp as wp
 
-from ..assemble import types
 from ..memory import load, store
+from ..vectors import types
 from .block_forces import add_blocks
 from .gather_forces import move_of, sum_at_vertices
 from .packed_residual import pack

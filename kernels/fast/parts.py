@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import warp as wp
 
-from ..assemble import types
 from ..term import Term
 
 
@@ -69,32 +68,6 @@ def local_gradient(part: Part, dtype, corrected: bool = False):
         return elastic(k, beta, r, y, dy, h) + (beta / h * damped_measure(s)) * damped_gradient(y + dy, s)
 
     return with_damping
-
-
-@cache
-def of_corner(term: Term, dtype):
-    """The device functions of a corner: (rest, corner, place) → its part w ⊗ place of y, (rest, corner, g) → w·g."""
-    vec3, _ = types(dtype)
-    M, weight = wp.constant(term.rows), term.weight
-    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-
-    @wp.func
-    def part(rest: rest_type, corner: int, place: vec3):
-        w = weight(rest, corner)
-        y = y_type()
-        for m in range(M):
-            y[m] = w[m] * place
-        return y
-
-    @wp.func
-    def force(rest: rest_type, corner: int, g: y_type):
-        w = weight(rest, corner)
-        total = w[0] * g[0]
-        for m in range(1, M):
-            total += w[m] * g[m]
-        return total
-
-    return part, force
 
 
 @cache

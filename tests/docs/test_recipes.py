@@ -9,7 +9,7 @@ from scipy.sparse.linalg import splu
 
 import warpcloth as wc
 from support.continuum import TILT, flat, turn
-from warpcloth.core.operators import constant_matrices
+from warpcloth.core.constant_matrix import constant_matrices
 from warpcloth.deformation.arap import _half_cotangents
 from warpcloth.scenes import hanging
 

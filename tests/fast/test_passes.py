@@ -11,7 +11,7 @@ import warpcloth as wc
 from support.energies import damping_forces
 from support.setups import SOLVERS, allocations, square
 from support.sheets import SPRINGS, TERMS, N, declared
-from warpcloth.core.operators import Gradient
+from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
 from warpcloth.fast import block_layout as blocks
 from warpcloth.fast import gather_layout as incidences

@@ -13,7 +13,8 @@ from scipy.special import jv
 import warpcloth as wc
 from warpcloth.chart import closed_forms
 from warpcloth.chart.closed_forms import plot_physics
-from warpcloth.core.operators import Gradient, Hessian
+from warpcloth.core.gradient import Gradient
+from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.lab import physics
 from warpcloth.lab.campaign import Store, sweep

@@ -9,7 +9,9 @@ import warp as wp
 import warpcloth as wc
 from support.energies import damping_forces
 from support.nets import net
-from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
+from warpcloth.core.sums import Sums
 from warpcloth.model.damping import damped_terms, dissipations
 from warpcloth.solvers.explicit import step_limits
 from warpcloth.terms.refresh import STEP, Moment

@@ -13,7 +13,9 @@ import warp as wp
 
 import warpcloth as wc
 from support.energies import DECLARED
-from warpcloth.core.operators import Energy, Gradient, RowSums, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
+from warpcloth.core.sums import RowSums, Sums
 from warpcloth.model.model import DTYPES
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS as KINDS

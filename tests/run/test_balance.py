@@ -11,7 +11,8 @@ from support.meshes import PAIR
 from support.scenes import LIVELY, QUICK, scene
 from support.scenes import SMALL as SIZES
 from warpcloth.cli import main
-from warpcloth.core.operators import Energy, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.sums import Sums
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.stability import measure
 from warpcloth.run import balance

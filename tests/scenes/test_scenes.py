@@ -10,8 +10,10 @@ import warp as wp
 import warpcloth as wc
 from support.meshes import PAIR
 from support.scenes import LIVELY, QUICK, SMALL, scene
-from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result, digits, sentence
+from warpcloth.core.sums import Sums
 from warpcloth.solvers import SOLVERS as RECORDS
 from warpcloth.solvers.explicit import step_limits
 

@@ -10,7 +10,7 @@ import warp as wp
 import warpcloth as wc
 from support.scenes import scene
 from support.steps import HANGING_PAIR, hanging_mass, swinging
-from warpcloth.core.operators import Gradient
+from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
 from warpcloth.kernels.terms import CATALOGUE, DIHEDRAL_BENDING, SPRING
 

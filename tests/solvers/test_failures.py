@@ -24,8 +24,10 @@ from support.nets import NETS, jacobian, net
 from support.scenes import scene
 from support.setups import SOLVERS as STEPPING
 from support.steps import METHODS, after_one_step, hanging_mass, newton_step, objective, swinging
-from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
+from warpcloth.core.sums import Sums
 from warpcloth.kernels.terms import SPRING
 from warpcloth.numerics.sweeps import SWEEPS, Sweep
 from warpcloth.solvers.explicit import step_limits

@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay
 import warpcloth as wc
 from support.scenes import scene
 from support.steps import after_one_step, hanging_mass, swinging
-from warpcloth.core.operators import Gradient
+from warpcloth.core.gradient import Gradient
 from warpcloth.kernels.terms import SPRING
 from warpcloth.numerics.sweeps import Sweep, colours
 

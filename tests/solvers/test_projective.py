@@ -8,7 +8,9 @@ import warp as wp
 
 import warpcloth as wc
 from support.steps import METHODS, after_one_step, newton_step, objective, swinging
-from warpcloth.core.operators import Gradient, Hessian, constant_matrices
+from warpcloth.core.constant_matrix import constant_matrices
+from warpcloth.core.gradient import Gradient
+from warpcloth.core.hessian import Hessian
 from warpcloth.core.status import Result, digits
 from warpcloth.kernels import accelerate
 from warpcloth.numerics import linear

@@ -11,7 +11,7 @@ import pytest
 
 import warpcloth as wc
 from support.steps import after_one_step, swinging
-from warpcloth.core.operators import Gradient
+from warpcloth.core.gradient import Gradient
 from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.projective_dynamics import ACCELERATIONS
 

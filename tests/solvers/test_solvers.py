@@ -13,8 +13,9 @@ from support.meshes import PAIR
 from support.nets import net
 from support.setups import SOLVERS, allocations, square
 from warpcloth.core.capture import Segment, on_host
-from warpcloth.core.operators import Hessian, RowSums, Sums
+from warpcloth.core.hessian import Hessian
 from warpcloth.core.status import Result
+from warpcloth.core.sums import RowSums, Sums
 from warpcloth.numerics.constraints import Constraints
 from warpcloth.solvers import explicit
 from warpcloth.solvers.explicit import limit_in_motion, step_limits

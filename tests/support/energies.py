@@ -5,7 +5,9 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
+from warpcloth.core.sums import Sums
 from warpcloth.model.damping import dissipations
 from warpcloth.model.model import DTYPES
 from warpcloth.terms.refresh import STEP, Moment

@@ -8,7 +8,8 @@ import warp as wp
 
 import warpcloth as wc
 from support.scenes import scene
-from warpcloth.core.operators import Energy, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.sums import Sums
 from warpcloth.solvers.projective_dynamics import ACCELERATIONS
 
 HANGING_PAIR = wc.Mesh(np.array([[0.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), edges=[[0, 1]])

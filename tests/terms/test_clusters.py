@@ -11,8 +11,10 @@ from pxr import Usd, UsdGeom
 import warpcloth as wc
 from support.setups import allocations
 from support.usd_validation import validate
-from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
+from warpcloth.core.sums import Sums
 from warpcloth.numerics.constraints import Constraints
 from warpcloth.run.lines import lines_of
 from warpcloth.scenes import bar_twist, chain, hanging, mobile

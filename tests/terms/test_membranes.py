@@ -6,7 +6,9 @@ import warp as wp
 
 import warpcloth as wc
 from support.energies import DENSITIES, FEW, eps, every_dtype, material_of, random_rotation
-from warpcloth.core.operators import Energy, Gradient, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
+from warpcloth.core.sums import Sums
 from warpcloth.run.equilibrium import SETTLED
 from warpcloth.solvers.explicit import step_limits
 

@@ -26,16 +26,21 @@ from support.energies import (
     model_of,
     random_rotation,
 )
-from warpcloth.core.operators import Energy, Gradient, Hessian, Sums
+from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
+from warpcloth.core.hessian import Hessian
+from warpcloth.core.sums import Sums
 from warpcloth.fast import quadratic_pairs as quadratic
 from warpcloth.fast.gather_layout import chain, gathered
 from warpcloth.kernels import admm as splitting
 from warpcloth.kernels import assemble, project
+from warpcloth.kernels import constraint_jacobian as jacobian
 from warpcloth.kernels import constraint_rows as constrain
 from warpcloth.kernels import terms as energies
 from warpcloth.kernels.fast import gather_forces as gather
 from warpcloth.kernels.fast.parts import chain_of
 from warpcloth.kernels.term import HessianPolicy, Term
+from warpcloth.kernels.vectors import types
 from warpcloth.model.model import DTYPES
 from warpcloth.terms import needs
 
@@ -112,7 +117,7 @@ class Stencils(NamedTuple):
         return [self.stencil, self.array(self.stiffness, self.scalar), rest]
 
     def places(self, x=None):
-        return self.array((self.x if x is None else x).reshape(-1, 3), assemble.types(self.scalar)[0])
+        return self.array((self.x if x is None else x).reshape(-1, 3), types(self.scalar)[0])
 
     def launch(self, kernel, *arguments):
         wp.launch(kernel, dim=len(self.x), inputs=list(arguments), device=self.device)
@@ -132,13 +137,14 @@ class Stencils(NamedTuple):
     def gradient(self, correction=None):
         """(E, K, 3) [N]."""
         out = self.places(np.zeros_like(self.x))
-        self.launch(*self.state(assemble.scatter_gradient, correction), out)
+        kernel, stencil, stiffness, rest, x, d = self.state(assemble.scatter_gradient, correction)
+        self.launch(kernel, stencil, rest, elastic(self.term, self.scalar, stencil, stiffness, x, d), out)
         return out.numpy().reshape(self.x.shape)
 
     def hessian(self, policy=RAW, correction=None):
         """(E, 3K, 3K) [N/m]."""
         E, K = self.x.shape[:2]
-        out = wp.zeros((E, K * K), dtype=assemble.types(self.scalar)[1], device=self.device)
+        out = wp.zeros((E, K * K), dtype=types(self.scalar)[1], device=self.device)
         policies = wp.array([int(policy)], dtype=wp.int32, device=self.device)
         self.launch(*self.state(assemble.hessian_blocks, correction), E, policies, out)
         return out.numpy().reshape(E, K, K, 3, 3).transpose(0, 1, 3, 2, 4).reshape(E, 3 * K, 3 * K)
@@ -1063,20 +1069,27 @@ def test_gathering_is_scattering(term, dtype, device, monkeypatch):
     part, arrays = gathered(model, model.terms[0])
     scalar = model.dtype
 
-    def forces(factory, *key):
-        scatters = factory is assemble.scatter_gradient
-        on = other if scatters else model
-        out = on.vectors()
-        out.fill_(on.vec3(1.0, 2.0, 3.0))  # both add to what is there
-        given = on.terms[0].arguments if scatters else [chain([part], [arrays], scalar)]
-        on.launch(factory(*key), on.terms[0].count if scatters else on.count, [*given, on.positions, on.vectors()], [out])
+    def sums_of_core(on, factory, incidences=()):
+        out, elements = on.vectors(), on.terms[0]
+        out.fill_(on.vec3(1.0, 2.0, 3.0))  # all add to what is there
+        data = elastic(term, scalar, elements.stencil, elements.stiffness, on.positions, None)
+        given = [*incidences, elements.rest, data] if incidences else [elements.stencil, elements.rest, data]
+        on.launch(factory(term, scalar), on.count if incidences else elements.count, given, [out])
         return out.numpy()
 
-    scattered = forces(assemble.scatter_gradient, term, scalar)
+    def forces(factory, *key):
+        out = model.vectors()
+        out.fill_(model.vec3(1.0, 2.0, 3.0))
+        given = [chain([part], [arrays], scalar), model.positions, model.vectors()]
+        model.launch(factory(*key), model.count, given, [out])
+        return out.numpy()
+
+    scattered = sums_of_core(other, assemble.scatter_gradient)
+    gathered_in_core = sums_of_core(model, assemble.gather_gradient, model.terms[0].incidences)
     found, again = (forces(gather.gather_gradient, (part,), scalar) for _ in range(2))
     # Only the order of the sum differs, and the compiler's use of fused multiplication.
     size = np.abs(mesh.points).max() + 1.0
-    for each in (found, *(forces(gradient_by_lanes, part, scalar, lanes) for lanes in (3, 4))):
+    for each in (found, gathered_in_core, *(forces(gradient_by_lanes, part, scalar, lanes) for lanes in (3, 4))):
         assert (np.linalg.norm(scattered - each, axis=1) <= FEW * eps(dtype) * (4.0 + size * row_sums(model))).all()
     assert (found == again).all() and (found != [1.0, 2.0, 3.0]).any()
 
@@ -1128,6 +1141,15 @@ def test_bending_that_gathers_by_element_has_no_net_force(device):
     assert nets[False] <= FEW * eps("float32") * forces.sum() < 0.1 * nets[True]
 
 
+def elastic(term, dtype, stencil, stiffness, x, d):
+    """What the forces of a term are computed from."""
+    data = assemble.elastic(term, dtype)()
+    data.stencil, data.stiffness, data.x = stencil, stiffness, x
+    if d is not None:
+        data.d = d
+    return data
+
+
 def agree(found, dtype):
     """Whether sums over elements in several orders agree but for rounding, and are not 0."""
     scattered, gathered_ = found
@@ -1145,14 +1167,16 @@ def test_sums_of_splitting_gather_what_they_scatter(term, dtype, device):
         elements = model.terms[0]
         random, matrix = np.random.default_rng(10), wp.types.matrix((term.rows, 3), model.dtype)
         ratio, scale = (model.array(random.uniform(0.5, 2.0, elements.count), model.dtype) for _ in range(2))
-        values = (model.array(random.normal(size=(elements.count, term.rows, 3)), matrix) for _ in range(3))
-        given = [*elements.arguments, ratio, scale, *values]
+        values = [model.array(random.normal(size=(elements.count, term.rows, 3)), matrix) for _ in range(3)]
+        of = splitting.splitting(term, model.dtype)()
+        of.stiffness, of.ratio, of.scale = elements.stiffness, ratio, scale
+        of.u, of.gap, of.change = values
         out = [model.vectors() for _ in range(3)]
         for array in out:
             array.fill_(model.vec3(1.0, 2.0, 3.0))
         gathers = factory is splitting.gather_splitting
-        dim = model.count if gathers else elements.count
-        model.launch(factory(term, model.dtype), dim, [*(elements.incidences if gathers else ()), *given], out)
+        given = [*(elements.incidences if gathers else [elements.stencil]), elements.rest, of]
+        model.launch(factory(term, model.dtype), model.count if gathers else elements.count, given, out)
         found.append([array.numpy() - [1.0, 2.0, 3.0] for array in out])
     assert all(agree(both, dtype) for both in zip(*found, strict=True))
 
@@ -1172,7 +1196,7 @@ ROWS = [
 def test_rows_of_constraints_gather_what_they_scatter(term, scalar, curved, dtype, device):
     """out += Jᵀλ of the copies that are active."""
     found, rows = [], constrain.rows_of(term, scalar, curved)
-    for factory, each in ((constrain.scatter_rows, "cpu"), (constrain.gather_rows, device)):
+    for factory, each in ((jacobian.scatter_rows, "cpu"), (jacobian.gather_rows, device)):
         model = model_of(rest_mesh(), None, [term.name], dtype, each, pins=[0, 7], copies=3)
         elements = model.terms[0]
         first, per_copy = 5, rows * elements.per_copy + 7  # rows of other terms before and after
@@ -1182,12 +1206,14 @@ def test_rows_of_constraints_gather_what_they_scatter(term, scalar, curved, dtyp
         slopes.assign(random.normal(size=slopes.numpy().shape))
         lambdas = model.array(random.normal(size=3 * per_copy), model.dtype)
         active = wp.array([1, 0, 1], dtype=wp.int32, device=each)
-        given = [elements.stencil, elements.rest, slopes, lambdas, elements.per_copy, first, per_copy, active]
+        held = jacobian.held_rows(*key)()
+        held.slopes, held.multipliers, held.active = slopes, lambdas, active
+        held.layout.per_copy, held.layout.first, held.layout.rows_per_copy = elements.per_copy, first, per_copy
         out = model.vectors()
         out.fill_(model.vec3(1.0, 2.0, 3.0))
-        gathers = factory is constrain.gather_rows
-        dim = model.count if gathers else elements.count
-        model.launch(factory(*key), dim, [*(elements.incidences if gathers else ()), *given], [out])
+        gathers = factory is jacobian.gather_rows
+        given = [*(elements.incidences if gathers else [elements.stencil]), elements.rest, held]
+        model.launch(factory(*key), model.count if gathers else elements.count, given, [out])
         found.append(out.numpy() - [1.0, 2.0, 3.0])
     assert agree(found, dtype)
     assert all((each[model.per_copy : 2 * model.per_copy] == 0.0).all() for each in found)

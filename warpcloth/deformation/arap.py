@@ -11,10 +11,10 @@ from ..base.checks import choice, number, numeric, shown, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..core.capture import Mirror, Segment
-from ..core.operators import CHUNKS
+from ..core.sums import CHUNKS
 from ..kernels import arap_cells as cells
 from ..kernels import reduce
-from ..kernels.assemble import types
+from ..kernels.vectors import types
 from ..mesh.ordering import worthwhile_order
 from ..mesh.selection import distinct_vertices
 from ..model.model import DTYPES

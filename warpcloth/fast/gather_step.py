@@ -3,12 +3,12 @@
 import numpy as np
 import warp as wp
 
-from ..core.operators import Gradient
 from ..kernels.fast import gather_step as kernels
 from ..kernels.fast.parts import Part
 from ..terms.refresh import EVALUATION, STEP, Moment
 from .block_layout import in_blocks
 from .gather_layout import chain, gathered, lanes
+from .gradient import gradient
 from .quadratic_pairs import as_pairs
 
 # Of a block that is a copy; of 1024 vertices 256 threads take 2.1 times as long, 1024 1.2 times (H200).
@@ -44,7 +44,7 @@ class Sweep:
         fresh, others = (
             [elements for elements in model.terms if (elements.refresh is None) == apart] for apart in (False, True)
         )
-        self._fresh, self._gradient = Gradient(model, terms=fresh), model.vectors()
+        self._fresh, self._gradient = gradient(model, terms=fresh), model.vectors()
         swept = [as_pairs(model, elements) for elements in others]
         vertices, swept, numbers = in_blocks(swept, model.per_copy, model.copies)
         kept = [after if after.term is before.term else before for before, after in zip(others, swept, strict=True)]

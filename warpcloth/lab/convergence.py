@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 
 from ..base.turns import in_turn
-from ..core.operators import Energy, Sums
+from ..core.energy import Energy
+from ..core.sums import Sums
 from ..run.equilibrium import SETTLED
 from ..run.simulate import simulate
 from ..solvers import Newton

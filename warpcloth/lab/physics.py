@@ -31,8 +31,9 @@ from scipy.optimize import brentq
 
 from ..base.checks import choice, number, whole
 from ..base.turns import in_turn
-from ..core.operators import Energy, Sums
+from ..core.energy import Energy
 from ..core.status import Result
+from ..core.sums import Sums
 from ..run.equilibrium import SETTLED, equilibrium
 from ..scene.scene import Scene
 from ..scenes import catenary, chain

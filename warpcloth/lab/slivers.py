@@ -8,7 +8,7 @@ jumps from π to −π, and the force turns round.
 import numpy as np
 
 from ..base.turns import in_turn
-from ..core.operators import Gradient
+from ..core.gradient import Gradient
 from ..mesh.mesh import Mesh
 from ..scene.scene import Scene
 from ..solvers.explicit import step_limits

@@ -10,7 +10,8 @@ import time
 
 import numpy as np
 
-from ..core.operators import Hessian, constant_matrices
+from ..core.constant_matrix import constant_matrices
+from ..core.hessian import Hessian
 from ..kernels.term import HessianPolicy
 from ..solvers import ProjectiveDynamics
 from .convergence import LADDER, one_step

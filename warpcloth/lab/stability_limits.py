@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..base.turns import in_turn
-from ..core.operators import Hessian
+from ..core.hessian import Hessian
 from ..kernels.term import HessianPolicy
 from ..numerics.integrators import INTEGRATORS
 from ..numerics.sweeps import colours

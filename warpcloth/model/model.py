@@ -13,8 +13,8 @@ import warp as wp
 from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
-from ..kernels.assemble import types
 from ..kernels.term import Term
+from ..kernels.vectors import types
 from ..mesh.selection import distinct_vertices
 from ..terms.refresh import Refresh
 from .precision import cast, refuse_coarse

@@ -7,6 +7,7 @@ import warp as wp
 
 from ..core.capture import Mirror
 from ..kernels import cluster_rows as kernels
+from ..kernels.transpose import stored
 
 
 class ClusterRows:
@@ -23,7 +24,7 @@ class ClusterRows:
     def __init__(self, model, elements):
         self.model, self.elements, self.cells = model, elements, elements.cells
         self.count = 3 * elements.per_copy
-        names = ("linearise_clusters", "apply_cluster_rows", "pull_clusters", "gather_pulls")
+        names = ("linearise_clusters", "apply_cluster_rows", "pull_clusters")
         self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
         self._stencil, self._offsets = elements.stencil.numpy()[:, 0], self.cells.offsets.numpy()
         self._mass = elements.rest.numpy()[:, 3].astype(np.float64)
@@ -32,8 +33,10 @@ class ClusterRows:
         self._inertia = model.array(self._inverses, model.mat33)
         self._rotations = wp.zeros(self.cells.count, dtype=model.mat33, device=model.device)
         self._turned = Mirror(self._rotations)
+        self._gather_pulls = model.kernel(kernels.gather_pulls, elements.term, model.dtype)
         self._incidences = elements.incidences  # now: made during a capture they would only be recorded
-        self._pulls = wp.zeros(elements.count, dtype=model.vec3, device=model.device)
+        self._pulls = stored(elements.term, model.dtype).data()
+        self._pulls.z = wp.zeros(elements.count, dtype=wp.types.matrix((1, 3), model.dtype), device=model.device)
 
     def _inertias(self):
         """Σ m(q²I − qqᵀ) of each cell at rest, (C, 3, 3) [kg m²]."""
@@ -41,31 +44,31 @@ class ClusterRows:
         each = mass[:, None, None] * ((q**2).sum(axis=1)[:, None, None] * np.eye(3) - q[:, :, None] * q[:, None, :])
         return np.add.reduceat(each, self._offsets[:-1], axis=0)
 
-    def place(self, first, per_copy):
-        """Where its rows are: from ``first`` on in the ``per_copy`` of each copy."""
-        self._where = [self.elements.per_copy, first, per_copy]
+    def place(self, layout):
+        """Where its rows are, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
+        self.layout = layout
 
-    def launch_linearise(self, x, d, h, least, multipliers, *out):
+    def launch_linearise(self, x, d, h, least, values):
         """As :meth:`warpcloth.numerics.constraints.TermRows.launch_linearise`."""
         cells = self.cells
-        given = [cells.offsets, cells.shape, *self.elements.arguments, x, d, h, least, *self._where]
-        self._launch("linearise_clusters", cells.count, given, [multipliers, self._rotations, *out])
+        given = [cells.offsets, cells.shape, *self.elements.arguments, x, d, h, least, self.layout]
+        self._launch("linearise_clusters", cells.count, given, [self._rotations, values])
 
     def launch_apply(self, v, out, active=None):
         """out += J v, of all copies."""
-        given = [*self._shape(), self.elements.stencil, self.elements.rest, v, *self._where]
+        given = [*self._shape(), self.elements.stencil, self.elements.rest, v, self.layout]
         self._launch("apply_cluster_rows", self.cells.count, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
         """out += Jᵀ rows, of all copies."""
-        given = [*self._shape(), self.elements.rest, rows, *self._where]
-        self._launch("pull_clusters", self.cells.count, given, [self._pulls])
-        self._launch("gather_pulls", len(self._incidences[0]) - 1, [*self._incidences, self._pulls], [out])
+        given = [*self._shape(), self.elements.rest, rows, self.layout]
+        self._launch("pull_clusters", self.cells.count, given, [self._pulls.z])
+        given = [*self._incidences, self.elements.rest, self._pulls]
+        self.model.launch(self._gather_pulls, len(self._incidences[0]) - 1, given, [out])
 
     def entries(self):
         """J on the host: values, rows and columns."""
         mass, q, R, found = self._mass, self._places, self._turned.read().astype(np.float64), []
-        per_copy, first, rows_per_copy = self._where
         for cell, (start, stop) in enumerate(pairwise(self._offsets)):
             if not R[cell].any():
                 continue
@@ -78,8 +81,8 @@ class ClusterRows:
             world = R[cell] @ self._inverses[cell] @ R[cell].T
             Q = linear @ linear.T / mass[elements].sum() + moments.T @ world @ moments
             block = (np.eye(len(Q)) - Q) * np.repeat(root, 3)
-            copy, e = np.divmod(elements, per_copy)
-            rows = ((copy * rows_per_copy + first + 3 * e)[:, None] + np.arange(3)).ravel()
+            copy, e = np.divmod(elements, self.layout.per_copy)
+            rows = ((copy * self.layout.rows_per_copy + self.layout.first + 3 * e)[:, None] + np.arange(3)).ravel()
             columns = (3 * self._stencil[elements][:, None] + np.arange(3)).ravel()
             found.append((block.ravel(), np.repeat(rows, len(columns)), np.tile(columns, len(rows))))
         if not found:

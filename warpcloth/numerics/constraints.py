@@ -9,7 +9,10 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror
+from ..core.transpose import Transpose
+from ..kernels import constraint_jacobian as jacobian
 from ..kernels import constraint_rows as kernels
+from ..kernels.constraint_step import scale_rows, weigh
 from ..terms.refresh import EVALUATION, Moment
 from .cluster_rows import ClusterRows
 
@@ -27,37 +30,38 @@ class TermRows:
     """
 
     def __init__(self, model, elements, curved):
-        term, cuda = elements.term, model.device.is_cuda
+        term = elements.term
         scalar = term.constraint is not None
         key = (term, model.dtype, scalar, curved and scalar)
         self.model, self.elements, self._key = model, elements, key
         self.rows = kernels.rows_of(term, *key[2:])
         self.count = self.rows * elements.per_copy
         self._slopes = wp.zeros(elements.count, dtype=kernels.slope_type(*key), device=model.device)
-        self._linearise, self._apply = model.kernel(kernels.linearise, *key), model.kernel(kernels.apply_rows, *key)
-        self._transpose = model.kernel(kernels.gather_rows if cuda else kernels.scatter_rows, *key)
-        self._incidences = elements.incidences if cuda else ()
+        self._linearise, self._apply = model.kernel(kernels.linearise, *key), model.kernel(jacobian.apply_rows, *key)
+        self._transpose = Transpose(model, elements, jacobian.scatter_rows, jacobian.gather_rows, *key)
 
-    def place(self, first, per_copy):
-        """Where its rows are: from ``first`` on in the ``per_copy`` of each copy."""
-        self._first, self._where = first, [self.elements.per_copy, first, per_copy]
+    def place(self, layout):
+        """Where its rows are, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
+        self.layout = layout
 
-    def launch_linearise(self, x, d, h, least, multipliers, *out):
-        """Of x + d its part of what :func:`warpcloth.kernels.constraint_rows.linearise` makes, in the order of that."""
+    def launch_linearise(self, x, d, h, least, values):
+        """Of x + d its part of what :func:`warpcloth.kernels.constraint_rows.linearise` makes, in the struct ``values``."""
         model = self.model
-        given = [*self.elements.arguments, model.inverse_mass, x, d, h, least, *self._where]
-        model.launch(self._linearise, self.elements.count, given, [multipliers, self._slopes, *out])
+        given = [*self.elements.arguments, model.inverse_mass, x, d, h, least, self.layout]
+        model.launch(self._linearise, self.elements.count, given, [self._slopes, values])
 
     def launch_apply(self, v, out, active=None):
         """out += J v, of the copies that are ``active`` (B,), all of them where it is None."""
-        given = [self.elements.stencil, self.elements.rest, self._slopes, v, *self._where, active]
+        given = [self.elements.stencil, self.elements.rest, self._slopes, v, self.layout, active]
         self.model.launch(self._apply, self.elements.count, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
-        """out += Jᵀ rows, likewise."""
-        given = [*self._incidences, self.elements.stencil, self.elements.rest, self._slopes, rows, *self._where, active]
-        dim = len(self._incidences[0]) - 1 if self._incidences else self.elements.count
-        self.model.launch(self._transpose, dim, given, [out])
+        """out += Jᵀ rows, of the copies that are ``active`` (B,), all of them where it is None."""
+        held = jacobian.held_rows(*self._key)()
+        held.slopes, held.multipliers, held.layout = self._slopes, rows, self.layout
+        if active is not None:
+            held.active = active
+        self._transpose.add(held, out)
 
     @cached_property
     def _in_full(self):
@@ -67,10 +71,10 @@ class TermRows:
         E, K = stencil.shape
         blocks = Mirror(wp.zeros((E, Q * K), dtype=wp.vec3d, device=self.model.device))
         copy, e = np.divmod(np.arange(E), elements.per_copy)
-        rows = copy * self._where[2] + self._first + e * Q
+        rows = copy * self.layout.rows_per_copy + self.layout.first + e * Q
         rows = np.broadcast_to(rows[:, None, None, None] + np.arange(Q)[None, None, :, None], (E, K, Q, 3))
         columns = np.broadcast_to(3 * stencil[:, :, None, None] + np.arange(3), (E, K, Q, 3))
-        return blocks, self.model.kernel(kernels.rows_in_full, *self._key), rows.ravel(), columns.ravel()
+        return blocks, self.model.kernel(jacobian.rows_in_full, *self._key), rows.ravel(), columns.ravel()
 
     def entries(self):
         """J on the host: values, rows and columns."""
@@ -105,7 +109,9 @@ class Constraints:
         self.count = self.per_copy * model.copies
         first = 0
         for part in self.parts:
-            part.place(first, self.per_copy)
+            layout = kernels.RowLayout()
+            layout.per_copy, layout.first, layout.rows_per_copy = part.elements.per_copy, first, self.per_copy
+            part.place(layout)
             first += part.count
 
         def rows(dtype=model.dtype):
@@ -113,8 +119,12 @@ class Constraints:
 
         self.multipliers, self.gap, self._compliance, self._inverse = (rows() for _ in range(4))
         self.residual, self.rounding, self.carried = (rows(wp.float64) for _ in range(3))
+        self._values = kernels.row_values(model.dtype)()
+        self._values.multipliers, self._values.gap = self.multipliers, self.gap
+        self._values.compliance, self._values.inverse = self._compliance, self._inverse
+        self._values.residual, self._values.rounding, self._values.carried = self.residual, self.rounding, self.carried
         self._vectors = model.vectors()
-        self._weigh, self._scale = (model.kernel(factory, model.dtype) for factory in (kernels.weigh, kernels.scale_rows))
+        self._weigh, self._scale = (model.kernel(factory, model.dtype) for factory in (weigh, scale_rows))
         self.vector = self.block = model.dtype
         # Of redundant hard rows A would be singular, and what they share of λ undetermined.
         self.least = float(np.finfo(model.numpy_dtype).eps) ** 0.7
@@ -122,9 +132,8 @@ class Constraints:
     def launch_linearise(self, x, d):
         """All rows at x + d, with λ as it is."""
         self.model.refresh(EVALUATION, Moment(x, d), self._fresh)
-        out = [self.multipliers, self.gap, self._compliance, self._inverse, self.residual, self.rounding, self.carried]
         for part in self.parts:
-            part.launch_linearise(x, d, self.h, self.least, *out)
+            part.launch_linearise(x, d, self.h, self.least, self._values)
 
     def launch_apply(self, v, out, active=None):
         """out += J v; of copies that are not ``active`` (B,), if that is given, less or nothing."""

@@ -22,9 +22,9 @@ class ConjugateGradients:
     (Steihaug 1983).
 
     Args:
-        matrix: A, such as :class:`warpcloth.core.operators.Hessian`: what it has of ``count``, ``per_copy``, ``vector`` and
+        matrix: A, such as :class:`warpcloth.core.hessian.Hessian`: what it has of ``count``, ``per_copy``, ``vector`` and
             ``block``, ``prepare``, ``multiply`` and ``invert_diagonal``.
-        sums: :class:`warpcloth.core.operators.Sums` over its unknowns.
+        sums: :class:`warpcloth.core.sums.Sums` over its unknowns.
         iterations: The most iterations of one solve.
     """
 
@@ -92,7 +92,7 @@ class Factorised:
     copy with a negative one. Of two pivots of about 0 in an indefinite matrix no promise is made.
 
     Args:
-        hessian: The :class:`warpcloth.core.operators.Hessian`.
+        hessian: The :class:`warpcloth.core.hessian.Hessian`.
     """
 
     capturable = False

@@ -4,8 +4,9 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror, Segment
-from ..core.operators import Hessian, Sums
+from ..core.hessian import Hessian
 from ..core.status import Result
+from ..core.sums import Sums
 from ..kernels import minimise as kernels
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy

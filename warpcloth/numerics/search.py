@@ -3,7 +3,8 @@
 import numpy as np
 import warp as wp
 
-from ..core.operators import Energy, Gradient
+from ..core.energy import Energy
+from ..fast.gradient import gradient
 from ..kernels import minimise as kernels
 
 # Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
@@ -16,7 +17,7 @@ class Search:
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         base: Where d = 0 is, (N,) vectors [m]; the caller's array, read only.
-        sums: :class:`warpcloth.core.operators.Sums`.
+        sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia, 1/h² [1/s²].
         load: Part of gravity that acts as a force.
 
@@ -30,7 +31,7 @@ class Search:
 
     def __init__(self, model, base, sums, s, load=0.0):
         self.model, self.base, self.sums, self.s, self.load = model, base, sums, s, load
-        self.gradient_of, self.energy_of = Gradient(model, corrected=True), Energy(model, sums, corrected=True)
+        self.gradient_of, self.energy_of = gradient(model, corrected=True), Energy(model, sums, corrected=True)
         self.correction, self.trial, self.gradient, self.direction = (model.vectors() for _ in range(4))
         self.work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
 

@@ -16,7 +16,9 @@ import numpy as np
 import warp as wp
 
 from ..base.turns import TURN
-from ..core.operators import Energy, Gradient, Sums
+from ..core.energy import Energy
+from ..core.gradient import Gradient
+from ..core.sums import Sums
 from ..numerics.rotation import kabsch
 
 # A run has diverged when it has this many times the energy that its sources can have put in. Stable runs reach up to 1.4 times

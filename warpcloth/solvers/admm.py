@@ -7,8 +7,10 @@ import warp as wp
 
 from ..base.checks import number, whole
 from ..core.capture import Mirror, Segment
-from ..core.operators import Sums, constant_blocks, constant_matrices
+from ..core.constant_matrix import constant_blocks, constant_matrices
 from ..core.status import Residual, Result
+from ..core.sums import Sums
+from ..core.transpose import Transpose
 from ..kernels import admm as kernels
 from ..kernels.accelerate import plain_step
 from ..kernels.minimise import add_inertia
@@ -122,21 +124,18 @@ class ADMMStepper(Stepper):
         weighed = model.with_terms(map(_weighed, model.terms, factors))
         self._factors = CopyFactors(model, constant_matrices(weighed, self.s))
         self.factorise_seconds = self._factors.seconds
-        self._sums, cuda = Sums(model), model.device.is_cuda
+        self._sums = Sums(model)
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
         self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         self._primal, self._dual = (Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device)) for _ in range(2))
         self._active = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
-        self._locals = []  # of each term z, u, gap, change
-        for elements in model.terms:
-            kind = wp.types.matrix((elements.term.rows, 3), model.dtype)
-            self._locals.append([wp.zeros(elements.count, dtype=kind, device=model.device) for _ in range(4)])
-        sum_of = kernels.gather_splitting if cuda else kernels.scatter_splitting
+        self._locals = [self._local_state(*each) for each in zip(model.terms, self._ratios, self._scales, strict=True)]
+        factories = kernels.start_splitting, kernels.split
         self._kernels = [
-            [model.kernel(factory, elements.term, model.dtype) for factory in (kernels.start_splitting, kernels.split, sum_of)]
-            for elements in model.terms
+            [model.kernel(factory, elements.term, model.dtype) for factory in factories] for elements in model.terms
         ]
-        self._incidences = [elements.incidences if cuda else () for elements in model.terms]
+        sums = kernels.scatter_splitting, kernels.gather_splitting
+        self._sums_of = [Transpose(model, elements, *sums, elements.term, model.dtype) for elements in model.terms]
         self._add_inertia, self._plain_step = (model.kernel(factory, model.dtype) for factory in (add_inertia, plain_step))
         gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         self._scale = np.where(gravity > 0.0, gravity, 1.0)
@@ -180,13 +179,21 @@ class ADMMStepper(Stepper):
         least = min(_FLOORS[self.options.integrator] / self.options.iterations, 1.0)
         return model.array(np.maximum(best_weights(model, elements, self.he), least), model.dtype)
 
+    def _local_state(self, elements, ratio, scale):
+        """The struct of z, u, gap and change of a term, all 0."""
+        model, kind = self.model, wp.types.matrix((elements.term.rows, 3), self.model.dtype)
+        of = kernels.splitting(elements.term, model.dtype)()
+        of.stiffness, of.ratio, of.scale = elements.stiffness, ratio, scale
+        of.z, of.u, of.gap, of.change = (wp.zeros(elements.count, dtype=kind, device=model.device) for _ in range(4))
+        return of
+
     # What the segments record.
 
     def _launch_start(self):
         self.launch_prediction()
         self.correction.zero_()
-        for elements, (z, u, _gap, _change), (start, _split, _sum) in self._each():
-            self.model.launch(start, elements.count, [*elements.arguments, self.state.x], [z, u])
+        for elements, of, (start, _split) in self._each():
+            self.model.launch(start, elements.count, [elements.stencil, elements.rest, self.state.x], [of])
 
     def _launch_local(self):
         """z and u, and the forces that follow: of the gaps, of the changes, and what the matrix is to take away."""
@@ -195,12 +202,10 @@ class ADMMStepper(Stepper):
         for array in sums:
             array.zero_()
         model.refresh(EVALUATION, Moment(self.state.x, self.correction))
-        for i, (elements, (z, u, gap, change), (_start, split, sum_of)) in enumerate(self._each()):
-            ratio, scale = self._ratios[i], self._scales[i]
-            given = [*elements.arguments, self.state.x, self.correction, ratio, scale, kernels.STEPS]
-            model.launch(split, elements.count, given, [z, u, gap, change])
-            dim = len(self._incidences[i][0]) - 1 if self._incidences[i] else elements.count
-            model.launch(sum_of, dim, [*self._incidences[i], *elements.arguments, ratio, scale, u, gap, change], sums)
+        for (elements, of, (_start, split)), transpose in zip(self._each(), self._sums_of, strict=True):
+            given = [elements.stencil, elements.rest, self.state.x, self.correction, kernels.STEPS]
+            model.launch(split, elements.count, given, [of])
+            transpose.add(of, *sums)
         given = [model.mass, model.inverse_mass, model.gravity, model.per_copy, self.s, 0.0, self.correction]
         model.launch(self._add_inertia, model.count, given, [self._force, self._work])
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):

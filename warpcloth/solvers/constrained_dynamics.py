@@ -7,9 +7,9 @@ import warp as wp
 
 from ..base.checks import choice, number, whole
 from ..core.capture import Mirror, Segment
-from ..core.operators import RowSums, Sums
 from ..core.status import Residual, Result
-from ..kernels import constraint_rows as kernels
+from ..core.sums import RowSums, Sums
+from ..kernels import constraint_step as kernels
 from ..model.damping import refuse_apart
 from ..numerics.constraints import Constraints
 from ..numerics.linear import ConjugateGradients, FactorisedRows
@@ -151,7 +151,7 @@ class ConstrainedDynamicsStepper(Stepper):
             self._linear = FactorisedRows(self.constraints, (self._right, self._change, self._active.array))
         self._unbalanced, self._open, self._rounding, self._carried = (per_copy(wp.float64) for _ in range(4))
         self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("mismatch", "negate_rows")}
-        self._advance = [model.kernel(kernels.advance, model.dtype, vectors) for vectors in (True, False)]
+        self._add_step = [model.kernel(kernels.add_step, model.dtype, vectors) for vectors in (True, False)]
         self._begin_step = model.kernel(kernels.begin_step)
         self._gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         self.iterations = 0
@@ -233,9 +233,9 @@ class ConstrainedDynamicsStepper(Stepper):
             self._search.launch(self._active.array)
         else:
             model.launch(self._begin_step, model.copies, [self._active.array], [self._step])
-            model.launch(self._advance[0], model.count, [self._step, self._direction, model.per_copy], [self.correction])
+            model.launch(self._add_step[0], model.count, [self._step, self._direction, model.per_copy], [self.correction])
         given = [self._step, self._change, constraints.per_copy]
-        model.launch(self._advance[1], constraints.count, given, [constraints.multipliers])
+        model.launch(self._add_step[1], constraints.count, given, [constraints.multipliers])
         self._launch_linearise()
 
     def _launch(self, name, dim, inputs, outputs):

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.checks import choice
 from ..base.turns import in_turn
-from ..core.operators import Hessian
+from ..core.hessian import Hessian
 from ..fast.gather_step import Gather, Sweep, is_fine
 from ..fast.subdomains import Ranges
 from ..model.damping import dissipations

@@ -7,8 +7,11 @@ import warp as wp
 
 from ..base.checks import choice, number, whole
 from ..core.capture import Mirror, Segment
-from ..core.operators import CHUNKS, Energy, Gradient, Sums, constant_matrices
+from ..core.constant_matrix import constant_matrices
+from ..core.energy import Energy
 from ..core.status import UNBALANCED, Residual, Result
+from ..core.sums import CHUNKS, Sums
+from ..fast.gradient import gradient
 from ..kernels import accelerate as kernels
 from ..kernels.minimise import add_inertia
 from ..numerics.acceleration import LBFGS, Anderson, Chebyshev
@@ -91,7 +94,7 @@ class ProjectiveDynamicsStepper(Stepper):
         self._sizes = np.stack([np.asarray(abs(matrix).sum(axis=1)).ravel() for matrix in matrices])
         self._linear = CopyFactors(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
         self.factorise_seconds = self._linear.seconds
-        self._sums, self._gradient_of = Sums(model), Gradient(model, corrected=True)
+        self._sums, self._gradient_of = Sums(model), gradient(model, corrected=True)
         self.correction, self._gradient, self._w = (model.vectors() for _ in range(3))
         self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         self._acceleration = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))

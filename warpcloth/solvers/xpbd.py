@@ -7,8 +7,9 @@ import warp as wp
 
 from ..base.checks import choice, number, whole
 from ..core.capture import Mirror
-from ..core.operators import Gradient, Sums
 from ..core.status import UNBALANCED, Residual, Result
+from ..core.sums import Sums
+from ..fast.gradient import gradient
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..numerics.sweeps import IN_PLACE, Sweep, refuse_unprojectable
@@ -123,7 +124,7 @@ class XPBDStepper(LaunchedStepper):
         self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
-        self._gradient = Gradient(model, corrected=True, terms=self.sweep.elements) if soft else None
+        self._gradient = gradient(model, corrected=True, terms=self.sweep.elements) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
         self._acceleration = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
         self.worst = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))

@@ -1,0 +1,147 @@
+"""Factories of the Jacobian J of the constraint rows of a term, and of its transpose; see :mod:`.constraint_rows`.
+
+They share the key (term, dtype, scalar, curved).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .constraint_rows import RowLayout, first_row, rows_of, slope_type
+from .local import local_coordinate
+from .reduce import left_out
+from .term import Term
+from .transpose import Source, gather, scatter
+from .vectors import types
+
+
+@cache
+def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
+    """Kernel over elements: rows += J v, of the copies that are active, see :func:`.reduce.left_out`."""
+    vec3, _ = types(dtype)
+    M, Q = wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
+    rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
+    y_of = local_coordinate(term, dtype, False)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def apply(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        rest: wp.array(dtype=rest_type),
+        slopes: wp.array(dtype=slope),
+        # state in
+        v: wp.array(dtype=vec3),
+        # parameters
+        layout: RowLayout,
+        active: wp.array(dtype=wp.int32),
+        # in and out
+        rows: wp.array(dtype=dtype),
+    ):
+        e = wp.tid()
+        if left_out(active, e // layout.per_copy):
+            return
+        s = first_row(e, layout, Q)
+        y = y_of(stencil, e, rest[e], v, v)
+        if wp.static(scalar):
+            for j in range(Q):
+                total = rows[s + j]
+                for m in range(M):
+                    for a in range(3):
+                        total += slopes[e][j, 3 * m + a] * y[m, a]
+                rows[s + j] = total
+        else:
+            for m in range(M):
+                for a in range(3):
+                    rows[s + 3 * m + a] = rows[s + 3 * m + a] + slopes[e] * y[m, a]
+
+    return apply
+
+
+@cache
+def held_rows(term: Term, dtype, scalar: bool, curved: bool):
+    """The struct of what the forces of the rows of a term are computed from: numbers λ of all rows, of the active copies."""
+    slope = slope_type(term, dtype, scalar, curved)
+
+    @wp.struct
+    class HeldRows:
+        slopes: wp.array(dtype=slope)
+        multipliers: wp.array(dtype=dtype)
+        layout: RowLayout
+        active: wp.array(dtype=wp.int32)
+
+    return HeldRows
+
+
+@cache
+def pulls(term: Term, dtype, scalar: bool, curved: bool):
+    """The :class:`.transpose.Source` of the force of the rows of an element over y (M, 3)."""
+    M, Q = wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    data = held_rows(term, dtype, scalar, curved)
+
+    @wp.func
+    def of_constraint(rows: data, e: int, rest: rest_type):
+        z = y_type()
+        s = first_row(e, rows.layout, Q)
+        for j in range(Q):
+            for m in range(M):
+                for a in range(3):
+                    z[m, a] = z[m, a] + rows.slopes[e][j, 3 * m + a] * rows.multipliers[s + j]
+        return z
+
+    @wp.func
+    def of_projection(rows: data, e: int, rest: rest_type):
+        z = y_type()
+        s = first_row(e, rows.layout, Q)
+        for m in range(M):
+            for a in range(3):
+                z[m, a] = rows.slopes[e] * rows.multipliers[s + 3 * m + a]
+        return z
+
+    @wp.func
+    def stands_aside(rows: data, e: int):
+        return left_out(rows.active, e // rows.layout.per_copy)
+
+    return Source(data, of_constraint if scalar else of_projection, stands_aside)
+
+
+def scatter_rows(term: Term, dtype, scalar: bool, curved: bool):
+    """Kernel over elements: out += Jᵀλ, of active copies, see :func:`.transpose.scatter`."""
+    return scatter(term, dtype, pulls(term, dtype, scalar, curved))
+
+
+def gather_rows(term: Term, dtype, scalar: bool, curved: bool):
+    """Kernel over vertices: the sum that :func:`scatter_rows` makes, see :func:`.transpose.gather`."""
+    return gather(term, dtype, pulls(term, dtype, scalar, curved))
+
+
+@cache
+def rows_in_full(term: Term, dtype, scalar: bool, curved: bool):
+    """Kernel over elements: out[e, rows·i + j] = row j of ∂/∂xᵢ, in double precision, to be assembled on the host."""
+    K, M, Q = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
+    rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
+    weight = term.weight
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def expand(
+        # elements
+        rest: wp.array(dtype=rest_type),
+        slopes: wp.array(dtype=slope),
+        # out
+        out: wp.array2d(dtype=wp.vec3d),
+    ):
+        e = wp.tid()
+        r = rest[e]
+        for i in range(K):
+            w = weight(r, i)
+            for j in range(Q):
+                row = wp.vec3d()
+                if wp.static(scalar):
+                    for m in range(M):
+                        for a in range(3):
+                            row[a] = row[a] + wp.float64(w[m]) * wp.float64(slopes[e][j, 3 * m + a])
+                else:
+                    row[j % 3] = wp.float64(w[j // 3]) * wp.float64(slopes[e])
+                out[e, Q * i + j] = row
+
+    return expand

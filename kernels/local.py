@@ -1,0 +1,50 @@
+"""Local coordinates y = Dx of an element, Σᵢ wᵢ ⊗ xᵢ over its stencil; :mod:`.transpose` is the transpose."""
+
+from functools import cache
+
+import warp as wp
+
+from .memory import load
+from .term import Term
+from .vectors import types
+
+
+@cache
+def from_corner(term: Term, dtype):
+    """The device function (rest, i, x) → wᵢ ⊗ x, what vertex i of an element adds to y."""
+    vec3, _ = types(dtype)
+    M, weight = wp.constant(term.rows), term.weight
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+
+    @wp.func
+    def part_of(rest: rest_type, corner: int, x: vec3):
+        w = weight(rest, corner)
+        y = y_type()
+        for m in range(M):
+            y[m] = w[m] * x
+        return y
+
+    return part_of
+
+
+@cache
+def local_coordinate(term: Term, dtype, corrected: bool):
+    """The device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ of a term, or with ``corrected`` Σᵢ wᵢ ⊗ (xᵢ + dᵢ).
+
+    In float32 the sum x + d would lose the digits of d to the size of x; the difference of neighbouring x is nearly exact.
+    """
+    vec3, _ = types(dtype)
+    K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
+    part_of, vector, vertex = from_corner(term, dtype), load(vec3), load(wp.int32, 2)
+
+    @wp.func
+    def y_of(stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
+        y = part_of(rest, 0, vector(x, vertex(stencil, K * e)))
+        for i in range(1, K):
+            y += part_of(rest, i, vector(x, vertex(stencil, K * e + i)))
+        if wp.static(corrected):
+            for i in range(K):
+                y += part_of(rest, i, vector(d, vertex(stencil, K * e + i)))
+        return y
+
+    return y_of

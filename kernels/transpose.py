@@ -1,0 +1,124 @@
+"""The transpose of local coordinates, out += Dᵀz: vertex i of an element gets Σₘ wᵢ[m] z[m].
+
+z is what its user says: forces kA∂u/∂y, multipliers of constraints. A :class:`Source` computes it from arrays of its own, and
+two kernels add it up: over elements in order, for the CPU, and over vertices, for a GPU, each with its elements in order.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from .memory import load, store
+from .term import Term
+from .vectors import types
+
+
+@cache
+def to_corner(term: Term, dtype):
+    """The device function (rest, i, z) → Σₘ wᵢ[m] z[m], what vertex i of an element gets of z (M, 3)."""
+    M, weight = wp.constant(term.rows), term.weight
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+
+    @wp.func
+    def share_of(rest: rest_type, corner: int, z: y_type):
+        w = weight(rest, corner)
+        total = w[0] * z[0]
+        for m in range(1, M):
+            total += w[m] * z[m]
+        return total
+
+    return share_of
+
+
+class Source(NamedTuple):
+    """Where z comes from.
+
+    Attributes:
+        data: The Warp struct of the arrays that it is computed from.
+        z_of: The device function (data, element, rest) → z (M, 3).
+        left_out: The device function (data, element) → whether the copy of the element takes no part; or None.
+    """
+
+    data: Any
+    z_of: Callable
+    left_out: Callable | None = None
+
+
+@cache
+def stored(term: Term, dtype):
+    """The source of a z that is computed already."""
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+
+    @wp.struct
+    class Stored:
+        z: wp.array(dtype=y_type)
+
+    @wp.func
+    def stored_z(data: Stored, e: int, rest: rest_type):
+        return data.z[e]
+
+    return Source(Stored, stored_z)
+
+
+@cache
+def scatter(term: Term, dtype, source: Source):
+    """Kernel over elements: out += Dᵀz. For the CPU, which takes elements in order: nothing is atomic."""
+    vec3, _ = types(dtype)
+    K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
+    share_of, z_of, left_out = to_corner(term, dtype), source.z_of, source.left_out
+    vector, vertex, rest_of, put = load(vec3), load(wp.int32, 2), load(rest_type), store(vec3)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter_elements(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        rest: wp.array(dtype=rest_type),
+        # state in
+        data: source.data,
+        # in and out
+        out: wp.array(dtype=vec3),
+    ):
+        e = wp.tid()
+        if wp.static(left_out is not None):
+            if left_out(data, e):
+                return
+        r = rest_of(rest, e)
+        z = z_of(data, e, r)
+        for i in range(K):
+            v = vertex(stencil, K * e + i)
+            put(out, v, vector(out, v) + share_of(r, i, z))
+
+    return scatter_elements
+
+
+@cache
+def gather(term: Term, dtype, source: Source):
+    """Kernel over vertices: out += Dᵀz in a fixed order, through :class:`warpcloth.model.incidence.Incidence`."""
+    vec3, _ = types(dtype)
+    K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
+    share_of, z_of, left_out = to_corner(term, dtype), source.z_of, source.left_out
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather_elements(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        codes: wp.array(dtype=wp.int32),
+        rest: wp.array(dtype=rest_type),
+        # state in
+        data: source.data,
+        # in and out
+        out: wp.array(dtype=vec3),
+    ):
+        v = wp.tid()
+        total = vec3()
+        for n in range(offsets[v], offsets[v + 1]):
+            e = codes[n] // K
+            if wp.static(left_out is not None):
+                if left_out(data, e):
+                    return
+            total += share_of(rest[e], codes[n] - e * K, z_of(data, e, rest[e]))
+        out[v] = out[v] + total
+
+    return gather_elements

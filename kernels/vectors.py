@@ -1,0 +1,11 @@
+"""The types of a vertex's vectors and of the blocks between two vertices."""
+
+from functools import cache
+
+import warp as wp
+
+
+@cache
+def types(dtype):
+    """The vector and 3×3 matrix types of a scalar type: (vec3, mat33)."""
+    return wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)

@@ -1,0 +1,36 @@
+"""The constant matrix s·M + Σ k A GᵀG of a model, G the weights of y, which projective dynamics and ADMM factorise."""
+
+import numpy as np
+import warp as wp
+
+from ..kernels import assemble
+
+
+def constant_blocks(model, elements):
+    """k A GᵀG of each element, G the weights of y, (E, K, K) [N/m]."""
+    K = elements.term.vertices
+    blocks = wp.zeros((elements.count, K * K), dtype=wp.float64, device=model.device)
+    kernel = model.kernel(assemble.constant_blocks, elements.term, model.dtype)
+    model.launch(kernel, elements.count, elements.arguments, [blocks])
+    return blocks.numpy().reshape(-1, K, K)
+
+
+def constant_matrices(model, s):
+    """s·M + Σ k A GᵀG of each copy, G the weights of y, as scipy matrices (n, n) [N/m]; pins are the identity."""
+    from scipy.sparse import coo_matrix
+
+    n, B = model.per_copy, model.copies
+    free = model.inverse_mass.numpy() > 0.0
+    diagonal = np.where(free, s * model.mass.numpy().astype(np.float64), 1.0).reshape(B, n)
+    vertices = np.arange(n)
+    rows, columns, values = [vertices], [vertices], [diagonal]
+    for elements in model.terms:
+        stencil = elements.stencil.numpy()[: elements.per_copy]
+        K = stencil.shape[1]
+        rows.append(np.repeat(stencil, K, axis=1).ravel())
+        columns.append(np.tile(stencil, K).ravel())
+        values.append(constant_blocks(model, elements).reshape(B, -1))
+    rows, columns, values = np.concatenate(rows), np.concatenate(columns), np.concatenate(values, axis=1)
+    free = free[:n]  # pins are those of the scene, in every copy
+    keep = (free[rows] & free[columns]) | (np.arange(len(rows)) < n)
+    return [coo_matrix((each[keep], (rows[keep], columns[keep])), shape=(n, n)).tocsc() for each in values]

@@ -1,0 +1,66 @@
+"""Sums and maxima of each copy, in two launches: chunks, and then their sum."""
+
+import warp as wp
+
+from ..base.turns import in_turn
+from ..kernels import reduce
+
+# Chunks of a sum per copy: one on the CPU, which runs them in turn; on a GPU enough for it to be busy.
+CHUNKS = 256
+
+
+class Sums:
+    """Sums and maxima per copy in double precision and a fixed order."""
+
+    @in_turn
+    def __init__(self, model):
+        self.model = model
+        chunks = CHUNKS if model.device.is_cuda else 1
+        self.partial = wp.zeros((model.copies, chunks), dtype=wp.float64, device=model.device)
+        self._finish = model.kernel(reduce.finish_sum)
+        self._sum = model.kernel(reduce.partial_sum)
+        self._dot = model.kernel(reduce.partial_dot, model.dtype)
+        self._largest = model.kernel(reduce.partial_largest, model.dtype)
+        self._finish_largest = model.kernel(reduce.finish_largest)
+
+    def dot(self, a, b, out, active=None):
+        """out (B,) = Σ a·b over the vertices of each copy; anything for those not ``active`` (B,), if that is given."""
+        self.model.launch(self._dot, self.partial.shape, [a, b, active, self.model.per_copy], [self.partial])
+        self._add_chunks(0, out)
+
+    def sum(self, values, per_copy, out, accumulate=0):
+        """out (B,) = Σ of the ``per_copy`` values of each copy, and what out held too where ``accumulate`` is 1."""
+        self.model.launch(self._sum, self.partial.shape, [values, per_copy], [self.partial])
+        self._add_chunks(accumulate, out)
+
+    def largest(self, weights, a, out):
+        """out (B,) = max wᵢ‖aᵢ‖ over the vertices of each copy."""
+        self.model.launch(self._largest, self.partial.shape, [weights, a, self.model.per_copy], [self.partial])
+        self.model.launch(self._finish_largest, self.model.copies, [self.partial], [out])
+
+    def _add_chunks(self, accumulate, out):
+        self.model.launch(self._finish, self.model.copies, [self.partial, accumulate], [out])
+
+
+class RowSums(Sums):
+    """Sums and maxima of numbers that every copy has ``per_copy`` of, such as the rows of constraints."""
+
+    @in_turn
+    def __init__(self, model, per_copy):
+        self.model, self.per_copy = model, per_copy
+        chunks = CHUNKS if model.device.is_cuda else 1
+        self.partial = wp.zeros((model.copies, chunks), dtype=wp.float64, device=model.device)
+        self._finish = model.kernel(reduce.finish_sum)
+        self._dot = model.kernel(reduce.partial_product, model.dtype)
+        self._largest = model.kernel(reduce.partial_largest_number)
+        self._finish_largest = model.kernel(reduce.finish_largest)
+
+    def dot(self, a, b, out, active=None):
+        """out (B,) = Σ a b of each copy, as :meth:`Sums.dot`."""
+        self.model.launch(self._dot, self.partial.shape, [a, b, active, self.per_copy], [self.partial])
+        self._add_chunks(0, out)
+
+    def largest(self, values, out):
+        """out (B,) = max of each copy of double precision ``values`` of 0 or more."""
+        self.model.launch(self._largest, self.partial.shape, [values, self.per_copy], [self.partial])
+        self.model.launch(self._finish_largest, self.model.copies, [self.partial], [out])

@@ -1,0 +1,25 @@
+"""The transpose of local coordinates, out += Dᵀz, for the elements of one term."""
+
+
+class Transpose:
+    """Adds Dᵀz up: on the CPU element by element, on CUDA vertex by vertex, in the same order every time.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        elements: Its :class:`warpcloth.model.model.DeviceElements`.
+        scatter, gather: The factories of the two kernels, see :mod:`warpcloth.kernels.transpose`.
+        key: Arguments of both.
+    """
+
+    def __init__(self, model, elements, scatter, gather, *key):
+        self.model, cuda = model, model.device.is_cuda
+        self._kernel = model.kernel(gather if cuda else scatter, *key)
+        if cuda:
+            offsets, codes = elements.incidences  # now: made during a capture they would only be recorded
+            self._dim, self._given = len(offsets) - 1, [offsets, codes, elements.rest]
+        else:
+            self._dim, self._given = elements.count, [elements.stencil, elements.rest]
+
+    def add(self, data, *out):
+        """out += Dᵀz of what the struct ``data`` holds."""
+        self.model.launch(self._kernel, self._dim, [*self._given, data], out)
