@@ -3,9 +3,9 @@
 import gc
 import json
 import os
+import select
 import signal
 import threading
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -306,17 +306,16 @@ def test_a_forked_process_has_threads_of_its_own(device):
     """Those of its parent are not there."""
     stepper = wc.Explicit(substeps=8, above_limit="allow").bind(declared([SPRINGS]).build(device=device, threads=2))
     stepper.frame()
+    ours, theirs = os.pipe()  # the child's end is closed when it ends
     child = os.fork()
     if child == 0:
         stepper.frame()
         os._exit(0 if np.isfinite(stepper.state.x.numpy()).all() else 1)
-    for _ in range(200):
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            break
-        time.sleep(0.05)
-    else:
+    os.close(theirs)
+    ended, _, _ = select.select([ours], [], [], 300.0)
+    os.close(ours)
+    if not ended:
         os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        pytest.fail("the forked process hangs")
+    _, status = os.waitpid(child, 0)
+    assert ended, "the forked process hangs"
     assert os.waitstatus_to_exitcode(status) == 0

@@ -35,13 +35,14 @@ def scene(n: int = 4):
 """
 
 
-def square(x, folder):
-    """x² after a while, so that another worker has something to do, and a mark in a folder that it was measured."""
-    with open(os.path.join(folder, f"{x}-{time.time_ns()}"), "w"):
+def square(x, folder, after=None):
+    """x², and a mark in a folder that it was measured; once both workers are at it, and a file is there."""
+    with open(os.path.join(folder, f"{x}-{os.getpid()}-{time.time_ns()}"), "w"):
         pass
     if x < 0:
         raise ValueError(f"x is {x}; it must be 0 or more")
-    time.sleep(0.1)
+    until(lambda: len({mark.split("-")[-2] for mark in os.listdir(folder)}) == 2)
+    until(lambda: after is None or os.path.exists(after))
     return {"square": x * x, "threads": os.environ.get("OMP_NUM_THREADS"), "process": os.getpid()}
 
 
@@ -56,8 +57,15 @@ def digest(scene):
     return scene_digest(SceneRef(**scene).load())
 
 
-def squares(count, folder):
-    return [task(square, x=x, folder=str(folder)) for x in range(count)]
+def until(true):
+    """Waits; a minute is far more than anything here takes, and keeps a worker from waiting for ever."""
+    ends = time.monotonic() + 60.0
+    while not true() and time.monotonic() < ends:
+        time.sleep(0.01)
+
+
+def squares(count, folder, after=None, first=0):
+    return [task(square, x=x, folder=str(folder), after=after and str(after)) for x in range(first, count)]
 
 
 @pytest.fixture(scope="module")
@@ -82,19 +90,22 @@ def test_every_task_once_on_both_workers(address, tmp_path):
 
 
 def test_an_error_is_the_task_s_own_and_the_rest_is_dropped(address, tmp_path):
-    store = Store(tmp_path / "store.jsonl")
+    store, refused = Store(tmp_path / "store.jsonl"), tmp_path / "refused"
     marks = tmp_path / "marks"
     marks.mkdir()
+    tasks = [*squares(2, marks), task(square, x=-1, folder=str(marks)), *squares(60, marks, refused, first=2)]
     with connect(address) as cluster:
         with pytest.raises(ValueError, match=r"^x is -1; it must be 0 or more$"):
-            list(sweep([*squares(2, marks), task(square, x=-1, folder=str(marks)), *squares(60, marks)[2:]], cluster, store))
+            list(sweep(tasks, cluster, store))
+        until(lambda: all(future.status != "pending" for future in cluster._client.futures.values()))
+        refused.touch()
         assert next(iter(sweep(squares(1, marks), cluster)))[1]["square"] == 0
     # It is among the first that run; each worker may have begun a few more before it hears of it.
-    assert len(list(marks.iterdir())) < 30 and len(store) < 30
+    assert len(list(marks.iterdir())) < 30 and len(store) <= 2
 
 
 def test_an_interruption_keeps_what_is_finished(address, tmp_path):
-    store = Store(tmp_path / "store.jsonl")
+    store, interrupted = Store(tmp_path / "store.jsonl"), tmp_path / "interrupted"
     marks = tmp_path / "marks"
     marks.mkdir()
 
@@ -102,10 +113,11 @@ def test_an_interruption_keeps_what_is_finished(address, tmp_path):
         if done == 2:
             raise KeyboardInterrupt
 
+    tasks = [*squares(2, marks), *squares(30, marks, interrupted, first=2)]
     with pytest.raises(KeyboardInterrupt), connect(address) as cluster:
-        list(sweep(squares(30, marks), cluster, store, interrupt))
-    begun = len(list(marks.iterdir()))
-    assert 2 <= len(Store(store.path)) <= begun < 20
+        list(sweep(tasks, cluster, store, interrupt))
+    assert len(Store(store.path)) == 2 and len(list(marks.iterdir())) <= 4
+    interrupted.touch()
     with connect(address) as cluster:
         found = list(sweep(squares(6, marks), cluster, store))
     assert sorted(result["square"] for _, result in found) == [0, 1, 4, 9, 16, 25]

@@ -296,7 +296,7 @@ def test_motion_that_no_step_resolves_ends_early(folder, monkeypatch):
     monkeypatch.setattr(module, "simulate", scattered)
     with pytest.warns(UserWarning, match=r"only, not to 1e-09: smaller steps make it no less, for the motion is chaotic"):
         found = reference(CHAIN, 2, tolerance=1e-9)
-    assert found.limit == np.inf and found.error > 1e-3 and found.seconds < 60.0
+    assert found.limit == np.inf and found.error > 1e-3
 
 
 def test_runs_that_diverge_are_left_out(folder, runs, monkeypatch):

@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import select
 import signal
 import subprocess
 import sys
@@ -123,20 +124,21 @@ def dict_of(results):
 
 
 def die(after):
-    """Waits for a file, then ends its process as a lack of memory does."""
-    while after and not os.path.exists(after):
-        time.sleep(0.01)
+    """Waits until a named pipe is closed, then ends its process as a lack of memory does."""
+    if after:
+        Path(after).read_bytes()
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_process_that_is_killed_is_said(tmp_path):
     """What is finished is kept."""
-    store, mark = tmp_path / "store.jsonl", tmp_path / "mark"
-    tasks = [*squares(2), task(die, after=str(mark))]
+    store, pipe = tmp_path / "store.jsonl", tmp_path / "pipe"
+    os.mkfifo(pipe)
+    tasks = [*squares(2), task(die, after=str(pipe))]
     with pytest.raises(ChildProcessError, match=r"ended: killed, as for want of memory, .* what is finished is kept"):
         for done, _ in enumerate(sweep(tasks, store=Store(store), workers=2), 1):
             if done == 2:
-                mark.touch()
+                pipe.write_bytes(b"")
     assert len(Store(store)) == 2
 
 
@@ -198,50 +200,41 @@ def test_other_code_is_refused_and_the_machine_kept(tmp_path):
 
 
 SCRIPT = """
-import os, sys, time
+import sys, threading
 from warpcloth.lab.campaign import sweep
 from warpcloth.lab.measurements import task
 
-def wait(folder):
-    open(os.path.join(folder, str(os.getpid())), "w").close()
-    time.sleep(60.0)
+def wait(pipe):
+    with open(pipe, "wb", buffering=0) as file:
+        file.write(b"here")
+        threading.Event().wait()
 
 if __name__ == "__main__":
     import waits
-    list(sweep([task(waits.wait, folder=sys.argv[1])], workers=1))
+    list(sweep([task(waits.wait, pipe=sys.argv[1])], workers=1))
 """
 
 
 def test_processes_end_with_the_one_that_started_them(tmp_path):
-    """Killed, it tells them nothing."""
-    marks = tmp_path / "marks"
-    marks.mkdir()
+    """Killed, it tells them nothing. Their end of a pipe is closed when they end."""
+    os.mkfifo(tmp_path / "pipe")
     (tmp_path / "waits.py").write_text(SCRIPT)
     root = str(Path(wc.__file__).parents[1])
     path = os.pathsep.join([root, str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    parent = subprocess.Popen([sys.executable, "waits.py", str(marks)], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
-    try:
-        until(lambda: any(marks.iterdir()))
-    finally:
-        parent.kill()
-        parent.wait()
-    (mark,) = marks.iterdir()
-    until(lambda: not alive(int(mark.name)))
+    parent = subprocess.Popen([sys.executable, "waits.py", "pipe"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
+    with open(os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as pipe:
+        try:
+            assert read(pipe) == b"here"
+        finally:
+            parent.kill()
+            parent.wait()
+        assert read(pipe) == b""
 
 
-def until(true):
-    ends = time.monotonic() + 30.0
-    while not true():
-        assert time.monotonic() < ends
-        time.sleep(0.02)
-
-
-def alive(process):
-    """Whether a process runs; one that has ended may wait for whoever takes note of it."""
-    try:
-        return "State:\tZ" not in Path(f"/proc/{process}/status").read_text()
-    except FileNotFoundError:
-        return False
+def read(pipe):
+    """What comes next, b"" once nobody has the other end; what takes five minutes hangs."""
+    assert select.select([pipe], [], [], 300.0)[0]
+    return pipe.read(4)
 
 
 def test_a_file_that_is_no_store_is_refused(tmp_path):

@@ -574,20 +574,22 @@ def test_report_numbers_terms_of_one_label(device):
 
 # --- copies
 
-RANDOM = np.random.default_rng(0)
 COPIES = 3
-STARTS = MESH.points + RANDOM.normal(scale=0.03, size=(COPIES, VERTICES, 3))
+STARTS = MESH.points + np.random.default_rng(0).normal(scale=0.03, size=(COPIES, VERTICES, 3))
 VARIED = {
     "gravity": ([[0, -9.81, 0], [0, -1.62, 0], [1, 2, 3]], lambda value: {"gravity": value}),
     "density": ([0.1, 0.2, 0.4], lambda value: {"density": value}),
     "positions": (STARTS, lambda value: {"positions": value}),
-    "velocities": (RANDOM.normal(size=(COPIES, VERTICES, 3)), lambda value: {"velocities": value}),
+    "velocities": (np.random.default_rng(1).normal(size=(COPIES, VERTICES, 3)), lambda value: {"velocities": value}),
     "Spring.stiffness": ([10.0, 20.0, 40.0], lambda value: {"terms": all_terms(spring=value)}),
     "bend.stiffness": (
-        RANDOM.uniform(1e-3, 2e-3, (COPIES, HINGES)),
+        np.random.default_rng(2).uniform(1e-3, 2e-3, (COPIES, HINGES)),
         lambda value: {"terms": all_terms(bend=value)},
     ),
-    "Attachment.stiffness": (RANDOM.uniform(1, 2, (COPIES, 4)), lambda value: {"terms": all_terms(hold=value)}),
+    "Attachment.stiffness": (
+        np.random.default_rng(3).uniform(1, 2, (COPIES, 4)),
+        lambda value: {"terms": all_terms(hold=value)},
+    ),
 }
 
 

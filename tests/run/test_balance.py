@@ -89,8 +89,8 @@ def test_no_scene_that_holds_is_called_diverged(name, solver, device):
         declared = noisy(declared, 0.01)
     try:
         record.bind(declared.build(device=device))
-    except ValueError:  # what a solver cannot take it refuses
-        return
+    except ValueError as refusal:
+        pytest.skip(str(refusal))
     status = wc.simulate(declared, record, device=device, frames=FRAMES.get(name, 30)).status
     assert status.ok, status.message
 

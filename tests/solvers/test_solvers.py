@@ -36,7 +36,6 @@ def oscillator(omega, h):
     )
 
 
-RANDOM = np.random.default_rng(5)
 UNLIKE = {
     "stiffness and gravity": {
         "Spring.stiffness": [50.0, 100.0, 200.0],
@@ -48,9 +47,9 @@ UNLIKE = {
         "Spring.damping": [0.0, 0.01, 0.05],
     },
     "masses and start": {
-        "masses": RANDOM.uniform(0.002, 0.004, (3, 36)),
-        "positions": square().mesh.points + RANDOM.normal(scale=0.01, size=(3, 36, 3)),
-        "velocities": RANDOM.normal(scale=0.1, size=(3, 36, 3)),
+        "masses": np.random.default_rng(5).uniform(0.002, 0.004, (3, 36)),
+        "positions": square().mesh.points + np.random.default_rng(6).normal(scale=0.01, size=(3, 36, 3)),
+        "velocities": np.random.default_rng(7).normal(scale=0.1, size=(3, 36, 3)),
     },
 }
 
@@ -206,7 +205,13 @@ def test_a_sheet_at_rest_stays_there(name, dtype, device):
 
 VARIED = {
     "nothing": (2, {}),
-    "where they are": (2, {"gravity": RANDOM.normal(size=(2, 3)), "velocities": RANDOM.normal(size=(2, 36, 3))}),
+    "where they are": (
+        2,
+        {
+            "gravity": np.random.default_rng(8).normal(size=(2, 3)),
+            "velocities": np.random.default_rng(9).normal(size=(2, 36, 3)),
+        },
+    ),
     "density": (3, {"density": [0.1, 0.3, 0.1]}),
     "stiffness": (3, {"Spring.stiffness": [100.0, 100.0, 400.0]}),
     "damping": (2, {"Spring.damping": [0.1, 0.0]}),
@@ -289,7 +294,8 @@ def test_options_are_checked(make, message):
 @pytest.mark.parametrize("kind", ["hessian", "constraints"])
 def test_copies_that_are_done_are_left_out(kind, device):
     """Of a product with the matrix, and of its sums: those that are active have theirs, what the others hold is as it was."""
-    model = square(positions=square().mesh.points + RANDOM.normal(scale=0.01, size=(36, 3))).build(
+    random = np.random.default_rng(10)
+    model = square(positions=square().mesh.points + random.normal(scale=0.01, size=(36, 3))).build(
         device=device, dtype="float64", copies=3
     )
     if kind == "hessian":
@@ -300,7 +306,7 @@ def test_copies_that_are_done_are_left_out(kind, device):
         matrix.launch_linearise(model.positions, model.vectors())
         sums = RowSums(model, matrix.per_copy)
     matrix.prepare()
-    p = RANDOM.normal(size=(3, *np.shape(matrix.matrices()[0])[:1]))
+    p = random.normal(size=(3, *np.shape(matrix.matrices()[0])[:1]))
     given = wp.array(p.reshape(matrix.count, -1).squeeze(), dtype=matrix.vector, device=device)
     product, active = wp.zeros_like(given), wp.array([1, 0, 1], dtype=wp.int32, device=device)
     matrix.multiply(given, product, active)

@@ -8,9 +8,8 @@ import warpcloth as wc
 
 MESH = wc.Mesh.grid(7, 5, pattern="alternating")
 N = len(MESH.points)
-_random = np.random.default_rng(3)
-POSITIONS = MESH.points + _random.normal(scale=0.01, size=(N, 3))
-VELOCITIES = _random.normal(size=(N, 3))
+POSITIONS = MESH.points + np.random.default_rng(3).normal(scale=0.01, size=(N, 3))
+VELOCITIES = np.random.default_rng(4).normal(size=(N, 3))
 SPRINGS = wc.Spring(pairs=("structural", "shear"), stiffness=100.0)
 BACKWARDS = wc.Spring(pairs=SPRINGS.stencil(MESH)[:, ::-1], stiffness=100.0 + np.arange(len(SPRINGS.stencil(MESH))))
 TERMS = {

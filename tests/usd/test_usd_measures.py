@@ -181,7 +181,7 @@ def test_nothing_but_measures_is_said_about_the_source(result):
     path, _, source, _ = result
     folder = Path(path).parent / f"{Path(path).stem}_frames"
     if source is None or not folder.exists():
-        return
+        pytest.skip("a result in one file, or without a source, has no layer over one")
     own = set()
     stage, _ = animated_prim(path)
     for layer in stage.GetLayerStack(includeSessionLayers=False):
@@ -205,7 +205,7 @@ def test_facts_survive(result):
 def test_directions_stand_in_the_world(result):
     path, mesh, _, _ = result
     if not len(mesh.triangles):
-        return
+        pytest.skip("a net has no directions")
     stage, prim = animated_prim(path)
     metres = UsdGeom.GetStageMetersPerUnit(stage)
     for name in DIRECTIONS:
