@@ -390,7 +390,11 @@ def test_what_is_not_finite_is_said(device):
 @pytest.mark.parametrize(
     ("term", "options", "message"),
     [
-        (wc.StVKMembrane(stiffness=1.0), {}, "cannot take StVKMembrane, whose energy is no square of a constraint; Newton"),
+        (
+            wc.StVKMembrane(stiffness=1.0),
+            {},
+            "cannot take StVKMembrane, whose energy is no square of a constraint; Explicit",
+        ),
         (wc.StrainLimit(most=1.1), {}, "cannot take StrainLimit with infinite stiffness, as it has no scalar constraint; PBD"),
         (wc.Spring(stiffness=np.inf), {"integrator": "bdf2"}, "with integrator='bdf2' cannot take Spring with infinite"),
         (wc.Spring(stiffness=np.inf), {"stabilisation": "line-search"}, "with stabilisation='line-search' cannot take Spring"),

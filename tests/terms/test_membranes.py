@@ -319,7 +319,7 @@ def test_hard_limits_are_refused_where_forces_are_needed(kind, solver, device):
 
 @pytest.mark.parametrize("name", ["StVKMembrane", "NeoHookeanMembrane"])
 def test_pbd_refuses_what_has_no_projection(name, device):
-    with pytest.raises(ValueError, match=f"PBD cannot project {name}, whose energy is no distance to a constraint"):
+    with pytest.raises(ValueError, match=f"PBD cannot take {name}, whose energy is no distance to a constraint"):
         wc.PBD(substeps=1).bind(flung("alternating", membrane(name, 0.3)[0]).build(device=device))
 
 

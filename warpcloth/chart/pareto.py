@@ -5,18 +5,8 @@ import textwrap
 from ..lab.machine import in_words
 from ..lab.work_precision import WITHIN, cheapest, front, left_out, spread
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
+from ..solvers import SOLVERS
 
-# Each solver has its colour and marker in every picture.
-_STYLES = {
-    "explicit": ("tab:gray", "s"),
-    "newton": ("black", "o"),
-    "projective-dynamics": ("tab:blue", "^"),
-    "admm": ("tab:cyan", "v"),
-    "pbd": ("tab:pink", "D"),
-    "hierarchical-pbd": ("tab:purple", "P"),
-    "xpbd": ("tab:red", "X"),
-    "constrained-dynamics": ("tab:green", "p"),
-}
 _DASHES = ("-", "--", ":", "-.")
 _WIDTH, _LINES = 46, 48  # characters and lines of the texts beside a picture
 _SMALL, _TEXT = 8.5, 10.0  # sizes of letters [pt]
@@ -61,7 +51,7 @@ def plot_time(path, found):
     ends = {axes: [] for axes in panels}
     for (solver, integrator), line in lines.items():
         line.sort(key=lambda row: row["ms_per_second"])
-        colour, marker = _STYLES[solver]
+        colour, marker = SOLVERS[solver].facts.style
         for axes, name in zip(panels, _ERRORS, strict=True):
             x, y = ([row[of] for row in line] for of in ("ms_per_second", name))
             axes.plot(x, y, color=colour, linewidth=0.7, alpha=0.6)
@@ -100,7 +90,7 @@ def plot_solver(path, found):
     figure, panels, notes = _figure(path, texts)
     seen, floor = {}, max((row["floor"] for row in found["rows"]), default=None)
     for row in found["rows"]:
-        colour, marker = _STYLES[row["solver"]]
+        colour, marker = SOLVERS[row["solver"]].facts.style
         style = _DASHES[seen.setdefault(row["solver"], 0) % len(_DASHES)]
         seen[row["solver"]] += 1
         if not row["points"]:

@@ -90,7 +90,7 @@ def _benchmarks(arguments, device):
     """
     from ..lab.benchmarks import Benchmark, standard
     from ..lab.measurements import SceneRef, Setup
-    from ..solvers import SOLVERS
+    from ..solvers import DEFAULT, SOLVERS
 
     given = {
         "device": str(device),
@@ -104,10 +104,10 @@ def _benchmarks(arguments, device):
         return standard(**given)
     _source, values, scene = named_scene(arguments)
     parameters = {name: values[name] for name in assignments(arguments.p)}
-    arguments.solver = arguments.solver or "newton"
+    arguments.solver = arguments.solver or DEFAULT
     chosen = options(SOLVERS[arguments.solver], assignments(arguments.s))
     step_given = {"dt", "substeps"} & set(chosen)
-    if step_given or arguments.solver != "explicit":
+    if step_given or not SOLVERS[arguments.solver].limited:
         solver = solver_setup(arguments, scene, device).solver
         chosen |= {} if step_given else {"substeps": solver.substeps}
     sizes = tuple(sorted(set(arguments.sizes)))

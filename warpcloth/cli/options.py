@@ -27,9 +27,9 @@ def show_help(arguments):
 
 
 def _of_solver(name):
-    from ..solvers import SOLVERS
+    from ..solvers import DEFAULT, SOLVERS
 
-    name = name or "newton"
+    name = name or DEFAULT
     record = SOLVERS[name]
     found = _listed(f"-s of {name}", record.__doc__, record, scene_files.parameters_of(record))
     return found | {"note": "give dt or substeps, not both; without either a step is chosen"}

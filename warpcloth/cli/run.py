@@ -14,14 +14,15 @@ from ..run import scene_files
 from ..scene.freedom import freedom
 from .terminal import Progress, as_json, check_writable, frames_folder_of, place, say
 
-# A step that all solvers but the explicit ones take well; where no step is given the substeps come nearest to it.
+# A step that all solvers without a limit take well; where no step is given the substeps come nearest to it.
 _STEPS_A_SECOND = 240
 # More substeps a frame than this, and the implicit solver is worth a hint.
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
-Where neither dt nor substeps is given: explicit takes the fewest substeps that are 10 % below the limit about the rest shape
-and below the bound for motion (exact for springs; hinges count as at rest), all others those that come nearest to 1/240 s.
+Where neither dt nor substeps is given: solvers with a limit of stability take the fewest substeps that are 10 % below the limit
+about the rest shape and below the bound for motion (exact for springs; hinges count as at rest), all others those that come
+nearest to 1/240 s.
 """
 
 
@@ -243,15 +244,15 @@ class _Built:
 
 
 def solver_setup(arguments, scene, device, limits=False):
-    """The solver that the arguments name; ``limits`` asks for those of explicit even where its step is given."""
-    from ..solvers import SOLVERS
+    """Returns the solver that the arguments name; ``limits`` asks for those of a limited one even where its step is given."""
+    from ..solvers import DEFAULT, SOLVERS
 
-    arguments.solver = arguments.solver or "newton"
+    arguments.solver = arguments.solver or DEFAULT
     record = SOLVERS[arguments.solver]
     given = scene_files.options(record, scene_files.assignments(arguments.s))
     step_given = "dt" in given or "substeps" in given
     solver = record(**given, **({} if step_given else {"substeps": 1}))  # a wrong option is said before anything is built
-    if arguments.solver != "explicit":
+    if not record.limited:
         if step_given:
             return _Setup(solver, solver)
         solver = replace(solver, substeps=max(1, round(_STEPS_A_SECOND / scene.fps)))
@@ -259,20 +260,20 @@ def solver_setup(arguments, scene, device, limits=False):
     if step_given and not limits:
         return _Setup(solver, solver)
     from ..mesh.ordering import order_of_run
-    from ..solvers.explicit import fewest_substeps, step_limits
+    from ..solvers.step import fewest_substeps
 
     began = time.perf_counter()
     model = scene.build(
         device=device, dtype=arguments.dtype, order=order_of_run(scene, solver), threads=getattr(arguments, "threads", 1)
     )
-    rest, motion = step_limits(model)
+    rest, motion = record.step_limits(model)
     setup = _Setup(solver, solver, None, model, (rest, motion), time.perf_counter() - began)
     if not step_given:
         setup.solver = replace(solver, substeps=fewest_substeps(scene.fps, rest, motion))
         setup.chosen = f"by default the fewest stable ones, limits {rest:.3g} and {motion:.3g} s"
     setup.checked = setup.solver
-    if solver.scheme == "symplectic" and 1.0 / (scene.fps * setup.solver.per_frame(scene.fps)) < min(rest, motion):
-        setup.checked = replace(setup.solver, above_limit="allow")  # which leaves out a second search for the limits
+    if setup.solver.stable(1.0 / (scene.fps * setup.solver.per_frame(scene.fps)), min(rest, motion)):
+        setup.checked = setup.solver.without_limits()  # which leaves out a second search for them
     return setup
 
 
@@ -283,10 +284,12 @@ def _fewest(fps, limit):
 
 def _hint(arguments, setup, scene):
     """A line for those who may wait longer than they need, or None."""
+    from ..solvers import DEFAULT
+
     substeps = setup.solver.per_frame(scene.fps)
-    if arguments.solver != "explicit" or substeps <= _MANY_SUBSTEPS:
+    if not setup.solver.limited or substeps <= _MANY_SUBSTEPS:
         return None
-    return f"warpcloth: hint: explicit takes {substeps:,} substeps a frame here; --solver newton may suit better"
+    return f"warpcloth: hint: {setup.solver.name} takes {substeps:,} substeps a frame here; --solver {DEFAULT} may suit better"
 
 
 def _solver_facts(arguments, setup, fps):

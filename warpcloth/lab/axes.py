@@ -7,7 +7,6 @@ import numpy as np
 
 from ..base.checks import number, whole
 from ..run.scene_files import find_source
-from ..solvers import Explicit
 from .measurements import Setup
 
 # Approximate number of frames that are compared; a frame has as many steps as that needs.
@@ -166,7 +165,7 @@ def record_at(setup, values):
             if name not in known:
                 raise ValueError(f"{setup.solver} has no {name}")
             record = replace(record, **{name: values[name]})
-    return replace(record, above_limit="allow") if isinstance(record, Explicit) else record
+    return record.without_limits()
 
 
 def _furthest(scene):

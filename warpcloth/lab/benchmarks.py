@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from ..base.quiet import initialise_warp
+from ..solvers import SOLVERS
 from . import bandwidth
 from .axes import refined
 from .campaign import sweep
@@ -21,7 +22,7 @@ class Benchmark:
 
     Attributes:
         scene: Of any size.
-        setup: Of explicit without a step, the fewest stable substeps of each size.
+        setup: Of a limited solver without a step, the fewest stable substeps of each size.
         sizes: Resolutions of the scene, see :func:`warpcloth.lab.axes.refined`; without any the scene as it is.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
@@ -49,42 +50,23 @@ class Benchmark:
 
     def setup_of(self, scene):
         """The :class:`Setup` for one of the scenes."""
-        if self.setup.solver != "explicit" or {"dt", "substeps"} & set(self.setup.options):
+        solver = self.setup.solver
+        if not SOLVERS[solver].limited or {"dt", "substeps"} & set(self.setup.options):
             return self.setup
-        (fewest, *_) = setups_of_runs(scene, ["explicit"], self.device, self.dtype)
-        return Setup("explicit", {**fewest.options, **self.setup.options})
-
-
-_STEPS = {"substeps": 4}
-_SWEEPS = {**_STEPS, "iterations": 20}
-# Sizes such that a frame of each solver takes less than about a second, on one core and on an H200.
-_SMALL, _LARGE = (16, 32, 64, 128), (64, 128, 256, 512, 1024)
-_SETUPS = (
-    (Setup("explicit"), {"cpu": _SMALL, "cuda": _LARGE}),
-    (Setup("newton", _STEPS), {"cpu": (16, 32, 64), "cuda": (32, 64, 128)}),
-    (Setup("projective-dynamics", _SWEEPS), {"cpu": (16, 32, 64), "cuda": (32, 64, 128, 256)}),
-    (Setup("admm", _SWEEPS), {"cpu": (16, 32, 64), "cuda": (32, 64, 128, 256)}),
-    (Setup("pbd", _SWEEPS), {"cpu": _SMALL, "cuda": _LARGE}),
-    (Setup("hierarchical-pbd", _SWEEPS), {"cpu": _SMALL, "cuda": _LARGE}),
-    (Setup("xpbd", _SWEEPS), {"cpu": _SMALL, "cuda": _LARGE}),
-    (Setup("constrained-dynamics", {**_STEPS, "iterations": 1}), {"cpu": (8, 16, 32), "cuda": (16, 32, 64)}),
-)
-
-
-# Local sweeps alone: so many that what a frame takes besides, its points on the host above all, does not count.
-_LOCAL = Setup("pbd", {"substeps": 1, "iterations": 1000, "sweep": "vertex-averaged"})
-_LOCAL_SIZES = {"cpu": _SMALL, "cuda": (256, 512, 1024, 2048)}
+        (fewest, *_) = setups_of_runs(scene, [solver], self.device, self.dtype)
+        return Setup(solver, {"substeps": fewest.options["substeps"], **self.setup.options})
 
 
 def standard(**given):
-    """Every solver on ``hanging`` of growing size, and Jacobi sweeps over the springs of ``net``.
+    """Returns every solver on ``hanging`` of growing size, and what else their records measure.
 
     Args:
         given: Further fields of each :class:`Benchmark`.
     """
     kind = "cuda" if given.get("device", "cpu").startswith("cuda") else "cpu"
-    local = Benchmark(SceneRef("net"), _LOCAL, _LOCAL_SIZES[kind], **given)
-    return [*(Benchmark(SceneRef("hanging"), setup, sizes[kind], **given) for setup, sizes in _SETUPS), local]
+    listed = [(name, each) for name, record in SOLVERS.items() for each in record.facts.benchmarks]
+    listed.sort(key=lambda one: one[1].scene != "hanging")
+    return [Benchmark(SceneRef(one.scene), Setup(name, one.options), getattr(one, kind), **given) for name, one in listed]
 
 
 class Run:

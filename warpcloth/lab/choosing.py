@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict, dataclass
 
 from ..base.checks import number
+from ..solvers import SOLVERS
 from . import trajectory
 from .campaign import kept, sweep
 from .measurements import Setup, task
@@ -189,8 +190,8 @@ def ladders(setups):
 
 def _measured(setup, result, machine):
     spread = None if result["spread"] is None else tuple(result["spread"])
-    # Of explicit alone a finer step may be taken where one is refused.
-    final = result["status"] == "slow" or (result["status"] == "refused" and setup.solver != "explicit")
+    # Of a limited solver alone a finer step may be taken where one is refused.
+    final = result["status"] == "slow" or (result["status"] == "refused" and not SOLVERS[setup.solver].limited)
     return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final)
 
 

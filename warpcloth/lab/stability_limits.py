@@ -1,6 +1,6 @@
 """Where methods fail by theory: of a scene and a solver, numbers that are above 1 beyond the limit."""
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -8,8 +8,7 @@ from ..base.turns import in_turn
 from ..core.hessian import Hessian
 from ..kernels.term import HessianPolicy
 from ..numerics.integrators import INTEGRATORS
-from ..numerics.sweeps import colours
-from ..solvers import ADMM, PBD, XPBD, ConstrainedDynamics, Explicit, HierarchicalPBD, Newton, ProjectiveDynamics
+from ..numerics.sweeps import IN_PLACE, colours
 from ..solvers.admm import best_weights
 from ..solvers.explicit import step_limits
 from ..terms import Spring
@@ -35,54 +34,120 @@ _MOST = 1000
 
 
 def rules(scene, record, steps):
-    """Ratios by name, each above 1 beyond its limit.
-
-    - ``2/ω_max``: h over the largest stable step of symplectic Euler about the rest shape; ``2/√(2 Σk/m)``: over that in
-      motion, see :func:`warpcloth.solvers.explicit.step_limits`.
-    - ``forward Euler``: the fastest mode grows by 1 + h²ω² a step and has grown by :data:`GROWTH` at the end; no line if
-      damping stops it.
-    - ``h² = m/(k(L/l − 1))``: hₑ √−λ with λ the least eigenvalue of M⁻¹∂²U/∂x² at the start and hₑ the effective step of the
-      integrator, beyond which what a step minimises is not convex (Choi and Ko 2002).
-    - ``ω λ_max = 2``: of Jacobi sweeps over springs, averaged or not, see :func:`largest_relaxation`.
-    - ``Gauss–Seidel, |z| = 1``: for sweeps in their own order; beyond it energy grows by :data:`GROWTH` in the steps of the
-      run, see :func:`largest_ordered`.
-    - ``1 + Σk h²/m iterations``: those that projections need across springs, for accelerated ones the root.
-    - ``r = 1/(2hω)``: the weight of ADMM divided by the smallest that :func:`warpcloth.solvers.admm.best_weights` gives, that
-      of the stiffest element. A larger weight stalls, a smaller one oscillates.
-    - ``a ring an iteration``: how many edges lie between pins and the furthest vertex, over the sweeps.
+    """Returns, by name, the ratios of those of :data:`LIMITS` that the record of a solver names, each above 1 beyond its limit.
 
     Args:
-        scene: The :class:`warpcloth.Scene` of a cell, of finite stiffness but for sweeps.
+        scene: The :class:`warpcloth.Scene` of a cell.
         record: The options of the solver.
         steps: Length of the run.
     """
-    h, hard = 1.0 / (scene.fps * record.per_frame(scene.fps)), any(np.isinf(t.stiffness).any() for t in scene.terms)
-    he = INTEGRATORS[getattr(record, "integrator", "euler")].part * h
-    damped = any(getattr(term, "damping", None) is not None for term in scene.terms)
-    found = {}
-    if isinstance(record, (PBD, XPBD)) and not damped and all(isinstance(term, Spring) for term in scene.terms):
-        if record.sweep not in ("coloured", "sequential"):
-            found["ω λ_max = 2"] = record.relaxation / largest_relaxation(scene, he, record)
-        elif (limit := largest_ordered(scene, he, record, steps)) is not None:
-            found["Gauss–Seidel, |z| = 1"] = record.relaxation / limit
-    if isinstance(record, (PBD, XPBD)) and len(scene.pins.vertices):
-        found["a ring an iteration"] = rings(scene) / record.iterations
-    if hard or isinstance(record, (PBD, HierarchicalPBD)):
-        return found
-    model = scene.build(dtype="float64")
-    if isinstance(record, Explicit):
-        rest, motion = step_limits(model)
-        if record.scheme == "forward":
-            return {} if damped else {"forward Euler": steps * np.log1p((2.0 * h / rest) ** 2) / np.log(GROWTH)}
-        return {"2/ω_max": h / rest, "2/√(2 Σk/m)": h / motion}
-    if isinstance(record, ProjectiveDynamics):
-        needed = 1.0 + 2.0 * (he / step_limits(model)[1]) ** 2
-        found["1 + Σk h²/m iterations"] = (needed if record.acceleration == "none" else np.sqrt(needed)) / record.iterations
-    if isinstance(record, ADMM) and record.weight != "auto":
-        found["r = 1/(2hω)"] = record.weight / min(best_weights(model, elements, he).min() for elements in model.terms)
-    if isinstance(record, (Newton, ProjectiveDynamics, ADMM, XPBD, ConstrainedDynamics)):
-        found["h² = m/(k(L/l − 1))"] = he * np.sqrt(concave_rate(model))
-    return found
+    cell = _Cell(scene, record, steps)
+    found = {name: LIMITS[name](cell) for name in record.facts.limits}
+    return {name: ratio for name, ratio in found.items() if ratio is not None}
+
+
+class _Cell:
+    """A scene, a solver and the length of a run, with what limits need of them.
+
+    Attributes:
+        h: Step [s].
+        he: Effective step hₑ [s] of the integrator.
+        damped: Whether a term has damping.
+        springs: Whether all terms are springs without damping.
+    """
+
+    def __init__(self, scene, record, steps):
+        self.scene, self.record, self.steps = scene, record, steps
+        self.h = 1.0 / (scene.fps * record.per_frame(scene.fps))
+        self.he = INTEGRATORS[getattr(record, "integrator", "euler")].part * self.h
+        self.damped = any(getattr(term, "damping", None) is not None for term in scene.terms)
+        self.springs = not self.damped and all(isinstance(term, Spring) for term in scene.terms)
+
+    @cached_property
+    def model(self):
+        """The model in float64; None where a stiffness is infinite."""
+        if any(np.isinf(term.stiffness).any() for term in self.scene.terms):
+            return None
+        return self.scene.build(dtype="float64")
+
+    @cached_property
+    def step_limits(self):
+        """As :func:`warpcloth.solvers.explicit.step_limits` gives them; None where a stiffness is infinite."""
+        return self.model and step_limits(self.model)
+
+
+def _below_rest(cell):
+    """Divides h by the largest stable step of symplectic Euler about the rest shape."""
+    if cell.record.scheme == "symplectic" and cell.step_limits:
+        return cell.h / cell.step_limits[0]
+
+
+def _below_motion(cell):
+    """Divides h by the largest stable step in motion, see :func:`warpcloth.solvers.explicit.step_limits`."""
+    if cell.record.scheme == "symplectic" and cell.step_limits:
+        return cell.h / cell.step_limits[1]
+
+
+def _forward_growth(cell):
+    """The fastest mode grows by 1 + h²ω² a step and has grown by :data:`GROWTH` at the end; no line if damping stops it."""
+    if cell.record.scheme == "forward" and not cell.damped and cell.step_limits:
+        return cell.steps * np.log1p((2.0 * cell.h / cell.step_limits[0]) ** 2) / np.log(GROWTH)
+
+
+def _jacobi_relaxation(cell):
+    """Relaxation of Jacobi sweeps over springs, averaged or not, see :func:`largest_relaxation`."""
+    if cell.springs and cell.record.sweep not in IN_PLACE:
+        return cell.record.relaxation / largest_relaxation(cell.scene, cell.he, cell.record)
+
+
+def _ordered_relaxation(cell):
+    """Relaxation of Gauss–Seidel sweeps over springs; beyond it energy grows by :data:`GROWTH` in the steps of the run, see
+    :func:`largest_ordered`."""
+    if cell.springs and cell.record.sweep in IN_PLACE:
+        limit = largest_ordered(cell.scene, cell.he, cell.record, cell.steps)
+        return None if limit is None else cell.record.relaxation / limit
+
+
+def _reach(cell):
+    """Divides how many edges lie between pins and the furthest vertex by the sweeps."""
+    if len(cell.scene.pins.vertices):
+        return rings(cell.scene) / cell.record.iterations
+
+
+def _iterations_across(cell):
+    """Divides the iterations that projections need across springs, for accelerated ones the root, by those there are."""
+    if cell.step_limits:
+        needed = 1.0 + 2.0 * (cell.he / cell.step_limits[1]) ** 2
+        return (needed if cell.record.acceleration == "none" else np.sqrt(needed)) / cell.record.iterations
+
+
+def _weight(cell):
+    """Divides the weight of ADMM by the smallest that :func:`warpcloth.solvers.admm.best_weights` gives, that of the stiffest
+    element. A larger weight stalls, a smaller one oscillates."""
+    if cell.record.weight != "auto" and cell.model:
+        return cell.record.weight / min(best_weights(cell.model, elements, cell.he).min() for elements in cell.model.terms)
+
+
+def _not_convex(cell):
+    """hₑ √−λ with λ the least eigenvalue of M⁻¹∂²U/∂x² at the start and hₑ the effective step of the integrator, beyond which
+    what a step minimises is not convex (Choi and Ko 2002)."""
+    if cell.model:
+        return cell.he * np.sqrt(concave_rate(cell.model))
+
+
+# Functions of a :class:`_Cell` that give the ratio, or None where the limit does not apply, by the name that the line has. The
+# record of a solver names those that it has.
+LIMITS = {
+    "2/ω_max": _below_rest,
+    "2/√(2 Σk/m)": _below_motion,
+    "forward Euler": _forward_growth,
+    "h² = m/(k(L/l − 1))": _not_convex,
+    "ω λ_max = 2": _jacobi_relaxation,
+    "Gauss–Seidel, |z| = 1": _ordered_relaxation,
+    "1 + Σk h²/m iterations": _iterations_across,
+    "r = 1/(2hω)": _weight,
+    "a ring an iteration": _reach,
+}
 
 
 @in_turn
@@ -141,7 +206,7 @@ def largest_relaxation(scene, he, record):
     moved = J @ J.T
     n = record.iterations
     # Of the first sweep λ is 0 before it.
-    largest, v = _largest(moved + diags_array(factor * compliance) if isinstance(record, XPBD) and n > 1 else moved)
+    largest, v = _largest(moved + diags_array(factor * compliance) if record.multipliers and n > 1 else moved)
     part = float(v @ (moved @ v)) / largest
     least = _LEAST[getattr(record, "integrator", "euler")]
     return float(1.0 + (((1.0 - least) / part - 1.0) ** (1.0 / n) if n % 2 else 1.0)) / largest
@@ -171,7 +236,7 @@ def largest_ordered(scene, he, record, steps):
         return None
     J = (_directions(scene, pairs) * np.repeat(np.sqrt(_inverse_masses(scene)), 3)).toarray()
     share = _share(mobility, compliance, record)
-    kept = compliance if isinstance(record, XPBD) else np.zeros_like(compliance)
+    kept = compliance if record.multipliers else np.zeros_like(compliance)
     integrator = getattr(record, "integrator", "euler")
     to_and_fro = integrator == "midpoint"
     return _largest_ordered(

@@ -28,20 +28,6 @@ def dissipations(model, he):
     return [_dissipation(model, elements, he, 0.0) for elements in model.terms if elements.damping is not None]
 
 
-def refuse_apart(model, solver):
-    """Refuses damping that does not merge with what a solver projects.
-
-    Raises:
-        ValueError: Naming the term, the solver and what would work.
-    """
-    for elements in model.terms:
-        if elements.damping is not None and not elements.term.dissipation.merges:
-            raise ValueError(
-                f"{solver} cannot take the damping of {elements.label}, which no projection has in it; "
-                "ADMM, Newton or Explicit can"
-            )
-
-
 def _dissipation(model, elements, he, stiffness):
     """The elements of D, or with their ``stiffness`` those of both."""
     dissipation, count = elements.term.dissipation, elements.count

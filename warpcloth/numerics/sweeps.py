@@ -11,7 +11,6 @@ from ..core.thread_pool import ThreadPool
 from ..fast.jacobi_sweeps import Gather, Scatter
 from ..kernels import project as kernels
 from ..kernels.clusters import correct_clusters
-from ..model.damping import refuse_apart
 from ..terms.refresh import EVALUATION, Moment
 
 # By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
@@ -45,21 +44,6 @@ def colours(constraints, free):
     if len(pairs):
         wp.utils.graph_coloring_assign(wp.array(pairs, dtype=wp.int32, device="cpu"), found)
     return found.numpy()
-
-
-def refuse_unprojectable(model, solver):
-    """Refuses terms that have nothing to project on.
-
-    Raises:
-        ValueError: Naming the term, the solver and what would work.
-    """
-    refuse_apart(model, solver)
-    for elements in model.terms:
-        if elements.term.project is None and elements.term.constraint is None:
-            raise ValueError(
-                f"{solver} cannot project {elements.label}, whose energy is no distance to a constraint; "
-                "ADMM, Newton or Explicit can"
-            )
 
 
 class Sweep:

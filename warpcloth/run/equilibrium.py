@@ -9,7 +9,7 @@ from ..base.checks import choice, number, whole
 from ..base.turns import in_turn
 from ..core.status import Residual, Result, Status, digits, sentence
 from ..numerics.minimise import Minimiser
-from ..solvers.solver import refuse_hard
+from ..terms.needs import FINITE, refuse_unmet
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
@@ -74,7 +74,7 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     whole("iterations", iterations, 1)
     choice("linear", linear, ("factorised", "cg"))
     model = scene.build(device=device, dtype=dtype)
-    refuse_hard(model, "equilibrium", "give a finite stiffness")
+    refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
     base = wp.clone(model.positions)
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0)
     descent = _Descent(minimiser, base, tolerance, iterations)

@@ -1,4 +1,9 @@
-"""One file a method: options, the equation and its source, the bound solver."""
+"""The catalogue of the solvers: one file, one record and two lines here for each.
+
+A file has the equation of a method and its source, its options, what it needs of every term, how it is measured and drawn, and
+the bound solver. What takes a solver by name, such as the command line, finds those of :data:`SOLVERS`; :func:`register` adds
+one from elsewhere.
+"""
 
 from .admm import ADMM
 from .constrained_dynamics import ConstrainedDynamics
@@ -7,23 +12,14 @@ from .hierarchical_pbd import HierarchicalPBD
 from .newton import Newton
 from .pbd import PBD
 from .projective_dynamics import ProjectiveDynamics
+from .step import DEFAULT as DEFAULT
+from .step import SOLVERS as SOLVERS
+from .step import register as register
 from .xpbd import XPBD
 
-SOLVERS = {
-    "explicit": Explicit,
-    "newton": Newton,
-    "projective-dynamics": ProjectiveDynamics,
-    "admm": ADMM,
-    "pbd": PBD,
-    "hierarchical-pbd": HierarchicalPBD,
-    "xpbd": XPBD,
-    "constrained-dynamics": ConstrainedDynamics,
-}
-
-__all__ = [
+__all__ = [  # noqa: RUF022: in the order in which lists and charts have them
     "ADMM",
     "PBD",
-    "SOLVERS",
     "XPBD",
     "ConstrainedDynamics",
     "Explicit",
@@ -31,3 +27,6 @@ __all__ = [
     "Newton",
     "ProjectiveDynamics",
 ]
+
+for _name in __all__:
+    register(globals()[_name])

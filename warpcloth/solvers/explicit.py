@@ -1,8 +1,7 @@
 """Explicit integration: symplectic and forward Euler, and the largest step that the first may take."""
 
-import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 
 import numpy as np
@@ -13,8 +12,11 @@ from ..core.hessian import Hessian
 from ..fast.gather_step import Gather, Sweep, is_fine
 from ..fast.subdomains import Ranges
 from ..model.damping import dissipations
+from ..terms.needs import FINITE
 from ..terms.refresh import STEP, Moment
-from .solver import LaunchedStepper, Step, refuse_hard
+from .facts import Benchmark, Facts
+from .solver import LaunchedStepper
+from .step import Step
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,16 @@ class Explicit(Step):
         ValueError: If an option breaks a rule.
     """
 
+    name = "explicit"
+    needs = (FINITE,)
+    limited = True
+    facts = Facts(
+        benchmarks=(Benchmark({}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),),
+        runs=tuple({"fewest": factor} for factor in (1.0, 1.5, 2.0)),
+        limits=("forward Euler", "2/ω_max", "2/√(2 Σk/m)"),
+        style=("tab:gray", "s"),
+    )
+
     scheme: str = "symplectic"
     above_limit: str = "refuse"
 
@@ -49,6 +61,16 @@ class Explicit(Step):
     def staggered(self):
         return self.scheme == "symplectic"
 
+    @classmethod
+    def step_limits(cls, model):
+        return step_limits(model)
+
+    def stable(self, h, limit):
+        return self.scheme == "symplectic" and h < limit
+
+    def without_limits(self):
+        return replace(self, above_limit="allow")
+
     def bind(self, model):
         """The solver on ``model``, all scratch allocated.
 
@@ -59,14 +81,14 @@ class Explicit(Step):
         Raises:
             ValueError: If the step is above the limit and that is not allowed, or a stiffness is infinite.
         """
-        refuse_hard(model, "Explicit")
+        self.refuse(model)
         stepper = self._on(ExplicitStepper, model)
         if self.above_limit == "refuse":
             self._refuse_unstable(model, stepper.h)
         return stepper
 
     def _refuse_unstable(self, model, h):
-        if self.scheme == "symplectic" and h < limit_in_motion(model):
+        if self.stable(h, limit_in_motion(model)):
             return  # below that about the rest shape too
         rest, motion = step_limits(model)
         fewest = int(1.0 / (model.scene.fps * rest)) + 1 if rest > 0.0 else 0
@@ -106,7 +128,7 @@ def step_limits(model):
     Raises:
         ValueError: If a stiffness is infinite.
     """
-    refuse_hard(model, "Explicit")
+    Explicit.refuse(model)
     found = [(_at_rest(*stiff), _in_motion(*stiff)) for stiff in map(_linearised, _unlike(model))]
     return tuple(min(limits) for limits in zip(*found, strict=True))
 
@@ -118,7 +140,7 @@ def limit_in_motion(model):
     Raises:
         ValueError: If a stiffness is infinite.
     """
-    refuse_hard(model, "Explicit")
+    Explicit.refuse(model)
     return min(_in_motion(*_linearised(one)) for one in _unlike(model))
 
 
@@ -164,11 +186,6 @@ def _at_rest(stiff, damping):
 def _in_motion(stiff, damping):
     """The second of :func:`step_limits`."""
     return float(_root(_bounds(stiff), 0.0 if damping is None else _bounds(damping)).min(initial=np.inf))
-
-
-def fewest_substeps(fps, rest, motion):
-    """The fewest steps a frame that are 10 % below the limit about the rest shape and below that in motion [s]."""
-    return math.floor(1.0 / (fps * min(rest / 1.1, motion))) + 1
 
 
 def _root(k, c):

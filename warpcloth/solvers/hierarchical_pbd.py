@@ -8,8 +8,11 @@ import warp as wp
 from ..base.checks import number, whole
 from ..kernels.hierarchy import follow
 from ..numerics.hierarchy import levels, on_device
-from ..numerics.sweeps import Sweep, refuse_unprojectable
-from .solver import LaunchedStepper, Step, require_model
+from ..numerics.sweeps import Sweep
+from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
+from .facts import Benchmark, Facts, grid
+from .solver import LaunchedStepper
+from .step import Step
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,14 @@ class HierarchicalPBD(Step):
         ValueError: If an option breaks a rule.
     """
 
+    name = "hierarchical-pbd"
+    needs = (MERGED_DAMPING, LOCAL_STEP)
     ordered = closes = True
+    facts = Facts(
+        benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),),
+        runs=grid([(8, 2), (15, 2), (30, 2), (60, 2), (120, 2)]),
+        style=("tab:purple", "P"),
+    )
 
     iterations: int = 20
     coarse_iterations: int = 5
@@ -69,8 +79,7 @@ class HierarchicalPBD(Step):
         Raises:
             ValueError: If a term has nothing to project on.
         """
-        require_model(model)
-        refuse_unprojectable(model, "HierarchicalPBD")
+        self.refuse(model)
         return self._on(HierarchicalPBDStepper, model)
 
 

@@ -3,8 +3,11 @@
 from dataclasses import dataclass
 
 from ..base.checks import choice, number, whole
-from ..numerics.sweeps import IN_PLACE, SWEEPS, Sweep, refuse_unprojectable
-from .solver import LaunchedStepper, Step, require_model
+from ..numerics.sweeps import IN_PLACE, SWEEPS, Sweep
+from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
+from .facts import Benchmark, Facts, grid
+from .solver import LaunchedStepper
+from .step import Step
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,24 @@ class PBD(Step):
         ValueError: If an option breaks a rule.
     """
 
-    closes = True
+    name = "pbd"
+    needs = (MERGED_DAMPING, LOCAL_STEP)
+    closes, multipliers = True, False  # λ does not add up over the sweeps of a step
+    facts = Facts(
+        benchmarks=(
+            Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),
+            # Jacobi sweeps alone: so many that what a frame takes besides, its points on the host above all, does not count.
+            Benchmark(
+                {"substeps": 1, "iterations": 1000, "sweep": "vertex-averaged"},
+                cpu=(16, 32, 64, 128),
+                cuda=(256, 512, 1024, 2048),
+                scene="net",
+            ),
+        ),
+        runs=grid([(30, 1), (60, 1), (120, 1), (240, 1)], stiffness="per-step"),
+        limits=("ω λ_max = 2", "Gauss–Seidel, |z| = 1", "a ring an iteration"),
+        style=("tab:pink", "D"),
+    )
 
     iterations: int = 20
     sweep: str = "coloured"
@@ -68,8 +88,7 @@ class PBD(Step):
         Raises:
             ValueError: If a term has nothing to project on.
         """
-        require_model(model)
-        refuse_unprojectable(model, "PBD")
+        self.refuse(model)
         return self._on(PBDStepper, model)
 
 

@@ -16,7 +16,10 @@ from ..kernels import accelerate as kernels
 from ..kernels.minimise import add_inertia
 from ..numerics.acceleration import LBFGS, Anderson, Chebyshev
 from ..numerics.linear import CopyFactors, DiagonalScaling
-from .solver import ImplicitStep, Stepper, refuse_hard, refuse_without_projection
+from ..terms.needs import FINITE, MERGED_DAMPING, PROJECTION
+from .facts import Benchmark, Facts, grid
+from .solver import Stepper
+from .step import ImplicitStep
 
 ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")
 
@@ -51,7 +54,20 @@ class ProjectiveDynamics(ImplicitStep):
         ValueError: If an option breaks a rule.
     """
 
+    name = "projective-dynamics"
+    needs = (FINITE, MERGED_DAMPING, PROJECTION)
     residual = Residual(UNBALANCED, "times the largest at the start of its step")
+    facts = Facts(
+        benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64), cuda=(32, 64, 128, 256)),),
+        runs=(
+            *grid([(8, 2), (16, 2), (24, 2), (48, 2), (96, 2)], integrator="midpoint", acceleration="none"),
+            *grid([(8, 5), (16, 5)], integrator="bdf2"),
+            *grid([(4, 20)]),
+        ),
+        one_step=tuple({"acceleration": acceleration, "tolerance": 1e-14} for acceleration in ACCELERATIONS),
+        limits=("1 + Σk h²/m iterations", "h² = m/(k(L/l − 1))"),
+        style=("tab:blue", "^"),
+    )
 
     iterations: int = 20
     tolerance: float = 1e-3
@@ -73,8 +89,7 @@ class ProjectiveDynamics(ImplicitStep):
         Raises:
             ValueError: If a term has infinite stiffness, or an energy that is no squared distance.
         """
-        refuse_hard(model, "ProjectiveDynamics")
-        refuse_without_projection(model, "ProjectiveDynamics")
+        self.refuse(model)
         return self._on(ProjectiveDynamicsStepper, model)
 
 

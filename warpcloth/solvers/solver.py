@@ -1,24 +1,19 @@
-"""What all solvers share: the options of the step and the state of a bound solver."""
+"""The state of a bound solver, and what all of them share."""
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
-from ..base.checks import choice, number, shown, whole
-from ..base.limits import MOST
 from ..base.turns import in_turn, methods_in_turn
 from ..core.capture import Segment
 from ..core.reset import Reset
 from ..core.status import Result
 from ..core.thread_pool import ThreadPool
 from ..kernels import step as kernels
-from ..model.damping import damped_terms, refuse_apart
-from ..model.model import Model
+from ..model.damping import damped_terms
 from ..numerics.integrators import INTEGRATORS
-from ..scene.scene import Scene
 from ..terms.refresh import STEP
 
 
@@ -27,108 +22,6 @@ class State(NamedTuple):
 
     x: wp.array
     v: wp.array
-
-
-@dataclass(frozen=True)
-class Step:
-    """The step of a solver: exactly one of ``dt`` and ``substeps``.
-
-    Attributes:
-        dt: Step [s]; 1/(fps·dt) must be a whole number.
-        substeps: Steps a frame.
-        ordered: Whether the result depends on the order of elements by more than rounding.
-        staggered: Whether velocities belong to a time half a step before that of the positions.
-        closes: Whether a step may close a gap regardless of the stiffness.
-        residual: The :class:`warpcloth.core.status.Residual` that its steps report, or None.
-
-    Raises:
-        ValueError: If both or neither are given, or they are not above 0.
-    """
-
-    ordered = staggered = closes = False
-    residual = None
-
-    def __init_subclass__(cls, **options):
-        super().__init_subclass__(**options)
-        methods_in_turn(cls, "bind")
-
-    dt: float | None = None
-    substeps: int | None = None
-
-    def residual_on(self, model):
-        """Returns the residual that its steps report on a model, which may depend on the terms."""
-        return self.residual
-
-    @property
-    def divides(self):
-        """Whether several threads can share the steps of one cloth."""
-        return False
-
-    def _on(self, stepper, model):
-        """The :class:`Stepper` of type ``stepper`` on a model, or of copies for several threads one for each of these.
-
-        Raises:
-            ValueError: If several threads are to share one cloth, and cannot, or are more than its vertices.
-        """
-        threads = model.threads
-        if threads > 1 and model.copies > 1:
-            from .threaded import ThreadedStepper
-
-            return ThreadedStepper(self, stepper, model)
-        if threads > 1 and not self.divides:
-            raise ValueError(
-                f"threads is {threads} with one copy, whose steps {type(self).__name__} cannot divide as it is set; "
-                "Explicit and HierarchicalPBD can, PBD and XPBD with sweep='coloured', and with several copies every solver"
-            )
-        if threads > model.count:
-            raise ValueError(f"threads is {threads} for {model.count} vertices; there must be one for each at least")
-        return stepper(self, model)
-
-    def __post_init__(self):
-        if (self.dt is None) == (self.substeps is None):
-            raise ValueError("exactly one of dt and substeps must be given")
-        if self.dt is not None:
-            number("dt", self.dt, above=0.0)
-        else:
-            whole("substeps", self.substeps, 1)
-
-    def per_frame(self, fps):
-        """Steps a frame at ``fps``."""
-        if self.substeps is not None:
-            return self.substeps
-        steps = 1.0 / max(float(fps) * self.dt, 1e-300)
-        if steps > MOST:
-            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be {MOST:,} steps or less, not {steps:.3g}")
-        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
-            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be a whole number of steps, not {steps:g}")
-        return round(steps)
-
-
-@dataclass(frozen=True)
-class ImplicitStep(Step):
-    """The step of a solver that minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x), where ``integrator`` says what hₑ and x̃ are.
-
-    On x″ = −ω²x implicit Euler, of first order, multiplies the energy by 1/(1 + ω²h²) a step; midpoint, of second order, keeps
-    it, and the noise of stiff springs with it; BDF2, of second order, damps by about 1 − ω⁴h⁴/2 where ωh is small and what is
-    stiff nearly at once. All three are stable for every h in linear motion and converged steps; in free fall, midpoint and BDF2
-    are exact. Midpoint does not forgive steps too large for what turns, nor few iterations: of 4 substeps a frame ``hanging``
-    diverges with projective dynamics and ADMM, and of more vertices with XPBD, whose sweeps go to and fro by midpoint, for
-    always in one order they made it grow at every step tried. BDF2 takes two steps of Euler when it is bound, to know what was
-    before; it may start out of balance or damped by as much as one likes.
-
-    Attributes:
-        dt, substeps: See :class:`Step`.
-        integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, see :mod:`warpcloth.numerics.integrators`.
-
-    Raises:
-        ValueError: If an option breaks a rule.
-    """
-
-    integrator: str = "euler"
-
-    def __post_init__(self):
-        super().__post_init__()
-        choice("integrator", self.integrator, tuple(INTEGRATORS))
 
 
 class Stepper:
@@ -161,7 +54,6 @@ class Stepper:
         methods_in_turn(cls, "__init__", "step", "frame", "prepare_frame", "reset")
 
     def __init__(self, options, model, integrator=None):
-        require_model(model)
         fps = model.scene.fps
         self.options, self.model = options, model
         self.steps_per_frame = options.per_frame(fps)
@@ -316,56 +208,3 @@ class LaunchedStepper(Stepper):
 
     def note(self):
         """Takes down how the steps since the last call ended; of methods that have no residual nothing."""
-
-
-def require_model(model):
-    """Refuses what is no model, such as the scene that one is built from.
-
-    Raises:
-        ValueError: Saying how to make one.
-    """
-    if not isinstance(model, Model):
-        given = "a Scene" if isinstance(model, Scene) else shown(model)
-        raise ValueError(f"model is {given}; bind takes a model, which scene.build() makes")
-
-
-def refuse_hard(model, solver, instead="PBD, HierarchicalPBD and XPBD take hard constraints, or give a finite stiffness"):
-    """Refuses infinite stiffness for a solver that needs forces.
-
-    Raises:
-        ValueError: Naming the term, the solver and what would work; or as :func:`require_model`.
-    """
-    require_model(model)
-    for elements in model.terms:
-        if elements.hard:
-            raise ValueError(f"{solver} cannot take {elements.label} with infinite stiffness; {instead}")
-
-
-def refuse_cells(model, solver):
-    """Refuses terms of cells, for a solver that takes elements one by one.
-
-    Raises:
-        ValueError: Naming the term, the solver and what would work; or as :func:`require_model`.
-    """
-    require_model(model)
-    for elements in model.terms:
-        if elements.cells:
-            raise ValueError(
-                f"{solver} cannot take {elements.label}, whose bodies are no elements by themselves; "
-                "PBD, HierarchicalPBD, XPBD, ConstrainedDynamics, ProjectiveDynamics, Newton or Explicit can"
-            )
-
-
-def refuse_without_projection(model, solver):
-    """Refuses terms whose energy is no squared distance to a set, for a solver that lives on that.
-
-    Raises:
-        ValueError: Naming the term, the solver and what would work.
-    """
-    refuse_apart(model, solver)
-    for elements in model.terms:
-        if elements.term.project is None:
-            others = "ADMM, Newton or Explicit" if elements.term.constraint is None else "ADMM, Newton, Explicit, PBD or XPBD"
-            raise ValueError(
-                f"{solver} cannot take {elements.label}, whose energy is no squared distance to a set; {others} can"
-            )

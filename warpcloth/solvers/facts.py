@@ -1,0 +1,46 @@
+"""How benchmarks, charts and `choose` measure a solver, and how they draw it: data that stand in its record."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A scene of several sizes that `warpcloth bench` runs with a solver.
+
+    Attributes:
+        options: Of the record; of a limited solver without a step, whose fewest stable substeps are taken.
+        cpu, cuda: Resolutions of the scene, such that a frame takes less than about a second on one core and on an H200.
+        scene: Name of the scene.
+    """
+
+    options: dict
+    cpu: tuple = (16, 32, 64)
+    cuda: tuple = (32, 64, 128)
+    scene: str = "hanging"
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is measured of a solver, and how it is drawn.
+
+    Attributes:
+        benchmarks: A :class:`Benchmark` each.
+        runs: Options of the settings that trade speed for accuracy: about what no other setting of the solver beats in both
+            error and time on ``hanging`` with 32² and 64² vertices, and around it. Substeps are of frames of 1/60 s; of a
+            limited solver ``fewest`` in their place is a multiple of the fewest stable ones.
+        one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler; of those with
+            a tolerance, none ends by it.
+        limits: Names of the limits, see :data:`warpcloth.lab.stability_limits.LIMITS`, that maps of stability draw.
+        style: Colour and marker in every picture.
+    """
+
+    benchmarks: tuple = (Benchmark({"substeps": 4}),)
+    runs: tuple = tuple({"substeps": substeps} for substeps in (1, 4, 16, 64))
+    one_step: tuple = ()
+    limits: tuple = ()
+    style: tuple = ("tab:brown", "*")
+
+
+def grid(settings, **options):
+    """Returns options for each (substeps, iterations)."""
+    return tuple({"substeps": substeps, "iterations": iterations, **options} for substeps, iterations in settings)

@@ -1,0 +1,195 @@
+"""What all records of options share: the step, what a solver needs of every term, and its facts; and the catalogue by name."""
+
+import math
+from dataclasses import dataclass
+
+from ..base.checks import choice, number, shown, whole
+from ..base.limits import MOST
+from ..base.turns import methods_in_turn
+from ..model.model import Model
+from ..numerics.integrators import INTEGRATORS
+from ..scene.scene import Scene
+from ..terms.needs import refuse_unmet
+from .facts import Facts
+from .threaded import ThreadedStepper
+
+# The records by their names, in the order in which lists and charts have them.
+SOLVERS = {}
+# The name of the one that is taken where none is given.
+DEFAULT = "newton"
+
+
+def register(record):
+    """Adds the record of a solver to :data:`SOLVERS`, so that the command line, benchmarks and charts know it by its ``name``.
+
+    Args:
+        record: A frozen dataclass that derives from :class:`Step` and has a ``name``.
+
+    Returns:
+        The same class, so that this is a decorator too.
+
+    Raises:
+        ValueError: If it is no such class, or another one of that name is registered.
+    """
+    if not (isinstance(record, type) and issubclass(record, Step)) or record.name is None:
+        raise ValueError(
+            f"{record!r} is no solver; it must be a class with a name that derives from warpcloth.solvers.step.Step"
+        )
+    known = SOLVERS.get(record.name, record)
+    if known.__module__ != record.__module__:
+        raise ValueError(f"{record.name!r} is the name of a solver of {known.__module__}; {record.__name__} must have another")
+    SOLVERS[record.name] = record
+    return record
+
+
+@dataclass(frozen=True)
+class Step:
+    """The step of a solver: exactly one of ``dt`` and ``substeps``.
+
+    Attributes:
+        dt: Step [s]; 1/(fps·dt) must be a whole number.
+        substeps: Steps a frame.
+        ordered: Whether the result depends on the order of elements by more than rounding.
+        staggered: Whether velocities belong to a time half a step before that of the positions.
+        closes: Whether a step may close a gap regardless of the stiffness.
+        residual: The :class:`warpcloth.core.status.Residual` that its steps report, or None.
+        name: Its name on the command line and in benchmarks and charts; each record has its own.
+        needs: What it needs of every term, of :mod:`warpcloth.terms.needs`, those to be told first at first.
+        facts: The :class:`warpcloth.solvers.facts.Facts` by which it is measured and drawn.
+        limited: Whether it refuses steps above a limit, which :meth:`step_limits` then finds.
+
+    Raises:
+        ValueError: If both or neither are given, or they are not above 0.
+    """
+
+    ordered = staggered = closes = False
+    residual = None
+    name, needs, facts, limited = None, (), Facts(), False
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        methods_in_turn(cls, "bind")
+
+    dt: float | None = None
+    substeps: int | None = None
+
+    def residual_on(self, model):
+        """Returns the residual that its steps report on a model, which may depend on the terms."""
+        return self.residual
+
+    @property
+    def divides(self):
+        """Whether several threads can share the steps of one cloth."""
+        return False
+
+    def bind(self, model):
+        """Returns the solver on ``model``, all scratch allocated.
+
+        Raises:
+            ValueError: If a term lacks what the solver needs.
+        """
+        raise NotImplementedError  # every solver has its own
+
+    @classmethod
+    def refuse(cls, model, needs=None, options="", instead=None):
+        """Refuses what is no model, and terms that lack what the solver needs.
+
+        Args:
+            model: The model.
+            needs: Of a solver as it is set, where these are not those of the record.
+            options: The option that asks for them, as text.
+            instead: The option that does not.
+
+        Raises:
+            ValueError: Naming the term, the solver and what would work.
+        """
+        if not isinstance(model, Model):
+            given = "a Scene" if isinstance(model, Scene) else shown(model)
+            raise ValueError(f"model is {given}; bind takes a model, which scene.build() makes")
+        if needs is None:
+            refuse_unmet(model.terms, cls.__name__, cls.needs, {record.__name__: record.needs for record in SOLVERS.values()})
+        else:
+            refuse_unmet(model.terms, f"{cls.__name__} with {options}", needs, {instead: ()})
+
+    @classmethod
+    def step_limits(cls, model):
+        """Returns the largest stable steps [s] on a model, about the rest shape and in motion, of a ``limited`` solver."""
+        raise NotImplementedError
+
+    def stable(self, h, limit):
+        """Returns whether a step h [s] below the smaller of :meth:`step_limits` is stable."""
+        return h < limit
+
+    def without_limits(self):
+        """Returns the record without its check of limits, for maps, which go beyond them, and where they are kept anyway."""
+        return self
+
+    def _on(self, stepper, model):
+        """The :class:`Stepper` of type ``stepper`` on a model, or of copies for several threads one for each of these.
+
+        Raises:
+            ValueError: If several threads are to share one cloth, and cannot, or are more than its vertices.
+        """
+        threads = model.threads
+        if threads > 1 and model.copies > 1:
+            return ThreadedStepper(self, stepper, model)
+        if threads > 1 and not self.divides:
+            able = ", ".join(record.__name__ for record in SOLVERS.values() if record(substeps=1).divides)
+            raise ValueError(
+                f"threads is {threads} with one copy, whose steps {type(self).__name__} cannot divide as it is set; "
+                f"{able} can as they are by default, and with several copies every solver"
+            )
+        if threads > model.count:
+            raise ValueError(f"threads is {threads} for {model.count} vertices; there must be one for each at least")
+        return stepper(self, model)
+
+    def __post_init__(self):
+        if (self.dt is None) == (self.substeps is None):
+            raise ValueError("exactly one of dt and substeps must be given")
+        if self.dt is not None:
+            number("dt", self.dt, above=0.0)
+        else:
+            whole("substeps", self.substeps, 1)
+
+    def per_frame(self, fps):
+        """Steps a frame at ``fps``."""
+        if self.substeps is not None:
+            return self.substeps
+        steps = 1.0 / max(float(fps) * self.dt, 1e-300)
+        if steps > MOST:
+            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be {MOST:,} steps or less, not {steps:.3g}")
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be a whole number of steps, not {steps:g}")
+        return round(steps)
+
+
+@dataclass(frozen=True)
+class ImplicitStep(Step):
+    """The step of a solver that minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x), where ``integrator`` says what hₑ and x̃ are.
+
+    On x″ = −ω²x implicit Euler, of first order, multiplies the energy by 1/(1 + ω²h²) a step; midpoint, of second order, keeps
+    it, and the noise of stiff springs with it; BDF2, of second order, damps by about 1 − ω⁴h⁴/2 where ωh is small and what is
+    stiff nearly at once. All three are stable for every h in linear motion and converged steps; in free fall, midpoint and BDF2
+    are exact. Midpoint does not forgive steps too large for what turns, nor few iterations: of 4 substeps a frame ``hanging``
+    diverges with projective dynamics and ADMM, and of more vertices with XPBD, whose sweeps go to and fro by midpoint, for
+    always in one order they made it grow at every step tried. BDF2 takes two steps of Euler when it is bound, to know what was
+    before; it may start out of balance or damped by as much as one likes.
+
+    Attributes:
+        dt, substeps: See :class:`Step`.
+        integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, see :mod:`warpcloth.numerics.integrators`.
+
+    Raises:
+        ValueError: If an option breaks a rule.
+    """
+
+    integrator: str = "euler"
+
+    def __post_init__(self):
+        super().__post_init__()
+        choice("integrator", self.integrator, tuple(INTEGRATORS))
+
+
+def fewest_substeps(fps, rest, motion):
+    """The fewest steps a frame that are 10 % below the limit about the rest shape and below that in motion [s]."""
+    return math.floor(1.0 / (fps * min(rest / 1.1, motion))) + 1
