@@ -17,15 +17,16 @@ from .step import SOLVERS as SOLVERS
 from .step import register as register
 from .xpbd import XPBD
 
-__all__ = [  # noqa: RUF022: in the order in which lists and charts have them
-    "ADMM",
-    "PBD",
-    "XPBD",
-    "ConstrainedDynamics",
+# In the order in which lists and charts have them.
+__all__ = [  # noqa: RUF022
     "Explicit",
-    "HierarchicalPBD",
     "Newton",
     "ProjectiveDynamics",
+    "ADMM",
+    "PBD",
+    "HierarchicalPBD",
+    "XPBD",
+    "ConstrainedDynamics",
 ]
 
 for _name in __all__:
