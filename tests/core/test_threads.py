@@ -257,7 +257,7 @@ def test_more_threads_than_cores_warn(device):
         (lambda: wc.Newton(substeps=1).bind(square().build(threads=2)), "one copy, whose steps Newton cannot divide"),
         (
             lambda: wc.XPBD(substeps=1, sweep="constraint-averaged").bind(square().build(threads=2)),
-            "PBD and XPBD with sweep='coloured'",
+            "PBD, HierarchicalPBD, XPBD can as they are by default",
         ),
         (
             lambda: wc.Explicit(substeps=500).bind(declared(TERMS["clusters"]).build(threads=2)),
