@@ -1,6 +1,7 @@
 """Writes the tables of README.md and docs/ that follow from the code, between their markers: python docs/tables.py"""
 
 import argparse
+import inspect
 import re
 from pathlib import Path
 
@@ -16,6 +17,17 @@ def table(head, rows):
     """A table of Markdown, of one line a row."""
     lines = [head, ["---"] * len(head), *rows]
     return "".join(f"| {' | '.join(cells)} |\n".replace("|  |", "| |") for cells in lines)
+
+
+def energies():
+    """Lists the energies, from the docstrings of their records: the first paragraph, and the unit of the stiffness."""
+    rows = []
+    for name, energy in TERMS.items():
+        said = inspect.getdoc(energy)
+        first = re.sub(r" \([A-Z][^()]*\d{4}\)", "", " ".join(said.partition("\n\n")[0].split()))  # without its source
+        symbol, unit = re.search(r"stiffness: (\S+?),? .*?(\[.*?\])", said, re.DOTALL).groups()
+        rows.append([f"`{name}`", first.rstrip(".").replace("|", "\\|"), f"{symbol} {unit}"])
+    return table(("Term", "Energy", "Stiffness"), rows)
 
 
 def attributes():
@@ -72,7 +84,7 @@ def options():
     return "".join(parts) + "\n"
 
 
-TABLES = {"attributes": attributes, "term attributes": term_attributes, "options": options}
+TABLES = {"energies": energies, "attributes": attributes, "term attributes": term_attributes, "options": options}
 
 
 def filled(text):

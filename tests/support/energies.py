@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.outside import Plane
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import Sums
@@ -27,6 +28,7 @@ MATERIALS = {
     "NeoHookeanMembrane": {"poisson_ratio": 0.3},
     "SpringLimit": {"least": 0.9, "most": 1.05},
     "StrainLimit": {"least": 0.9, "most": 1.05},
+    "Plane": {"normal": np.array([1.0, 2.0, 2.0])},
 }
 
 
@@ -66,6 +68,7 @@ DECLARED = {
     "StrainLimit": lambda mesh: wc.StrainLimit(stiffness=50.0, **MATERIALS["StrainLimit"]),
     "QuadraticBending": lambda mesh: wc.QuadraticBending(stiffness=0.5),
     "DihedralBending": lambda mesh: wc.DihedralBending(stiffness=0.5),
+    "Plane": lambda mesh: Plane(stiffness=5.0, **MATERIALS["Plane"]),
     "Attachment": lambda mesh: wc.Attachment(vertices=np.arange(len(mesh.points)), stiffness=5.0, targets=1.1 * mesh.points),
 }
 

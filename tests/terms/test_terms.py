@@ -26,6 +26,7 @@ from support.energies import (
     model_of,
     random_rotation,
 )
+from support.outside import Plane
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
@@ -36,18 +37,25 @@ from warpcloth.kernels import admm as splitting
 from warpcloth.kernels import assemble, project
 from warpcloth.kernels import constraint_jacobian as jacobian
 from warpcloth.kernels import constraint_rows as constrain
-from warpcloth.kernels import terms as energies
 from warpcloth.kernels.fast import gather_forces as gather
 from warpcloth.kernels.fast.parts import chain_of
 from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.kernels.vectors import types
 from warpcloth.model.model import DTYPES
-from warpcloth.terms import needs
+from warpcloth.terms import TERMS, needs
 
 RAW, CLAMP, ABSOLUTE = HessianPolicy
+
+
+def _has_another(term):
+    """Whether its damping is another energy."""
+    return term.dissipation is not None and term.dissipation.term is not None
+
+
 # Elements by themselves; cells are in test_clusters.py.
-DECLARABLE = tuple(term for term in energies.CATALOGUE if term is not energies.RIGID_CLUSTER)
-CATALOGUE = (*DECLARABLE, *energies.DISSIPATIONS)
+DECLARABLE = tuple(energy.term for energy in (*TERMS.values(), Plane) if not energy.term.cells)
+# And what damping makes of those whose sum with it is another energy, or that it stands beside.
+CATALOGUE = (*DECLARABLE, *dict.fromkeys(term.dissipation.term for term in DECLARABLE if _has_another(term)))
 SCALES = (1.0, 0.1, 0.01, 0.001)
 
 
@@ -56,17 +64,12 @@ def named(terms):
 
 
 every_term = pytest.mark.parametrize("term", **named(CATALOGUE))
-MEMBRANES = ("CorotatedMembrane", "StVKMembrane", "NeoHookeanMembrane", "StrainLimit")
-LIMITS = ("SpringLimit", "StrainLimit")
+MEMBRANES = tuple(term.name for term in DECLARABLE if term.vertices == 3)
+LIMITS = tuple(term.name for term in DECLARABLE if term.slack)
 
 
 def term_of(name):
     return next(term for term in CATALOGUE if term.name == name)
-
-
-def moves(term):
-    """Whether a term has a local projection."""
-    return bool(term.project or term.constraint)
 
 
 def rest_state(term, points, indices):
@@ -79,7 +82,7 @@ constraining = pytest.mark.parametrize("term", **named([term for term in CATALOG
 world_bound = pytest.mark.xfail(strict=True, reason="holds on to a place in the world, so moving all vertices costs energy")
 invariant = pytest.mark.parametrize(
     "term",
-    [pytest.param(term, marks=world_bound if term.name == "Attachment" else (), id=term.name) for term in CATALOGUE],
+    [pytest.param(term, marks=world_bound if term.vertices == 1 else (), id=term.name) for term in CATALOGUE],
 )
 
 
@@ -517,8 +520,8 @@ def test_hessian_turns_with_the_stencil(term, policy, device):
     rotation = random_rotation(np.random.default_rng(3))
     turn = np.kron(np.eye(term.vertices), rotation)
     turned = elements.at(elements.x @ rotation.T)
-    if term.name == "Attachment":
-        turned = turned._replace(rest=elements.rest @ rotation.T)
+    if term.vertices == 1:  # the world turns too: a target, or a normal and a distance
+        turned = turned._replace(rest=np.column_stack([elements.rest[:, :3] @ rotation.T, elements.rest[:, 3:]]))
     hessian = elements.hessian(policy)
     # Rounding of y by eps|x| against the smallest length, on which f″ depends.
     tolerance = FEW * eps("float64") * norms(hessian) * np.abs(elements.x).max() / smallest_length(elements.x)
@@ -527,9 +530,19 @@ def test_hessian_turns_with_the_stencil(term, policy, device):
 
 # --- projections and constraints
 
+
+def in_planes(points, rest):
+    """The points of planes nearest to some points, (E, 3)."""
+    for _ in range(2):  # the second takes what the first rounded
+        distance = np.einsum("ij,ij->i", points, rest[:, :3]) - rest[:, 3]
+        points = points - distance[:, None] * rest[:, :3]
+    return points
+
+
 # For each term with a projection: random points of the set that it projects on, (rest (E, P), random) → (E, M, 3).
 SETS = {
     "Spring": lambda rest, random: rest[:, None] * unit(random.normal(size=(len(rest), 1, 3))),
+    "Plane": lambda rest, random: in_planes(random.normal(size=(len(rest), 3)), rest)[:, None],
     "SpringLimit": lambda rest, random: between(*rest.T, random)[:, None, None] * unit(random.normal(size=(len(rest), 1, 3))),
     "CorotatedMembrane": lambda rest, random: isometries(len(rest), random),
     "StrainLimit": lambda rest, random: stretched(isometries(len(rest), random), *rest[:, 3:].T, random),
@@ -617,7 +630,7 @@ def test_correction_solves_the_local_step(term, dtype, hard, device):
     )
 
 
-@pytest.mark.parametrize("term", **named([term for term in CATALOGUE if moves(term)]))
+@pytest.mark.parametrize("term", **named([term for term in CATALOGUE if term.moves]))
 @every_dtype
 def test_without_stiffness_nothing_is_corrected(term, dtype, device):
     elements = stencils(term, "random", 1.0, dtype, device)
@@ -968,7 +981,7 @@ def test_edges_stay_finite(term, edge, scale, dtype, device):
     elements = edge_stencils(term, edge, scale, dtype, device)
     results = [elements.energy(), elements.gradient(), *(elements.hessian(policy) for policy in HessianPolicy)]
     hard = elements._replace(stiffness=np.full(len(elements.x), np.inf))
-    if moves(term):
+    if term.moves:
         results += [stencil.correction(np.ones(elements.x.shape[:2]), 0.1) for stencil in (elements, hard)]
     if term.project:
         results.append(elements.projection(elements.y()))
@@ -1009,7 +1022,7 @@ def test_nan_is_never_swallowed(term, dtype, device):
                 broken = elements.at(x)
                 assert np.isnan(broken.energy()).all()
                 assert np.isnan(broken.gradient()).any(axis=(1, 2)).all()
-                if moves(term):
+                if term.moves:
                     assert np.isnan(broken.correction(np.ones(x.shape[:2]), 0.1)).any(axis=(1, 2)).all()
 
 
@@ -1353,7 +1366,7 @@ def test_a_cylinder_costs_its_curvature(name, pattern, degrees, least, most, dev
     ],
 )
 def test_a_solver_refuses_a_term_that_lacks_what_it_needs(name, changes, wanted, sentence):
-    term = next(term for term in energies.CATALOGUE if term.name == name)
+    term = TERMS[name].term
     elements = SimpleNamespace(**{"term": term, "label": name, "hard": False, "damping": None} | changes)
     others = {"A": wanted, "B": [needs.LOCAL_STEP], "C": [needs.LOCAL_STEP, needs.FINITE]}
     if sentence is None:
