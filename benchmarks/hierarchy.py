@@ -55,11 +55,10 @@ SETUPS += [wc.HierarchicalPBD(substeps=4, iterations=n, coarse_iterations=20) fo
 def measure(scene, options, device):
     """Time of a step and what it leaves."""
     stepper = options.bind(scene.build(device=device))
-    start = [wp.clone(array) for array in stepper.state]
+    start = stepper.state.copy()
     times = []
     for _ in range(3):
-        for array, first in zip(stepper.state, start, strict=True):
-            wp.copy(array, first)
+        stepper.state.assign(start)
         wp.synchronize()
         began = time.perf_counter()
         stepper.step()

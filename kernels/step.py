@@ -221,33 +221,31 @@ def note_move(dtype):
 
 
 @cache
-def reset(dtype, led: bool, packed: bool = False):
-    """Kernel over vertices: those of the copies that the mask (B,) has true start again, and what is kept of these copies too.
+def reset(dtype, led: bool):
+    """Kernel over vertices: those of the copies that the mask (B,) has true start again, and what else is carried of these too.
 
-    Arrays that a stepper lacks are None. A pinned vertex stands still; where keyframes lead it (``led``) it starts where the
-    model has it, whatever ``x_start`` says. What places are rounded by may be ``packed``, see :mod:`.places`.
+    A pinned vertex stands still; where keyframes lead it (``led``) it starts where the model has it, whatever ``x_start`` says.
+    What is carried beside x and v are arrays by their addresses, all of whose bits start as those of another or as 0. Each has
+    so many words of 32 bits a vertex, or where that number is negative a copy.
     """
     vec3, _ = types(dtype)
-    low_type = wp.int32 if packed else vec3
 
     @wp.kernel(module="unique", enable_backward=False)
     def reset_vertices(
+        # parameters
         mask: wp.array(dtype=wp.bool),
         inverse_mass: wp.array(dtype=dtype),
         per_copy: int,
+        # starts
         positions: wp.array(dtype=vec3),
         x_start: wp.array(dtype=vec3),
         v_start: wp.array(dtype=vec3),
-        move_start: wp.array(dtype=vec3),
-        v_before_start: wp.array(dtype=vec3),
+        starts: wp.array(dtype=wp.uint64),
+        words: wp.array(dtype=wp.int32),
         # out
+        carried: wp.array(dtype=wp.uint64),
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
-        move: wp.array(dtype=vec3),
-        v_before: wp.array(dtype=vec3),
-        low: wp.array(dtype=low_type),
-        step: wp.array(dtype=wp.int32),
-        worst: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
         copy = i // per_copy
@@ -258,18 +256,20 @@ def reset(dtype, led: bool, packed: bool = False):
                 v[i] = vec3()
                 if wp.static(led):
                     x[i] = positions[i]
-            if move:
-                move[i] = move_start[i]
-                v_before[i] = v_before_start[i]
-            if low:
-                if wp.static(packed):
-                    low[i] = 0
-                else:
-                    low[i] = vec3()
-            if i == copy * per_copy:
-                if step:
-                    step[copy] = 0
-                if worst:
-                    worst[copy] = wp.float64(0.0)
+            for k in range(carried.shape[0]):
+                count = words[k]
+                row = i
+                if count < 0:
+                    count = -count
+                    row = copy
+                if words[k] > 0 or i == copy * per_copy:
+                    end = (row + 1) * count
+                    out = wp.array(ptr=carried[k], shape=(end,), dtype=wp.int32)
+                    start = wp.array(ptr=starts[k], shape=(end,), dtype=wp.int32)
+                    for word in range(row * count, end):
+                        if starts[k] == wp.uint64(0):
+                            out[word] = 0
+                        else:
+                            out[word] = start[word]
 
     return reset_vertices

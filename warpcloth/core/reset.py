@@ -19,24 +19,38 @@ class Reset:
 
     def __init__(self, stepper):
         self.stepper, self.model = stepper, stepper.model
-        packed = stepper.low is not None and stepper.low.dtype is wp.int32
-        self._kernel = self.model.kernel(kernels.reset, self.model.dtype, self.model.pins is not None, packed)
+        self._kernel = None
         self._buffers = {}  # of what comes from the host, made when first needed
 
+    def _prepare(self):
+        """Finds the kernel, and the arrays beside x and v with their starts, by address and size."""
+        model, state = self.model, self.stepper.state
+        names = [name for name in state.arrays if name not in ("x", "v")]
+        carried, starts = ([arrays.get(name) for name in names] for arrays in (state.arrays, state.starts))
+        words = [wp.types.type_size_in_bytes(array.dtype) // 4 for array in carried]
+        per_vertex = [len(array) == model.count and model.per_copy > 1 for array in carried]
+        words = [count if each else -count for count, each in zip(words, per_vertex, strict=True)]
+        self._given = [
+            wp.array([0 if array is None else array.ptr for array in starts], dtype=wp.uint64, device=model.device),
+            wp.array(words, dtype=wp.int32, device=model.device),
+            wp.array([array.ptr for array in carried], dtype=wp.uint64, device=model.device),
+        ]
+        self._kernel = model.kernel(kernels.reset, model.dtype, model.pins is not None)
+
     def __call__(self, mask, positions, velocities):
-        stepper, model, integrator = self.stepper, self.model, self.stepper.integrator
-        started = integrator.started if integrator else (None, None)
-        past = integrator.past if integrator else (None, None)
-        if started[0] is not None and not (positions is None and velocities is None):
+        stepper, model = self.stepper, self.model
+        if stepper.state.starts and not (positions is None and velocities is None):
             raise ValueError(
                 "reset takes no positions or velocities with integrator='bdf2', which knows what was before the start of the "
                 "model alone; 'euler' and 'midpoint' take them"
             )
         mask, x, v = self.on_device(mask, positions, velocities)
         x, v = model.positions if x is None else x, model.velocities if v is None else v
-        given = [mask, model.inverse_mass, model.per_copy, model.positions, x, v, *started]
-        worst = stepper.worst and stepper.worst.array
-        model.launch(self._kernel, model.count, given, [*stepper.state, *past, stepper.low, stepper.count, worst])
+        if self._kernel is None:
+            self._prepare()
+        starts, words, carried = self._given
+        given = [mask, model.inverse_mass, model.per_copy, model.positions, x, v, starts, words]
+        model.launch(self._kernel, model.count, given, [carried, *stepper.state])
         if stepper.residual.any() or any(result is not Result.COMPLETED for result in stepper.results):
             chosen = mask.numpy()
             stepper.residual = np.where(chosen, 0.0, stepper.residual)

@@ -22,7 +22,6 @@ class Euler:
     """
 
     part = 1.0  # hₑ/h
-    past = started = (None, None)  # what is kept from step to step beside x and v, and what it is before the first
 
     def __init__(self, stepper):
         self.stepper, self.he = stepper, self.part * stepper.h
@@ -98,7 +97,8 @@ class BDF2(Euler):
 
     def __init__(self, stepper):
         super().__init__(stepper)
-        self.past = self.move, self.v_before = [stepper.model.vectors() for _ in range(2)]
+        self.move = stepper.state.add("move before", stepper.model.vectors())
+        self.v_before = stepper.state.add("v before", stepper.model.vectors())
 
     def start(self):
         """Finds what was before, by steps with x₋₁ = x₀ and v₋₁ = v₀, which are those of Euler of hₑ, and puts the state back.
@@ -113,7 +113,7 @@ class BDF2(Euler):
                 stepper.count.fill_(-1)  # pins are led to their first keyframe, which is where they are
             stepper.step()
         self._launch(kernels.start_bdf2, [stepper.h, model.velocities, v], [self.move, self.v_before])
-        self.started = [wp.clone(array) for array in self.past]
+        stepper.state.start_here("move before", "v before")
         wp.copy(x, model.positions)
         wp.copy(v, model.velocities)
 

@@ -88,7 +88,7 @@ def _copies(stepper, number):
     if not model.device.is_cuda:
         return [_HostCopy(stepper) for _ in range(number)]
     on_host(model.device, "reading a frame")
-    shape = (number, len(stepper.state), model.count)
+    shape = (number, 2, model.count)
     found = wp.empty(shape, dtype=model.vec3, device=model.device)
     host = wp.empty(shape, dtype=model.vec3, device="cpu", pinned=True)
     places = None if model.places is None else wp.array(model.places, dtype=wp.int32, device=model.device)

@@ -245,10 +245,13 @@ class ExplicitStepper(LaunchedStepper):
         symplectic = options.scheme == "symplectic"
         if self.pool.threads > 1:
             _refuse_undivided(model)
-            self.passes = Ranges(self.pool, model, self.state, self.h, symplectic, self.count, is_fine(model))
+            self.passes = Ranges(self.pool, model, tuple(self.state), self.h, symplectic, self.count, is_fine(model))
         else:
-            self.passes = (Gather if model.device.is_cuda else Sweep)(model, self.state, self.h, symplectic, is_fine(model))
-        self.model, self.low = self.passes.model, self.passes.low
+            self.passes = (Gather if model.device.is_cuda else Sweep)(
+                model, tuple(self.state), self.h, symplectic, is_fine(model)
+            )
+        self.model = self.passes.model
+        self.state.add("position residual", self.passes.low)
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):

@@ -1,27 +1,18 @@
 """The state of a bound solver, and what all of them share."""
 
 from functools import partial
-from typing import NamedTuple
 
-import numpy as np
 import warp as wp
 
 from ..base.turns import in_turn, methods_in_turn
 from ..core.capture import Segment
 from ..core.reset import Reset
-from ..core.status import Result
+from ..core.state import State
 from ..core.thread_pool import ThreadPool
 from ..kernels import step as kernels
 from ..model.damping import damped_terms
 from ..numerics.integrators import INTEGRATORS
 from ..terms.refresh import STEP
-
-
-class State(NamedTuple):
-    """x (N,) [m] and v (N,) [m/s] of all copies, on the device."""
-
-    x: wp.array
-    v: wp.array
 
 
 class Stepper:
@@ -30,7 +21,7 @@ class Stepper:
     The constructor of one that takes an integrator ends with ``integrator.start()``, which may step.
 
     Attributes:
-        state: :class:`State`.
+        state: The :class:`warpcloth.core.state.State`.
         h: Step [s].
         model: The model; with an integrator its terms are damped as a step has it, and its terms are those that are refreshed.
         integrator: What leads to x̃ and away from the minimiser, see :mod:`warpcloth.numerics.integrators`; None of steps that
@@ -46,8 +37,6 @@ class Stepper:
     factorise_seconds = 0.0
     iterations = 1
     uniform = False  # Whether all steps have as many iterations
-    low = None  # What x is rounded by (B·n,), vectors [m] or packed, of steps that keep it
-    worst = None  # Mirror of the residuals of methods that keep the largest on the device, (B,)
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -58,15 +47,33 @@ class Stepper:
         self.options, self.model = options, model
         self.steps_per_frame = options.per_frame(fps)
         self.h = 1.0 / (fps * self.steps_per_frame)
-        self.state = State(*(model.state or (wp.clone(model.positions), wp.clone(model.velocities))))
-        self.results, self.residual = [Result.COMPLETED] * model.copies, np.zeros(model.copies)
+        motion = model.state or (wp.clone(model.positions), wp.clone(model.velocities))
+        self.state = State(*motion, model.copies)
         self.count = None if model.pins is None else wp.zeros(model.copies, dtype=wp.int32, device=model.device)
+        self.state.add("steps of keyframes", self.count)
         self._reset = None
         self.integrator, self.he = None, self.h
         if integrator is not None:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he
             self.model = model.with_terms(damped_terms(model, self.he))
+
+    @property
+    def results(self):
+        """See :class:`warpcloth.core.state.State`, as of the next."""
+        return self.state.results
+
+    @results.setter
+    def results(self, results):
+        self.state.results = results
+
+    @property
+    def residual(self):
+        return self.state.residual
+
+    @residual.setter
+    def residual(self, residual):
+        self.state.residual = residual
 
     def launch_pins(self, parts=1, x=None, v=None):
         """Moves the pins that have keyframes on by h/``parts``, the same in all calls, in x and v if not in the state."""

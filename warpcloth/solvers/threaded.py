@@ -6,8 +6,9 @@ import numpy as np
 import warp as wp
 
 from ..core.reset import Reset
+from ..core.state import State
 from ..core.thread_pool import ThreadPool
-from .solver import State, Stepper
+from .solver import Stepper
 
 
 class ThreadedStepper(Stepper):
@@ -24,12 +25,13 @@ class ThreadedStepper(Stepper):
 
     def __init__(self, options, stepper, model):
         self.options, self.model, self._reset = options, model, None
-        self.state = State(wp.clone(model.positions), wp.clone(model.velocities))
+        motion = wp.clone(model.positions), wp.clone(model.velocities)
         self.pool = ThreadPool(min(model.threads, model.copies))
         shares = self.pool.threads
         ends = [model.copies * share // shares for share in range(shares + 1)]
         self._copies = list(pairwise(ends))
-        self.shares = [stepper(options, model.share(first, end - first, self.state)) for first, end in self._copies]
+        self.shares = [stepper(options, model.share(first, end - first, motion)) for first, end in self._copies]
+        self.state = State(*motion, model.copies, [share.state for share in self.shares])
         first = self.shares[0]
         self.steps_per_frame, self.h, self.he, self.uniform = first.steps_per_frame, first.h, first.he, first.uniform
         self.factorise_seconds = sum(share.factorise_seconds for share in self.shares)

@@ -140,7 +140,8 @@ class XPBDStepper(LaunchedStepper):
         self._gradient = gradient(model, corrected=True, terms=self.sweep.elements) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
         self._acceleration = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
-        self.worst = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))
+        largest = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
+        self._largest = Mirror(self.state.add("largest acceleration", largest))
         self._keep_largest = model.kernel(keep_largest)
         gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
         self._scale = np.where(gravity > 0.0, gravity, 1.0)
@@ -173,7 +174,7 @@ class XPBDStepper(LaunchedStepper):
             self._gradient.add(self.state.x, self._force, d)
         self._launch_momentum(1.0)
         self._sums.largest(model.inverse_mass, self._force, self._acceleration)
-        model.launch(self._keep_largest, model.copies, [self._acceleration], [self.worst.array])
+        model.launch(self._keep_largest, model.copies, [self._acceleration], [self._largest.array])
         self.launch_finish(d)
 
     def _launch_momentum(self, sign):
@@ -181,6 +182,6 @@ class XPBDStepper(LaunchedStepper):
         self.model.launch(self._add_momentum, self.model.count, given, [self._force])
 
     def note(self):
-        self.residual = self.worst.read() / self._scale
+        self.residual = self._largest.read() / self._scale
         for copy in np.flatnonzero(~np.isfinite(self.residual)):
             self.results[copy] = Result.DIVERGED

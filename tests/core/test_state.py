@@ -1,0 +1,62 @@
+"""A state is all that a solver carries from step to step: put back it leads to the same bits, and a copy is a value."""
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from support.setups import SOLVERS
+from warpcloth.core.state import State
+
+MESH = wc.Mesh.grid(5, 5, pattern="alternating")
+
+
+def moved(offset=0.0):
+    """A damped cloth, one of whose corners is led; far from the origin explicit steps keep the position residual."""
+    mesh = wc.Mesh(MESH.points + offset, MESH.triangles, grid_shape=MESH.grid_shape)
+    pins = [0, 4]
+    keyframes = mesh.points[pins][None] + np.linspace(0.0, 0.2, 5)[:, None, None] * [0.0, 0.3, 1.0]
+    terms = [wc.Spring(pairs=("structural", "shear"), stiffness=100.0, damping=0.0 if offset else 0.05)]
+    return wc.Scene(mesh, density=0.1, terms=terms, pins=wc.Pins(pins, keyframes), fps=480.0, duration=0.025)
+
+
+def steps(stepper, number):
+    for _ in range(number):
+        stepper.step()
+    return stepper.state.copy()
+
+
+CASES = [(name, 0.0, dtype) for name in SOLVERS for dtype in ("float32", "float64")]
+
+
+@pytest.mark.parametrize(("name", "offset", "dtype"), [*CASES, ("explicit", 300.0, "float32")])
+def test_from_a_state_on_all_bits_are_the_same(name, offset, dtype, device):
+    stepper = SOLVERS[name].bind(moved(offset).build(device=device, dtype=dtype))
+    assert ("position residual" in stepper.state.arrays) == bool(offset)
+    before = steps(stepper, 2)
+    stored = before.to_host()
+    after = steps(stepper, 3)
+    assert isinstance(before, State) and before == before.copy() and before != after
+    stepper.state.assign(before)
+    assert stepper.state == before and steps(stepper, 3) == after
+    another = SOLVERS[name].bind(moved(offset).build(device=device, dtype=dtype))
+    another.state.from_host(stored)
+    assert another.state == before and steps(another, 3) == after
+
+
+def test_states_of_a_shared_batch_go_with_the_whole(device):
+    if device != "cpu":
+        pytest.skip("threads are for the CPU")
+    model = moved().build(copies=3, threads=2)
+    stepper = wc.XPBD(substeps=1, iterations=2, integrator="bdf2").bind(model)
+    before = steps(stepper, 2)
+    after = steps(stepper, 2)
+    stepper.state.assign(before)
+    assert stepper.state == before and steps(stepper, 2) == after
+    stepper.state.from_host(before.to_host())
+    assert stepper.state == before and steps(stepper, 2) == after
+
+
+def test_another_scene_has_another_state(device):
+    one, other = (wc.Newton(substeps=1, integrator=way).bind(moved().build(device=device)) for way in ("euler", "bdf2"))
+    with pytest.raises(ValueError, match="another scene or solver"):
+        one.state.from_host(other.state.to_host())

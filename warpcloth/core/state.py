@@ -1,0 +1,106 @@
+"""The state of a bound solver as a value: all that it carries from one step to the next."""
+
+import numpy as np
+import warp as wp
+
+from .status import Result
+
+
+class State:
+    """Every array that a step reads and leaves to the next one, and what the steps so far have said.
+
+    A stepper adds what it carries beside x and v: the position residual of compensated summation, what a method knows of the
+    step before, how far keyframes have led the pins. Whoever copies, compares, resets or stores a state needs to know none of
+    these. What a step computes anew before it reads it is no part of a state.
+
+    Args:
+        x: Positions (N,) vectors [m].
+        v: Velocities (N,) vectors [m/s].
+        batch_size: Copies of the scene, B.
+        parts: States of parts of the batch, whose x and v are views of these.
+
+    Attributes:
+        arrays: All arrays on the device, by name, ``"x"`` and ``"v"`` among them; of N or of B entries.
+        starts: Values of these at the start of the model, of those of which it is neither 0 nor in the model.
+        results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
+        residual: The largest residual of each copy so far, (B,).
+    """
+
+    def __init__(self, x, v, batch_size, parts=()):
+        self.arrays, self.starts, self.parts = {"x": x, "v": v}, {}, tuple(parts)
+        self.results, self.residual = [Result.COMPLETED] * batch_size, np.zeros(batch_size)
+
+    @property
+    def x(self):
+        """Positions (N,) vectors [m]."""
+        return self.arrays["x"]
+
+    @property
+    def v(self):
+        """Velocities (N,) vectors [m/s]."""
+        return self.arrays["v"]
+
+    def __iter__(self):
+        """x and v, for ``x, v = stepper.state``."""
+        return iter((self.x, self.v))
+
+    def add(self, name, array):
+        """Takes an array in that is 0 at the start, or None, and returns it."""
+        if array is not None:
+            self.arrays[name] = array
+        return array
+
+    def start_here(self, *names):
+        """Takes the values that the arrays of these names have now for those at the start."""
+        self.starts |= {name: wp.clone(self.arrays[name]) for name in names}
+
+    def copy(self):
+        """A state of its own, equal to this one."""
+        other = State(wp.clone(self.x), wp.clone(self.v), len(self.results), [part.copy() for part in self.parts])
+        other.arrays |= {name: wp.clone(array) for name, array in self.arrays.items() if name not in other.arrays}
+        other.starts, other.results, other.residual = self.starts, list(self.results), self.residual.copy()
+        return other
+
+    def assign(self, other):
+        """Makes this state equal to another of the same solver and model; the arrays stay where they are."""
+        for name, array in self.arrays.items():
+            wp.copy(array, other.arrays[name])
+        for part, of_other in zip(self.parts, other.parts, strict=True):
+            part.assign(of_other)
+        self.results, self.residual = list(other.results), other.residual.copy()
+
+    def __eq__(self, other):
+        """Whether every bit is the same; what is not a number equals itself."""
+        if not isinstance(other, State):
+            return NotImplemented
+        mine, of_other = self.to_host(), other.to_host()
+        return mine.keys() == of_other.keys() and all(
+            values.dtype == of_other[name].dtype and values.tobytes() == of_other[name].tobytes()
+            for name, values in mine.items()
+        )
+
+    __hash__ = None
+
+    def to_host(self):
+        """Everything as NumPy arrays of their own, by name."""
+        found = {name: np.array(array.numpy()) for name, array in self.arrays.items()}
+        found |= {"results": np.array([result.name for result in self.results]), "residual": np.array(self.residual)}
+        for k, part in enumerate(self.parts):
+            found |= {f"part {k} {name}": values for name, values in part.to_host().items() if name not in ("x", "v")}
+        return found
+
+    def from_host(self, values):
+        """Sets everything to what :meth:`to_host` gave for an equal scene and solver.
+
+        Raises:
+            ValueError: If it is of another scene or solver.
+        """
+        now = self.to_host()
+        if now.keys() != values.keys() or any(now[name].shape != values[name].shape for name in now):
+            raise ValueError("the state is of another scene or solver")
+        for name, array in self.arrays.items():
+            array.assign(values[name])
+        self.results, self.residual = [Result[name] for name in values["results"]], np.array(values["residual"])
+        for k, part in enumerate(self.parts):
+            own = {name: values.get(f"part {k} {name}", array) for name, array in part.to_host().items()}
+            part.from_host(own)
