@@ -23,7 +23,7 @@ class Stepper:
     Attributes:
         state: The :class:`warpcloth.core.state.State`.
         h: Step [s].
-        model: The model; with an integrator its terms are damped as a step has it, and its terms are those that are refreshed.
+        model: The model with the terms that its steps take, damped and ordered as they have them.
         integrator: What leads to x̃ and away from the minimiser, see :mod:`warpcloth.numerics.integrators`; None of steps that
             have no x̃.
         he: Its hₑ [s], else h.
