@@ -42,14 +42,14 @@ def measure(path, setup, device, frames):
         options["measures"] = [name for name, found in MEASURES["triangle"].items() if not found.rate]
     sequence = wc.open_sequence(path)
     sequence = wc.as_sequence(sequence.mesh, [sequence[frame] for frame in range(2)], dt=1 / 60)
-    consume(wc.Analyzer(None, sequence, **options))  # compiles
+    consume(wc.Analyzer(sequence, **options))  # compiles
     seconds = []
     for _ in range(3):
         sequence = wc.open_sequence(path)
         for name in ("labels", "times"):
             object.__setattr__(sequence, name, getattr(sequence, name)[:frames])
         start = time.perf_counter()
-        memory = consume(wc.Analyzer(None, sequence, **options))
+        memory = consume(wc.Analyzer(sequence, **options))
         seconds.append(time.perf_counter() - start)
     return seconds, memory
 

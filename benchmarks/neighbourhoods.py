@@ -66,7 +66,7 @@ def errors(mesh, kind, noise, seed, waves):
     frames = [motion(mesh.points, t, waves)[0] for t in (0.0, DT)]
     frames = [x + noise * edge * rng.normal(size=x.shape) for x in frames]
     options = {"neighbourhood": kind, "measures": ("deformation_gradient", "rate_of_strain")}
-    found = wc.analyze(mesh, frames, dt=DT, **options)
+    found = wc.analyze(frames, mesh, dt=DT, **options)
     places, size = (mesh.points[mesh.triangles].mean(axis=1), 3) if kind is None else (mesh.points, members(mesh, kind))
     F, D = found["deformation_gradient"][1], found["rate_of_strain"][1]
     if kind is None:  # from the triangle's own axes to X and Z

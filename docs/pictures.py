@@ -168,7 +168,7 @@ def picture_analysis(n=32, frame=20):
     scene = hanging.scene(n=n)
     animation = wc.simulate(scene, wc.Newton(dt=1 / 240), frames=frame)
     assert animation.status.ok, animation.status
-    analyzer = wc.Analyzer(scene.mesh, animation, measures=("stretch", "directions"))
+    analyzer = wc.Analyzer(animation, scene.mesh, measures=("stretch", "directions"))
     write_report(analyzer, stills={frame: DOCS / "analysis.png"}, curves=True)
 
 

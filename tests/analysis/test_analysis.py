@@ -63,7 +63,7 @@ def test_affine_maps_of_triangles(mesh, dtype, device):
     rng = np.random.default_rng(1)
     maps = [random_map(rng) for _ in range(6)]
     places = [mesh.points @ G.T + b for G, b in maps]
-    found = wc.analyze(mesh, places, measures=STATIC, dtype=dtype, device=device)
+    found = wc.analyze(places, mesh, measures=STATIC, dtype=dtype, device=device)
     T, bound = frames(mesh), rounding(mesh, places, dtype)
     for k, (G, _) in enumerate(maps):
         check_triangles(found, k, G @ T[:, :, :2], T, bound)
@@ -75,7 +75,7 @@ def test_any_motion_of_triangles(dtype, device):
     """F = Σ xᵢ ⊗ ∇φᵢ T of the linear functions φᵢ of the rest shape's corners."""
     mesh = jittered(lift=hill)
     places = [drifting(mesh, t) for t in (0.0, 0.3, 0.6)]
-    found = wc.analyze(mesh, places, measures=STATIC, dtype=dtype, device=device)
+    found = wc.analyze(places, mesh, measures=STATIC, dtype=dtype, device=device)
     T, bound = frames(mesh), rounding(mesh, places, dtype)
     for k, x in enumerate(places):
         check_triangles(found, k, gradients(mesh, x) @ T[:, :, :2], T, bound)
@@ -89,7 +89,7 @@ def test_warp_and_weft_of_texture_coordinates(dtype, device):
     lines = TILT[:, :2] @ np.linalg.inv(st)
     lines /= np.linalg.norm(lines, axis=0)
     places = [mesh.points, mesh.points @ G.T + b]
-    found = wc.analyze(mesh, places, measures=("length_ratio", "angle"), directions="st", dtype=dtype, device=device)
+    found = wc.analyze(places, mesh, measures=("length_ratio", "angle"), directions="st", dtype=dtype, device=device)
     bound = rounding(mesh, places, dtype)
     for k, A in enumerate((lines, G @ lines)):
         bounded(found["length_ratio"][k], np.linalg.norm(A, axis=0), 4.0 * bound)
@@ -130,7 +130,7 @@ def test_affine_maps_of_neighbourhoods(neighbourhood, dtype, device):
     maps = [random_map(rng) for _ in range(4)]
     places = [mesh.points @ G.T + b for G, b in maps]
     measures = ("deformation_gradient", "stretch", "directions")
-    found = wc.analyze(mesh, places, measures=measures, neighbourhood=neighbourhood, dtype=dtype, device=device)
+    found = wc.analyze(places, mesh, measures=measures, neighbourhood=neighbourhood, dtype=dtype, device=device)
     bound, N = rounding(mesh, places, dtype), TILT[:, 2]
     for k, (G, _) in enumerate(maps):
         n = np.cross(G @ TILT[:, 0], G @ TILT[:, 1])
@@ -152,7 +152,7 @@ def test_fits_of_any_motion(neighbourhood, dtype, device):
     G, b = random_map(rng)
     x = mesh.points @ G.T + b + 0.02 * rng.normal(size=mesh.points.shape)
     measures = ("deformation_gradient", "stretch", "rotation", "rotation_angle", "residual", "cross_covariance")
-    found = wc.analyze(mesh, [x], measures=measures, neighbourhood=neighbourhood, dtype=dtype, device=device)
+    found = wc.analyze([x], mesh, measures=measures, neighbourhood=neighbourhood, dtype=dtype, device=device)
     sets, bound = SETS[neighbourhood](mesh), rounding(mesh, [x], dtype)
     F, R, residual = fitted(mesh, x, sets)
     # Of one-sided sets Σppᵀ is worse conditioned by up to the square of length over width, and sets here are 4 as long as wide.
@@ -180,7 +180,7 @@ def test_simple_shear(before, after, rate, dtype, device):
     e1, e2, N = TILT.T
     places = [mesh.points @ (np.eye(3) + g * np.outer(e1, e2)).T for g in (before, after)]
     names = (*STATIC, *RATES, "length_ratio", "angle", "length_rate", "angle_rate")
-    found = wc.analyze(mesh, places, dt=dt, measures=names, rates=rate, directions=e1, dtype=dtype, device=device)
+    found = wc.analyze(places, mesh, dt=dt, measures=names, rates=rate, directions=e1, dtype=dtype, device=device)
     bound = rounding(mesh, places, dtype) * (1.0 + abs(after)) ** 2
     lines = []
     for k, g in enumerate((before, after)):
@@ -223,7 +223,7 @@ def test_uniaxial_stretch(neighbourhood, rate, dtype, device):
     values = np.exp(speed * dt * np.arange(1, 4))
     places = [mesh.points @ (TILT @ np.diag([s, s**-0.5, 1.0]) @ TILT.T).T for s in values]
     given = {"neighbourhood": neighbourhood, "rates": rate, "dtype": dtype, "device": device}
-    found = wc.analyze(mesh, places, dt=dt, measures=("stretch", "rotation_angle", *RATES), **given)
+    found = wc.analyze(places, mesh, dt=dt, measures=("stretch", "rotation_angle", *RATES), **given)
     bound = rounding(mesh, places, dtype) * values[-1]
     for k, s in enumerate(values):
         wanted = (s, s**-0.5) if neighbourhood is None else (s, 1.0, s**-0.5)
@@ -257,7 +257,7 @@ def test_a_sheet_rolled_to_a_cylinder(dtype, device):
     given = {"dt": dt, "rates": "logarithm", "dtype": dtype, "device": device}
     names = ("stretch", "rotation_angle", "stretch_rate")
     found = wc.analyze(
-        mesh, places, measures=(*names, "area_ratio", "green_strain", "length_ratio"), directions=(1, 0, 0), **given
+        places, mesh, measures=(*names, "area_ratio", "green_strain", "length_ratio"), directions=(1, 0, 0), **given
     )
     bound, chords = rounding(mesh, places, dtype), np.sin(bends * h / 2.0) / (bends * h / 2.0)
     sides = X[mesh.triangles]
@@ -271,7 +271,7 @@ def test_a_sheet_rolled_to_a_cylinder(dtype, device):
         if k:
             bounded(found["stretch_rate"][k], (0.0, np.log(chord / chords[k - 1]) / dt), 2.0 * bound / dt)
     names = (*names, "directions", "rotation")
-    found = wc.analyze(mesh, places, measures=names, neighbourhood="1-ring", **given)
+    found = wc.analyze(places, mesh, measures=names, neighbourhood="1-ring", **given)
     inner = np.setdiff1d(np.arange(n * n), mesh.boundary)
     slopes = np.sin(bends * h) / (bends * h)
     for k, slope in enumerate(slopes):
@@ -304,7 +304,7 @@ def test_objectivity(neighbourhood, rate, dtype, device):
     given = {"dt": dt, "rates": rate, "neighbourhood": neighbourhood, "dtype": dtype, "device": device, "measures": "all"}
     if neighbourhood is None:
         given |= {"directions": (1.0, 0.3, 0.2), "material": wc.NeoHookeanMembrane(stiffness=1.0, poisson_ratio=0.3)}
-    found, turned_found = (wc.analyze(mesh, [x @ A.T for x in places], **given) for A in (np.eye(3), Q))
+    found, turned_found = (wc.analyze([x @ A.T for x in places], mesh, **given) for A in (np.eye(3), Q))
     # On this motion λ₂ > 0.4 and λ₁ − λ₂ > 0.02 λ₁; the fits of one-sided rings are worse by up to 16.
     bound, gap = 16.0 * rounding(mesh, places, dtype) / 0.4, 0.02
     low = found["stretch"][:, :, 1 if neighbourhood is None else 2].min()
@@ -344,10 +344,10 @@ def test_the_reference_does_not_matter_to_the_velocity_gradient(rate, dtype, dev
     names = ("velocity_gradient", "rate_of_strain", "spin")
     given = {"dt": dt, "measures": names, "rates": rate, "dtype": dtype, "device": device}
     found = [
-        wc.analyze(mesh, places, **given),
-        wc.analyze(other, places, **given),
-        wc.analyze(mesh, places, reference="first", **given),
-        wc.analyze(mesh, places, reference="previous", **given),
+        wc.analyze(places, mesh, **given),
+        wc.analyze(places, other, **given),
+        wc.analyze(places, mesh, reference="first", **given),
+        wc.analyze(places, mesh, reference="previous", **given),
     ]
     # L is at most 4 here and F₁ − F₀ is known to ε|x| over the altitude of either reference.
     bound = 2.0 * max(rounding(one, places, dtype) for one in (mesh, other)) / dt
@@ -377,7 +377,7 @@ def test_a_recorded_triangle(device):
     planar = moved_sides[:, :2].T @ np.linalg.inv(sides[:, :2].T)
     assert np.linalg.svd(planar, compute_uv=False).round(4).tolist() == [1.0544, 0.6757]
     mesh = wc.Mesh(rest, [[0, 1, 2]])
-    found = wc.analyze(mesh, [moved], measures=STATIC, device=device)
+    found = wc.analyze([moved], mesh, measures=STATIC, device=device)
     assert found["stretch"][0, 0].round(4).tolist() == [1.0507, 0.9896]
     # What is written is exact: F maps the sides of the rest shape, and det C is the square of the ratio of areas.
     F = found["deformation_gradient"][0, 0] @ frames(mesh)[0, :, :2].T
@@ -398,7 +398,7 @@ def test_stretches_by_singular_and_by_eigenvalues(dtype, device):
     ratio = 10.0 ** rng.uniform(-10.0, 0.0, count)
     F = (U * np.stack([np.ones(count), ratio], axis=1)[:, None, :]) @ V.mT
     mesh, x = separate(F)
-    found = wc.analyze(mesh, [x], measures=("stretch", "right_cauchy_green"), dtype=dtype, device=device)
+    found = wc.analyze([x], mesh, measures=("stretch", "right_cauchy_green"), dtype=dtype, device=device)
     bounded(found["stretch"][0], np.stack([np.ones(count), ratio], axis=1), 8.0 * eps)
     with np.errstate(invalid="ignore"):
         roots = np.sqrt(np.linalg.eigvalsh(found["right_cauchy_green"][0])[:, ::-1])
@@ -411,7 +411,7 @@ def test_stretches_by_singular_and_by_eigenvalues(dtype, device):
     # Of rank 1, in whole numbers, so that nothing is rounded on the way.
     u, v = rng.integers(1, 50, (count, 3)) * rng.choice([-1, 1], (count, 3)), rng.integers(1, 50, (count, 2))
     mesh, x = separate((u[:, :, None] * v[:, None, :]).astype(float))
-    found = wc.analyze(mesh, [x], measures=("stretch", "area_ratio"), dtype=dtype, device=device)
+    found = wc.analyze([x], mesh, measures=("stretch", "area_ratio"), dtype=dtype, device=device)
     first = np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
     assert np.isfinite(found["stretch"]).all() and not found.excluded
     bounded(found["stretch"][0, :, 0] / first, 1.0, 8.0 * eps)
@@ -430,7 +430,7 @@ def test_the_cross_covariance_is_no_gradient(dtype, device):
         mesh = wc.Mesh.grid(n, n, size=tuple(scale * s for s in size), pattern="alternating")
         places = [mesh.points @ (turn((1, 2, 3), 1.0) @ np.diag([s, 1.0, 1.0])).T for s in (1.0, 1.5)]
         names = ("cross_covariance", "stretch", "deformation_gradient")
-        found = wc.analyze(mesh, places, measures=names, neighbourhood="1-ring", dtype=dtype, device=device)
+        found = wc.analyze(places, mesh, measures=names, neighbourhood="1-ring", dtype=dtype, device=device)
         eight = [i for i, ring in enumerate(rings(mesh)) if len(ring) == 9]
         assert len(eight) == 25
         bound, (a, b) = rounding(mesh, places, dtype), (scale * s / (n - 1) for s in size)
@@ -450,7 +450,7 @@ def test_the_best_rotation_of_a_set_is_not_that_in_its_gradient(dtype, device):
     G = np.array([[1.3, 0.0, 0.4], [0.0, 1.0, 0.0], [0.4, 0.0, 0.9]])
     places = [mesh.points @ G.T]
     names = ("rotation_angle", "deformation_gradient")
-    found = wc.analyze(mesh, places, measures=names, neighbourhood="1-ring", dtype=dtype, device=device)
+    found = wc.analyze(places, mesh, measures=names, neighbourhood="1-ring", dtype=dtype, device=device)
     inner = np.setdiff1d(np.arange(81), mesh.boundary)
     bound = rounding(mesh, places, dtype)
     bounded(found["rotation_angle"][0][inner], np.arctan(0.4 * (4.0 - 1.0) / (1.3 * 4.0 + 0.9 * 1.0)), 4.0 * bound)

@@ -26,7 +26,7 @@ def errors_of(mesh, neighbourhood, device):
     """‖F − ∇x‖ of each element, ∇x at the centroid of a triangle or at the vertex; of vertices with n as the third column."""
     uv = mesh.points[:, [2, 0]] if np.ptp(mesh.points[:, 2]) > 0 else mesh.points[:, :2]  # grids face y, which is z × x
     basis = np.eye(3)[:, [2, 0, 1]] if np.ptp(mesh.points[:, 2]) > 0 else np.eye(3)
-    found = wc.analyze(mesh, [waves(uv)[0]], measures="deformation_gradient", neighbourhood=neighbourhood, device=device)
+    found = wc.analyze([waves(uv)[0]], mesh, measures="deformation_gradient", neighbourhood=neighbourhood, device=device)
     F = found["deformation_gradient"][0]
     if neighbourhood is None:
         gradient = waves(uv[mesh.triangles].mean(axis=1))[1]

@@ -46,7 +46,7 @@ def test_turning(axis, neighbourhood, mesh, dtype, device):
     bound, given = rounding(mesh, places, dtype), {"neighbourhood": neighbourhood, "dtype": dtype, "device": device}
     names = ("stretch", "stretch_rate", "rotation_angle", "rate_of_strain", "spin")
     for method, size in (("midpoint", 2.0 * np.tan(angle / 2.0)), ("logarithm", angle), ("forward", np.sin(angle))):
-        found = wc.analyze(mesh, places, dt=dt, measures=names, rates=method, **given)
+        found = wc.analyze(places, mesh, dt=dt, measures=names, rates=method, **given)
         bounded(found["stretch"], 1.0, bound)
         bounded(found["stretch_rate"][1:] * dt, 0.0, 2.0 * bound)
         bounded(found["rotation_angle"], (angle * np.arange(7))[:, None], bound)
@@ -94,7 +94,7 @@ def test_a_constant_velocity_gradient(name, neighbourhood, dtype, device):
     given = {"neighbourhood": neighbourhood, "dtype": dtype, "device": device}
     wanted = {"logarithm": LDt, "midpoint": 2.0 * tanhm(0.5 * LDt), "forward": step - np.eye(3)}
     for method, L in wanted.items():
-        found = wc.analyze(mesh, places, dt=dt, measures=("velocity_gradient", "rate_of_strain", "spin"), rates=method, **given)
+        found = wc.analyze(places, mesh, dt=dt, measures=("velocity_gradient", "rate_of_strain", "spin"), rates=method, **given)
         bounded(found["velocity_gradient"][1:] * dt, L, bound)
         bounded(found["rate_of_strain"][1:] * dt, 0.5 * (L + L.T), bound)
         bounded(found["spin"][1:] * dt, 0.5 * (L - L.T), bound)
@@ -133,7 +133,7 @@ def test_what_a_turn_does_to_the_rate_of_strain(axis, degrees, neighbourhood, de
         places = [mesh.points, mesh.points @ (turn(a, angle) @ expm(E)).T]
         for method in ("midpoint", "logarithm", "forward"):
             given = {"rates": method, "neighbourhood": neighbourhood, "device": device}
-            found = wc.analyze(mesh, places, dt=1.0, measures=("rate_of_strain", "stretch_rate"), **given)
+            found = wc.analyze(places, mesh, dt=1.0, measures=("rate_of_strain", "stretch_rate"), **given)
             steep = 1.0 / np.cos(angle / 2.0) ** 4  # second derivatives in E
             bounded(
                 found["rate_of_strain"][1], turned_rate(method, a, angle, E, TILT[:, 2]), 4.0 * steep * size**2 + 1e-12 * steep
@@ -155,7 +155,7 @@ def test_what_a_turn_does_to_a_dilation(degrees, device):
     for name, method in zip(TURNS, ("midpoint", "logarithm", "midpoint", "logarithm", "logarithm"), strict=True):
         axis = TILT[:, 0] + TILT[:, 2] if name == "45°" else AXES[name]
         places = [mesh.points, np.exp(e) * mesh.points @ turn(axis, angle).T]
-        found = wc.analyze(mesh, places, dt=1.0, measures=("rate_of_strain",), rates=method, device=device)
+        found = wc.analyze(places, mesh, dt=1.0, measures=("rate_of_strain",), rates=method, device=device)
         largest.append(np.linalg.eigvalsh(found["rate_of_strain"][1]).max() / e)
     assert [float(cell) for cell in row] == pytest.approx(largest, abs=6e-4)
     assert largest[:2] == pytest.approx([2.0 * np.sinh(e) / (np.cosh(e) + np.cos(angle)) / e, 1.0], rel=1e-9)
@@ -169,7 +169,7 @@ def test_half_a_turn_is_undefined(rate, neighbourhood, device):
     for axis in AXES.values():
         places = [mesh.points, mesh.points @ turn(axis, np.pi).T + 1.0]
         given = {"neighbourhood": neighbourhood, "rates": rate, "device": device}
-        found = wc.analyze(mesh, places, dt=1.0, measures=("velocity_gradient", "rate_of_strain", "spin"), **given)
+        found = wc.analyze(places, mesh, dt=1.0, measures=("velocity_gradient", "rate_of_strain", "spin"), **given)
         for name in found:
             assert np.isnan(found[name][1]).all()
         assert any("180°" in str(exclusion) for exclusion in found.excluded)
@@ -203,7 +203,7 @@ def test_rates_converge(neighbourhood, method, device):
     for dt in (0.02, 0.01, 0.005):
         places = [motion(mesh.points, middle + s * dt / 2.0) for s in (-1.0, 1.0)]
         found = wc.analyze(
-            mesh, places, dt=dt, measures=tuple(wanted), rates=method, neighbourhood=neighbourhood, device=device, **threads
+            places, mesh, dt=dt, measures=tuple(wanted), rates=method, neighbourhood=neighbourhood, device=device, **threads
         )
         for name, values in wanted.items():
             difference = np.reshape(found[name][1] - values, (len(found[name][1]), -1))
@@ -226,8 +226,8 @@ def test_a_spinning_observer(neighbourhood, method, device):
     for dt in (0.02, 0.01, 0.005):
         given = {"dt": dt, "measures": names, "rates": method, "neighbourhood": neighbourhood, "device": device}
         times = middle - dt / 2.0, middle + dt / 2.0
-        still = wc.analyze(mesh, [drifting(mesh, t) for t in times], **given)
-        seen = wc.analyze(mesh, [drifting(mesh, t) @ expm(skew(w) * t).T for t in times], **given)
+        still = wc.analyze([drifting(mesh, t) for t in times], mesh, **given)
+        seen = wc.analyze([drifting(mesh, t) @ expm(skew(w) * t).T for t in times], mesh, **given)
         apart = seen["rate_of_strain"][1] - Q @ still["rate_of_strain"][1] @ Q.T
         spin = seen["spin"][1] - Q @ still["spin"][1] @ Q.T - skew(w)
         errors.append([np.abs(apart).max(), np.abs(spin).max()])

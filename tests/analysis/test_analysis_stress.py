@@ -44,7 +44,7 @@ def test_neo_hookean(mesh, ratio, dtype, device):
     for _ in range(4):
         G, b = random_map(rng)
         x = mesh.points @ G.T + b
-        found = wc.analyze(mesh, [x], measures=NAMES, material=membrane, dtype=dtype, device=device)
+        found = wc.analyze([x], mesh, measures=NAMES, material=membrane, dtype=dtype, device=device)
         F = G @ frames(mesh)[:, :, :2]
         u, P = neo_hookean(F, mu, lam)
         J = np.linalg.norm(np.cross(F[:, :, 0], F[:, :, 1]), axis=1)
@@ -63,7 +63,7 @@ def test_stress_is_the_derivative_of_the_energy(name, device):
     mesh, x = separate(F)
     shifts = delta * np.eye(6).reshape(6, 3, 2)
     places = [x, *(separate(F + sign * shift)[1] for shift in shifts for sign in (1.0, -1.0))]
-    found = wc.analyze(mesh, places, measures=NAMES, material=membrane, device=device)
+    found = wc.analyze(places, mesh, measures=NAMES, material=membrane, device=device)
     u = found["energy_density"][1:].reshape(6, 2, len(F))
     wanted = (u[:, 0] - u[:, 1]).T.reshape(-1, 3, 2) / (2.0 * delta)
     scale = (2.0 * mu + lam) * 27.0
@@ -86,7 +86,7 @@ def test_at_rest(name, ratio, dtype, device):
     mesh, x = separate(F)
     turned = turn((1.0, 2.0, 3.0), 1.0)
     found = wc.analyze(
-        mesh, [mesh.points, mesh.points @ turned.T, x], measures=NAMES, material=membrane, dtype=dtype, device=device
+        [mesh.points, mesh.points @ turned.T, x], mesh, measures=NAMES, material=membrane, dtype=dtype, device=device
     )
     size = 2.0 * mu + abs(lam)
     for k in (0, 1):
@@ -115,7 +115,7 @@ def test_uniaxial_tension(ratio, dtype, device):
     F = np.zeros((len(a), 3, 2))
     F[:, 0, 0], F[:, 1, 1] = a, b
     mesh, x = separate(F)
-    found = wc.analyze(mesh, [x], measures=NAMES, material=membrane, dtype=dtype, device=device)
+    found = wc.analyze([x], mesh, measures=NAMES, material=membrane, dtype=dtype, device=device)
     pull = mu * (a - b) + (lam + mu) * (a * b - 1.0) * b
     P, sigma = np.zeros((len(a), 3, 2)), np.zeros((len(a), 3, 3))
     P[:, 0, 0], sigma[:, 0, 0] = pull, pull / b
@@ -135,7 +135,7 @@ def test_cauchy_stress(name, dtype, device):
     F, Q = gradients_of(rng, 50), turn((1.0, -3.0, 2.0), 2.0)
     mesh, x = separate(F)
     found = wc.analyze(
-        mesh, [x, x @ Q.T], measures=("deformation_gradient", *NAMES), material=membrane, dtype=dtype, device=device
+        [x, x @ Q.T], mesh, measures=("deformation_gradient", *NAMES), material=membrane, dtype=dtype, device=device
     )
     P, sigma, turned = (found[name][k].astype(np.float64) for name, k in ((NAMES[1], 0), (NAMES[2], 0), (NAMES[2], 1)))
     normal = np.cross(F[:, :, 0], F[:, :, 1])

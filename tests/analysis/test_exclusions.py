@@ -50,7 +50,7 @@ def named(analysis, frame, kind):
 @pytest.mark.parametrize("on", ALL)
 def test_clean_input_has_nothing_excluded_but_the_rates_of_the_first_frame(device, on, dtype):
     mesh = sheet()
-    found = wc.analyze(mesh, strained(mesh), DT, device=device, dtype=dtype, **ALL[on])
+    found = wc.analyze(strained(mesh), mesh, DT, device=device, dtype=dtype, **ALL[on])
     expected = np.zeros(31, dtype=bool)
     expected[30] = True
     for name, values in found.items():
@@ -73,9 +73,9 @@ def test_points_that_are_not_finite(device, on, bad):
     """All that touches them is left out in that frame, and its rates to the next; nothing else changes by a bit."""
     mesh = sheet()
     frames = strained(mesh)
-    clean = wc.analyze(mesh, frames, DT, device=device, **ALL[on])
+    clean = wc.analyze(frames, mesh, DT, device=device, **ALL[on])
     frames[1, 8, 1] = bad
-    found = wc.analyze(mesh, frames, DT, device=device, **ALL[on])
+    found = wc.analyze(frames, mesh, DT, device=device, **ALL[on])
     touched = (mesh.triangles == 8).any(axis=1)
     if on == "vertex":
         touched = np.isin(np.arange(31), mesh.triangles[touched])
@@ -96,7 +96,7 @@ def test_triangles_without_area_in_the_reference(device, reference):
     target = points if reference == "rest" else frames[2]
     target[corners[2]] = 0.3 * target[corners[0]] + 0.7 * target[corners[1]]
     mesh = Surface(points, mesh.triangles)
-    found = wc.analyze(mesh, frames, DT, reference=reference, device=device, **ALL["triangle"])
+    found = wc.analyze(frames, mesh, DT, reference=reference, device=device, **ALL["triangle"])
     for values in found.values():
         assert lost(values)[:, 7].all()
     where = "rest shape" if reference == "rest" else "frame 2"
@@ -109,7 +109,7 @@ def test_a_reference_that_was_measured_before_is_named_too(device, options):
     frames = strained(mesh)
     a, b, c = mesh.triangles[7]
     frames[2, c] = 0.25 * frames[2, a] + 0.75 * frames[2, b]
-    found = wc.analyze(mesh, frames, device=device, **options)
+    found = wc.analyze(frames, mesh, device=device, **options)
     row = found.pairs.index((2, 3))
     assert lost(found["stretch"])[row, 7]
     assert named(found, 2, "triangle") == set(np.flatnonzero(lost(found["stretch"])[row]).tolist())
@@ -122,7 +122,7 @@ def test_rates_from_nothing_are_not_infinite(device, rates):
     frames = strained(mesh)
     frames[1, mesh.triangles[7]] = frames[1, mesh.triangles[7, 0]]
     options = {"measures": ("stretch_rate", "length_rate"), "directions": (1, 0, 0.3), "rates": rates}
-    found = wc.analyze(mesh, frames, DT, device=device, **options)
+    found = wc.analyze(frames, mesh, DT, device=device, **options)
     for values in found.values():
         assert not np.isinf(values).any() and lost(values)[2, 7]
         assert set(np.flatnonzero(lost(values)[2]).tolist()) <= named(found, 2, "triangle")
@@ -134,7 +134,7 @@ def test_a_triangle_crushed_to_a_line_keeps_what_has_a_meaning(device):
     frames = strained(mesh)
     a, b, c = mesh.triangles[7]
     frames[2, c] = 0.25 * frames[2, a] + 0.75 * frames[2, b]
-    found = wc.analyze(mesh, frames, DT, device=device, **ALL["triangle"])
+    found = wc.analyze(frames, mesh, DT, device=device, **ALL["triangle"])
     assert found["stretch"][2, 7, 1] <= 8 * np.finfo(float).eps * found["stretch"][2, 7, 0]
     assert np.isfinite(found["deformation_gradient"][2, 7]).all()
     assert found["area_ratio"][2, 7] <= 8 * np.finfo(float).eps * found["stretch"][2, 7, 0] ** 2
@@ -153,10 +153,10 @@ def test_what_has_collapsed_has_no_rotation(device, onto):
     frames = strained(mesh)
     frames[2] = frames[2] * onto + 0.3
     around = wc.analyze(
-        mesh, frames, device=device, measures=("rotation", "rotation_angle", "residual"), neighbourhood="1-ring"
+        frames, mesh, device=device, measures=("rotation", "rotation_angle", "residual"), neighbourhood="1-ring"
     )
     names = ("rotation", "rotation_angle", "angle", "angle_rate", "stretch")
-    found = wc.analyze(mesh, frames, DT, device=device, measures=names, directions=(1, 0, 0.3))
+    found = wc.analyze(frames, mesh, DT, device=device, measures=names, directions=(1, 0, 0.3))
     for one in (around, found):
         for name in ("rotation", "rotation_angle"):
             assert lost(one[name])[2].all() and not lost(one[name])[1, :30].any()
@@ -172,9 +172,9 @@ def test_what_has_collapsed_has_no_rotation(device, onto):
 def test_size_does_not_matter(device, on, size, dtype):
     mesh = sheet()
     options = {"neighbourhood": ALL[on].get("neighbourhood"), "dtype": dtype, "device": device}
-    expected = wc.analyze(mesh, strained(mesh), measures=("stretch", "rotation_angle"), **options)
+    expected = wc.analyze(strained(mesh), mesh, measures=("stretch", "rotation_angle"), **options)
     mesh = Surface(size * mesh.points, mesh.triangles)
-    found = wc.analyze(mesh, size * strained(sheet()), measures=("stretch", "rotation_angle"), **options)
+    found = wc.analyze(size * strained(sheet()), mesh, measures=("stretch", "rotation_angle"), **options)
     for name, values in found.items():
         # Nothing but the rounding of size itself and of sums differs; edges are of 0.1 to 2 in places to 2.
         np.testing.assert_allclose(values, expected[name], atol=200 * np.finfo(dtype).eps, rtol=0.0)
@@ -188,7 +188,7 @@ def test_areas_made_of_what_the_input_is_rounded_by(device, on):
     points = (points + np.array([1.0, 2.0, 3.0])).astype(np.float32)
     mesh = Surface(points, [[0, 1, 2], [0, 1, 3]])
     options = {"triangle": {}, "vertex": {"neighbourhood": [[0, 1, 2], [0, 1, 3], [0, 1, 2], [0, 1, 3]]}}[on]
-    found = wc.analyze(mesh, np.stack([points, points * np.float32([1, 2, 1])]), device=device, **options)
+    found = wc.analyze(np.stack([points, points * np.float32([1, 2, 1])]), mesh, device=device, **options)
     expected = {"triangle": {0}, "vertex": {0, 2}}[on]
     assert np.array_equal(np.flatnonzero(lost(found["stretch"])[1]), sorted(expected))
     assert named(found, None, on) == expected
@@ -198,7 +198,7 @@ def test_half_a_turn_a_frame_has_no_rate(device):
     mesh = sheet()
     turned = mesh.points * [-1.0, 1.0, -1.0]
     for rates in ("midpoint", "logarithm"):
-        found = wc.analyze(mesh, np.stack([mesh.points, turned]), DT, measures="rate_of_strain", rates=rates, device=device)
+        found = wc.analyze(np.stack([mesh.points, turned]), mesh, DT, measures="rate_of_strain", rates=rates, device=device)
         assert lost(found["rate_of_strain"]).all()
         assert named(found, 1, "triangle") == set(range(len(mesh.triangles)))
 
@@ -206,7 +206,7 @@ def test_half_a_turn_a_frame_has_no_rate(device):
 def test_equal_stretches_have_no_principal_directions(device):
     mesh = sheet()
     names = ("rest_direction_rate", "direction_rate")
-    found = wc.analyze(mesh, np.stack([mesh.points] * 2), DT, measures=names, device=device)
+    found = wc.analyze(np.stack([mesh.points] * 2), mesh, DT, measures=names, device=device)
     excluded = [str(e) for e in found.excluded if e.frame == 1]
     assert len(excluded) == 1 and all(
         words in excluded[0] for words in (*names, "stretches that are equal", "40 triangles 0, 1")
@@ -217,13 +217,13 @@ def test_missing_frames_are_named():
     mesh = sheet()
     sequence = as_sequence(mesh, strained(mesh), times=[0.0, 0.1, 0.3, 0.4])
     object.__setattr__(sequence, "labels", np.array([1, 2, 4, 5]))
-    found = wc.analyze(mesh, sequence, reference="previous", measures="stretch_rate")
+    found = wc.analyze(sequence, mesh, reference="previous", measures="stretch_rate")
     assert [str(e) for e in found.excluded] == ["frame 3 is missing"]
     assert found.pairs == [(1, 2), (2, 4), (4, 5)]
-    lagged = wc.analyze(mesh, sequence, lag=1)
+    lagged = wc.analyze(sequence, mesh, lag=1)
     assert "frame 2 has no frame 1 later, for 3 is missing" in [str(e) for e in lagged.excluded]
     # The time between them is that of the sequence, not a frame's.
-    twice = wc.analyze(mesh, sequence.read(slice(None))[[1, 2]], dt=0.2, reference="previous", measures="stretch_rate")
+    twice = wc.analyze(sequence.read(slice(None))[[1, 2]], mesh, dt=0.2, reference="previous", measures="stretch_rate")
     np.testing.assert_allclose(found["stretch_rate"][1], twice["stretch_rate"][0], rtol=1e-12)
 
 
@@ -237,18 +237,18 @@ def test_directions_are_not_made_of_what_the_input_is_rounded_by(device, on, pre
     turned = np.array([at, at @ [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]]).astype(precision)
     options = {**ALL[on], "measures": ("rest_direction_rate", "direction_rate"), "device": device}
     options.pop("directions", None), options.pop("material", None)
-    rigid = wc.analyze(mesh, turned, DT, **options)
+    rigid = wc.analyze(turned, mesh, DT, **options)
     assert np.isnan(rigid["direction_rate"]).all() and np.isnan(rigid["rest_direction_rate"]).all()
-    stretched = wc.analyze(mesh, (turned * [1.05, 1.0, 1.0]).astype(precision), DT, **options)
+    stretched = wc.analyze((turned * [1.05, 1.0, 1.0]).astype(precision), mesh, DT, **options)
     assert (np.isfinite(stretched["direction_rate"][1]).all(axis=1).mean()) > 0.9
 
 
 def test_far_from_the_origin_float32_loses_nothing_but_what_the_input_has_lost(device):
     mesh = sheet()
     frames = strained(mesh) + 1000.0
-    single, double = (wc.analyze(mesh, frames, device=device, dtype=dtype)["stretch"] for dtype in ("float32", "float64"))
-    near = wc.analyze(mesh, strained(mesh), device=device, dtype="float32")["stretch"]
-    exact = wc.analyze(mesh, strained(mesh), device=device, dtype="float64")["stretch"]
+    single, double = (wc.analyze(frames, mesh, device=device, dtype=dtype)["stretch"] for dtype in ("float32", "float64"))
+    near = wc.analyze(strained(mesh), mesh, device=device, dtype="float32")["stretch"]
+    exact = wc.analyze(strained(mesh), mesh, device=device, dtype="float64")["stretch"]
     assert np.abs(single - double).max() < 2.0 * np.abs(near - exact).max() + 1e-6
 
 
@@ -258,9 +258,9 @@ def test_each_measure_by_itself_is_the_same(device, on):
     mesh = sheet()
     frames = strained(mesh, 3)
     options = {**ALL[on], "device": device}
-    together = wc.analyze(mesh, frames, DT, **options)
+    together = wc.analyze(frames, mesh, DT, **options)
     for name in MEASURES[on]:
-        alone = wc.analyze(mesh, frames, DT, **(options | {"measures": name}))
+        alone = wc.analyze(frames, mesh, DT, **(options | {"measures": name}))
         assert list(alone) == [name]
         assert np.array_equal(alone[name], together[name], equal_nan=True), name
 
@@ -279,7 +279,7 @@ def test_memory_does_not_grow_with_the_frames():
             return still * (1.0 + 0.01 * frame)
 
     def peak(count):
-        analyzer = wc.Analyzer(mesh, Frames(count), measures=("stretch", "rate_of_strain"))
+        analyzer = wc.Analyzer(Frames(count), mesh, measures=("stretch", "rate_of_strain"))
         tracemalloc.start()
         for sample in analyzer:
             assert sample.values["stretch"].shape == (len(mesh.triangles), 2)
@@ -333,12 +333,12 @@ OPTIONS = [
 def test_refused(options, words):
     mesh = sheet()
     with pytest.raises(ValueError, match=words):
-        wc.analyze(mesh, strained(mesh), **({"dt": DT} | options))
+        wc.analyze(strained(mesh), mesh, **({"dt": DT} | options))
 
 
 def test_measures_may_come_from_a_generator():
     mesh = sheet()
-    assert list(wc.analyze(mesh, strained(mesh), measures=(name for name in ("stretch", "rotation")))) == [
+    assert list(wc.analyze(strained(mesh), mesh, measures=(name for name in ("stretch", "rotation")))) == [
         "stretch",
         "rotation",
     ]
@@ -347,12 +347,12 @@ def test_measures_may_come_from_a_generator():
 def test_a_sequence_has_its_own_times():
     mesh = sheet()
     with pytest.raises(ValueError, match="dt: is for arrays and files"):
-        wc.analyze(mesh, as_sequence(mesh, strained(mesh)), dt=DT, measures="spin")
+        wc.analyze(as_sequence(mesh, strained(mesh)), mesh, dt=DT, measures="spin")
 
 
 def test_iterations_do_not_disturb_one_another():
     mesh = sheet()
-    analyzer = wc.Analyzer(mesh, strained(mesh), pairs="0:1,0:2,3:1")
+    analyzer = wc.Analyzer(strained(mesh), mesh, pairs="0:1,0:2,3:1")
     expected = [sample.values["stretch"].copy() for sample in analyzer]
     rows = iter(analyzer)
     for stretch in expected:
@@ -362,7 +362,7 @@ def test_iterations_do_not_disturb_one_another():
 
 def test_points_of_a_sample_are_those_of_the_next_rates():
     mesh = sheet()
-    for sample in wc.Analyzer(mesh, strained(mesh), DT, measures="spin"):
+    for sample in wc.Analyzer(strained(mesh), mesh, DT, measures="spin"):
         with pytest.raises(ValueError, match="read-only"):
             sample.points[:] = 0.0
 
@@ -370,10 +370,10 @@ def test_points_of_a_sample_are_those_of_the_next_rates():
 def test_rates_need_times():
     mesh = sheet()
     with pytest.raises(ValueError, match="'spin' needs dt"):
-        wc.analyze(mesh, strained(mesh), measures="spin")
-    assert "spin" not in wc.analyze(mesh, strained(mesh), measures="all")
+        wc.analyze(strained(mesh), mesh, measures="spin")
+    assert "spin" not in wc.analyze(strained(mesh), mesh, measures="all")
 
 
 def test_edges_alone_have_no_strain():
     with pytest.raises(ValueError, match="triangles"):
-        wc.analyze(EDGES, EDGES.points[None], DT)
+        wc.analyze(EDGES.points[None], EDGES, DT)

@@ -68,7 +68,7 @@ def test_a_share_of_few_vertices_determines_rotations(cells, device):
     turn = wc.polar(np.random.default_rng(0).normal(size=(3, 3)))[0]
     with pytest.warns(UserWarning, match="no rotation"):
         measured = wc.analyze(
-            mesh, [points @ turn.T], measures=("rotation",), neighbourhood="nearest:2%", device=device, dtype="float64"
+            [points @ turn.T], mesh, measures=("rotation",), neighbourhood="nearest:2%", device=device, dtype="float64"
         )
     assert np.abs(measured["rotation"] - turn).max() < 1e-12
 

@@ -46,11 +46,9 @@ def folder(cloth, tmp_path):
 def test_every_file_says_what_the_arrays_say(cloth, tmp_path, neighbourhood):
     measures = ["stretch", "directions", "rotation_angle", "rate_of_strain", "spin"]
     options = {"measures": measures, "neighbourhood": neighbourhood, "every": 2}
-    expected = wc.analyze(None, cloth, **options)
+    expected = wc.analyze(cloth, **options)
     files = {name: tmp_path / f"out.{name}" for name in ("csv", "json", "npz")}
-    report = write_report(
-        wc.Analyzer(None, cloth, **options), usd=tmp_path / "out.usdc", colour="stretch_2", curves=True, **files
-    )
+    report = write_report(wc.Analyzer(cloth, **options), usd=tmp_path / "out.usdc", colour="stretch_2", curves=True, **files)
     fields = {name: found for m in measures for name, found in rows_of(expected, m).items()}
     with open(files["csv"], encoding="utf-8") as file:
         table = list(csv.DictReader(file))
@@ -94,8 +92,8 @@ def rows_of(analysis, name):
 
 def test_curves_are_the_principal_directions(cloth, tmp_path):
     options = {"measures": ["stretch", "directions"], "reference": "first"}
-    found = wc.analyze(None, cloth, **options)
-    write_report(wc.Analyzer(None, cloth, **options), usd=tmp_path / "out.usda", curves=True)
+    found = wc.analyze(cloth, **options)
+    write_report(wc.Analyzer(cloth, **options), usd=tmp_path / "out.usda", curves=True)
     stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
     sequence = wc.open_sequence(cloth)
     centres = sequence[5][sequence.mesh.triangles].mean(axis=1)
@@ -118,7 +116,7 @@ def test_a_folder_of_files_becomes_a_stage(folder, cloth, capsys):
     stage = Usd.Stage.Open(str(out))
     assert UsdGeom.GetStageUpAxis(stage) == "Z" and stage.GetFramesPerSecond() == FPS
     read = FrameSequence(str(out), attribute="primvars:stretch1")
-    expected = wc.analyze(None, cloth)["stretch"][:, :, 0]
+    expected = wc.analyze(cloth)["stretch"][:, :, 0]
     assert read.time_codes.tolist() == [1, 2, 3, 4, 5, 6, 7]
     np.testing.assert_allclose(np.asarray(read), expected, rtol=1e-6)
     np.testing.assert_allclose(np.asarray(FrameSequence(str(out))), np.asarray(FrameSequence(str(cloth))), atol=1e-7)
@@ -155,7 +153,7 @@ def test_files_of_the_input_are_not_written_over(folder, kind):
     (folder / "link").symlink_to(sequence.files[-1])
     for path in (sequence.files[-1], folder / "link"):
         with pytest.raises(ValueError, match="is a file of the input, which must not be changed"):
-            write_report(wc.Analyzer(None, sequence), csv=path)
+            write_report(wc.Analyzer(sequence), csv=path)
     assert {path: path.read_bytes() for path in before} == before
 
 
@@ -178,12 +176,12 @@ def test_points_without_a_place_hide_no_other_directions(tmp_path, recwarn, plac
     if frame != "rest":
         sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(mesh.points.astype(np.float32)))
     stage.Save()
-    analyzer = wc.Analyzer(None, tmp_path / "cache.usda", measures=["stretch", "directions"], neighbourhood=neighbourhood)
+    analyzer = wc.Analyzer(tmp_path / "cache.usda", measures=["stretch", "directions"], neighbourhood=neighbourhood)
     report = write_report(analyzer, usd=tmp_path / "out.usdc", curves=True, csv=tmp_path / "t.csv", plot=tmp_path / "p.png")
     assert report.rows == 3 and report.excluded
     shown = Usd.Stage.Open(str(tmp_path / "out.usdc"))
     curves = UsdGeom.BasisCurves(shown.GetPrimAtPath("/Sheet_principal1"))
-    stretches = wc.analyze(None, tmp_path / "cache.usda", neighbourhood=neighbourhood)["stretch"][2, :, 0]
+    stretches = wc.analyze(tmp_path / "cache.usda", neighbourhood=neighbourhood)["stretch"][2, :, 0]
     ends = np.array(curves.GetPointsAttr().Get(2.0)).reshape(-1, 2, 3)
     seen = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 0.0
     np.testing.assert_array_equal(seen, np.isfinite(stretches))
@@ -402,14 +400,14 @@ def test_a_stage_of_frames_that_are_not_even_in_time(tmp_path):
     times = np.array([0.0, 0.1, 0.4, 0.5])
     path = str(tmp_path / "frames.npz")
     np.savez(path, points=frames, triangles=mesh.triangles, times=times)
-    write_report(wc.Analyzer(None, path), usd=tmp_path / "out.usdc")
+    write_report(wc.Analyzer(path), usd=tmp_path / "out.usdc")
     stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
     codes = np.array(stage.GetPrimAtPath("/World/Cloth").GetAttribute("primvars:stretch1").GetTimeSamples())
     np.testing.assert_allclose(codes / stage.GetTimeCodesPerSecond(), times, atol=1e-9)
     frames[0, 3] = np.nan
     np.savez(path, points=frames, triangles=mesh.triangles, times=times)
     with pytest.raises(ValueError, match=r"frames.npz: frame 0, which is the rest shape, has vertex 3 in no finite place"):
-        write_report(wc.Analyzer(None, path), usd=tmp_path / "out.usdc")
+        write_report(wc.Analyzer(path), usd=tmp_path / "out.usdc")
 
 
 def test_a_layer_over_a_measured_stage(cloth, tmp_path):
@@ -425,5 +423,5 @@ def test_an_animation_of_other_lengths_has_its_own_colours(tmp_path):
     mesh = wc.Mesh.grid(4, 4)
     with AnimationWriter(tmp_path / "still.usdc", mesh, FPS) as writer:
         writer.append(mesh.points, np.zeros_like(mesh.points))
-    report = write_report(wc.Analyzer(None, tmp_path / "still.usdc", measures="spin"), usd=tmp_path / "out.usdc")
+    report = write_report(wc.Analyzer(tmp_path / "still.usdc", measures="spin"), usd=tmp_path / "out.usdc")
     assert report.scale[0] < report.scale[1] and report.extremes["spin_norm"].largest is None

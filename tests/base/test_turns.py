@@ -41,7 +41,7 @@ CALLS = {
     "equilibrium": (scene, lambda declared: wc.equilibrium(declared, tolerance=1e-3).points),
     "arap": (lambda: None, lambda _: wc.Arap(MESH, np.arange(4)).solve(MESH.points[:4]).points),
     "deform": (pins, lambda moved: wc.deform(MESH, moved, fps=24).points),
-    "analyze": (lambda: None, lambda _: wc.analyze(MESH, [MESH.points, MOVED], dt=1.0)),
+    "analyze": (lambda: None, lambda _: wc.analyze([MESH.points, MOVED], MESH, dt=1.0)),
     "distances": (lambda: None, lambda _: surface_distances(MOVED, MESH.points, MESH.triangles)),
     "svd": (lambda: TURNED, wc.svd),
     "polar": (lambda: TURNED, wc.polar),

@@ -40,7 +40,7 @@ def gradient_from_two_axes():
     corners = [points[mesh.triangles][:, :, [0, 2]] for points in (mesh.points, x)]  # two of three axes
     Dm, Ds = (np.stack([c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]], axis=2) for c in corners)
     wrong = np.linalg.svd(Ds @ np.linalg.inv(Dm), compute_uv=False).min()
-    return wrong, wc.analyze(mesh, [x], measures=("stretch",))["stretch"].min()
+    return wrong, wc.analyze([x], mesh, measures=("stretch",))["stretch"].min()
 
 
 def dome(height):
@@ -61,7 +61,7 @@ def reflection():
 def covariance_for_gradient():
     """The ratio of the principal stretches of a cloth whose cells are twice as long as wide, not deformed, in its middle."""
     mesh = wc.Mesh.grid(7, 7, size=(2.0, 1.0), pattern="alternating")
-    found = wc.analyze(mesh, [mesh.points], neighbourhood="1-ring", measures=("cross_covariance", "stretch"))
+    found = wc.analyze([mesh.points], mesh, neighbourhood="1-ring", measures=("cross_covariance", "stretch"))
     middle = 24
     values = np.linalg.svd(found["cross_covariance"][0, middle], compute_uv=False)
     return values[0] / values[1], found["stretch"][0, middle, 0] / found["stretch"][0, middle, 1]
@@ -92,7 +92,7 @@ def rate_of_shear():
     """γ̇ of simple shear x = X + t Z by e₁·D e₂, and by the rate of the angle [1/s]."""
     mesh, dt = wc.Mesh.grid(5, 5), 1e-3
     frames = [mesh.points + t * mesh.points[:, [2]] * [1.0, 0.0, 0.0] for t in (-0.5 * dt, 0.5 * dt)]
-    found = wc.analyze(mesh, frames, dt=dt, directions=(1.0, 0.0, 0.0), measures=("rate_of_strain", "angle_rate"))
+    found = wc.analyze(frames, mesh, dt=dt, directions=(1.0, 0.0, 0.0), measures=("rate_of_strain", "angle_rate"))
     return found["rate_of_strain"][1, 0, 0, 2], np.abs(found["angle_rate"][1, 0])
 
 

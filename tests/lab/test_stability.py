@@ -128,7 +128,7 @@ SOFT_JACOBI = [
     ("xpbd", {"sweep": "constraint-averaged"}),
     ("xpbd", {"sweep": "constraint-averaged", "integrator": "midpoint"}),
     ("xpbd", {"sweep": "constraint-averaged", "integrator": "bdf2"}),
-    ("pbd", {"sweep": "jacobi", "stiffness": "per-step"}),
+    ("pbd", {"sweep": "jacobi", "correction": "per-step"}),
     ("pbd", {"sweep": "constraint-averaged"}),
 ]
 

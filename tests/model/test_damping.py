@@ -263,7 +263,7 @@ def implicit(integrator):
 SOLVERS = {f"{name} {way}": solver for way in ("euler", "midpoint", "bdf2") for name, solver in implicit(way).items()}
 SOLVERS["explicit"] = wc.Explicit(substeps=1)
 SOLVERS["pbd"] = wc.PBD(substeps=1, iterations=1)
-SOLVERS["pbd per step"] = wc.PBD(substeps=1, iterations=7, stiffness="per-step")
+SOLVERS["pbd per step"] = wc.PBD(substeps=1, iterations=7, correction="per-step")
 
 
 @pytest.mark.host

@@ -191,22 +191,22 @@ def test_02_a_collapsed_spring_has_no_direction(solver, dtype, device):
 # --- 3. PBD: stiffness depends on iterations and step; XPBD's is mgα.
 
 
-@pytest.mark.parametrize("stiffness", ["per-sweep", "per-step"])
+@pytest.mark.parametrize("correction", ["per-sweep", "per-step"])
 @pytest.mark.parametrize("iterations", [1, 3, 10])
 @pytest.mark.parametrize("substeps", [1, 5])
 @pytest.mark.parametrize("s", [0.05, 0.5, 0.9])
-def test_03_pbd_hangs_too_long_by_the_known_amount(s, substeps, iterations, stiffness, device):
+def test_03_pbd_hangs_too_long_by_the_known_amount(s, substeps, iterations, correction, device):
     """One mass hangs by g h²(1−s)ⁿ/(1−(1−s)ⁿ), which depends on n and h; s′ = 1 − (1−s)^(1/n) removes n (Müller et al. 2006).
 
     At one s the extension left is g h²(1−s)/s, and still that of h².
     """
     m, h = 0.1, 1 / (60.0 * substeps)
     k = s / (1 - s) * m / h**2
-    n = iterations if stiffness == "per-sweep" else 1
+    n = iterations if correction == "per-sweep" else 1
     expected = 9.81 * h**2 * (1 - s) ** n / (1 - (1 - s) ** n)
     if n == 1:
         assert expected == pytest.approx(m * 9.81 / k, rel=1e-12)
-    solver = wc.PBD(substeps=substeps, iterations=iterations, stiffness=stiffness)
+    solver = wc.PBD(substeps=substeps, iterations=iterations, correction=correction)
     stepper = solver.bind(hanging_mass(k, m, expected).build(device=device, dtype="float64"))
     for _ in range(20):
         stepper.step()

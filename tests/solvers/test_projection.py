@@ -101,7 +101,7 @@ def test_averaging_counts_the_constraints_of_the_busiest_vertex_that_moves(pins,
 
 def test_no_stiffness_is_no_constraint(device):
     """α̃ is infinite there, and 0·∞ must not get in."""
-    for solver in (wc.PBD(substeps=1), wc.PBD(substeps=1, stiffness="per-step"), wc.XPBD(substeps=1)):
+    for solver in (wc.PBD(substeps=1), wc.PBD(substeps=1, correction="per-step"), wc.XPBD(substeps=1)):
         stepper = solver.bind(hanging_mass(0.0, 1.0, 0.5).build(device=device))
         stepper.step()
         assert stepper.state.x.numpy()[1, 1] == pytest.approx(-1.5 - 9.81 / 3600, rel=1e-6)
@@ -109,8 +109,8 @@ def test_no_stiffness_is_no_constraint(device):
 
 def test_one_sweep_of_a_step_has_no_stiffness_to_spread(device):
     found = []
-    for stiffness in ("per-sweep", "per-step"):
-        stepper = wc.PBD(substeps=4, iterations=1, stiffness=stiffness).bind(scene("hanging", n=8).build(device=device))
+    for correction in ("per-sweep", "per-step"):
+        stepper = wc.PBD(substeps=4, iterations=1, correction=correction).bind(scene("hanging", n=8).build(device=device))
         for _ in range(5):
             stepper.frame()
         found.append((stepper.state.x.numpy(), stepper.model.kernels))

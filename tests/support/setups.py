@@ -12,7 +12,7 @@ SOLVERS = {
     "newton midpoint": wc.Newton(substeps=1, tolerance=1e-12, integrator="midpoint"),
     "newton bdf2": wc.Newton(substeps=1, tolerance=1e-12, integrator="bdf2"),
     "pbd": wc.PBD(substeps=1, iterations=4),
-    "pbd sequential": wc.PBD(substeps=1, iterations=4, sweep="sequential", stiffness="per-step"),
+    "pbd sequential": wc.PBD(substeps=1, iterations=4, sweep="sequential", correction="per-step"),
     "pbd averaged by vertex": wc.PBD(substeps=1, iterations=4, sweep="vertex-averaged"),
     "pbd averaged by constraint": wc.PBD(substeps=1, iterations=4, sweep="constraint-averaged"),
     "pbd plain": wc.PBD(substeps=1, iterations=4, sweep="jacobi", relaxation=0.3),

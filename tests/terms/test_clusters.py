@@ -266,7 +266,7 @@ def test_pbd_per_step_moves_a_soft_body_alike(iterations, device):
     rest, kappa = np.array(BODIES["solid"]), 3000.0
     x = rest + 0.2 * np.random.default_rng(1).normal(size=rest.shape)
     scene = body(rest, positions=x, stiffness=kappa)
-    solver = wc.PBD(substeps=1, iterations=iterations, stiffness="per-step")
+    solver = wc.PBD(substeps=1, iterations=iterations, correction="per-step")
     stepper = solver.bind(scene.build(device=device, dtype="float64"))
     stepper.step()
     part = 1.0 / (1.0 + 1.0 / (kappa * stepper.h**2))

@@ -1029,7 +1029,7 @@ def test_a_run_that_was_cut_short_is_recovered_under_its_own_name(tmp_path, cut)
     left = writer.path
     del writer  # killed: nothing is packed
     gc.collect()
-    analyzer = Analyzer(None, left)
+    analyzer = Analyzer(left)
     if cut:
         with pytest.raises(KeyboardInterrupt):
             write_report(analyzer, usd=output, progress=lambda row, _: interrupt_twice(row == 4))

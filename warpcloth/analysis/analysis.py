@@ -1,12 +1,13 @@
 """Measures of an animated cloth: deformation, strain, rotation and their rates, frame by frame or of all frames at once."""
 
+import warnings
 from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
 
 from ..base.checks import choice, number
-from ..mesh.mesh import same_topology
+from ..mesh.mesh import Mesh, same_topology
 from ..mesh.sequences import Sequence, as_sequence, open_sequence
 from ..model.model import DTYPES
 from .frame_pairs import pairs_of
@@ -17,7 +18,7 @@ from .surfaces import RATES, Neighbourhoods, Triangles, check_material, material
 _MOST = 100  # missing frames that have a sentence each
 
 
-def analyze(mesh, frames, dt=None, **options):
+def analyze(frames, mesh=None, dt=None, **options):
     """Measures an animation.
 
     With a ``neighbourhood`` of each vertex, else of each triangle: see :data:`warpcloth.analysis.measures.MEASURES` for all
@@ -25,9 +26,9 @@ def analyze(mesh, frames, dt=None, **options):
     grow.
 
     Args:
-        mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape; None for that of the file.
         frames: Points (F, n, 3) [m], an :class:`warpcloth.Animation`, anything that :func:`warpcloth.open_sequence` opens or
             returned.
+        mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape; by default that of the file.
         dt: Time between frames [s], which rates need; a file or an animation has its own.
         options: As of :class:`Analyzer`.
 
@@ -37,7 +38,8 @@ def analyze(mesh, frames, dt=None, **options):
     Raises:
         ValueError: As :class:`Analyzer`; or a frame is broken.
     """
-    analyzer = Analyzer(mesh, frames, dt, **options)
+    frames, mesh = _frames_first("analyze", frames, mesh)
+    analyzer = Analyzer(frames, mesh, dt, **options)
     values = {
         measure.name: np.empty((len(analyzer.pairs), analyzer.count, *measure.shape), analyzer.dtype)
         for measure in analyzer.measures
@@ -55,13 +57,13 @@ def analyze(mesh, frames, dt=None, **options):
 
 
 class Analyzer:
-    """Measures of an animation, row by row: ``for sample in Analyzer(mesh, frames): …`` gives a :class:`Sample` for each.
+    """Measures of an animation, row by row: ``for sample in Analyzer(frames, mesh): …`` gives a :class:`Sample` for each.
 
     A row is a frame against its reference. Memory holds three frames, however many there are.
 
     Args:
-        mesh: As of :func:`analyze`.
-        frames: As there.
+        frames: As of :func:`analyze`.
+        mesh: As there.
         dt: As there.
         measures: Names, or "all" that can be had with what is given. Nothing else is computed.
         reference: "rest", "first", "previous" or the number of a frame, see :func:`warpcloth.analysis.frame_pairs.pairs_of`;
@@ -92,8 +94,8 @@ class Analyzer:
 
     def __init__(
         self,
-        mesh,
         frames,
+        mesh=None,
         dt=None,
         measures=("stretch",),
         reference=None,
@@ -107,6 +109,7 @@ class Analyzer:
         device="cpu",
         dtype="float64",
     ):
+        frames, mesh = _frames_first("Analyzer", frames, mesh)
         self._given = {name: value for name, value in locals().items() if name != "self"}
         choice("rates", rates, tuple(RATES))
         choice("dtype", dtype, tuple(DTYPES))
@@ -270,6 +273,14 @@ def _missing(labels):
 
 def _frame(label, reason):
     return Exclusion(label, "frame", np.empty(0, dtype=int), reason)
+
+
+def _frames_first(name, frames, mesh):
+    """Returns frames and mesh; takes them in the other order, which was that of before, with a warning."""
+    if isinstance(frames, Mesh) or frames is None:
+        warnings.warn(f"{name}: frames come first now, {name}(frames, mesh)", DeprecationWarning, stacklevel=3)
+        return mesh, frames
+    return frames, mesh
 
 
 def _sequence(mesh, frames, dt):

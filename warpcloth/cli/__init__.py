@@ -33,6 +33,7 @@ def main(argv=None):
         warnings.showwarning = show_warning
         # NumPy's warnings about numbers that are not finite: the code reports such numbers by name, or expects them.
         warnings.filterwarnings("ignore", ".* encountered in ", RuntimeWarning)
+        warnings.filterwarnings("default", category=DeprecationWarning, module=r"warpcloth\.")  # an option has another name now
         debug = False
         try:
             parser = _parser()

@@ -156,8 +156,8 @@ def _analyzer(arguments):
     if directions is not None and directions != "st":
         directions = [scene_files.convert("--directions", number, (float,)) for number in directions.split(",")]
     return Analyzer(
-        rest,
         sequence,
+        rest,
         measures="all" if arguments.measure == ["all"] else arguments.measure,
         reference=arguments.reference,
         pairs=arguments.pairs,

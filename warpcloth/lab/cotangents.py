@@ -138,7 +138,7 @@ def _bends(choices, device):
             ended = Arap(mesh, handles, device=device, **given).solve(
                 np.concatenate([mesh.points[held], turned]), iterations=500
             )
-            stretch = analyze(mesh, ended.points[None], measures=("stretch",))["stretch"]
+            stretch = analyze(ended.points[None], mesh, measures=("stretch",))["stretch"]
             yield point("bend", name, negative, np.asarray(stretch).max())
 
 

@@ -322,7 +322,7 @@ def _roots(half, product):
 
 def _share(mobility, compliance, record):
     """What a sweep takes of what is wrong with a constraint by itself, without ω."""
-    if getattr(record, "stiffness", None) == "per-step":
+    if getattr(record, "correction", None) == "per-step":
         return 1.0 - (compliance / (mobility + compliance)) ** (1.0 / record.iterations)
     return mobility / (mobility + compliance)
 

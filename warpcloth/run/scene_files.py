@@ -9,10 +9,11 @@ import os
 import sys
 import types
 import typing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from ..base.checks import number
+from ..base.renamed import new_name
 from ..scene.scene import Scene
 from ..usd import ENDINGS as STAGES
 from ..usd import read_scene
@@ -234,7 +235,9 @@ def options(record, texts):
     Raises:
         ValueError: A name or a value that it does not take.
     """
-    kinds = typing.get_type_hints(record)
+    hints = typing.get_type_hints(record)
+    kinds = {field.name: hints[field.name] for field in fields(record)}
+    texts = {new_name(record, name, stacklevel=1): text for name, text in texts.items()}
     for name in texts:
         if name not in kinds:
             raise ValueError(f"{record.__name__} has no option {name!r}; {_allowed(kinds)}")

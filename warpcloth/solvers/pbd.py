@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from ..base.checks import choice, number, whole
+from ..base.renamed import renamed
 from ..numerics.sweeps import IN_PLACE, SWEEPS, Sweep
 from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
@@ -10,16 +11,17 @@ from .solver import LaunchedStepper
 from .step import Step
 
 
+@renamed(stiffness="correction")
 @dataclass(frozen=True)
 class PBD(Step):
     """Position based dynamics (Müller et al. 2006).
 
     A sweep moves the vertices of each constraint, weighted by inverse mass (equal masses: half and half), by
     Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y) with α̃ = 1/(kAh²): fully onto it for infinite stiffness k, the classical method; with a
-    finite one by the part s = w/(w + α̃) that the material would move by itself in a step. Spent once a sweep, s makes the
-    cloth stiffer with iterations and with 1/h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest, n the iterations.
-    Spent once a step, as s′ = 1 − (1−s)^(1/n) a sweep, it stretches by g h²(1−s)/s whatever n is, which with this s is mg/k;
-    where constraints meet, the result still depends on n.
+    finite one by the part s = w/(w + α̃) that the material would move by itself in a step. Corrected by s in every sweep, cloth
+    becomes stiffer with iterations and with 1/h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest, n the iterations.
+    Corrected by s in a step, which is s′ = 1 − (1−s)^(1/n) in each sweep, it stretches by g h²(1−s)/s whatever n is, which with
+    this s is mg/k; where constraints meet, the result still depends on n.
 
     Jacobi sweeps move by the sum of all corrections at once. Times ω it diverges iff ω λ_max(D⁻¹JWJᵀ) > 2. Averaged by vertex
     (Σx_new + αx)/(n + α), n its constraints, it converges for every α ≥ 0, but momentum is not conserved; averaged by
@@ -31,9 +33,10 @@ class PBD(Step):
         iterations: Sweeps a step.
         sweep: Jacobi ``"vertex-averaged"``, ``"constraint-averaged"`` or plain ``"jacobi"``; Gauss–Seidel ``"coloured"``, or
             ``"sequential"``: elements in the order of the scene, by one thread, which on a GPU is for small scenes.
-        alpha: α ≥ 0, weight of the old place when averaging by vertex.
+        alpha: α ≥ 0, weight of the old position when averaging by vertex.
         relaxation: ω > 0, a factor of every move.
-        stiffness: Whether finite stiffness is spent ``"per-sweep"`` (s) or ``"per-step"`` (s′).
+        correction: Whether a constraint of finite stiffness is corrected by the part s ``"per-sweep"``, or ``"per-step"``, with
+            s′ in each sweep.
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -53,7 +56,7 @@ class PBD(Step):
                 scene="net",
             ),
         ),
-        runs=grid([(30, 1), (60, 1), (120, 1), (240, 1)], stiffness="per-step"),
+        runs=grid([(30, 1), (60, 1), (120, 1), (240, 1)], correction="per-step"),
         limits=("ω λ_max = 2", "Gauss–Seidel, |z| = 1", "a ring an iteration"),
         style=("tab:pink", "D"),
     )
@@ -62,7 +65,7 @@ class PBD(Step):
     sweep: str = "coloured"
     alpha: float = 0.0
     relaxation: float = 1.0
-    stiffness: str = "per-sweep"
+    correction: str = "per-sweep"
 
     def __post_init__(self):
         super().__post_init__()
@@ -70,7 +73,7 @@ class PBD(Step):
         choice("sweep", self.sweep, SWEEPS)
         number("alpha", self.alpha, least=0.0)
         number("relaxation", self.relaxation, above=0.0)
-        choice("stiffness", self.stiffness, ("per-sweep", "per-step"))
+        choice("correction", self.correction, ("per-sweep", "per-step"))
         if self.sweep != "vertex-averaged" and self.alpha != 0.0:
             raise ValueError(f"alpha is {self.alpha:g}; it belongs to sweep='vertex-averaged' and must be 0 without")
 
@@ -104,7 +107,7 @@ class PBDStepper(LaunchedStepper):
         self.iterations = options.iterations
         model = self.model
         # Spread over one sweep it is what it is.
-        spread = options.iterations if options.stiffness == "per-step" and options.iterations > 1 else None
+        spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         self.sweep = Sweep(
             model, self.state.x, self.h, options.sweep, options.relaxation, options.alpha, spread=spread, pool=self.pool
         )
