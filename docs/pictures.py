@@ -85,9 +85,12 @@ def picture_hanging(fps=25, colours=256, least=1e-4):
         for artist in [*axes.collections, *axes.lines, *axes.texts]:
             artist.remove()
     plt.close(figure)
-    # One palette for all frames, so that what stands still is stored once.
+    # One palette for all frames, so that what stands still is stored once, with a white that is white.
     sample = Image.fromarray(np.concatenate([np.asarray(image) for image in images[::6]]))
-    palette = sample.quantize(colours)
+    entries = np.array(sample.quantize(colours).getpalette())
+    entries[entries > 248] = 255
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(entries.tolist())
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     images[0].save(DOCS / "hanging.gif", save_all=True, append_images=images[1:], duration=1000 // fps, loop=0, optimize=True)
 
