@@ -51,18 +51,22 @@ def solve_definite(H: Any, b: Any, n: int):
 def local_minimiser(term: Term, dtype):
     """The device function (v, z, rest, r) → argmin u(z) + ½r‖v − z‖², r > 0, from a guess z.
 
-    In closed form (p(v) + r v)/(1 + r) of a term that projects; else by Newton's method with the semi-definite Hessian of
-    the term and a line search. NaN where a force or the energy is not finite, which would else pass for the minimum: of what
-    overflows CUDA's fused products make infinity where others make NaN.
+    By the prox of a term that gives one; (p(v) + r v)/(1 + r) of one that projects; else by Newton's method with the
+    semi-definite Hessian of the term and a line search. NaN where a force or the energy is not finite, which would else pass
+    for the minimum: of what overflows CUDA's fused products make infinity where others make NaN.
     """
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     flat = wp.types.vector(3 * term.rows, dtype)
     size = wp.constant(3 * term.rows)
-    project, u, gradient, hessian = term.project, term.energy, term.gradient, term.hessian
+    project, prox, u, gradient, hessian = term.project, term.prox, term.energy, term.gradient, term.hessian
 
     @wp.func
     def closed(v: y_type, z: y_type, rest: rest_type, r: dtype, steps: int):
         return v + (project(v, rest) - v) / (dtype(1.0) + r)
+
+    @wp.func
+    def by_prox(v: y_type, z: y_type, rest: rest_type, r: dtype, steps: int):
+        return prox(v, rest, dtype(1.0) / r)
 
     @wp.func
     def value(v: y_type, z: y_type, rest: rest_type, r: dtype):
@@ -108,6 +112,8 @@ def local_minimiser(term: Term, dtype):
                         return z + (now - now) * z
         return z + (now - now) * z
 
+    if prox is not None:
+        return by_prox
     return closed if project is not None else newton
 
 

@@ -8,6 +8,10 @@ with G the weights of y and W the inverse masses, or on the scalar constraint of
 
     Δλ = −(C + α̃ λ)/(Σ wᵢ‖∇C‖² + α̃),   Δxᵢ = ∇ᵢC Δλ / mᵢ.
 
+or by the prox of a term that gives one, with s no less than any eigenvalue of G W Gᵀ (equal to it for M = 1),
+
+    Δλ = (prox(y − s λ, s/α̃) − y)/s,   prox(v, c) = argmin u(y) + ‖y − v‖²/2c.
+
 XPBD adds Δλ up in λ; for PBD λ is 0. With an infinite stiffness α̃ = 0 and, for springs, this is the projection of Müller et al.
 2006 (*Position based dynamics*). A stencil of pins alone has nothing to move and gives 0, and so does no stiffness; one with
 so few free vertices that the matrix is singular moves y as near to p(y) as they can take it, by the pseudo-inverse.
@@ -72,10 +76,10 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     corners = wp.types.vector(term.vertices, dtype)
-    weight, project = term.weight, term.project
+    weight, project, prox = term.weight, term.project, term.prox
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
     spread, share_of = spread_compliance(dtype), to_corner(term, dtype)
-    if project is not None and term.rows > 2:
+    if project is not None and prox is None and term.rows > 2:
         raise NotImplementedError(f"{term.name} projects {term.rows} rows; two at most")
 
     @wp.func
@@ -120,7 +124,28 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
         change = wp.where(moves, -(constraint(y, r) + compliance * before) / (total + compliance), dtype(0.0))
         return change, change * g
 
-    return of_constraint if scalar else of_projection
+    @wp.func
+    def of_prox(y: y_type, r: rest_type, w: corners, compliance: dtype, before: y_type, sweeps: int):
+        system = w[0] * wp.outer(weight(r, 0), weight(r, 0))
+        for i in range(1, K):
+            system += w[i] * wp.outer(weight(r, i), weight(r, i))
+        if wp.static(per_step):
+            compliance = spread(wp.trace(system) * dtype(wp.static(1.0 / term.rows)), compliance, sweeps)
+        # No eigenvalue is above the largest sum of a row.
+        largest = dtype(0.0)
+        for m in range(M):
+            total = dtype(0.0)
+            for n in range(M):
+                total += wp.abs(system[m, n])
+            largest = wp.max(largest, total)
+        rows = y_type()
+        if wp.where(compliance < dtype(wp.inf), largest, dtype(0.0)) != dtype(0.0):
+            rows = (prox(y - largest * before, r, largest / compliance) - y) / largest
+        return rows, rows
+
+    if scalar:
+        return of_constraint
+    return of_projection if prox is None else of_prox
 
 
 @cache

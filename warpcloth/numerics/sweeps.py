@@ -92,7 +92,9 @@ class Sweep:
             self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True) if model.terms else ((), ())
         keys = []
         for elements in model.terms:
-            of_constraint = elements.term.project is None or (scalar and elements.term.constraint is not None)
+            term = elements.term
+            only = term.project is None and term.prox is None
+            of_constraint = only or (scalar and term.constraint is not None)
             keys.append((elements.term, model.dtype, of_constraint))
         self.multipliers = [
             wp.zeros(elements.count, dtype=kernels.multiplier_type(*key), device=model.device) if multipliers else None
