@@ -13,7 +13,7 @@ def copy_rows():
 
     @wp.kernel(module="unique", enable_backward=False)
     def copy_each_row(
-        # in
+        # state in
         source: wp.array(dtype=wp.vec4),
         # out
         out: wp.array(dtype=wp.vec4),
@@ -31,8 +31,9 @@ def take_vertices(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def take_each_vertex(
-        # in
+        # state in
         values: wp.array(dtype=vec3),
+        # parameters
         places: wp.array(dtype=wp.int32),
         # out
         out: wp.array(dtype=vec3),
@@ -51,10 +52,10 @@ def copy_chosen(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def copy_each_chosen(
-        # parameters
+        # elements
         sources: wp.array(dtype=wp.int32),
         targets: wp.array(dtype=wp.int32),
-        # in
+        # state in
         source: wp.array(dtype=vec3),
         # out
         out: wp.array(dtype=vec3),

@@ -55,6 +55,7 @@ def into_three(function, matrix, types, block):
 
     @wp.kernel(module="unique", enable_backward=False)
     def decompose(
+        # state in
         A: wp.array(dtype=matrix),
         # out
         a: wp.array(dtype=a_type),
@@ -79,6 +80,7 @@ def into_two(function, matrix, types, block):
 
     @wp.kernel(module="unique", enable_backward=False)
     def decompose(
+        # state in
         A: wp.array(dtype=matrix),
         # out
         a: wp.array(dtype=a_type),

@@ -91,7 +91,9 @@ def frame_triangles(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_frames(
+        # elements
         triangles: wp.array2d(dtype=wp.int32),
+        # state in
         X: wp.array(dtype=vec3),
         # parameters
         rounding: dtype,
@@ -127,8 +129,10 @@ def triangle_gradients(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_gradients(
+        # elements
         triangles: wp.array2d(dtype=wp.int32),
         inverse_edges: wp.array(dtype=vec3),
+        # state in
         x: wp.array(dtype=vec3),
         # out
         gradients: wp.array(dtype=mat33),
@@ -156,6 +160,7 @@ def unit_directions(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_directions(
+        # elements
         coefficients: wp.array(dtype=mat22),
         inverse_edges: wp.array(dtype=vec3),
         # out
@@ -175,6 +180,30 @@ def unit_directions(dtype):
 
 
 @cache
+def triangle_measures(dtype):
+    """The struct of the outputs of :func:`measure_triangles`, (E,) each, by the names of measures."""
+    vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
+    mat32, mat23 = wp.types.matrix((3, 2), dtype), wp.types.matrix((2, 3), dtype)
+
+    @wp.struct
+    class TriangleMeasures:
+        deformation_gradient: wp.array(dtype=mat32)
+        rotation: wp.array(dtype=mat32)
+        right_stretch: wp.array(dtype=mat22)
+        right_cauchy_green: wp.array(dtype=mat22)
+        green_strain: wp.array(dtype=mat22)
+        stretch: wp.array(dtype=vec2)
+        rest_directions: wp.array(dtype=mat23)
+        directions: wp.array(dtype=mat23)
+        rotation_angle: wp.array(dtype=dtype)
+        area_ratio: wp.array(dtype=dtype)
+        length_ratio: wp.array(dtype=vec2)
+        angle: wp.array(dtype=dtype)
+
+    return TriangleMeasures
+
+
+@cache
 def measure_triangles(dtype):
     """Kernel over triangles: what follows from F = F̂'s first two columns, F = R U = W diag(λ) Vᵀ.
 
@@ -184,26 +213,17 @@ def measure_triangles(dtype):
     """
     _, mat33 = types(dtype)
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
-    mat32, mat23 = wp.types.matrix((3, 2), dtype), wp.types.matrix((2, 3), dtype)
+    outputs = triangle_measures(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def measure(
-        gradients: wp.array(dtype=mat33),
+        # elements
         frames: wp.array(dtype=mat33),
         materials: wp.array(dtype=mat22),
+        # state in
+        gradients: wp.array(dtype=mat33),
         # out
-        gradient: wp.array(dtype=mat32),
-        rotation: wp.array(dtype=mat32),
-        right_stretch: wp.array(dtype=mat22),
-        right_cauchy_green: wp.array(dtype=mat22),
-        green_strain: wp.array(dtype=mat22),
-        stretch: wp.array(dtype=vec2),
-        rest_directions: wp.array(dtype=mat23),
-        directions: wp.array(dtype=mat23),
-        rotation_angle: wp.array(dtype=dtype),
-        area_ratio: wp.array(dtype=dtype),
-        length_ratio: wp.array(dtype=vec2),
-        angle: wp.array(dtype=dtype),
+        out: outputs,
     ):
         t = wp.tid()
         half = dtype(0.5)
@@ -217,41 +237,41 @@ def measure_triangles(dtype):
             R = undefined(R[0, 0]) * R
         f1 = column(F, 0)
         f2 = column(F, 1)
-        if gradient:
-            gradient[t] = F
-        if rotation:
-            rotation[t] = R
-        if right_stretch:
+        if out.deformation_gradient:
+            out.deformation_gradient[t] = F
+        if out.rotation:
+            out.rotation[t] = R
+        if out.right_stretch:
             P = V * wp.diag(S) * wp.transpose(V)
             mean = half * (P[0, 1] + P[1, 0])
-            right_stretch[t] = mat22(P[0, 0], mean, mean, P[1, 1])
-        if right_cauchy_green:
-            right_cauchy_green[t] = C
-        if green_strain:
+            out.right_stretch[t] = mat22(P[0, 0], mean, mean, P[1, 1])
+        if out.right_cauchy_green:
+            out.right_cauchy_green[t] = C
+        if out.green_strain:
             # (‖f‖ − 1)(‖f‖ + 1) does not cancel.
             a = wp.length(f1)
             b = wp.length(f2)
-            green_strain[t] = half * mat22((a - one) * (a + one), C[0, 1], C[1, 0], (b - one) * (b + one))
-        if stretch:
-            stretch[t] = S
-        if rest_directions:
-            rest_directions[t] = wp.transpose(surface_part(T) * V)
-        if directions:
-            directions[t] = wp.transpose(U)
-        if rotation_angle:
+            out.green_strain[t] = half * mat22((a - one) * (a + one), C[0, 1], C[1, 0], (b - one) * (b + one))
+        if out.stretch:
+            out.stretch[t] = S
+        if out.rest_directions:
+            out.rest_directions[t] = wp.transpose(surface_part(T) * V)
+        if out.directions:
+            out.directions[t] = wp.transpose(U)
+        if out.rotation_angle:
             r1 = column(R, 0)
             r2 = column(R, 1)
-            rotation_angle[t] = angle_of(wp.matrix_from_cols(r1, r2, wp.cross(r1, r2)) * wp.transpose(T))
-        if area_ratio:
-            area_ratio[t] = wp.length(wp.cross(f1, f2))
+            out.rotation_angle[t] = angle_of(wp.matrix_from_cols(r1, r2, wp.cross(r1, r2)) * wp.transpose(T))
+        if out.area_ratio:
+            out.area_ratio[t] = wp.length(wp.cross(f1, f2))
         if materials:
             A = F * materials[t]
             a1 = column(A, 0)
             a2 = column(A, 1)
-            if length_ratio:
-                length_ratio[t] = vec2(wp.length(a1), wp.length(a2))
-            if angle:
-                angle[t] = angle_of_threads(F, A)
+            if out.length_ratio:
+                out.length_ratio[t] = vec2(wp.length(a1), wp.length(a2))
+            if out.angle:
+                out.angle[t] = angle_of_threads(F, A)
 
     return measure
 
@@ -266,9 +286,11 @@ def measure_stress(dtype, term):
 
     @wp.kernel(module="unique", enable_backward=False)
     def measure(
-        gradients: wp.array(dtype=mat33),
+        # elements
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=parameters),
+        # state in
+        gradients: wp.array(dtype=mat33),
         # out
         energy_density: wp.array(dtype=dtype),
         first_piola_stress: wp.array(dtype=mat32),

@@ -14,10 +14,12 @@ def follow(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def follow_kept(
+        # elements
         dropped: wp.array(dtype=wp.int32),
         offsets: wp.array(dtype=wp.int32),
         parents: wp.array(dtype=wp.int32),
         weights: wp.array(dtype=dtype),
+        # parameters
         per_copy: int,
         # in and out
         d: wp.array(dtype=vec3),

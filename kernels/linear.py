@@ -21,10 +21,13 @@ def set_inertia(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_diagonal(
+        # elements
         diagonal: wp.array(dtype=wp.int32),
         mass: wp.array(dtype=dtype),
         inverse_mass: wp.array(dtype=dtype),
+        # parameters
         scale: dtype,
+        # out
         values: wp.array(dtype=mat33),
     ):
         i = wp.tid()
@@ -43,9 +46,12 @@ def add_blocks(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_blocks(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         sources: wp.array(dtype=wp.int32),
+        # state in
         blocks: wp.array(dtype=mat33),
+        # in and out
         values: wp.array(dtype=mat33),
     ):
         s = wp.tid()
@@ -64,10 +70,13 @@ def multiply(dtype):
 
     @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
     def multiply_rows(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
+        # state in
         values: wp.array(dtype=mat33),
         p: wp.array(dtype=vec3),
+        # parameters
         active: wp.array(dtype=wp.int32),
         per_copy: int,
         # out
@@ -95,14 +104,18 @@ def rounding(dtype):
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def rounding_of_rows(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         diagonal: wp.array(dtype=wp.int32),
+        # state in
         values: wp.array(dtype=mat33),
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
+        # parameters
         epsilon: dtype,
         edge: dtype,
+        # out
         force: wp.array(dtype=wp.float64),
         energy: wp.array(dtype=wp.float64),
     ):
@@ -130,7 +143,14 @@ def invert_diagonal(dtype):
     _, mat33 = types(dtype)
 
     @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
-    def invert_blocks(diagonal: wp.array(dtype=wp.int32), values: wp.array(dtype=mat33), inverse: wp.array(dtype=mat33)):
+    def invert_blocks(
+        # elements
+        diagonal: wp.array(dtype=wp.int32),
+        # state in
+        values: wp.array(dtype=mat33),
+        # out
+        inverse: wp.array(dtype=mat33),
+    ):
         i = wp.tid()
         block = values[diagonal[i]]
         size = wp.sqrt(wp.ddot(block, block))
@@ -158,8 +178,10 @@ def start_iteration(dtype, numbers: bool = False):
 
     @wp.kernel(module=module, enable_backward=False)
     def start(
+        # state in
         preconditioner: wp.array(dtype=block),
         b: wp.array(dtype=vector),
+        # out
         x: wp.array(dtype=vector),
         r: wp.array(dtype=vector),
         z: wp.array(dtype=vector),
@@ -183,8 +205,11 @@ def start_copies():
 
     @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def start(
+        # state in
         rz: wp.array(dtype=wp.float64),
+        # parameters
         wanted: wp.array(dtype=wp.int32),
+        # out
         first: wp.array(dtype=wp.float64),
         active: wp.array(dtype=wp.int32),
         iteration: wp.array(dtype=wp.int32),
@@ -210,11 +235,13 @@ def advance(dtype, numbers: bool = False):
 
     @wp.kernel(module=module, enable_backward=False)
     def advance_unknowns(
+        # state in
         preconditioner: wp.array(dtype=block),
         p: wp.array(dtype=vector),
         q: wp.array(dtype=vector),
         rz: wp.array(dtype=wp.float64),
         pq: wp.array(dtype=wp.float64),
+        # parameters
         active: wp.array(dtype=wp.int32),
         iteration: wp.array(dtype=wp.int32),
         per_copy: int,
@@ -245,9 +272,11 @@ def check_copies():
 
     @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
     def check(
+        # state in
         new_rz: wp.array(dtype=wp.float64),
         pq: wp.array(dtype=wp.float64),
         first: wp.array(dtype=wp.float64),
+        # parameters
         tolerance: wp.array(dtype=wp.float64),
         # in and out
         rz: wp.array(dtype=wp.float64),
@@ -278,7 +307,12 @@ def begin_check():
     """Kernel of one thread, before :func:`check_copies`: counts the iteration; proceed = 0."""
 
     @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
-    def begin(iteration: wp.array(dtype=wp.int32), proceed: wp.array(dtype=wp.int32)):
+    def begin(
+        # in and out
+        iteration: wp.array(dtype=wp.int32),
+        # out
+        proceed: wp.array(dtype=wp.int32),
+    ):
         iteration[0] = iteration[0] + 1
         proceed[0] = 0
 
@@ -290,7 +324,14 @@ def limit_iterations():
     """Kernel of one thread, after :func:`check_copies`: proceed = 0 once the iterations are used up."""
 
     @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
-    def limit(iteration: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
+    def limit(
+        # state in
+        iteration: wp.array(dtype=wp.int32),
+        # parameters
+        most: int,
+        # out
+        proceed: wp.array(dtype=wp.int32),
+    ):
         if iteration[0] >= most:
             proceed[0] = 0
 
@@ -304,10 +345,13 @@ def new_direction(dtype, numbers: bool = False):
 
     @wp.kernel(module=module, enable_backward=False)
     def turn(
+        # state in
         z: wp.array(dtype=vector),
         ratio: wp.array(dtype=wp.float64),
+        # parameters
         active: wp.array(dtype=wp.int32),
         per_copy: int,
+        # in and out
         p: wp.array(dtype=vector),
     ):
         i = wp.tid()
@@ -324,7 +368,14 @@ def scale(dtype):
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def scale_vertices(s: wp.array(dtype=dtype), a: wp.array(dtype=vec3), out: wp.array(dtype=vec3)):
+    def scale_vertices(
+        # elements
+        s: wp.array(dtype=dtype),
+        # state in
+        a: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=vec3),
+    ):
         i = wp.tid()
         out[i] = s[i] * a[i]
 

@@ -17,9 +17,11 @@ def vertex_normals(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_normals(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         incident: wp.array(dtype=wp.int32),
         triangles: wp.array2d(dtype=wp.int32),
+        # state in
         x: wp.array(dtype=vec3),
         # out
         normals: wp.array(dtype=vec3),
@@ -74,10 +76,12 @@ def neighbourhood_gradients(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def fit(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         members: wp.array(dtype=wp.int32),
         reference_normals: wp.array(dtype=vec3),
         X: wp.array(dtype=vec3),
+        # state in
         normals: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         # parameters
@@ -143,6 +147,7 @@ def measure_neighbourhoods(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def measure(
+        # state in
         gradients: wp.array(dtype=mat33),
         frames: wp.array(dtype=mat33),
         rotations: wp.array(dtype=mat33),

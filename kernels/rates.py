@@ -76,6 +76,26 @@ def rate_of(before: Any, after: Any, dt: Any, method: int):
 
 
 @cache
+def rate_measures(dtype):
+    """The struct of the outputs of :func:`measure_rates`, (E,) each, by the names of measures."""
+    vec3, mat33 = types(dtype)
+    vec2 = wp.types.vector(2, dtype)
+
+    @wp.struct
+    class RateMeasures:
+        velocity_gradient: wp.array(dtype=mat33)
+        rate_of_strain: wp.array(dtype=mat33)
+        spin: wp.array(dtype=mat33)
+        stretch_rate: wp.array(dtype=vec2)
+        rest_direction_rate: wp.array(dtype=dtype)
+        direction_rate: wp.array(dtype=vec3)
+        length_rate: wp.array(dtype=vec2)
+        angle_rate: wp.array(dtype=dtype)
+
+    return RateMeasures
+
+
+@cache
 def measure_rates(dtype):
     """Kernel over elements: the velocity gradient L = ḞF⁻¹ = D + W and other rates between the gradients F̂₀ and F̂₁.
 
@@ -86,6 +106,7 @@ def measure_rates(dtype):
     """
     vec3, mat33 = types(dtype)
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
+    outputs = rate_measures(dtype)
 
     @wp.func
     def turn(a0: vec2, a1: vec2, b0: vec3, b1: vec3, dt: dtype):
@@ -108,29 +129,24 @@ def measure_rates(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def measure(
-        before: wp.array(dtype=mat33),
-        after: wp.array(dtype=mat33),
+        # elements
         materials: wp.array(dtype=mat22),
         sizes: wp.array(dtype=dtype),
+        # state in
+        before: wp.array(dtype=mat33),
+        after: wp.array(dtype=mat33),
         # parameters
         dt: dtype,
         method: int,
         rounding: dtype,
         # out
-        velocity_gradient: wp.array(dtype=mat33),
-        rate_of_strain: wp.array(dtype=mat33),
-        spin: wp.array(dtype=mat33),
-        stretch_rate: wp.array(dtype=vec2),
-        rest_direction_rate: wp.array(dtype=dtype),
-        direction_rate: wp.array(dtype=vec3),
-        length_rate: wp.array(dtype=vec2),
-        angle_rate: wp.array(dtype=dtype),
+        out: outputs,
     ):
         e = wp.tid()
         half = dtype(0.5)
         F0 = before[e]
         F1 = after[e]
-        if velocity_gradient or rate_of_strain or spin:
+        if out.velocity_gradient or out.rate_of_strain or out.spin:
             mean = half * (F0 + F1)
             size = half * (lengths(F0) + lengths(F1))
             L = F0
@@ -144,23 +160,23 @@ def measure_rates(dtype):
                 else:
                     L = logarithm(F1 * inverse)
             L = (dtype(1.0) / dt) * L
-            if velocity_gradient:
-                velocity_gradient[e] = L
-            if rate_of_strain:
+            if out.velocity_gradient:
+                out.velocity_gradient[e] = L
+            if out.rate_of_strain:
                 n = wp.cross(column(mean, 0), column(mean, 1))
                 n = (dtype(1.0) / wp.length(n)) * n
                 D = half * (L + wp.transpose(L))
                 Dn = D * n
                 # P D P, P = I − nnᵀ
-                rate_of_strain[e] = D - wp.outer(Dn, n) - wp.outer(n, Dn) + wp.dot(n, Dn) * wp.outer(n, n)
-            if spin:
-                spin[e] = half * (L - wp.transpose(L))
-        if stretch_rate or rest_direction_rate or direction_rate:
+                out.rate_of_strain[e] = D - wp.outer(Dn, n) - wp.outer(n, Dn) + wp.dot(n, Dn) * wp.outer(n, n)
+            if out.spin:
+                out.spin[e] = half * (L - wp.transpose(L))
+        if out.stretch_rate or out.rest_direction_rate or out.direction_rate:
             U0, S0, V0 = svd3x2(surface_part(F0))
             U1, S1, V1 = svd3x2(surface_part(F1))
-            if stretch_rate:
-                stretch_rate[e] = vec2(rate_of(S0[0], S1[0], dt, method), rate_of(S0[1], S1[1], dt, method))
-            if rest_direction_rate or direction_rate:
+            if out.stretch_rate:
+                out.stretch_rate[e] = vec2(rate_of(S0[0], S1[0], dt, method), rate_of(S0[1], S1[1], dt, method))
+            if out.rest_direction_rate or out.direction_rate:
                 a0 = wp.vector(V0[0, 0], V0[1, 0])
                 a1 = wp.vector(V1[0, 0], V1[1, 0])
                 in_frame, in_space = turn(a0, a1, column(U0, 0), column(U1, 0), dt)
@@ -169,20 +185,20 @@ def measure_rates(dtype):
                 if not (S0[0] - S0[1] > tiny * S0[0] and S1[0] - S1[1] > tiny * S1[0]):
                     in_frame = dtype(wp.NAN)
                     in_space = in_frame * vec3(dtype(1.0), dtype(1.0), dtype(1.0))
-                if rest_direction_rate:
-                    rest_direction_rate[e] = in_frame
-                if direction_rate:
-                    direction_rate[e] = in_space
+                if out.rest_direction_rate:
+                    out.rest_direction_rate[e] = in_frame
+                if out.direction_rate:
+                    out.direction_rate[e] = in_space
         if materials:
             f0 = surface_part(F0)
             f1 = surface_part(F1)
             A0 = f0 * materials[e]
             A1 = f1 * materials[e]
-            if length_rate:
+            if out.length_rate:
                 l0 = vec2(wp.length(column(A0, 0)), wp.length(column(A0, 1)))
                 l1 = vec2(wp.length(column(A1, 0)), wp.length(column(A1, 1)))
-                length_rate[e] = vec2(rate_of(l0[0], l1[0], dt, method), rate_of(l0[1], l1[1], dt, method))
-            if angle_rate:
-                angle_rate[e] = (angle_of_threads(f1, A1) - angle_of_threads(f0, A0)) / dt
+                out.length_rate[e] = vec2(rate_of(l0[0], l1[0], dt, method), rate_of(l0[1], l1[1], dt, method))
+            if out.angle_rate:
+                out.angle_rate[e] = (angle_of_threads(f1, A1) - angle_of_threads(f0, A0)) / dt
 
     return measure

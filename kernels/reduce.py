@@ -23,7 +23,14 @@ def partial_sum():
     """Kernel over (copies, chunks): out[copy, chunk] = Σ values."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
-    def sum_chunks(values: wp.array(dtype=wp.float64), per_copy: int, out: wp.array2d(dtype=wp.float64)):
+    def sum_chunks(
+        # state in
+        values: wp.array(dtype=wp.float64),
+        # parameters
+        per_copy: int,
+        # out
+        out: wp.array2d(dtype=wp.float64),
+    ):
         copy, chunk = wp.tid()
         total = wp.float64(0.0)
         for i in range(chunk, per_copy, out.shape[1]):
@@ -40,8 +47,10 @@ def partial_dot(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def dot_chunks(
+        # state in
         a: wp.array(dtype=vec3),
         b: wp.array(dtype=vec3),
+        # parameters
         active: wp.array(dtype=wp.int32),
         per_copy: int,
         # out
@@ -64,8 +73,10 @@ def partial_product(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def multiply_chunks(
+        # state in
         a: wp.array(dtype=dtype),
         b: wp.array(dtype=dtype),
+        # parameters
         active: wp.array(dtype=wp.int32),
         per_copy: int,
         # out
@@ -88,8 +99,11 @@ def finish_sum():
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def add_chunks(
+        # state in
         partial: wp.array2d(dtype=wp.float64),
+        # parameters
         accumulate: int,
+        # in and out
         out: wp.array(dtype=wp.float64),
     ):
         copy = wp.tid()
@@ -110,7 +124,14 @@ def partial_largest(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def largest_of_chunks(
-        weights: wp.array(dtype=dtype), a: wp.array(dtype=vec3), per_copy: int, out: wp.array2d(dtype=wp.float64)
+        # elements
+        weights: wp.array(dtype=dtype),
+        # state in
+        a: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        # out
+        out: wp.array2d(dtype=wp.float64),
     ):
         copy, chunk = wp.tid()
         most = wp.float64(0.0)
@@ -129,7 +150,14 @@ def partial_largest_number():
     """Kernel over (copies, chunks): out[copy, chunk] = max of numbers of 0 or more; NaN stays."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def largest_number_of_chunks(values: wp.array(dtype=wp.float64), per_copy: int, out: wp.array2d(dtype=wp.float64)):
+    def largest_number_of_chunks(
+        # state in
+        values: wp.array(dtype=wp.float64),
+        # parameters
+        per_copy: int,
+        # out
+        out: wp.array2d(dtype=wp.float64),
+    ):
         copy, chunk = wp.tid()
         most = wp.float64(0.0)
         for i in range(chunk, per_copy, out.shape[1]):
@@ -146,7 +174,12 @@ def finish_largest():
     """Kernel over copies: out[copy] = max partial[copy]; NaN stays."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
-    def largest_chunk(partial: wp.array2d(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
+    def largest_chunk(
+        # state in
+        partial: wp.array2d(dtype=wp.float64),
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
         copy = wp.tid()
         most = wp.float64(0.0)
         for chunk in range(partial.shape[1]):
@@ -162,7 +195,12 @@ def keep_largest():
     """Kernel over copies: out[copy] = max(out[copy], value[copy]) of numbers of 0 or more; NaN stays."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
-    def keep(values: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
+    def keep(
+        # state in
+        values: wp.array(dtype=wp.float64),
+        # in and out
+        out: wp.array(dtype=wp.float64),
+    ):
         copy = wp.tid()
         if out[copy] == out[copy] and not (values[copy] <= out[copy]):
             out[copy] = values[copy]

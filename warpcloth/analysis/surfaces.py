@@ -53,15 +53,22 @@ class _Elements:
         outputs = [self.results.get(out) if isinstance(out, str) else out for out in outputs]
         wp.launch(kernel, self.count if count is None else count, inputs=inputs, outputs=outputs, device=self.device)
 
+    def chosen(self, struct):
+        """A struct of measures with the results that somebody has chosen."""
+        found = struct()
+        for name in struct.vars:
+            if name in self.results:
+                setattr(found, name, self.results[name])
+        return found
+
     def wanted(self, *names):
         return any(name in self.results for name in names)
 
     def rates(self, dt, method, rounding):
         """Rates from the gradients ``before`` to ``gradients``, a time dt [s] later, of points rounded by ``rounding`` [m]."""
-        names = ("velocity_gradient", "rate_of_strain", "spin", "stretch_rate", "rest_direction_rate", "direction_rate")
-        inputs = [self.before, self.gradients, self.materials, self.sizes]
+        inputs = [self.materials, self.sizes, self.before, self.gradients]
         inputs += [self.scalar(dt), int(RATES[method]), self.scalar(rounding)]
-        self.launch(rates.measure_rates(self.scalar), inputs, (*names, "length_rate", "angle_rate"))
+        self.launch(rates.measure_rates(self.scalar), inputs, [self.chosen(rates.rate_measures(self.scalar))])
 
     @in_turn
     def read(self):
@@ -122,15 +129,14 @@ class Triangles(_Elements):
     def measure(self, x):
         """Measures the frame x (n, 3), all but rates."""
         self._find_gradients(x, self.gradients)
-        names = ("deformation_gradient", "rotation", "right_stretch", "right_cauchy_green", "green_strain", "stretch",
-                 "rest_directions", "directions", "rotation_angle", "area_ratio", "length_ratio", "angle")  # fmt: skip
-        if self.wanted(*names):
-            inputs = [self.gradients, self.frames, self.materials]
-            self.launch(deformation.measure_triangles(self.scalar), inputs, names)
+        outputs = deformation.triangle_measures(self.scalar)
+        if self.wanted(*outputs.vars):
+            inputs = [self.frames, self.materials, self.gradients]
+            self.launch(deformation.measure_triangles(self.scalar), inputs, [self.chosen(outputs)])
         names = ("energy_density", "first_piola_stress", "cauchy_stress")
         if self.wanted(*names):
             kernel = deformation.measure_stress(self.scalar, self.term)
-            self.launch(kernel, [self.gradients, self.stiffness, self.rest], names)
+            self.launch(kernel, [self.stiffness, self.rest, self.gradients], names)
 
     def _find_gradients(self, x, out):
         inputs = [self.triangles, self.inverse_edges, self.place(x)]
