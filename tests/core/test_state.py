@@ -11,12 +11,14 @@ MESH = wc.Mesh.grid(5, 5, pattern="alternating")
 
 
 def moved(offset=0.0):
-    """A damped cloth, one of whose corners is led; far from the origin explicit steps keep the position residual."""
+    """A damped cloth out of balance, two corners led; far from the origin explicit steps keep the position residual."""
     mesh = wc.Mesh(MESH.points + offset, MESH.triangles, grid_shape=MESH.grid_shape)
     pins = [0, 4]
     keyframes = mesh.points[pins][None] + np.linspace(0.0, 0.2, 5)[:, None, None] * [0.0, 0.3, 1.0]
+    start = mesh.points + np.random.default_rng(0).normal(scale=0.02, size=mesh.points.shape)
+    start[pins] = mesh.points[pins]
     terms = [wc.Spring(pairs=("structural", "shear"), stiffness=100.0, damping=0.0 if offset else 0.05)]
-    return wc.Scene(mesh, density=0.1, terms=terms, pins=wc.Pins(pins, keyframes), fps=480.0, duration=0.025)
+    return wc.Scene(mesh, density=0.1, positions=start, terms=terms, pins=wc.Pins(pins, keyframes), fps=480.0, duration=0.025)
 
 
 def steps(stepper, number):
