@@ -589,7 +589,7 @@ def test_a_second_interrupt_comes_at_once_and_loses_nothing(moment, ending, tmp_
 
 def test_interrupts_in_the_frames_before_and_after_them(tmp_path, capfd, monkeypatch):
     """Before the first frame nothing is left; in frames one ends the run and a second one leaves it in chunks."""
-    output, watch = tmp_path / "out.usdz", sys.modules["warpcloth.run.simulate"].Watch
+    output, watch = tmp_path / "out.usdz", sys.modules["warpcloth.run.watch"].Watch
     with monkeypatch.context() as patched:
         interrupt_in(patched, watch, "__init__", signal.SIGINT)
         found = run(capfd, "run", *SMALL, "-o", output)

@@ -1,6 +1,7 @@
 """A run that gains energy which no source put in is named, and no other run is."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -13,10 +14,14 @@ from support.scenes import SMALL as SIZES
 from warpcloth.cli import main
 from warpcloth.core.energy import Energy
 from warpcloth.core.sums import Sums
+from warpcloth.kernels.term import Term
+from warpcloth.kernels.terms import ATTACHMENT
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.stability import measure
 from warpcloth.run import balance
-from warpcloth.run.simulate import Watch
+from warpcloth.run.frames import Frame
+from warpcloth.run.sources import Source, source_of
+from warpcloth.run.watch import Watch
 from warpcloth.scenes import flag, hanging, net
 
 SMALL = SIZES | {"mobile": {"n": 5}, "net": {"n": 6}}
@@ -127,7 +132,7 @@ def test_symplectic_euler_is_judged_by_what_it_keeps(device):
         stepper.frame()
         x, v = (np.array(array.numpy()) for array in stepper.state)
         swings.append(0.5 * v[1, 0] ** 2 / start)
-        assert watch.passes(frame, x, v, stepper.results), watch.messages
+        assert watch.passes(frame, Frame(x, v, stepper.results, stepper.residual, 0.0)), watch.messages
     # Of E = ½ω²x₀² the kept quantity is ½u² + (1 − part²)½ω²x²; of v it is reached only if a step ends at its peak.
     assert 100.0 < max(swings) <= 1.001 / (1.0 - part**2)
     assert watch.growth[0] <= balance.GAIN
@@ -185,18 +190,57 @@ def test_each_copy_has_a_balance_of_its_own(device):
     assert status.good[0] == status.good[2] == 12 > status.good[1]
 
 
-def test_a_source_of_a_new_kind_counts(device, monkeypatch):
-    """A new solver that carries a mass along declares its source by an entry of SOURCES."""
+@dataclass(frozen=True, kw_only=True)
+class Windy(wc.Spring):
+    """A term that puts energy in beside its own, and says so of itself."""
 
-    class Wind(balance.Source):
-        name = "wind"
+    wind: float
 
-        def energy(self, frame, speed):
-            return 1e6
 
+@source_of.register
+def _wind(term: Windy, _balance, _stepper):
+    source = Source()
+    source.name, source.energy = "wind", lambda _frame, _speed: term.wind
+    return source
+
+
+def test_a_term_may_be_a_source_of_energy(device):
     make, solver, _ = BLOWN_UP["over-relaxed sweeps"]
-    monkeypatch.setattr(balance, "SOURCES", [*balance.SOURCES, lambda balance, stepper: Wind()])
-    assert wc.simulate(make(), solver, device=device).status.ok
+    declared = make()
+    for wind, ok in ((1e6, True), (1e-6, False)):
+        terms = [Windy(pairs="structural", stiffness=0.0, wind=wind), *declared.terms]
+        status = wc.simulate(replace(declared, terms=terms), solver, device=device).status
+        assert status.ok == ok
+    assert "of which the start, wind and falling can have put in no more" in status.message
+
+
+@wp.func
+def energy_of_well(y: Any, rest: Any):
+    """½‖y − target‖² less the ½ that it is at a distance of 1 m."""
+    offset = y[0] - rest
+    return y.dtype(0.5) * (wp.dot(offset, offset) - y.dtype(1.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Well(wc.Attachment):
+    term: ClassVar[Term] = replace(ATTACHMENT, name="Well", energy=energy_of_well)
+
+
+@pytest.mark.parametrize("distance", [1.0, 0.3, 0.0])
+@pytest.mark.parametrize("solver", [wc.Explicit(substeps=64), wc.Newton(substeps=16)])
+def test_an_energy_may_be_negative(solver, distance, device):
+    """A mass that starts where U = 0, or below, swings through U = −½k, and only a step that is too long is called diverged."""
+    k, given = 400.0, {"masses": [1.0, 1.0], "pins": [0], "gravity": (0, 0, 0), "duration": 1.0}
+    positions, velocities = [[0.0, 0.0, 0.0], [distance, 0.0, 0.0]], [[0.0] * 3, [0.0, 0.1, 0.0]]
+    given |= {"terms": [Well(vertices=[1], targets=[[0.0] * 3], stiffness=k)], "positions": positions, "velocities": velocities}
+    scene = wc.Scene(PAIR, **given)
+    animation = wc.simulate(scene, solver, device=device, dtype="float64")
+    assert animation.status.ok, animation.status.message
+    speed = np.linalg.norm(animation.velocities[:, 1], axis=1).max()
+    assert 0.5 * speed**2 > 0.5 * (0.25 * k * distance**2 + 0.01)
+    long = wc.Explicit(dt=1.01 * 2.0 / np.sqrt(k), above_limit="allow")
+    grown = wc.simulate(replace(scene, fps=1.0 / long.dt, duration=200 * long.dt), long, device=device, dtype="float64")
+    assert "gained energy" in grown.status.message
 
 
 def test_a_cell_of_a_map_that_gains_is_not_stable(device):

@@ -32,7 +32,7 @@ def threads():
 
 def look_ahead(monkeypatch, frames):
     """Lets runs compute so many frames ahead, on the CPU too."""
-    module = sys.modules["warpcloth.run.simulate"]
+    module = sys.modules["warpcloth.run.watch"]
     monkeypatch.setattr(module, "frames_of", lambda stepper, count, _ahead: frames_of(stepper, count, frames))
 
 
@@ -194,7 +194,9 @@ def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_
     asked, module = [], sys.modules["warpcloth.run.simulate"]
     monkeypatch.setattr(module.os, "sched_getaffinity", lambda _process: set(range(cores)), raising=False)
     monkeypatch.setattr(
-        module, "frames_of", lambda stepper, count, ahead: asked.append(ahead) or frames_of(stepper, count, ahead)
+        sys.modules["warpcloth.run.watch"],
+        "frames_of",
+        lambda stepper, count, ahead: asked.append(ahead) or frames_of(stepper, count, ahead),
     )
     path = None if output is None else str(tmp_path / output)
     wc.simulate(hanging.scene(n=8), SOLVERS["explicit"], output=path, device=device, frames=2)

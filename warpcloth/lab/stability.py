@@ -3,13 +3,14 @@
 import math
 import time
 import warnings
+from contextlib import closing
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from ..base.checks import choice, number
 from ..core.status import Result
-from ..run.simulate import Watch
+from ..run.watch import Watch, watched_frames
 from ..solvers import Newton
 from .axes import AXES, FIXED, OPTIONS, record_at, refined, scene_at, steps_in, together, vary
 from .digest import scene_digest
@@ -68,15 +69,11 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
     points = np.full((frames + 1, B, model.per_copy, 3), np.nan)
     points[0] = model.positions.numpy().reshape(B, -1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
-        for frame in range(1, frames + 1):
-            stepper.frame()
-            x, v = (np.array(array.numpy(), dtype=np.float64) for array in stepper.state)
-            watch.passes(frame, x, v, stepper.results)
-            points[frame, watch.alive] = x.reshape(B, -1, 3)[watch.alive]
-            if not watch.alive.any():
-                break
-            if time.perf_counter() - began > limit:
-                raise Slow(f"stopped after {limit:g} s, in frame {frame} of {frames}")
+        with closing(watched_frames(stepper, watch, frames)) as found:
+            for number, frame in found:
+                points[number, watch.alive] = frame.points.reshape(B, -1, 3)[watch.alive]
+                if time.perf_counter() - began > limit:
+                    raise Slow(f"stopped after {limit:g} s, in frame {number} of {frames}")
     said = [watch.messages.get(copy, each.value if each in _FAILED else "") for copy, each in enumerate(stepper.results)]
     said = [text.replace(f", copy {copy}:", ":") for copy, text in enumerate(said)]  # which is of the row, not of the map
     return Trial(points, watch.good, watch.growth, said, list(stepper.results), stepper.steps_per_frame)

@@ -7,7 +7,9 @@ Symplectic Euler has its velocities half a step before its positions. For x″ =
 the limit ωh = 2 is far below v², by a factor of up to 199 at ωh = 1.995. With the velocity at the time of the position,
 u = v − ½hω²x, the conserved quantity is u² + ω²x²(1 − ω²h²/4). Below the limit u² never exceeds it, so u is judged and not v.
 
-A :class:`Source` puts energy in. A new kind of source is an entry of :data:`SOURCES`.
+Where elastic energy is below 0, as that of an attraction may be, it is counted like height: the cloth may fall into it.
+
+What puts energy in are the sources of :mod:`warpcloth.run.sources`.
 """
 
 from functools import cached_property
@@ -19,7 +21,7 @@ from ..base.turns import TURN
 from ..core.energy import Energy
 from ..core.gradient import Gradient
 from ..core.sums import Sums
-from ..numerics.rotation import kabsch
+from .sources import source_of
 
 # A run has diverged when it has this many times the energy that its sources can have put in. Stable runs reach up to 1.4 times
 # with unconverged or large steps and 1.3 times with sweeps averaged by vertex. Single hierarchical sweeps, 16 a frame, reach
@@ -28,8 +30,6 @@ GAIN = 3.0
 # A run has diverged when an edge has this strain and the run does not have the energy for it. The fewest sweeps that hold a
 # cloth give up to 6.4 (one a step of 1/60 s, averaged by vertex); a cloth that falls as if nothing held it soon passes 10.
 STRETCHED = 10.0
-# More patches of pins than this are treated as one patch, whose pins move within it.
-_PATCHES = 32
 
 
 class Elastic:
@@ -45,16 +45,24 @@ class Elastic:
         return Sums(self.model)
 
     @cached_property
-    def _energy(self):
-        return Energy(self.model, self._sums, terms=self.soft)
+    def _energies(self):
+        return [Energy(self.model, self._sums, terms=(elements,)) for elements in self.soft]
 
     @cached_property
     def _gradient(self):
         return Gradient(self.model, terms=self.soft)
 
-    def energy(self, x):
-        """U [J] of the soft terms of each copy at x, (B,)."""
-        return self._value(self._energy, x) if self.soft else np.zeros(self.model.copies)
+    def energy(self, x, most=np.inf):
+        """U [J] of the soft terms of each copy at x, (B,), with no more than ``most`` of each term."""
+        energies = self._at_start if x is self.model.positions else self._energies_at(x)
+        return sum((np.minimum(energy, most) for energy in energies), np.zeros(self.model.copies))
+
+    def _energies_at(self, x):
+        return [self._value(energy, x) for energy in self._energies]
+
+    @cached_property
+    def _at_start(self):
+        return self._energies_at(self.model.positions)
 
     def gaps(self, x, terms):
         """Computes ½Σ gap² of the constraints of terms, which is their energy with a stiffness of 1, (B,)."""
@@ -80,163 +88,12 @@ class Elastic:
         return found.numpy()
 
 
-class Source:
-    """A source of energy for a cloth. All its numbers are upper bounds.
-
-    Attributes:
-        name: Its name in messages.
-    """
-
-    name = "a source"
-
-    def energy(self, frame, speed):
-        """Energy that it has put in up to a frame, (B,) [J]; called once for each frame, in order from 1.
-
-        Args:
-            frame: Number of the frame.
-            speed: Largest RMS speed of each copy in any earlier frame plus what falling adds in one frame, (B,) [m/s].
-        """
-        return 0.0
-
-    def speed(self, frame):
-        """Speed at which it carries the whole cloth along in a frame [m/s]; energy is counted relative to that motion."""
-        return 0.0
-
-    def stored(self, frame):
-        """Further energy that it has put in, (B,) [J]; costly, so called only if everything else is not enough."""
-        return 0.0
-
-
-class Start(Source):
-    """Kinetic and elastic energy at the start.
-
-    Hard constraints count with the energy of closing their gaps in one step. N of them in a row move what hangs on them by up
-    to Σ gap ≤ √(N Σ gap²), and midpoint or a relaxation of 2 doubles the speed that hₑ gives. Soft constraints count in the
-    same way for solvers whose sweeps may close them too (``closes``).
-    """
-
-    name = "the start"
-
-    def __init__(self, balance, stepper):
-        model, elastic = balance.model, balance.elastic
-        closed = elastic.hard + (elastic.soft if stepper.options.closes else ())
-        velocities = model.in_scene_order(model.velocities.numpy()).astype(np.float64)
-        self._energy = balance.kinetic(velocities) + elastic.energy(model.positions)
-        gaps = sum(elements.per_copy for elements in closed) * elastic.gaps(model.positions, closed)
-        self._energy += 4.0 * balance.total * gaps / stepper.he**2
-
-    def energy(self, frame, speed):
-        return self._energy
-
-
-class Pins(Source):
-    """Pins that keyframes move.
-
-    Pins that are joined by edges form a patch. If a patch moves as a rigid body, the cloth can move with it and keep its energy
-    relative to that motion. A change δ of the patch's speed, taken over the whole cloth, adds at most ½δ² + δ·speed per unit
-    mass, and apart from that only lifting adds energy. Patches that move against one another store at most the energy of
-    deforming the start with them, each vertex by the mean of their motions with weights 1/distance².
-    """
-
-    name = "moving pins"
-
-    def __init__(self, balance, _stepper):
-        scene, self._balance = balance.model.scene, balance
-        self._stored, self._seen = np.zeros(balance.model.copies), 0
-        self._kicked, pins = 0.0, scene.pins
-        self._points, self._frames = scene.positions, pins.keyframes
-        self._patches = self._found()
-        share = np.where(np.isin(np.arange(len(self._points)), pins.vertices), 0.0, scene.vertex_masses)
-        share = share / share.sum() if share.any() else share
-        places = np.column_stack([self._points, np.ones(len(self._points))])
-        spread, middle = (share[:, None] * places).T @ places, share @ places
-        speeds, kicks, rises = [], [], []
-        for patch, maps in zip(self._patches, self._maps, strict=True):
-            beside = self._frames[:, patch] - np.einsum("fij,pj->fpi", maps, places[pins.vertices[patch]])
-            moves, own = (np.diff(each, axis=0, prepend=each[:1], append=each[-1:]) for each in (maps, beside))
-            turns, own_turns = (np.diff(each, axis=0, prepend=0.0 * each[:1]) for each in (moves, own))
-            for found, of_maps, of_pins in ((speeds, moves, own), (kicks, turns, own_turns)):
-                mean = np.sqrt(np.maximum(np.einsum("fij,jk,fik->f", of_maps, spread, of_maps), 0.0))
-                found.append(scene.fps * (mean + np.linalg.norm(of_pins, axis=-1).max(axis=1)))
-            rises.append((maps - maps[0]) @ middle)
-        self._speeds, self._kicks = np.max(speeds, axis=0), np.max(kicks, axis=0)
-        gravity = balance.model.gravity.numpy().astype(np.float64)
-        heights = np.max(-np.einsum("pfi,bi->pfb", np.array(rises), gravity), axis=0)
-        self._lifted = balance.total * np.maximum.accumulate(np.maximum(heights, 0.0))
-
-    def _found(self):
-        """Indices of the pins of each patch."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
-        scene = self._balance.model.scene
-        vertices, n = scene.pins.vertices, len(scene.mesh.points)
-        place = np.full(n, -1)
-        place[vertices] = np.arange(len(vertices))
-        a, b = place[scene.mesh.edges.T]
-        joined = (a >= 0) & (b >= 0)
-        graph = coo_array((np.ones(joined.sum()), (a[joined], b[joined])), shape=(len(vertices), len(vertices)))
-        count, labels = connected_components(graph, directed=False)
-        return [np.arange(len(vertices))] if count > _PATCHES else [np.flatnonzero(labels == k) for k in range(count)]
-
-    @cached_property
-    def _maps(self):
-        """The rigid motion of each patch since the start, as affine maps (F, 3, 4)."""
-        found = []
-        for patch in self._patches:
-            frames = self._frames[:, patch]
-            turned = np.asarray(kabsch(frames[0], frames))
-            middles = frames.mean(axis=1)
-            found.append(np.concatenate([turned, (middles - turned @ middles[0])[:, :, None]], axis=-1))
-        return found
-
-    @cached_property
-    def _weights(self):
-        """Of each vertex and patch, (n, P)."""
-        from scipy.spatial import cKDTree
-
-        pins = self._points[self._balance.model.scene.pins.vertices]
-        distances = np.stack([cKDTree(pins[patch]).query(self._points)[0] for patch in self._patches], axis=1)
-        weights = np.maximum(distances, 1e-9 * np.ptp(self._points, axis=0).max()) ** -2.0
-        return weights / weights.sum(axis=1, keepdims=True)
-
-    def energy(self, frame, speed):
-        kick, total = self._kicks[frame] if frame < len(self._kicks) else 0.0, self._balance.total
-        self._kicked = self._kicked + total * kick * (speed + self.speed(frame) + 0.5 * kick)
-        return self._kicked + self._lifted[min(frame, len(self._lifted) - 1)]
-
-    def speed(self, frame):
-        return self._speeds[frame] if frame < len(self._speeds) else 0.0
-
-    def stored(self, frame):
-        elastic, pins = self._balance.elastic, self._balance.model.scene.pins.vertices
-        while self._seen < min(frame, len(self._frames) - 1):
-            self._seen += 1
-            points = np.zeros_like(self._points)
-            for weight, maps in zip(self._weights.T, self._maps, strict=True):
-                matrix = maps[self._seen]
-                points += weight[:, None] * (self._points @ matrix[:, :3].T + matrix[:, 3])
-            points[pins] = self._frames[self._seen]
-            x = elastic.put(np.tile(points, (self._balance.model.copies, 1)))
-            self._stored = np.maximum(self._stored, elastic.energy(x))
-        return self._stored
-
-
-def _moving(balance, stepper):
-    keyframes = balance.model.scene.pins.keyframes
-    moves = keyframes is not None and keyframes.shape[1] and (keyframes != keyframes[0]).any()
-    return Pins(balance, stepper) if moves else None
-
-
-# Functions of (balance, stepper), each of which returns a source, or None if the scene has none of its kind.
-SOURCES = [Start, _moving]
-
-
 class Balance:
     """Compares the energy of each copy, frame by frame, with what the sources of the scene can have put in.
 
-    Energies are counted from the lowest height that a copy has had, so falling is not a separate source. A cloth that no pin
-    and no attachment holds is judged by its motion relative to its centre of mass, to which gravity adds nothing.
+    Energies are counted from the lowest height that a copy has had, so falling is not a separate source. Elastic energy below 0
+    counts with the height; it is computed at the start and in frames that would be judged diverged without it. A cloth that no
+    pin and no attachment holds is judged by its motion relative to its centre of mass, to which gravity adds nothing.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -261,12 +118,13 @@ class Balance:
         held = any(elements.term.vertices == 1 and not elements.cells for elements in model.terms)
         self._free = not (held or len(model.scene.pins.vertices))
         self._gravity = model.gravity.numpy().astype(np.float64)
-        self._moment, self._lowest, self._fastest = self._moments(points), np.zeros(model.copies), np.zeros(model.copies)
+        self._moment, self._fastest = self._moments(points), np.zeros(model.copies)
         self._rounding = np.zeros(model.copies)
         self.elastic = Elastic(model)
+        self._lowest = self.elastic.energy(model.positions, most=0.0)
         # Rounding of positions gives a velocity of at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
         self._note_farthest(points)
-        found = (make(self, stepper) for make in SOURCES)
+        found = (source_of(part, self, stepper) for part in (stepper, *model.scene.parts))
         self.sources = [source for source in found if source is not None]
 
     def kinetic(self, velocities):
@@ -301,6 +159,9 @@ class Balance:
                     if self._staggered and self.elastic.soft:
                         kinetic = np.fmin(kinetic, self.kinetic(self._at_positions(points, velocities)))
                     given = given + sum(source.stored(frame) for source in self.sources)
+                    height = height + self.elastic.energy(self.elastic.put(points), most=0.0)
+                    before, self._lowest = self._lowest, np.fmin(self._lowest, height)
+                    given = given + (before - self._lowest)
                 found = self._gain(kinetic, height, carried, given)
             root = np.sqrt(2.0 * kinetic / np.where(self.total > 0.0, self.total, 1.0))
             self._fastest = np.where(found <= GAIN, np.fmax(self._fastest, root), self._fastest)

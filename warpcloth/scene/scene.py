@@ -83,6 +83,11 @@ class Scene:
     name: str = "scene"
     stage: object | None = None
 
+    @property
+    def parts(self):
+        """All that it declares beside the cloth itself, any of which may put energy in."""
+        return (self.pins, *self.terms)
+
     def __post_init__(self):
         if not isinstance(self.mesh, Mesh):
             raise ValueError(f"mesh is {shown(self.mesh)}; it must be a Mesh, such as Mesh.grid(32, 32)")

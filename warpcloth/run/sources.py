@@ -1,0 +1,183 @@
+"""Sources of energy for a cloth: what the start and moving pins can have put in, and how others say so of themselves.
+
+A part of a scene that puts energy in (a term, a wind, a collider) registers a function for its type with :func:`source_of`. The
+watch over the energy of a run asks all parts, and names none.
+"""
+
+from functools import cached_property, singledispatch
+
+import numpy as np
+
+from ..numerics.rotation import kabsch
+from ..scene.scene import Pins
+from ..solvers.solver import Stepper
+
+# More patches of pins than this are treated as one patch, whose pins move within it.
+_PATCHES = 32
+
+
+class Source:
+    """A source of energy for a cloth. All its numbers are upper bounds.
+
+    Attributes:
+        name: Its name in messages.
+        carried: Names of its attributes that go on from frame to frame.
+    """
+
+    name = "a source"
+    carried = ()
+
+    def energy(self, frame, speed):
+        """Energy that it has put in up to a frame, (B,) [J]; called once for each frame, in order from 1.
+
+        Args:
+            frame: Number of the frame.
+            speed: Largest RMS speed of each copy in any earlier frame plus what falling adds in one frame, (B,) [m/s].
+        """
+        return 0.0
+
+    def speed(self, frame):
+        """Speed at which it carries the whole cloth along in a frame [m/s]; energy is counted relative to that motion."""
+        return 0.0
+
+    def stored(self, frame):
+        """Further energy that it has put in, (B,) [J]; costly, so called only if everything else is not enough."""
+        return 0.0
+
+
+@singledispatch
+def source_of(part, balance, stepper):
+    """The source of energy that a part of a scene is, or its solver; None of what puts no energy in.
+
+    Args:
+        part: The part; ``source_of.register`` takes a function for a type of them.
+        balance: The :class:`warpcloth.run.balance.Balance` that asks.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper` of the run.
+
+    Returns:
+        :class:`Source` or None.
+    """
+
+
+@source_of.register(Stepper)
+class Start(Source):
+    """Kinetic and elastic energy at the start.
+
+    Hard constraints count with the energy of closing their gaps in one step. N of them in a row move what hangs on them by up
+    to Σ gap ≤ √(N Σ gap²), and midpoint or a relaxation of 2 doubles the speed that hₑ gives. Soft constraints count in the
+    same way for solvers whose sweeps may close them too (``closes``).
+    """
+
+    name = "the start"
+
+    def __init__(self, stepper, balance, _stepper):
+        model, elastic = balance.model, balance.elastic
+        closed = elastic.hard + (elastic.soft if stepper.options.closes else ())
+        velocities = model.in_scene_order(model.velocities.numpy()).astype(np.float64)
+        self._energy = balance.kinetic(velocities) + elastic.energy(model.positions)
+        gaps = sum(elements.per_copy for elements in closed) * elastic.gaps(model.positions, closed)
+        self._energy += 4.0 * balance.total * gaps / stepper.he**2
+
+    def energy(self, frame, speed):
+        return self._energy
+
+
+class MovingPins(Source):
+    """Pins that keyframes move.
+
+    Pins that are joined by edges form a patch. If a patch moves as a rigid body, the cloth can move with it and keep its energy
+    relative to that motion. A change δ of the patch's speed, taken over the whole cloth, adds at most ½δ² + δ·speed per unit
+    mass, and apart from that only lifting adds energy. Patches that move against one another store at most the energy of
+    deforming the start with them, each vertex by the mean of their motions with weights 1/distance².
+    """
+
+    name = "moving pins"
+    carried = ("_stored", "_seen", "_kicked")
+
+    def __init__(self, balance):
+        scene, self._balance = balance.model.scene, balance
+        self._stored, self._seen = np.zeros(balance.model.copies), 0
+        self._kicked, pins = 0.0, scene.pins
+        self._points, self._frames = scene.positions, pins.keyframes
+        self._patches = self._found()
+        share = np.where(np.isin(np.arange(len(self._points)), pins.vertices), 0.0, scene.vertex_masses)
+        share = share / share.sum() if share.any() else share
+        places = np.column_stack([self._points, np.ones(len(self._points))])
+        spread, middle = (share[:, None] * places).T @ places, share @ places
+        speeds, kicks, rises = [], [], []
+        for patch, maps in zip(self._patches, self._maps, strict=True):
+            beside = self._frames[:, patch] - np.einsum("fij,pj->fpi", maps, places[pins.vertices[patch]])
+            moves, own = (np.diff(each, axis=0, prepend=each[:1], append=each[-1:]) for each in (maps, beside))
+            turns, own_turns = (np.diff(each, axis=0, prepend=0.0 * each[:1]) for each in (moves, own))
+            for found, of_maps, of_pins in ((speeds, moves, own), (kicks, turns, own_turns)):
+                mean = np.sqrt(np.maximum(np.einsum("fij,jk,fik->f", of_maps, spread, of_maps), 0.0))
+                found.append(scene.fps * (mean + np.linalg.norm(of_pins, axis=-1).max(axis=1)))
+            rises.append((maps - maps[0]) @ middle)
+        self._speeds, self._kicks = np.max(speeds, axis=0), np.max(kicks, axis=0)
+        gravity = balance.model.gravity.numpy().astype(np.float64)
+        heights = np.max(-np.einsum("pfi,bi->pfb", np.array(rises), gravity), axis=0)
+        self._lifted = balance.total * np.maximum.accumulate(np.maximum(heights, 0.0))
+
+    def _found(self):
+        """Indices of the pins of each patch."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        scene = self._balance.model.scene
+        vertices, n = scene.pins.vertices, len(scene.mesh.points)
+        place = np.full(n, -1)
+        place[vertices] = np.arange(len(vertices))
+        a, b = place[scene.mesh.edges.T]
+        joined = (a >= 0) & (b >= 0)
+        graph = coo_array((np.ones(joined.sum()), (a[joined], b[joined])), shape=(len(vertices), len(vertices)))
+        count, labels = connected_components(graph, directed=False)
+        return [np.arange(len(vertices))] if count > _PATCHES else [np.flatnonzero(labels == k) for k in range(count)]
+
+    @cached_property
+    def _maps(self):
+        """The rigid motion of each patch since the start, as affine maps (F, 3, 4)."""
+        found = []
+        for patch in self._patches:
+            frames = self._frames[:, patch]
+            turned = np.asarray(kabsch(frames[0], frames))
+            middles = frames.mean(axis=1)
+            found.append(np.concatenate([turned, (middles - turned @ middles[0])[:, :, None]], axis=-1))
+        return found
+
+    @cached_property
+    def _weights(self):
+        """Of each vertex and patch, (n, P)."""
+        from scipy.spatial import cKDTree
+
+        pins = self._points[self._balance.model.scene.pins.vertices]
+        distances = np.stack([cKDTree(pins[patch]).query(self._points)[0] for patch in self._patches], axis=1)
+        weights = np.maximum(distances, 1e-9 * np.ptp(self._points, axis=0).max()) ** -2.0
+        return weights / weights.sum(axis=1, keepdims=True)
+
+    def energy(self, frame, speed):
+        kick, total = self._kicks[frame] if frame < len(self._kicks) else 0.0, self._balance.total
+        self._kicked = self._kicked + total * kick * (speed + self.speed(frame) + 0.5 * kick)
+        return self._kicked + self._lifted[min(frame, len(self._lifted) - 1)]
+
+    def speed(self, frame):
+        return self._speeds[frame] if frame < len(self._speeds) else 0.0
+
+    def stored(self, frame):
+        elastic, pins = self._balance.elastic, self._balance.model.scene.pins.vertices
+        while self._seen < min(frame, len(self._frames) - 1):
+            self._seen += 1
+            points = np.zeros_like(self._points)
+            for weight, maps in zip(self._weights.T, self._maps, strict=True):
+                matrix = maps[self._seen]
+                points += weight[:, None] * (self._points @ matrix[:, :3].T + matrix[:, 3])
+            points[pins] = self._frames[self._seen]
+            x = elastic.put(np.tile(points, (self._balance.model.copies, 1)))
+            self._stored = np.maximum(self._stored, elastic.energy(x))
+        return self._stored
+
+
+@source_of.register
+def _moving(pins: Pins, balance, _stepper):
+    keyframes = pins.keyframes
+    moves = keyframes is not None and keyframes.shape[1] and (keyframes != keyframes[0]).any()
+    return MovingPins(balance) if moves else None

@@ -1,0 +1,135 @@
+"""Tells runs that have diverged from runs that are merely fast, and ends them."""
+
+from contextlib import closing
+
+import numpy as np
+
+from ..base.turns import in_turn
+from ..core.status import Result, Status, sentence
+from .balance import GAIN, STRETCHED, Balance
+from .frames import frames_of
+
+
+def watched_frames(stepper, watch, frames, ahead=0, first=0):
+    """The frames of a stepper in which some copy is good, as a generator: the loop of every run.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+        watch: The :class:`Watch`; it also notes how the last frame ended, good or not.
+        frames: Number of the last frame.
+        ahead: See :func:`warpcloth.run.frames.frames_of`.
+        first: Number of the frame that the stepper is at.
+
+    Yields:
+        The number of each frame and the :class:`warpcloth.run.frames.Frame`, in which copies that diverged are NaN.
+    """
+    with closing(frames_of(stepper, frames - first, ahead)) as found:
+        for number, frame in enumerate(found, start=first + 1):
+            if not watch.passes(number, frame):
+                return
+            yield number, frame
+
+
+def of_copies(values):
+    """Returns one value per copy, (B,), or a float if there is one copy."""
+    return np.array(values) if len(values) > 1 else float(values[0])
+
+
+class Watch:
+    """Tells a copy that has diverged from one that is merely fast, from frames alone and for every solver.
+
+    A run has diverged if a value is not finite, a step of the solver says so, the energy has grown beyond what its sources put
+    in, or an edge is longer than the energy of the run allows; see :mod:`warpcloth.run.balance`.
+
+    Frames come in the order of the scene.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+        stretched: Strain of an edge above which its energy is checked.
+
+    Attributes:
+        good: The last good frame of each copy (B,).
+        alive: Whether a copy is still good (B,).
+        growth: Largest energy of motion and height in a good frame, divided by what the sources can have put in, (B,).
+        last: The last frame that was watched.
+        seconds: What computing each frame took, a list.
+        worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
+    """
+
+    @in_turn
+    def __init__(self, model, stepper, stretched=STRETCHED):
+        scene = model.scene
+        self._stretched = stretched
+        self.model, self.rest = model, scene.mesh.edge_lengths[scene.mesh.edge_lengths > 0.0]
+        self.ends = scene.mesh.edges[scene.mesh.edge_lengths > 0.0].T.astype(np.intp)
+        self.worst_strain, self.messages, self.seconds = np.zeros(model.copies), {}, []
+        self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
+        self.growth, self.balance = np.zeros(model.copies), Balance(model, stepper)
+
+    def passes(self, number, frame):
+        """Whether any copy is still good; marks those that no longer are, and puts NaN in their place.
+
+        Args:
+            number: Number of the frame; they come in order from 1.
+            frame: The :class:`warpcloth.run.frames.Frame`.
+        """
+        self.last, points, velocities = frame, frame.points, frame.velocities
+        self.seconds.append(frame.seconds)
+        B, n = self.model.copies, self.model.per_copy
+        finite = (np.isfinite(points) & np.isfinite(velocities)).reshape(B, 3 * n)
+        gains, strain = self.balance.gains(number, points, velocities), self._strain(points.reshape(B, n, 3))
+        stepped = np.array([result is not Result.DIVERGED for result in frame.results])
+        good = finite.all(axis=1) & stepped & (gains <= GAIN)
+        long = np.flatnonzero(self.alive & good & (strain > self._stretched))
+        long = [copy for copy in long if not self.balance.suffices(copy, points, self._stretched * self.rest.min())]
+        good[long] = False
+        for copy in np.flatnonzero(self.alive & ~good):
+            self.alive[copy] = False
+            where = f"diverged in frame {number}" + (f", copy {copy}" if B > 1 else "")
+            wrong = np.flatnonzero(~finite[copy])
+            if len(wrong):
+                self.messages[copy] = f"{where}: vertex {wrong[0] // 3} is not finite"
+            elif not stepped[copy]:
+                self.messages[copy] = f"{where}: the forces of a step are not finite"
+            elif copy in long:
+                self.messages[copy] = (
+                    f"{where}: an edge has a strain of {100.0 * strain[copy]:.3g} %, for which the energy of the run "
+                    "does not suffice"
+                )
+            else:
+                self.messages[copy] = f"{where}: {self.balance.sentence(copy)}"
+        self.good[self.alive] = number
+        self.growth = np.where(self.alive, np.fmax(self.growth, gains), self.growth)
+        self.worst_strain = np.where(self.alive, np.fmax(self.worst_strain, strain), self.worst_strain)
+        for array in (points, velocities):
+            array.reshape(B, n, 3)[~self.alive] = np.nan
+        return bool(self.alive.any())
+
+    def _strain(self, points):
+        """Largest |l/L − 1| of an edge of each copy, for points (B, n, 3); NaN for copies that are no longer good."""
+        squares = np.zeros((int(self.alive.sum()), len(self.rest)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for column in np.moveaxis(points[self.alive], -1, 0):  # a fifteenth of the time of rows of three
+                column = column.astype(np.float64)
+                squares += (column.take(self.ends[1], axis=1) - column.take(self.ends[0], axis=1)) ** 2
+            found = np.full(self.model.copies, np.nan)
+            found[self.alive] = np.abs(np.sqrt(squares) / self.rest - 1.0).max(axis=1, initial=0.0)
+        return found
+
+    def status(self, solver):
+        """Returns the :class:`Status` of a run with a solver, from its last frame."""
+        results, residual = self.last.results, self.last.residual
+        results = [Result.DIVERGED if copy in self.messages else result for copy, result in enumerate(results)]
+        result = max(results, key=list(Result).index)
+        kind, measure, unit = solver.residual_on(self.model), None, None
+        copy = int(np.argmax(residual))  # the first that is NaN, if any
+        if kind is not None:
+            measure, unit = kind.measure, kind.unit if self.balance.weighs[copy] else kind.weightless
+        if self.messages:
+            message = "; ".join(self.messages[copy] for copy in sorted(self.messages))
+        else:
+            dtype, tolerance = self.model.numpy_dtype.__name__, getattr(solver, "tolerance", None)
+            which = copy if len(residual) > 1 else None
+            message = sentence(result, dtype, residual[copy], measure, unit, tolerance, which)
+        return Status(result, int(self.good.max()), of_copies(residual), message, self.good, measure, unit)
