@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from warpcloth.base.digest import scene_digest, source_digest
 from warpcloth.cli import main
 from warpcloth.lab import cluster as clusters
 from warpcloth.lab.campaign import Store, kept, sweep
 from warpcloth.lab.cluster import Cluster, connect
-from warpcloth.lab.digest import scene_digest, source_digest
 from warpcloth.lab.measurements import SceneRef, task
 from warpcloth.lab.work_precision import time_diagram
 from warpcloth.run.scene_files import find_source

@@ -12,10 +12,10 @@ import warp as wp
 from scipy.integrate import solve_ivp
 
 import warpcloth as wc
+from warpcloth.base.digest import scene_digest
 from warpcloth.kernels.terms import SPRING
 from warpcloth.lab import reference as module
 from warpcloth.lab import trajectory
-from warpcloth.lab.digest import scene_digest
 from warpcloth.lab.measurements import SceneRef
 from warpcloth.lab.reference import Reference, cloth_size, position_error, reference, strain_error
 from warpcloth.lab.trajectory import measure

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from warpcloth.base.digest import source_digest
 from warpcloth.lab import measurements as listed
 from warpcloth.lab.campaign import Store, cache_folder, sweep
-from warpcloth.lab.digest import source_digest
 from warpcloth.lab.machine import machine, name
 from warpcloth.lab.measurements import SceneRef, Setup, Task, run, task
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from warpcloth.base.digest import scene_digest
 from warpcloth.chart import pareto as fronts
 from warpcloth.cli import main
 from warpcloth.lab import convergence, machine, spectrum, work_precision
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.convergence import OneStep
-from warpcloth.lab.digest import scene_digest
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.setups import label, setups_of_runs, setups_of_steps
 from warpcloth.lab.work_precision import (

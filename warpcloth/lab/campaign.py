@@ -10,8 +10,8 @@ import time
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+from ..base.digest import source_digest
 from ..base.quiet import initialise_warp
-from .digest import source_digest
 from .measurements import run
 
 _HEAD = b'{"key": "'  # of a line of results

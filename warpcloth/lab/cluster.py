@@ -14,10 +14,10 @@ from concurrent.futures import CancelledError, Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+from ..base.digest import source_digest
 from ..base.quiet import initialise_warp
 from ..run import scene_files
 from ..usd import flattened
-from .digest import source_digest
 from .machine import processor
 
 # How long a scheduler and the first of its workers may take to answer [s].

@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 import warp as wp
 
+from ..base.digest import scene_digest
 from ..base.turns import in_turn
 from ..core.energy import Energy
 from ..core.sums import Sums
 from ..run.equilibrium import SETTLED
 from ..run.simulate import simulate
 from ..solvers import Newton
-from .digest import scene_digest
 from .measurements import SceneRef, Setup
 
 # Iterations that are tried, about √2 apart.
@@ -136,7 +136,7 @@ def measure(scene, digest, setup, frame, substeps, device="cpu", dtype="float64"
 
     Args:
         scene: :class:`SceneRef` as a dictionary.
-        digest: Of the scene, see :func:`warpcloth.lab.digest.scene_digest`: another scene has another key.
+        digest: Of the scene, see :func:`warpcloth.base.digest.scene_digest`: another scene has another key.
         setup: :class:`Setup` as a dictionary, without step and iterations.
         frame: Frames before the step.
         substeps: Steps a frame.

@@ -5,8 +5,8 @@ import platform
 from functools import cache
 from pathlib import Path
 
+from ..base.digest import source_digest
 from ..base.quiet import find_device
-from .digest import source_digest
 
 
 def machine(device="cpu"):

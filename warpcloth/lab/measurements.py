@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import import_module
 
+from ..base.digest import source_digest
 from ..run import scene_files
 from ..solvers import SOLVERS
 from . import machine
-from .digest import source_digest
 
 # One measurement at a time in a process: threads side by side slow one another, and Warp records one graph at a time.
 _ALONE = threading.Lock()

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.checks import number, whole
+from ..base.digest import scene_digest, source_digest
 from ..base.outputs import Output
 from ..core.status import Result
 from ..run.simulate import simulate
@@ -20,7 +21,6 @@ from ..solvers import ConstrainedDynamics, Explicit, Newton
 from ..solvers.explicit import step_limits
 from .campaign import cache_folder
 from .clock import Clock, TooSlow
-from .digest import scene_digest, source_digest
 
 # A step of Newton's method takes as long as some 250 explicit ones, and 4, 8 and 16 a frame are the fewest that may do.
 _MOST_EXPLICIT = 4096
@@ -42,7 +42,7 @@ class Reference:
         seconds: What all runs took [s].
         path: The file.
         key: A hash of scene, frames and code.
-        scene: :func:`warpcloth.lab.digest.scene_digest` of the scene.
+        scene: :func:`warpcloth.base.digest.scene_digest` of the scene.
         method: The solver.
         limit: Seconds that do not suffice for less error: 0 where less was not asked for, infinite where none would.
     """

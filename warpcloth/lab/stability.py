@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ..base.checks import choice, number
+from ..base.digest import scene_digest
 from ..core.status import Result
 from ..run.watch import Watch, watched_frames
 from ..solvers import Newton
 from .axes import AXES, FIXED, OPTIONS, record_at, refined, scene_at, steps_in, together, vary
-from .digest import scene_digest
 from .measurements import SceneRef, Setup, task
 from .stability_limits import KNOWN, rules
 
@@ -109,7 +109,7 @@ def measure(
         limit: Seconds for each run.
         reference: Whether to compare with Newton and BDF2 at a quarter of the step, or in 2000 steps if that takes more. If
             Newton refuses the scene there is no reference.
-        digests: Digests of the scene, see :func:`warpcloth.lab.digest.scene_digest`: a scene that was changed has another
+        digests: Digests of the scene, see :func:`warpcloth.base.digest.scene_digest`: a scene that was changed has another
             key.
         duration: Time of motion that is compared with the reference, the same for all cells [s]; runs last at least as long. By
             default that of ``steps``.

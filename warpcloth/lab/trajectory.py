@@ -6,9 +6,9 @@ import warnings
 import numpy as np
 
 from ..base.checks import number, whole
+from ..base.digest import scene_digest
 from ..run.simulate import simulate
 from .clock import Clock, TooSlow
-from .digest import scene_digest
 from .measurements import SceneRef, Setup
 from .reference import Reference, position_error, strain_error
 

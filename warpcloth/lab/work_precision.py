@@ -8,10 +8,10 @@ import csv
 import json
 import math
 
+from ..base.digest import scene_digest
 from ..base.outputs import TEXT, Output
 from . import convergence, physics, spectrum, trajectory
 from .campaign import kept, sweep
-from .digest import scene_digest
 from .machine import machine
 from .measurements import task
 from .reference import reference

@@ -1,6 +1,7 @@
-"""Keys of what a measurement depends on: a scene, and the code of this package."""
+"""Keys of what a run depends on: a scene, and the code of this package."""
 
 import hashlib
+import os
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -46,7 +47,8 @@ def _add(digest, value):
 def source_digest():
     """A hash of the code of this package: what another version measured is measured again."""
     root, digest = Path(__file__).parents[1], hashlib.sha256()
-    files = [path for path in root.rglob("*.py") if path.is_file()]
+    folders = os.walk(root, followlinks=True)  # in a checkout the folder of kernels is a link
+    files = [Path(folder) / name for folder, _, names in folders for name in names if name.endswith(".py")]
     for path in sorted(files, key=lambda path: path.relative_to(root).as_posix()):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
