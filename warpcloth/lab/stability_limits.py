@@ -8,8 +8,8 @@ from ..base.turns import in_turn
 from ..core.hessian import Hessian
 from ..kernels.term import HessianPolicy
 from ..numerics.integrators import INTEGRATORS
+from ..numerics.local_weights import best_weights
 from ..numerics.sweeps import IN_PLACE, colours
-from ..solvers.admm import best_weights
 from ..solvers.explicit import step_limits
 from ..terms import Spring
 

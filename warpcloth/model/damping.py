@@ -38,18 +38,13 @@ def _dissipation(model, elements, he, stiffness):
     damped = replace(
         elements,
         term=term,
-        stiffness=_put(model, both),
+        stiffness=model.per_element(both),
         rest=wp.zeros(count, dtype=wp.types.vector(term.parameters, model.dtype), device=model.device),
         damping=None,
-        refresh=Refresh(STEP, partial(_set_rest, elements.term), (elements.rest, _put(model, share))),
+        refresh=Refresh(STEP, partial(_set_rest, elements.term), (elements.rest, model.per_element(share))),
     )
     model.refresh(STEP, Moment(model.positions), [damped])  # for those who ask for weights and measures before the first step
     return damped
-
-
-def _put(model, values):
-    same = values[0] == values[-1] and (values == values[0]).all()
-    return model.constant(values[0], len(values)) if same else model.array(values, model.dtype)
 
 
 def _set_rest(damped, model, elements, moment):

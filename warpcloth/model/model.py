@@ -431,6 +431,12 @@ class Model:
         """An array (count,) of one value, of stride 0."""
         return self._repeat(self.array([value], self.dtype), count)
 
+    def per_element(self, values):
+        """Numbers (E,) in an array, of stride 0 where they are all one value."""
+        if len(values) and (values == values[0]).all():
+            return self.constant(values[0], len(values))
+        return self.array(values, self.dtype)
+
     def _repeat(self, value, count):
         array = wp.array(ptr=value.ptr, shape=(count,), strides=(0,), dtype=self.dtype, device=self.device)
         array.value = value  # keeps the memory alive

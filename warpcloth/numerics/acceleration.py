@@ -130,3 +130,20 @@ class LBFGS(_History):
             older = _dot((alpha - beta)[:, i + 1 :], sy[:, i + 1 :, i])
             beta[:, i] = rho[:, i] * (curved[:, i] + older)
         return beta - alpha, alpha
+
+
+def accelerated(name, model, window, slowest):
+    """The acceleration of that name, with the ``window`` given; None for ``"none"``.
+
+    Args:
+        name: ``"none"``, ``"chebyshev"``, ``"anderson"`` or ``"l-bfgs"``.
+        model: The :class:`warpcloth.model.model.Model`.
+        window: Steps that Anderson and L-BFGS remember.
+        slowest: Function that returns ρ of Chebyshev, (B,).
+    """
+    if name == "none":
+        return None
+    if name == "chebyshev":
+        return Chebyshev(model.copies, slowest())
+    epsilon = 10.0 * float(np.finfo(model.numpy_dtype).eps)
+    return {"anderson": Anderson, "l-bfgs": LBFGS}[name](model.copies, window, epsilon)

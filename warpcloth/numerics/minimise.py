@@ -10,6 +10,7 @@ from ..core.sums import Sums
 from ..kernels import minimise as kernels
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
+from .iterate import GravityScale, iterate
 from .linear import ConjugateGradients, Factorised
 from .search import Search
 
@@ -33,7 +34,7 @@ class Minimiser:
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        base: Where d = 0 is, (N,) vectors [m]; the caller's array, read only.
+        base: The positions of d = 0, (N,) vectors [m]; the caller's array, read only.
         hessian: ``"adaptive"`` (raw; clamped in an iteration whose matrix shows a negative curvature), ``"raw"``,
             ``"clamp"`` or ``"absolute"``.
         linear: ``"cg"`` or ``"factorised"``.
@@ -76,19 +77,19 @@ class Minimiser:
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
         self.kernels = {"negate": model.kernel(kernels.negate, model.dtype), "rounding": model.kernel(rounding, model.dtype)}
         self._record()
-        self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
+        self.gravity_scale, self._given_scale = GravityScale(model), None
         self.residual, self.iterations = np.zeros(model.copies), 0
 
     def _record(self):
         device = self.model.device
-        self._start = Segment(device, self._launch_start)
+        self._clear = Segment(device, self._launch_clear)
         self._assemble = Segment(device, self._launch_assemble)
         self._solve = Segment(device, self._launch_solve) if self.linear.capturable else self._launch_solve
         self._step_on = Segment(device, self._launch_search)
 
     def set_objective(self, s, load):
         """Another s and load; what was recorded holds the old ones and is recorded again."""
-        self.search.s, self.search.load = s, load
+        self.search.inertia.s, self.search.inertia.load = s, load
         self._record()
 
     def minimise(self, tolerance, iterations, scale=None):
@@ -102,41 +103,42 @@ class Minimiser:
         Returns:
             A :class:`Result` for each copy.
         """
-        B = self.model.copies
-        self._start()
-        if scale is None:
-            scale = np.where(self.gravity > 0.0, self.gravity, self._acceleration.read())
-            scale[scale == 0.0] = 1.0
-        self.scale = scale
-        energy = self._energy.read().copy()
-        rounded = stalled = np.zeros(B, dtype=bool)
+        self._given_scale = scale
+        ended = iterate(self, tolerance, iterations)
+        self.residual, self.iterations = ended.residual, ended.iterations
+        return ended.results
+
+    # The loop of `iterate`.
+
+    def start(self):
+        """Goes to d = 0."""
+        self.clear()
+        acceleration = self._acceleration.read()
+        self.scale = self.gravity_scale.or_else(acceleration) if self._given_scale is None else self._given_scale
         # Linear systems are solved no better than the residual has fallen (Eisenstat and Walker 1996).
-        first = np.maximum(self._acceleration.read() / scale, 1.0)
-        self.iterations = 0
-        while True:
-            self.residual = self._acceleration.read() / scale
-            finite = np.isfinite(self.residual)
-            converged = finite & (self.residual <= tolerance)
-            active = finite & ~(converged | rounded | stalled)
-            if not active.any() or self.iterations == iterations:
-                break
-            self._active.write(active)
-            if self.linear.capturable:
-                self.linear.tolerance.write(np.clip(self.residual / first, 1e-12, 0.1))
-            self._find_direction()
-            self._step_on()
-            self.iterations += 1
-            noisy = self._square.read() <= ROUNDINGS**2 * self._rounding.read()
-            before, energy = energy, self._energy.read().copy()
-            with np.errstate(invalid="ignore"):  # of a copy that is not finite
-                level = before - energy <= self.resolution * np.abs(before) + TYPICAL * self._lost.read()
-            # A copy is stuck where no step was found, or there was none to look for.
-            stuck = active & ((self._step.read() == 0.0) | ~(self._slope.read() < 0.0))
-            rounded = rounded | (active & noisy & (stuck | level))
-            stalled = stalled | (stuck & ~noisy)
-        conditions = [~finite, converged, rounded, stalled]
-        results = [Result.DIVERGED, Result.CONVERGED, Result.ROUNDED, Result.STALLED]
-        return list(np.select(conditions, np.array(results, dtype=object), Result.ITERATIONS_USED_UP))
+        self._first = np.maximum(acceleration / self.scale, 1.0)
+        self._before = self._energy.read().copy()
+        self._ended = {}
+
+    def measure(self):
+        """The residual of each copy, and which copies can come no nearer."""
+        self.residual = self._acceleration.read() / self.scale
+        return self.residual, self._ended
+
+    def iterate(self, active):
+        """A step along the direction of Newton's method."""
+        self._active.write(active)
+        if self.linear.capturable:
+            self.linear.tolerance.write(np.clip(self.residual / self._first, 1e-12, 0.1))
+        self._find_direction()
+        self._step_on()
+        noisy = self._square.read() <= ROUNDINGS**2 * self._rounding.read()
+        before, self._before = self._before, self._energy.read().copy()
+        with np.errstate(invalid="ignore"):  # of a copy that is not finite
+            level = before - self._before <= self.resolution * np.abs(before) + TYPICAL * self._lost.read()
+        # A copy is stuck where no step was found, or there was none to look for.
+        stuck = (self._step.read() == 0.0) | ~(self._slope.read() < 0.0)
+        self._ended = {Result.ROUNDED: noisy & (stuck | level), Result.STALLED: stuck & ~noisy}
 
     def _find_direction(self):
         if self.adaptive:
@@ -171,23 +173,23 @@ class Minimiser:
 
     def _assemble_raw(self):
         before = self._policy.read().copy()
-        self.start()
+        self.clear()
         self._policy.write(int(HessianPolicy.RAW))
         self._assemble()
         self._policy.write(before)
 
-    def start(self):
+    def clear(self):
         """Sets d = 0 and everything that depends on it."""
-        self._start()
+        self._clear()
 
     # What the segments record.
 
-    def _launch_start(self):
+    def _launch_clear(self):
         self.search.launch_start()
         self._launch_norms()
 
     def _launch_assemble(self):
-        self.hessian.assemble(self.base, self.search.s, self.correction)
+        self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
         self._launch("negate", self.model.count, [self.search.gradient], [self.right])
         hessian, model = self.hessian, self.model
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]

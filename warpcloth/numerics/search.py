@@ -6,6 +6,7 @@ import warp as wp
 from ..core.energy import Energy
 from ..fast.gradient import gradient
 from ..kernels import minimise as kernels
+from .inertia import Inertia
 
 # Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
 HALVINGS = 30
@@ -16,10 +17,9 @@ class Search:
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        base: Where d = 0 is, (N,) vectors [m]; the caller's array, read only.
+        base: The positions of d = 0, (N,) vectors [m]; the caller's array, read only.
         sums: :class:`warpcloth.core.sums.Sums`.
-        s: Weight of the inertia, 1/h² [1/s²].
-        load: Part of gravity that acts as a force.
+        s, load: See :class:`warpcloth.numerics.inertia.Inertia`.
 
     Attributes:
         correction: d (N,) [m].
@@ -30,10 +30,9 @@ class Search:
     """
 
     def __init__(self, model, base, sums, s, load=0.0):
-        self.model, self.base, self.sums, self.s, self.load = model, base, sums, s, load
+        self.model, self.base, self.sums, self.inertia = model, base, sums, Inertia(model, s, load)
         self.gradient_of, self.energy_of = gradient(model, corrected=True), Energy(model, sums, corrected=True)
         self.correction, self.trial, self.gradient, self.direction = (model.vectors() for _ in range(4))
-        self.work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
 
         def per_copy(dtype):
             return wp.zeros(model.copies, dtype=dtype, device=model.device)
@@ -45,7 +44,7 @@ class Search:
         # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
         # energy to 2ε/e, so that √ε covers strains down to √ε.
         self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
-        self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("set_trial", "add_inertia")}
+        self.kernels = {"set_trial": model.kernel(kernels.set_trial, model.dtype)}
         names = ("begin_search", "check_trial", "begin_trial", "end_trial")
         self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in names}
 
@@ -71,9 +70,8 @@ class Search:
         N, n = model.count, model.per_copy
         self._launch("set_trial", N, [self.correction, self.direction, self.step, n], [self.trial, self.gradient])
         self.gradient_of.add(self.base, self.gradient, self.trial)
-        given = [model.mass, model.inverse_mass, model.gravity, n, self.s, self.load, self.trial]
-        self._launch("add_inertia", N, given, [self.gradient, self.work])
-        self.sums.sum(self.work, n, self.trial_energy)
+        self.inertia.add(self.trial, self.gradient)
+        self.sums.sum(self.inertia.work, n, self.trial_energy)
         self.energy_of.add(self.base, self.trial_energy, self.trial)
         self.sums.dot(self.gradient, self.direction, self.trial_slope)
 

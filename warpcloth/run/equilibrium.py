@@ -91,13 +91,13 @@ def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cp
     if result is Result.ROUNDED and residual <= tolerance:
         result = Result.CONVERGED
     # A sheet that has not moved leaves its whole weight, up to an ulp. Without gravity a start at rest leaves its own rounding.
-    elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity[0] > 0.0:
+    elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity_scale.gravity[0] > 0.0:
         result, began = Result.STALLED, f"rounding hides the rest shape in {dtype}"
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
     use = None if result in SETTLED else "not a rest shape"
     if result is Result.SADDLE:
         use = f"not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
-    unit = RESIDUAL.unit if minimiser.gravity[0] > 0.0 else RESIDUAL.weightless
+    unit = RESIDUAL.unit if minimiser.gravity_scale.gravity[0] > 0.0 else RESIDUAL.weightless
     message = sentence(result, dtype, residual, RESIDUAL.measure, unit, tolerance, use=use)
     if result is Result.STALLED:
         message = message.replace(result.value, began)
@@ -113,7 +113,9 @@ class _Descent:
         self.used, self.moved = 0, 0.0
         self.scale = None  # from the first descent: without gravity a later one would be scaled by its own rounding
         model = minimiser.model
-        self.load = float(minimiser.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64))
+        self.load = float(
+            minimiser.gravity_scale.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64)
+        )
         self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
 
     def run(self, load, s):
@@ -141,7 +143,7 @@ class _Descent:
     def _settle(self, s, load, most):
         self.minimiser.set_objective(s, load)
         if self.load == 0.0:
-            self.minimiser.start()
+            self.minimiser.clear()
             self.load = float(self.minimiser.unbalanced()[0]) or 1.0
         (result,) = self.minimiser.minimise(self.tolerance, min(most, max(self.iterations - self.used, 0)), self.scale)
         self.scale = self.minimiser.scale

@@ -1,24 +1,26 @@
 """ADMM: implicit Euler split into the elements and the vertices, which meet by multipliers."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from ..base.checks import number, whole
 from ..core.capture import Mirror, Segment
-from ..core.constant_matrix import constant_blocks, constant_matrices
-from ..core.status import Residual, Result
+from ..core.constant_matrix import constant_matrices
+from ..core.status import Residual
 from ..core.sums import Sums
 from ..core.transpose import Transpose
 from ..kernels import admm as kernels
 from ..kernels.accelerate import plain_step
-from ..kernels.minimise import add_inertia
+from ..numerics.inertia import Inertia
+from ..numerics.iterate import GravityScale
 from ..numerics.linear import CopyFactors
+from ..numerics.local_weights import best_weights, curvatures, weighed
 from ..terms.needs import ELEMENTS, FINITE
 from ..terms.refresh import EVALUATION, Moment
 from .facts import Benchmark, Facts, grid
-from .solver import Stepper
+from .implicit import ImplicitStepper
 from .step import ImplicitStep
 
 # n times the smallest r for n iterations. A small weight needs many iterations, and what a step leaves unfinished becomes a
@@ -119,7 +121,7 @@ class ADMM(ImplicitStep):
         return self._on(ADMMStepper, model)
 
 
-class ADMMStepper(Stepper):
+class ADMMStepper(ImplicitStepper):
     """:class:`ADMM` on a model.
 
     Attributes:
@@ -129,75 +131,63 @@ class ADMMStepper(Stepper):
     """
 
     def __init__(self, options, model):
-        super().__init__(options, model, options.integrator)
+        super().__init__(options, model)
         model = self.model
-        self.s = 1.0 / self.he**2
-        self._scales = [_curvatures(model, elements) for elements in model.terms]
-        self._ratios = [self._ratio_of(elements) for elements in model.terms]
-        factors = [scale.numpy() * ratio.numpy() for scale, ratio in zip(self._scales, self._ratios, strict=True)]
-        weighed = model.with_terms(map(_weighed, model.terms, factors))
-        self._factors = CopyFactors(model, constant_matrices(weighed, self.s))
+        scales = [curvatures(model, elements) for elements in model.terms]
+        ratios = [self._ratios_of(*each) for each in zip(model.terms, scales, strict=True)]
+        factors = [scale * ratio for scale, ratio in zip(scales, ratios, strict=True)]
+        self._inertia, self._sums = Inertia(model, 1.0 / self.he**2), Sums(model)
+        self._factors = CopyFactors(
+            model, constant_matrices(model.with_terms(map(weighed, model.terms, factors)), self._inertia.s)
+        )
         self.factorise_seconds = self._factors.seconds
-        self._sums = Sums(model)
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
-        self._work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         self._primal, self._dual = (Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device)) for _ in range(2))
         self._active = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
-        self._locals = [self._local_state(*each) for each in zip(model.terms, self._ratios, self._scales, strict=True)]
+        self._split = [self._split_of(*each) for each in zip(model.terms, ratios, scales, strict=True)]
         factories = kernels.start_splitting, kernels.split
         self._kernels = [
             [model.kernel(factory, elements.term, model.dtype) for factory in factories] for elements in model.terms
         ]
         sums = kernels.scatter_splitting, kernels.gather_splitting
         self._sums_of = [Transpose(model, elements, *sums, elements.term, model.dtype) for elements in model.terms]
-        self._add_inertia, self._plain_step = (model.kernel(factory, model.dtype) for factory in (add_inertia, plain_step))
-        gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
-        self._scale = np.where(gravity > 0.0, gravity, 1.0)
+        self._plain_step = model.kernel(plain_step, model.dtype)
+        self._scale = GravityScale(model).or_else(1.0)
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
-        self.iterations = 0
         self._start = Segment(model.device, self._launch_start)
         self._local = Segment(model.device, self._launch_local)
         self._move = Segment(model.device, self._launch_move)
-        self._finish = Segment(model.device, lambda: self.launch_finish(self.correction))
-        self.integrator.start()
+        self.ready()
 
-    def step(self):
+    def start(self):
         self._start()
-        active = np.ones(self.model.copies, dtype=bool)
-        self.iterations = 0
-        while True:
-            self._local()
-            self.primal = np.where(active, self._primal.read() / self._scale, self.primal)
-            self.dual = np.where(active, self._dual.read() / self._scale, self.dual)
-            residual = np.maximum(self.primal, self.dual)  # keeps NaN
-            finite = np.isfinite(residual)
-            converged = finite & (residual <= self.options.tolerance)
-            active &= finite & ~converged
-            if not active.any() or self.iterations == self.options.iterations:
-                break
-            self._active.write(active)
-            self._factors.solve(self._force, self._w)
-            self._move()
-            self.iterations += 1
-        self._finish()
-        self.residual = np.maximum(self.residual, residual)
-        for copy, before in enumerate(self.results):
-            now = Result.CONVERGED if converged[copy] else Result.ITERATIONS_USED_UP if finite[copy] else Result.DIVERGED
-            self.results[copy] = before.worse(now)
+        self._iterating = np.ones(self.model.copies, dtype=bool)
 
-    def _ratio_of(self, elements):
-        """Returns r of each element, an array (E,)."""
+    def measure(self):
+        self._local()
+        self.primal = np.where(self._iterating, self._primal.read() / self._scale, self.primal)
+        self.dual = np.where(self._iterating, self._dual.read() / self._scale, self.dual)
+        return np.maximum(self.primal, self.dual), {}  # keeps NaN
+
+    def iterate(self, active):
+        self._iterating = active.copy()
+        self._active.write(active)
+        self._factors.solve(self._force, self._w)
+        self._move()
+
+    def _ratios_of(self, elements, scale):
+        """Returns r of each element, (E,)."""
         model, weight = self.model, self.options.weight
         if weight != "auto":
-            return model.constant(weight, elements.count)
+            return np.full(elements.count, weight, dtype=model.numpy_dtype)
         least = min(_FLOORS[self.options.integrator] / self.options.iterations, 1.0)
-        return model.array(np.maximum(best_weights(model, elements, self.he), least), model.dtype)
+        return np.maximum(best_weights(model, elements, self.he, scale), least).astype(model.numpy_dtype)
 
-    def _local_state(self, elements, ratio, scale):
+    def _split_of(self, elements, ratio, scale):
         """The struct of z, u, gap and change of a term, all 0."""
         model, kind = self.model, wp.types.matrix((elements.term.rows, 3), self.model.dtype)
         of = kernels.splitting(elements.term, model.dtype)()
-        of.stiffness, of.ratio, of.scale = elements.stiffness, ratio, scale
+        of.stiffness, of.ratio, of.scale = elements.stiffness, model.per_element(ratio), model.per_element(scale)
         of.z, of.u, of.gap, of.change = (wp.zeros(elements.count, dtype=kind, device=model.device) for _ in range(4))
         return of
 
@@ -220,8 +210,7 @@ class ADMMStepper(Stepper):
             given = [elements.stencil, elements.rest, self.state.x, self.correction, kernels.STEPS]
             model.launch(split, elements.count, given, [of])
             transpose.add(of, *sums)
-        given = [model.mass, model.inverse_mass, model.gravity, model.per_copy, self.s, 0.0, self.correction]
-        model.launch(self._add_inertia, model.count, given, [self._force, self._work])
+        self._inertia.add(self.correction, self._force)
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
             self._sums.largest(model.inverse_mass, forces, largest.array)
 
@@ -231,38 +220,4 @@ class ADMMStepper(Stepper):
         model.launch(self._plain_step, model.count, given, [self.correction])
 
     def _each(self):
-        return zip(self.model.terms, self._locals, self._kernels, strict=True)
-
-
-def best_weights(model, elements, he):
-    """Computes r = 1/(2hₑω) of each element (E,), ω² its largest eigenvalue of M⁻¹ s k A DᵀD by itself; 1 if it cannot move.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        elements: One of its terms.
-        he: Effective step hₑ [s].
-    """
-    blocks = constant_blocks(model, _weighed(elements, _curvatures(model, elements).numpy()))
-    root = np.sqrt(model.inverse_mass.numpy().astype(np.float64))[elements.stencil.numpy()]
-    rates = np.linalg.eigvalsh(root[:, :, None] * blocks * root[:, None, :])[:, -1]
-    return np.divide(0.5, he * np.sqrt(rates), out=np.ones_like(rates), where=rates > 0.0)
-
-
-def _curvatures(model, elements):
-    """Computes the unit of r for each element: 1 for a squared distance, else the curvature s of its energy at rest."""
-    if elements.term.project is not None:
-        return model.constant(1.0, elements.count)
-    scale = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
-    rest_shape = model.array(np.tile(model.rest_points, (model.copies, 1)), model.vec3)
-    kernel = model.kernel(kernels.stiffness_scale, elements.term, model.dtype)
-    model.launch(kernel, elements.count, [*elements.arguments, rest_shape], [scale])
-    found = scale.numpy()
-    # A hinge without a normal at rest has no curvature there, and its weight would be 0.
-    found = np.where(found > 0.0, found, found.max() or 1.0)
-    return model.array(found, model.dtype)
-
-
-def _weighed(elements, factor):
-    """Returns the elements with k multiplied by a factor (E,)."""
-    stiffness = elements.stiffness.numpy() * factor
-    return replace(elements, stiffness=wp.array(stiffness, dtype=elements.stiffness.dtype, device=elements.stiffness.device))
+        return zip(self.model.terms, self._split, self._kernels, strict=True)

@@ -11,11 +11,12 @@ from ..core.status import Residual, Result
 from ..core.sums import RowSums, Sums
 from ..kernels import constraint_step as kernels
 from ..numerics.constraints import Constraints
+from ..numerics.iterate import GravityScale
 from ..numerics.linear import ConjugateGradients, FactorisedRows
 from ..numerics.search import Search
 from ..terms.needs import FINITE, MERGED_DAMPING, ROWS, STEADY_ROWS
 from .facts import Benchmark, Facts, grid
-from .solver import Stepper
+from .implicit import ImplicitStepper
 from .step import ImplicitStep
 
 STABILISATIONS = ("none", "geometric-stiffness", "line-search")
@@ -110,7 +111,7 @@ class ConstrainedDynamics(ImplicitStep):
         return self._on(ConstrainedDynamicsStepper, model)
 
 
-class ConstrainedDynamicsStepper(Stepper):
+class ConstrainedDynamicsStepper(ImplicitStepper):
     """:class:`ConstrainedDynamics` on a model.
 
     Attributes:
@@ -120,7 +121,7 @@ class ConstrainedDynamicsStepper(Stepper):
     """
 
     def __init__(self, options, model):
-        super().__init__(options, model, options.integrator)
+        super().__init__(options, model)
         model, device = self.model, self.model.device
         self.constraints = Constraints(model, self.he, options.stabilisation == "geometric-stiffness")
         self._sums, self._row_sums = Sums(model), RowSums(model, self.constraints.per_copy)
@@ -147,48 +148,41 @@ class ConstrainedDynamicsStepper(Stepper):
         self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("mismatch", "negate_rows")}
         self._add_step = [model.kernel(kernels.add_step, model.dtype, vectors) for vectors in (True, False)]
         self._begin_step = model.kernel(kernels.begin_step)
-        self._gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
-        self.iterations = 0
+        self._gravity_scale = GravityScale(model)
         self._start = Segment(device, self._launch_start)
         self._solve = Segment(device, self._launch_solve) if self._linear.capturable else self._launch_solve
         self._move = Segment(device, self._launch_move)
-        self._finish = Segment(device, lambda: self.launch_finish(self.correction))
-        self.integrator.start()
+        self.ready()
 
-    def step(self):
+    def start(self):
         self._start()
-        first, options = self._residual().copy(), self.options
-        scale = np.where(self._gravity > 0.0, self._gravity, np.where(first != 0.0, first, 1.0))
-        stuck = np.zeros(len(scale), dtype=bool)
-        least = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
-        self.iterations = 0
-        while True:
-            residual = self._residual() / scale
-            finite = np.isfinite(residual)
-            converged = finite & (residual <= options.tolerance)
-            rounded = finite & (residual * scale * self.he**2 <= self._rounding.read())
-            active = finite & ~(converged | rounded | stuck)
-            if not active.any() or self.iterations == options.iterations:
-                break
-            self._active.write(active)
-            if self._linear.capturable:  # a tenth of what the step is allowed
-                self._linear.tolerance.write(np.clip(0.1 * options.tolerance / np.where(active, residual, 1.0), least, 0.1))
-            self._solve()
-            self._move()
-            stuck = stuck | (active & (self._stepped.read() == 0.0))
-            self.iterations += 1
-        self._finish()
-        carried = self._carried.read() / (scale * self.he**2)
-        resolved = self._carried.read() > self._rounding.read()  # places and lengths contradict one another by rounding too
-        contradicted = finite & resolved & (carried > max(options.tolerance, CARRIED))
-        residual = np.where(contradicted, np.maximum(residual, carried), residual)
-        self.residual = np.maximum(self.residual, residual)  # keeps NaN
-        conditions = [~finite, contradicted, converged, rounded, stuck]
-        results = [Result.DIVERGED, Result.CONTRADICTED, Result.CONVERGED, Result.ROUNDED, Result.STALLED]
-        now = np.select(conditions, np.array(results, dtype=object), Result.ITERATIONS_USED_UP)
-        self.results = [before.worse(each) for before, each in zip(self.results, now, strict=True)]
+        self._scale = self._gravity_scale.or_else(self._accelerations())
+        self._stuck = np.zeros(self.model.copies, dtype=bool)
 
-    def _residual(self):
+    def measure(self):
+        self._residual = self._accelerations() / self._scale
+        rounded = self._residual * self._scale * self.he**2 <= self._rounding.read()
+        return self._residual, {Result.ROUNDED: rounded, Result.STALLED: self._stuck}
+
+    def iterate(self, active):
+        self._active.write(active)
+        if self._linear.capturable:  # a tenth of what the step is allowed
+            least = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
+            wanted = 0.1 * self.options.tolerance / np.where(active, self._residual, 1.0)
+            self._linear.tolerance.write(np.clip(wanted, least, 0.1))
+        self._solve()
+        self._move()
+        self._stuck = self._stepped.read() == 0.0
+
+    def note(self, results, residual):
+        """Takes down how a step ended; hard constraints that stay open contradict one another."""
+        carried = self._carried.read() / (self._scale * self.he**2)
+        resolved = self._carried.read() > self._rounding.read()  # positions and lengths contradict by rounding too
+        contradicted = np.isfinite(residual) & resolved & (carried > max(self.options.tolerance, CARRIED))
+        results = [Result.CONTRADICTED if each else result for result, each in zip(results, contradicted, strict=True)]
+        super().note(results, np.where(contradicted, np.maximum(residual, carried), residual))
+
+    def _accelerations(self):
         """The larger of both accelerations [m/s²] of each copy (B,)."""
         return np.maximum(self._unbalanced.read(), self._open.read()) / self.he**2
 

@@ -2,15 +2,13 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from ..base.checks import choice, number, whole
 from ..core.capture import Segment
 from ..core.status import UNBALANCED, Residual
 from ..numerics.minimise import LINEAR, POLICIES, Minimiser
 from ..terms.needs import FINITE
 from .facts import Benchmark, Facts
-from .solver import Stepper
+from .implicit import ImplicitStepper
 from .step import ImplicitStep
 
 
@@ -73,21 +71,27 @@ class Newton(ImplicitStep):
         return self._on(NewtonStepper, model)
 
 
-class NewtonStepper(Stepper):
-    """:class:`Newton` on a model."""
+class NewtonStepper(ImplicitStepper):
+    """:class:`Newton` on a model.
+
+    Attributes:
+        minimiser: The :class:`warpcloth.numerics.minimise.Minimiser`.
+    """
 
     def __init__(self, options, model):
-        super().__init__(options, model, options.integrator)
+        super().__init__(options, model)
         model = self.model
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.he**2)
+        self.correction = self.minimiser.correction
         self._predict = Segment(model.device, self.launch_prediction)
-        self._finish = Segment(model.device, lambda: self.launch_finish(self.minimiser.correction))
-        self.integrator.start()
+        self.ready()
 
-    def step(self):
+    def start(self):
         self._predict()
-        results = self.minimiser.minimise(self.options.tolerance, self.options.iterations)
-        self.iterations = self.minimiser.iterations
-        self._finish()
-        self.results = [before.worse(now) for before, now in zip(self.results, results, strict=True)]
-        self.residual = np.maximum(self.residual, self.minimiser.residual)  # keeps NaN
+        self.minimiser.start()
+
+    def measure(self):
+        return self.minimiser.measure()
+
+    def iterate(self, active):
+        self.minimiser.iterate(active)

@@ -12,6 +12,7 @@ from ..core.sums import Sums
 from ..fast.gradient import gradient
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
+from ..numerics.iterate import GravityScale
 from ..numerics.sweeps import IN_PLACE, Sweep
 from ..terms.needs import FINITE, LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
@@ -143,8 +144,7 @@ class XPBDStepper(LaunchedStepper):
         largest = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
         self._largest = Mirror(self.state.add("largest acceleration", largest))
         self._keep_largest = model.kernel(keep_largest)
-        gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
-        self._scale = np.where(gravity > 0.0, gravity, 1.0)
+        self._scale = GravityScale(model).or_else(1.0)
         sweeps = self.sweep.parts(options.iterations - (not soft))
         if options.integrator == "midpoint" and self.sweep.in_place:
             sweeps = [(self._launch_to_and_fro, options.iterations // 2)]

@@ -1,0 +1,84 @@
+"""The step of an accelerated iteration d ← d − A⁻¹∇φ(d), taken where it lowers φ more than the plain one."""
+
+import numpy as np
+import warp as wp
+
+from ..core.capture import Mirror, Segment
+from ..core.energy import Energy
+from ..core.sums import CHUNKS
+from ..kernels import accelerate as kernels
+
+
+class AcceleratedStep:
+    """The history of an iteration on the device, and the choice between the plain and the accelerated step.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.projective_dynamics.ProjectiveDynamicsStepper`.
+        method: What proposes, of :mod:`warpcloth.numerics.acceleration`.
+    """
+
+    def __init__(self, stepper, method):
+        model = stepper.model
+        self.stepper, self.method, B, device = stepper, method, model.copies, model.device
+        m = method.window
+        self.s, self.y, self.z = (wp.zeros((m, model.count), dtype=model.vec3, device=device) for _ in range(3))
+        self.plain, self.accelerated, self.last_gradient, self.last_w, self.unused = (model.vectors() for _ in range(5))
+        self.slot = wp.zeros(1, dtype=wp.int32, device=device)
+        self.partial = wp.zeros((B, CHUNKS if device.is_cuda else 1, 4 * m), dtype=wp.float64, device=device)
+        self.products = Mirror(wp.zeros((B, 4 * m), dtype=wp.float64, device=device))
+        self.coefficients = Mirror(wp.zeros((B, 1 + 2 * m), dtype=wp.float64, device=device))
+        self.plain_energy, self.energy = (Mirror(wp.zeros(B, dtype=wp.float64, device=device)) for _ in range(2))
+        self.energy_of = Energy(model, stepper.sums, corrected=True)
+        names = ("note_change", "partial_products", "combine", "choose")
+        self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
+        self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in ("finish_products", "next_slot")}
+        self._note = Segment(device, self._launch_note)
+
+    def start(self):
+        """Before the first iteration of a step."""
+        self.method.start()
+        self._iteration = 0
+
+    def propose(self, active):
+        """Sets the coefficients of the accelerated step of the copies that still iterate."""
+        self._note()
+        accepted = self.energy.read() <= self.plain_energy.read() if self._iteration else np.ones(len(active), dtype=bool)
+        products = self.products.read().reshape(len(active), 4, -1)
+        proposed = self.method.propose(self._iteration, products, accepted)
+        self.coefficients.write(np.where(active[:, None], proposed, 0.0))
+        self._iteration += 1
+
+    def launch_start(self):
+        """The first pair goes to the first slot."""
+        self.slot.zero_()
+
+    def _launch_note(self):
+        stepper, model = self.stepper, self.stepper.model
+        given = [self.slot, stepper.gradient, stepper.w]
+        self._launch("note_change", model.count, given, [self.last_gradient, self.last_w, self.y, self.z])
+        given = [self.slot, stepper.gradient, self.s, self.y, self.z, model.per_copy]
+        self._launch("partial_products", self.partial.shape, given, [self.partial])
+        self._launch("finish_products", self.products.array.shape, [self.partial], [self.products.array])
+
+    def launch_move(self):
+        """d = the better of the plain and the accelerated step."""
+        stepper, model = self.stepper, self.stepper.model
+        N, n, d = model.count, model.per_copy, stepper.correction
+        stepper.launch_plain_step(self.plain)
+        given = [self.coefficients.array, n, d, stepper.w, self.s, self.z]
+        self._launch("combine", N, given, [self.accelerated])
+        self._launch_energy(self.plain, self.plain_energy.array)
+        self._launch_energy(self.accelerated, self.energy.array)
+        self._launch("next_slot", 1, [self.slot, self.method.window], [])
+        given = [self.slot, n, self.plain, self.accelerated, self.plain_energy.array, self.energy.array]
+        self._launch("choose", N, given, [d, self.s])
+
+    def _launch_energy(self, d, out):
+        """out (B,) = φ(d)."""
+        stepper, model = self.stepper, self.stepper.model
+        stepper.launch_inertia(d, self.unused)
+        stepper.sums.sum(stepper.work, model.per_copy, out)
+        self.energy_of.add(stepper.state.x, out, d)
+
+    def _launch(self, name, dim, inputs, outputs):
+        self.stepper.model.launch(self.kernels[name], dim, inputs, outputs)

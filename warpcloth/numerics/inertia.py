@@ -1,0 +1,29 @@
+"""The quadratic part of the objective, s/2‖d‖²_M − load·Σ m g·d."""
+
+import warp as wp
+
+from ..kernels.minimise import add_inertia
+
+
+class Inertia:
+    """What inertia, and gravity where that is a force, add to the objective and to its gradient.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        s: Weight of the inertia, 1/h² [1/s²].
+        load: Part of gravity that acts as a force.
+
+    Attributes:
+        work: The sum by vertices, (N,) [J].
+    """
+
+    def __init__(self, model, s, load=0.0):
+        self.model, self.s, self.load = model, s, load
+        self.work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self._kernel = model.kernel(add_inertia, model.dtype)
+
+    def add(self, d, gradient):
+        """gradient (N,) += s M d − load·M g, and 0 for pins; sets ``work``."""
+        model = self.model
+        given = [model.mass, model.inverse_mass, model.gravity, model.per_copy, self.s, self.load, d]
+        model.launch(self._kernel, model.count, given, [gradient, self.work])

@@ -1,0 +1,76 @@
+"""The loop of the methods that iterate towards a minimiser, and the acceleration that their residuals are relative to."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.status import Result
+
+
+class Ended(NamedTuple):
+    """How the iterations of each copy ended.
+
+    Attributes:
+        results: A :class:`Result` of each copy, a list of B.
+        residual: The last residual of each copy, (B,).
+        iterations: How many there were.
+    """
+
+    results: list
+    residual: np.ndarray
+    iterations: int
+
+
+def iterate(method, tolerance, iterations):
+    """Iterates until every copy has converged, diverged or can come no nearer, or the iterations are used up.
+
+    Args:
+        method: What has the ``model`` and three functions:
+
+            - ``start()`` goes to the first iterate;
+            - ``measure()`` returns the residual (B,) of the iterate, which is not finite in a copy that diverged, and a dict of
+              other :class:`Result` that copies may have ended with, each with truth values (B,);
+            - ``iterate(active)`` does one iteration of the copies that are active, (B,) truth values.
+
+        tolerance: The residual at which a copy has converged.
+        iterations: The most iterations.
+
+    Returns:
+        :class:`Ended`. A copy that has ended keeps its residual and its result.
+    """
+    method.start()
+    copies = method.model.copies
+    active, residual = np.ones(copies, dtype=bool), np.zeros(copies)
+    results = [Result.ITERATIONS_USED_UP] * copies
+    done = 0
+    while True:
+        now, others = method.measure()
+        residual = np.where(active, now, residual)
+        ways = {Result.DIVERGED: ~np.isfinite(residual), Result.CONVERGED: residual <= tolerance, **others}
+        for result, ended in ways.items():
+            for copy in np.flatnonzero(active & ended):
+                results[copy] = result
+            active &= ~ended
+        if not active.any() or done == iterations:
+            return Ended(results, residual, done)
+        method.iterate(active)
+        done += 1
+
+
+class GravityScale:
+    """The acceleration that the residuals of each copy are relative to: gravity's, where there is any.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+
+    Attributes:
+        gravity: (B,) [m/s²].
+    """
+
+    def __init__(self, model):
+        self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
+
+    def or_else(self, acceleration):
+        """Gravity's, without any the ``acceleration`` (B,) [m/s²] given, and 1 m/s² where that is 0, (B,)."""
+        scale = np.where(self.gravity > 0.0, self.gravity, acceleration)
+        return np.where(scale != 0.0, scale, 1.0)

@@ -1,0 +1,43 @@
+"""Weights of the local problems of ADMM, r = W²/(s k A) of each element."""
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from ..core.constant_matrix import constant_blocks
+from ..kernels.admm import stiffness_scale
+
+
+def best_weights(model, elements, he, curvature=None):
+    """Computes r = 1/(2hₑω) of each element (E,), ω² its largest eigenvalue of M⁻¹ s k A DᵀD by itself; 1 if it cannot move.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        elements: One of its terms.
+        he: Effective step hₑ [s].
+        curvature: s of each element (E,), see :func:`curvatures`, if that is known.
+    """
+    blocks = constant_blocks(model, weighed(elements, curvatures(model, elements) if curvature is None else curvature))
+    root = np.sqrt(model.inverse_mass.numpy().astype(np.float64))[elements.stencil.numpy()]
+    rates = np.linalg.eigvalsh(root[:, :, None] * blocks * root[:, None, :])[:, -1]
+    return np.divide(0.5, he * np.sqrt(rates), out=np.ones_like(rates), where=rates > 0.0)
+
+
+def curvatures(model, elements):
+    """Computes the unit s of r for each element (E,): 1 for a squared distance, else the curvature of its energy at rest."""
+    if elements.term.project is not None:
+        return np.ones(elements.count, dtype=model.numpy_dtype)
+    scale = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
+    rest_shape = model.array(np.tile(model.rest_points, (model.copies, 1)), model.vec3)
+    kernel = model.kernel(stiffness_scale, elements.term, model.dtype)
+    model.launch(kernel, elements.count, [*elements.arguments, rest_shape], [scale])
+    found = scale.numpy()
+    # A hinge without a normal at rest has no curvature there, and its weight would be 0.
+    return np.where(found > 0.0, found, found.max() or 1.0)
+
+
+def weighed(elements, factor):
+    """Returns the elements with k multiplied by a factor (E,)."""
+    stiffness = elements.stiffness.numpy() * factor
+    return replace(elements, stiffness=wp.array(stiffness, dtype=elements.stiffness.dtype, device=elements.stiffness.device))
