@@ -124,7 +124,7 @@ def test_02_newton_loses_definiteness_in_compression(hessian, part, free, device
             held.build(device=device, dtype="float64")
         )
         minimiser = stepper.minimiser
-        minimiser._start()
+        minimiser.clear()
         minimiser._assemble()
         matrix = minimiser.hessian.matrix().toarray()
         least = np.linalg.eigvalsh(matrix if free else matrix[3:, 3:])[0]
@@ -445,17 +445,15 @@ def test_06_rate_on_one_spring(k, pull, across, device):
         assert np.abs(x[1] - exact).max() < 8 * EPS * (1.0 + pull)
         return
     normal, stepper = np.array([-ray[1], ray[0], 0.0]), solver.bind(declared.build(device=device, dtype="float64"))
-    stepper._start()
+    stepper.start()
     stepper.correction.assign(np.array([np.zeros(3), exact - predicted + 1e-6 * normal]))
     stepper._launch_gradient()
-    stepper._active.write(1)
     errors = [1e-6]
     rate = (k / length) / (m / h**2 + k)
     for _ in range(6):
         if errors[-1] * rate < 1e-9:  # below, rounding of x is above 1e-6 of it
             break
-        stepper._linear.solve(stepper._gradient, stepper._w)
-        stepper._move()
+        stepper.iterate(np.array([True]))
         errors.append((stepper.correction.numpy()[1] - (exact - predicted)) @ normal)
     assert len(errors) > 1 and np.abs(np.array(errors[1:]) / errors[:-1] / rate - 1.0).max() < 1e-6
 
@@ -498,11 +496,9 @@ def splitting(stepper, count):
     """Corrections and residuals (primal, dual) of ``count`` iterations from where the stepper's correction is, by hand."""
     moves, residuals = [], []
     for _ in range(count):
-        stepper._local()
-        residuals.append([stepper._primal.read()[0], stepper._dual.read()[0]])
-        stepper._active.write(1)
-        stepper._factors.solve(stepper._force, stepper._w)
-        stepper._move()
+        stepper.measure()
+        residuals.append([stepper.primal[0], stepper.dual[0]])
+        stepper.iterate(np.array([True]))
         moves.append(stepper.correction.numpy().copy())
     return np.array(moves), np.array(residuals)
 
@@ -519,7 +515,7 @@ def test_07_rate_of_admm_on_one_spring(r, device):
     beta = r * k / (m / h**2 + r * k)
     for axis in (0, 1):
         stepper = wc.ADMM(substeps=1, weight=r).bind(declared.build(device=device, dtype="float64"))
-        stepper._start()
+        stepper.start()
         stepper.correction.assign(error * np.eye(3)[[2, axis]] * [[0.0], [1.0]])
         moves, _ = splitting(stepper, 5)
         n = np.arange(1, 6)
@@ -541,7 +537,7 @@ def test_07_weights_that_are_too_large_stall_and_too_small_oscillate(device):
     for r in (1e-3, 0.03, 1.0, 10.0):
         solver = wc.ADMM(substeps=1, weight=r, iterations=2000, tolerance=1e-6)
         stepper = solver.bind(declared.build(device=device, dtype="float64"))
-        stepper._start()
+        stepper.start()
         _, residuals = splitting(stepper, 1500)
         worst = residuals.max(axis=1)
         falls[r], rises[r] = worst[600] / worst[300], (worst / np.minimum.accumulate(worst)).max()
@@ -572,7 +568,7 @@ def test_07_the_weight_by_itself_is_near_the_best(name, device):
     for weight in ("auto", *np.geomspace(1e-3, 10.0, 11)):
         solver = wc.ADMM(substeps=1, weight=weight, iterations=10**6)
         stepper = solver.bind(declared.build(device=device, dtype="float64"))
-        stepper._start()
+        stepper.start()
         predicted = stepper.state.x.numpy()
         moves, _ = splitting(stepper, 600)
         left = np.linalg.norm(predicted + moves - exact, axis=(1, 2)) / np.linalg.norm(predicted - exact)

@@ -141,7 +141,7 @@ def test_a_bad_proposal_is_dropped(device):
         return wrong
 
     stepper = replace(METHODS["anderson"], iterations=30).bind(declared.build(device=device, dtype="float64"))
-    stepper._history.method.propose = nonsense
+    stepper._accelerated.method.propose = nonsense
     stepper.step()
     assert np.array_equal(stepper.state.x.numpy(), plain)
 
@@ -233,14 +233,14 @@ def test_residuals_of_admm(device):
     model = last.model
     primal, dual = np.zeros((model.count, 3)), np.zeros((model.count, 3))
     (springs, hinges), x = model.terms, last.state.x.numpy()
-    for elements, mine, old in zip((springs, hinges), last._locals, before._locals, strict=True):
+    for elements, mine, old in zip((springs, hinges), last._split, before._split, strict=True):
         stencil, rest, k = elements.stencil.numpy(), elements.rest.numpy(), elements.stiffness.numpy()
         if elements is springs:
             G = np.tile([-1.0, 1.0], (len(stencil), 1))
         else:
             G, k = rest[:, :4], k * rest[:, 4]
         y = np.einsum("ei,eic->ec", G, x[stencil])
-        z, z_before = mine[0].numpy().reshape(-1, 3), old[0].numpy().reshape(-1, 3)
+        z, z_before = mine.z.numpy().reshape(-1, 3), old.z.numpy().reshape(-1, 3)
         for sums, rows in ((primal, y - z), (dual, z - z_before)):
             np.add.at(sums, stencil, (k[:, None] * G)[:, :, None] * rows[:, None])
     for found, forces in ((last.primal, primal), (last.dual, dual)):

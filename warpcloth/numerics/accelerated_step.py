@@ -76,8 +76,8 @@ class AcceleratedStep:
     def _launch_energy(self, d, out):
         """out (B,) = φ(d)."""
         stepper, model = self.stepper, self.stepper.model
-        stepper.launch_inertia(d, self.unused)
-        stepper.sums.sum(stepper.work, model.per_copy, out)
+        stepper.inertia.add(d, self.unused)
+        stepper.sums.sum(stepper.inertia.work, model.per_copy, out)
         self.energy_of.add(stepper.state.x, out, d)
 
     def _launch(self, name, dim, inputs, outputs):
