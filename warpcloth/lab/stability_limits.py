@@ -122,7 +122,7 @@ def _iterations_across(cell):
 
 
 def _weight(cell):
-    """Divides the weight of ADMM by the smallest that :func:`warpcloth.numerics.local_weights.best_weights` gives, that of the stiffest
+    """Divides the weight of ADMM by the smallest of :func:`warpcloth.numerics.local_weights.best_weights`, that of the stiffest
     element. A larger weight stalls, a smaller one oscillates."""
     if cell.record.weight != "auto" and cell.model:
         return cell.record.weight / min(best_weights(cell.model, elements, cell.he).min() for elements in cell.model.terms)
