@@ -75,7 +75,8 @@ def options():
             values = " ".join(values) if isinstance(values, tuple) else values
             flags = ", ".join(action.option_strings) or values
             said = (action.help or "") % vars(action) if action.help else ""
-            allowed = f"one of {', '.join(map(str, action.choices))}" if action.choices else ""
+            choices = ", ".join(map(str, action.choices or ()))
+            allowed = f"one of {choices}" if choices not in said else ""
             default = f"default {action.default}" if action.choices and isinstance(action.default, str) else ""
             meaning = "; ".join(part for part in (said, allowed, default) if part)
             more = f" {values}" if action.option_strings and values else ""

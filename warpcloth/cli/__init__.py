@@ -118,24 +118,24 @@ def _parser():
     bench.add_arguments(benches)
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-        sub.add_argument("--solver", choices=SOLVERS, help="newton where not given")
-        for option, metavar, text in (("-s", "option=value", "of the solver"), ("-p", "parameter=value", "of the scene")):
+        sub.add_argument("--solver", choices=SOLVERS, help="the solver; newton if not given")
+        for option, of, text in (("-s", "option", "options of the solver"), ("-p", "parameter", "parameters of the scene")):
             text = f"{text}; '{option} help' lists them"
-            sub.add_argument(option, nargs="+", action="extend", default=[], metavar=metavar, help=text)
+            sub.add_argument(option, nargs="+", action="extend", default=[], metavar=f"{of}=value", help=text)
         sub.add_argument("--prim", help="path or name of the cloth's prim, for a stage with several meshes")
         sub.add_argument("--pins", metavar="SELECTION", help="vertices that stand still; replaces the scene's pins")
-    info.add_argument("--advise", action="store_true", help="say which terms, precision and resolution matter, by trying")
-    info.add_argument("--tolerance", metavar="SHARE", help="of --advise: a change that does not matter, 1%% where not given")
-    info.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try, 30 where not given")
-    runs.add_argument("--tolerance", metavar="SHARE", help="choose solver and settings of that error, such as 1%%, see choose")
-    runs.add_argument("--budget", metavar="TIME", help="choose the most accurate of such a time a frame, such as 16ms")
-    runs.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not the scene's")
+    info.add_argument("--advise", action="store_true", help="try which terms, precision and resolution matter")
+    info.add_argument("--tolerance", metavar="SHARE", help="of --advise: the largest change that does not matter (1%%)")
+    info.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try (30)")
+    runs.add_argument("--tolerance", metavar="SHARE", help="choose solver and settings of this error, such as 1%%; see choose")
+    runs.add_argument("--budget", metavar="TIME", help="choose the most accurate within this time per frame, such as 16ms")
+    runs.add_argument("--frames", type=int, metavar="N", help="frames after the first; those of the scene if not given")
     for sub in (runs, info, deforms, analyzes, compares, chooses, benches):
-        sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+        sub.add_argument("--device", default="cpu", help="device: cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print one JSON object")
     for sub in (runs, benches):
         sub.add_argument(
-            "--threads", type=int, default=1, metavar="N", help="that share the steps on the CPU, 1 where not given"
+            "--threads", type=int, default=1, metavar="N", help="threads that share the steps on the CPU (default: 1)"
         )
     for sub in (runs, info, deforms, analyzes, chooses, benches):
         sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
@@ -144,9 +144,9 @@ def _parser():
         text += "" if sub is deforms else "; by default NAME.usdc, where NAME is the scene's, which must not exist yet"
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
     for sub in (runs, deforms, analyzes):
-        sub.add_argument("--single-file", action="store_true", help="one file in the end, with no folder of frames beside it")
+        sub.add_argument("--single-file", action="store_true", help="merge everything into one file, with no folder of frames")
     scenes = add("scenes", run.scenes, "List scenes and their parameters.")
-    scenes.add_argument("folder", nargs="?", help="a folder of .py files, if not the ones whose scenes are known by name")
+    scenes.add_argument("folder", nargs="?", help="a folder of .py files; those of scenes known by name if not given")
     return parser
 
 

@@ -28,44 +28,44 @@ def add_arguments(parser):
     add = parser.add_argument
     add("input", metavar="INPUT", nargs="?", help="the animation: a stage, a folder or pattern of mesh files, .npz or .npy")
     add("--prim", help="path or name of the prim, or geometry, of a file with several")
-    add("--fps", type=float, help="frames per second, where the input does not say; rates need it")
+    add("--fps", type=float, help="frames per second, if the input does not say; rates need it")
     add(
         "--rest",
         metavar="MESH",
-        help="the rest shape: a mesh file or stage with the same triangles; else INPUT's, or its first frame",
+        help="the rest shape, a mesh file or stage with the same triangles; if not given that of INPUT, or its first frame",
     )
-    add("--rest-prim", metavar="PRIM", help="of the rest shape, as --prim")
-    add("--measure", nargs="+", default=["stretch"], metavar="NAME", help="measures, or all, or help; stretch where not given")
+    add("--rest-prim", metavar="PRIM", help="as --prim, in the file of the rest shape")
+    add("--measure", nargs="+", default=["stretch"], metavar="NAME", help="measures, all, or help (default: stretch)")
     add("--neighbourhood", metavar="N", help="measure vertices: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%")
-    add("--reference", metavar="R", help="rest (default), first, previous, or the number of a frame")
-    add("--pairs", metavar="A:B,…", help="instead, pairs of reference and frame, such as 1:2,1:3,72:75")
-    add("--lag", type=int, metavar="K", help="instead, each frame against the one K before it")
-    add("--every", type=int, default=1, metavar="K", help="every K-th frame alone")
-    add("--rates", choices=("midpoint", "forward", "logarithm"), default="midpoint", help="midpoint where not given")
+    add("--reference", metavar="R", help="the reference: rest (default), first, previous, or the number of a frame")
+    add("--pairs", metavar="A:B,…", help="instead of --reference: pairs of reference and frame, such as 1:2,1:3,72:75")
+    add("--lag", type=int, metavar="K", help="instead of --reference: compare each frame with the one K before it")
+    add("--every", type=int, default=1, metavar="K", help="measure every K-th frame only")
+    add("--rates", choices=("midpoint", "forward", "logarithm"), default="midpoint", help="how rates are computed")
     add("--directions", metavar="D", help="warp and weft: st, or a vector such as 1,0,0 for the warp")
-    add("--material", metavar="M", help="for energy and stress: neo-hookean (where --stiffness is given), stvk or corotated")
-    add("--stiffness", type=float, metavar="K", help="of the material: Young's modulus times thickness [N/m]")
-    add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material, 0 where not given")
+    add("--material", metavar="M", help="for energy and stress: neo-hookean (default with --stiffness), stvk or corotated")
+    add("--stiffness", type=float, metavar="K", help="stiffness of the material, Young's modulus times thickness [N/m]")
+    add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material (default: 0)")
     add("-o", "--output", metavar="FILE", help="a .usd, .usda, .usdc or .usdz file: measures as primvars, one as colour")
     add(
         "--colour",
         metavar="NAME",
-        help="what is coloured, such as stretch_1, or none; the first number where not given",
+        help="the number that is shown as colour, such as stretch_1, or none (default: the first)",
     )
     add(
         "--range",
         type=float,
         nargs=2,
         metavar=("LOW", "HIGH"),
-        help="of the colours; else of all frames, without the last 1 %%",
+        help="range of the colours (default: that of all frames, without the last 1 %%)",
     )
-    add("--up-axis", choices=UP_AXES, help="up axis of an input that does not say its own (default: Y)")
+    add("--up-axis", choices=UP_AXES, help="up axis of an input that does not say (default: Y)")
     add("--curves", action="store_true", help="show the principal directions as curves")
-    add("--csv", metavar="FILE", help="a table: percentiles of every frame, the worst element and its place")
-    add("--report", metavar="FILE", help="the same and what is left out, as JSON")
+    add("--csv", metavar="FILE", help="a table: percentiles of every frame, the worst element and its position")
+    add("--report", metavar="FILE", help="the same, with what could not be measured, as JSON")
     add("--npz", metavar="FILE", help="the measures themselves, (frames, elements, …)")
     add("--plot", metavar="FILE", help="percentiles over time, .png, .svg or .pdf")
-    add("--still", metavar="FILE", help="pictures, .png; the number of the frame is put before the ending")
+    add("--still", metavar="FILE", help="pictures, .png; the frame number goes before the ending")
     add("--azimuth", type=float, metavar="DEGREES", help="azimuth of the viewer in --still (default: -38)")
     add("--elevation", type=float, metavar="DEGREES", help="elevation of the viewer in --still (default: 24)")
     add("--both-sides", action="store_true", help="show the cloth from the opposite side too in each --still")
@@ -74,7 +74,7 @@ def add_arguments(parser):
         metavar="NAME",
         help="a colour map of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
     )
-    add("--still-frames", type=float, nargs="+", metavar="FRAME", help="of which frames; of the last where not given")
+    add("--still-frames", type=float, nargs="+", metavar="FRAME", help="frames of --still (default: the last)")
 
 
 def analyze(arguments):

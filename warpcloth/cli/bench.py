@@ -36,20 +36,20 @@ def add_arguments(parser):
 
     add = parser.add_argument
     add("scene", nargs="?", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    add("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
-    add("--solver", choices=SOLVERS, help="newton where not given")
+    add("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
+    add("--solver", choices=SOLVERS, help="the solver; newton if not given")
     add("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
-    add("--sizes", nargs="+", type=int, default=[], metavar="N", help="resolutions of the scene, as its parameter says them")
+    add("--sizes", nargs="+", type=int, default=[], metavar="N", help="resolutions of the scene, values of its parameter")
     add(
         "--frames",
         type=int,
         default=_OF_A_RUN["frames"],
         metavar="N",
-        help="to time at most, 20 where not given; 3 are enough after 10 s",
+        help="the most frames to time (default: 20); after 10 s 3 are enough",
     )
-    add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="of the scene that run at once, 1 where not given")
+    add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="size of a batch that runs at once (default: 1)")
     add("--csv", metavar="FILE", help="write a table")
-    add("--compare", nargs=2, metavar=("OLD", "NEW"), help="print ratios of two results that --json printed")
+    add("--compare", nargs=2, metavar=("OLD", "NEW"), help="print the ratios of two results of --json")
 
 
 def bench(arguments):

@@ -55,8 +55,8 @@ def add(charts, name, command, text, epilog):
     form = argparse.RawDescriptionHelpFormatter
     sub = charts.add_parser(name, help=text, description=text, epilog=epilog, allow_abbrev=False, formatter_class=form)
     sub.set_defaults(command=command)
-    sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
-    sub.add_argument("--workers", type=int, metavar="N", help="processes side by side: by default the cores, on a GPU one")
+    sub.add_argument("--device", default="cpu", help="device: cpu (default), cuda:0, …")
+    sub.add_argument("--workers", type=int, metavar="N", help="processes at the same time (default: the cores, on a GPU one)")
     add_dask(sub)
     sub.add_argument("-o", "--output", metavar="FILE", help=f"draw it, as {', '.join(PICTURES)}")
     sub.add_argument("--csv", metavar="FILE", help="write a table")
@@ -71,13 +71,13 @@ def _add_work_precision(charts):
 
     sub = add(charts, "work-precision", work_precision, "Error over time, of settings of all solvers.", EPILOG)
     sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
-    sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="time where not given")
-    sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=SOLVERS, help="those alone")
-    sub.add_argument("--frames", type=int, metavar="N", help="to run, by default half; before a step, by default a third")
-    sub.add_argument("--dtype", choices=DTYPES, help="by default float32 of motion, float64 of a step")
+    sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
+    sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="which diagram")
+    sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=SOLVERS, help="measure these solvers only")
+    sub.add_argument("--frames", type=int, metavar="N", help="frames to run (default: half), or before a step (a third)")
+    sub.add_argument("--dtype", choices=DTYPES, help="default: float32 for motion, float64 for a step")
     sub.add_argument(
-        "--limit", type=float, default=20.0, metavar="SECONDS", help="that a setting may take (20), a reference six times that"
+        "--limit", type=float, default=20.0, metavar="SECONDS", help="of a setting (default: 20); a reference has six times it"
     )
 
 
@@ -85,7 +85,7 @@ def _add_failure(charts):
     from ..lab.failures import FAILURES
 
     sub = add(charts, "failure", failure, "Chart where terms, weights and fits fail, beside theory.", FAILURE_EPILOG)
-    sub.add_argument("failure", metavar="FAILURE", choices=FAILURES, help=", ".join(FAILURES))
+    sub.add_argument("failure", metavar="FAILURE", choices=FAILURES, help=f"one of {', '.join(FAILURES)}")
 
 
 def failure(arguments):

@@ -21,12 +21,12 @@ def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
     add("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    add("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    add("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
     add("--tolerance", metavar="SHARE", help="largest error, such as 1%% of the size of the cloth")
     add("--budget", metavar="TIME", help="longest frame, such as 16ms")
-    add("--solvers", nargs="+", metavar="NAME", help="to choose among; all where not given")
-    add("--frames", type=int, metavar="N", help="frames to run, if not the scene's")
-    add("--limit", type=float, default=60.0, metavar="SECONDS", help="that a run may take, 60 where not given")
+    add("--solvers", nargs="+", metavar="NAME", help="solvers to choose among (default: all)")
+    add("--frames", type=int, metavar="N", help="frames to run; those of the scene if not given")
+    add("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of a run (default: 60)")
     add_dask(parser)
 
 

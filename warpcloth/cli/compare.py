@@ -34,7 +34,7 @@ def add_arguments(parser):
         parser.add_argument(f"--up-axis-{name}", choices=UP_AXES, help=f"up axis of {of} alone")
     parser.add_argument("--fps", type=float, help="frames per second of both, if they do not say")
     parser.add_argument("--up-axis", choices=UP_AXES, help="up axis of both, which overrides their own")
-    parser.add_argument("--frames", type=int, metavar="N", help="that many frames after the first, if not all")
+    parser.add_argument("--frames", type=int, metavar="N", help="frames after the first (default: all)")
     parser.add_argument("--csv", metavar="FILE", help="write a line for each frame")
     parser.add_argument("--plot", metavar="FILE", help=f"draw the distances over time, as {', '.join(PICTURES)}")
 

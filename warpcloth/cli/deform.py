@@ -55,11 +55,11 @@ def add_arguments(parser):
     parser.add_argument("--frames", type=int, metavar="N", help=f"frames after the first: {_FRAMES}, or the scene's keyframes")
     parser.add_argument("--fps", type=float, help=f"frames per second: the stage's or scene's, or {_FPS:g}")
     parser.add_argument("--prim", help="path or name of the prim, or geometry, of a file with several")
-    parser.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    parser.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
     parser.add_argument("--weights", choices=("cotangent", "intrinsic", "uniform", "clamped"), default="cotangent")
     parser.add_argument("--energy", choices=("spokes", "spokes_and_rims"), default="spokes")
-    parser.add_argument("--iterations", type=int, default=500, metavar="N", help="most of a frame, 500 where not given")
-    parser.add_argument("--tolerance", type=float, default=1e-6, help="at which a frame has converged, 1e-6 where not given")
+    parser.add_argument("--iterations", type=int, default=500, metavar="N", help="the most iterations per frame (default: 500)")
+    parser.add_argument("--tolerance", type=float, default=1e-6, help="at which a frame has converged (default: 1e-6)")
 
 
 class _AddMove(argparse.Action):

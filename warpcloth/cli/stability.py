@@ -34,22 +34,24 @@ are kept, and not measured again.
 def add_arguments(parser):
     """Adds what the command takes but for what all charts do."""
     parser.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    parser.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="of the scene")
+    parser.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
     for of in "xy":
-        parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"the axis {of}, see below")
+        parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"what varies along {of}, see below")
         parser.add_argument(
-            f"--{of}-range", nargs=3, metavar=("LOW", "HIGH", "N"), help="its ends and number of values, at equal factors"
+            f"--{of}-range", nargs=3, metavar=("LOW", "HIGH", "N"), help="ends and number of values, a constant factor apart"
         )
-    parser.add_argument("--at", nargs="+", action="extend", default=[], metavar="axis=value", help="of other axes; dt=1/60")
-    parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), metavar="METHOD", help="the methods, all if not given")
+    parser.add_argument("--at", nargs="+", action="extend", default=[], metavar="axis=value", help="of other axes (dt=1/60)")
     parser.add_argument(
-        "--duration", type=float, metavar="SECONDS", help="time of motion that is compared (default: half of the scene's)"
+        "--solvers", nargs="+", default=list(SOLVERS), metavar="METHOD", help="methods, see below; all if not given"
     )
-    parser.add_argument("--steps", type=int, default=120, metavar="N", help="fewest steps of each run (default: 120)")
     parser.add_argument(
-        "--accuracy", type=float, default=ACCURACY, metavar="SHARE", help=f"{ACCURACY:g} if not given, 0 for none"
+        "--duration", type=float, metavar="SECONDS", help="time of motion that is compared (default: half of that of the scene)"
     )
-    parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="of each run, 60 if not given")
+    parser.add_argument("--steps", type=int, default=120, metavar="N", help="the fewest steps of each run (default: 120)")
+    parser.add_argument(
+        "--accuracy", type=float, default=ACCURACY, metavar="SHARE", help=f"largest error (default: {ACCURACY:g}), 0 for none"
+    )
+    parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="of each run (default: 60)")
     parser.add_argument("--dtype", choices=DTYPES, default="float64")
 
 
