@@ -51,12 +51,12 @@ class Term:
 
     Attributes:
         name: The name of the energy in reports and kernels.
-        vertices: K.
+        vertices: K; 0 of a term whose elements have any number of vertices, see :mod:`warpcloth.terms.sparse`.
         rows: M.
         parameters: P.
         rest_state: NumPy function (points (n, 3) [m], stencil (E, K), …) → (E, P), the rest state of every element; further
             arguments, by keyword, are what the material has beside its stiffness.
-        weight: (rest, i) → (M,), the weights of vertex i in y; also ∂y/∂xᵢ.
+        weight: (rest, i) → (M,), the weights of vertex i in y; also ∂y/∂xᵢ. None where K is 0.
         measure: (rest) → Aₑ.
         energy: (y, rest) → u.
         gradient: (y, rest) → ∂u/∂y (M, 3).

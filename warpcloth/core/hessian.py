@@ -4,7 +4,62 @@ import numpy as np
 import warp as wp
 
 from ..base.turns import in_turn
-from ..kernels import assemble, linear
+from ..kernels import assemble, linear, sparse
+
+
+def _is_sparse(elements):
+    return elements.cells is not None and elements.cells.weights is not None
+
+
+class _Blocks:
+    """The blocks of the elements of one term, (B·E, K²)."""
+
+    def __init__(self, model, elements, corrected):
+        self.model, self.elements, K = model, elements, elements.term.vertices
+        self._kernel = model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected)
+        self.blocks = wp.zeros((elements.count, K * K), dtype=model.mat33, device=model.device)
+
+    def pairs(self):
+        """The row and the column of each block."""
+        stencil = self.elements.stencil.numpy().astype(np.int64)
+        K = stencil.shape[1]
+        return np.repeat(stencil, K, axis=1).ravel(), np.tile(stencil, K).ravel()
+
+    def launch(self, x, correction, policy):
+        arguments = [*self.elements.arguments, x, correction, self.elements.per_copy, policy]
+        self.model.launch(self._kernel, self.elements.count, arguments, [self.blocks])
+
+    def add_norms(self, norms, rows):
+        """Adds the norms of the blocks to their rows."""
+        K = self.elements.term.vertices
+        np.add.at(rows, self.elements.stencil.numpy(), norms.reshape(-1, K, K).sum(axis=2))
+
+
+class _SparseBlocks:
+    """The blocks of the cells of one term, cell by cell, see :mod:`warpcloth.kernels.sparse`."""
+
+    def __init__(self, model, elements, corrected):
+        self.model, self.elements, cells = model, elements, elements.cells
+        self._kernel = model.kernel(sparse.blocks, cells.term, model.dtype, corrected)
+        ends = np.cumsum(np.diff(cells.offsets.numpy()).astype(np.int64) ** 2)
+        self._starts = wp.array(np.append(0, ends[:-1]).astype(np.int32), dtype=wp.int32, device=model.device)
+        self.blocks = wp.zeros(int(ends[-1]), dtype=model.mat33, device=model.device)
+
+    def pairs(self):
+        """The row and the column of each block."""
+        vertices = np.split(self.elements.stencil.numpy()[:, 0].astype(np.int64), self.elements.cells.offsets.numpy()[1:-1])
+        rows = [np.repeat(cell, len(cell)) for cell in vertices]
+        return np.concatenate(rows), np.concatenate([np.tile(cell, len(cell)) for cell in vertices])
+
+    def launch(self, x, correction, policy):
+        cells, elements = self.elements.cells, self.elements
+        given = [cells.offsets, self._starts, elements.stencil, cells.weights, elements.stiffness, cells.rest]
+        given += [x, correction, cells.per_copy, policy]
+        self.model.launch(self._kernel, cells.count, given, [self.blocks])
+
+    def add_norms(self, norms, rows):
+        """Adds the norms of the blocks to their rows."""
+        np.add.at(rows, self.pairs()[0], norms)
 
 
 class Hessian:
@@ -23,10 +78,8 @@ class Hessian:
         self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
         self.model, self.terms = model, model.terms if terms is None else terms
         device = model.device
-        self.kernels = [model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected) for elements in self.terms]
-        self.blocks = [
-            wp.zeros((elements.count, elements.term.vertices**2), dtype=model.mat33, device=device) for elements in self.terms
-        ]
+        self._of_terms = [(_SparseBlocks if _is_sparse(each) else _Blocks)(model, each, corrected) for each in self.terms]
+        self.blocks = [of_term.blocks for of_term in self._of_terms]
         self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=device)
         self._set_inertia = model.kernel(linear.set_inertia, model.dtype)
         self._add_blocks = model.kernel(linear.add_blocks, model.dtype)
@@ -38,10 +91,8 @@ class Hessian:
         model, n = self.model, self.model.count
         fixed = model.inverse_mass.numpy() == 0.0
         keys, sources = [np.arange(n, dtype=np.int64) * (n + 1)], []
-        for elements in self.terms:
-            stencil = elements.stencil.numpy().astype(np.int64)
-            K = stencil.shape[1]
-            rows, columns = np.repeat(stencil, K, axis=1).ravel(), np.tile(stencil, K).ravel()
+        for of_term in self._of_terms:
+            rows, columns = of_term.pairs()
             source = np.flatnonzero(~(fixed[rows] | fixed[columns]))
             keys.append(rows[source] * n + columns[source])
             sources.append(source)
@@ -67,10 +118,18 @@ class Hessian:
         model = self.model
         self.values.zero_()
         model.launch(self._set_inertia, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values])
-        for elements, kernel, blocks, gather in zip(self.terms, self.kernels, self.blocks, self.gathers, strict=True):
-            arguments = [*elements.arguments, x, correction, elements.per_copy, self.policy]
-            model.launch(kernel, elements.count, arguments, [blocks])
-            model.launch(self._add_blocks, len(self.values), [*gather, blocks.flatten()], [self.values])
+        for of_term, gather in zip(self._of_terms, self.gathers, strict=True):
+            of_term.launch(x, correction, self.policy)
+            model.launch(self._add_blocks, len(self.values), [*gather, of_term.blocks.flatten()], [self.values])
+
+    def norms(self):
+        """Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ of every vertex i, summed over elements, (N,) [N/m], each ‖·‖ by the bound √(‖·‖₁‖·‖∞)."""
+        rows = np.zeros(self.model.count)
+        for of_term in self._of_terms:
+            sizes = np.abs(of_term.blocks.numpy().astype(np.float64))
+            # No less than the spectral norm, equal to it along the axes and diagonals of a grid, and cheap.
+            of_term.add_norms(np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)), rows)
+        return rows
 
     def prepare(self):
         """Finds the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""

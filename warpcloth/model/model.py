@@ -13,6 +13,7 @@ import warp as wp
 from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
+from ..kernels.sparse import share
 from ..kernels.term import Term
 from ..kernels.vectors import types
 from ..mesh.selection import distinct_vertices
@@ -39,15 +40,61 @@ class Cells:
     per_copy: int
     shape: wp.array
 
+    weights = None
+
+    @property
+    def arrays(self):
+        """All arrays."""
+        return [self.offsets, self.shape]
+
     @property
     def count(self):
         """Cells of all copies, B·C."""
         return len(self.offsets) - 1
 
+    def share(self, first, count, elements):
+        """The cells of ``count`` of the copies from ``first`` on, whose elements are those of the slice ``elements``."""
+        return replace(self, offsets=self.offsets[: count * self.per_copy + 1], shape=self.shape[elements])
+
     @property
     def sizes(self):
         """Elements of each cell, (B·C,)."""
         return np.diff(self.offsets.numpy())
+
+
+@dataclass(frozen=True, eq=False)
+class SparseCells:
+    """Cells of a term whose elements have any number of vertices, each an element by itself, see :mod:`..kernels.sparse`.
+
+    Attributes:
+        term: The energy of a cell.
+        offsets: (B·C + 1,) int32.
+        per_copy: Cells of one copy, C.
+        weights: (B·E,) vectors of M.
+        rest: Rest state of each cell, (B·C,) vectors of P.
+    """
+
+    term: Term
+    offsets: wp.array
+    per_copy: int
+    weights: wp.array
+    rest: wp.array
+
+    @property
+    def arrays(self):
+        """All arrays."""
+        return [self.offsets, self.weights, self.rest]
+
+    @property
+    def count(self):
+        """Cells of all copies, B·C."""
+        return len(self.offsets) - 1
+
+    def share(self, first, count, elements):
+        """The cells of ``count`` of the copies from ``first`` on, whose elements are those of the slice ``elements``."""
+        C = self.per_copy
+        rest = self.rest[first * C : (first + count) * C]
+        return replace(self, offsets=self.offsets[: count * C + 1], weights=self.weights[elements], rest=rest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +110,7 @@ class DeviceElements:
         hard: Whether any stiffness is infinite.
         damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
         refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
-        cells: :class:`Cells` that the elements are the vertices of, or None.
+        cells: :class:`Cells` or :class:`SparseCells` that the elements are the vertices of, or None.
         pieces: Of elements in blocks where the pieces of each begin, and the first element and the count of each; or None. See
             :mod:`warpcloth.kernels.fast.block_forces`.
     """
@@ -78,7 +125,7 @@ class DeviceElements:
     hard: bool
     damping: wp.array | None = None
     refresh: Refresh | None = None
-    cells: Cells | None = None
+    cells: Cells | SparseCells | None = None
     pieces: tuple[wp.array, wp.array] | None = None
 
     @property
@@ -89,7 +136,7 @@ class DeviceElements:
     @property
     def arrays(self):
         """All arrays of the term."""
-        cells = [self.cells.offsets, self.cells.shape] if self.cells else []
+        cells = self.cells.arrays if self.cells else []
         return self.arguments + ([] if self.damping is None else [self.damping]) + [*(self.pieces or ())] + cells
 
     @property
@@ -148,9 +195,7 @@ class DeviceElements:
         changed = {name: getattr(self, name)[chosen] for name in ("stiffness", "rest")}
         if self.damping is not None:
             changed["damping"] = self.damping[chosen]
-        cells = self.cells
-        if cells:
-            cells = replace(cells, offsets=cells.offsets[: count * cells.per_copy + 1], shape=cells.shape[chosen])
+        cells = self.cells and self.cells.share(first, count, chosen)
         refresh = self.refresh and self.refresh.with_arrays(lambda array: array[chosen])
         return replace(self, **changed, stencil=self.stencil[: count * E], cells=cells, refresh=refresh)
 
@@ -375,16 +420,19 @@ class Model:
         if self.order is not None and vertices.shape[1] == 2:
             vertices = np.sort(vertices, axis=1)  # a pair has no direction, and those of one are faster
         stencil = vertices[None] + (np.arange(self.copies) * self.per_copy)[:, None, None]
-        rest_type = wp.types.vector(one.term.parameters, self.dtype)
-        cells = None
+        cells, declared = None, one.term
         if one.cells is not None:
-            cells, rest = self._cells(one)
+            if one.weights is None:
+                cells, rest = self._cells(one)
+            else:
+                cells, rest, declared = *self._sparse_cells(one, rest), share(one.term.name)
             if stiffness.shape[1] > 1:
                 stiffness = np.repeat(stiffness, np.diff(one.cells), axis=1)
+        rest_type = wp.types.vector(declared.parameters, self.dtype)
         found = DeviceElements(
             label=one.label,
             kind=one.kind,
-            term=one.term,
+            term=declared,
             per_copy=E,
             stencil=wp.array(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), dtype=wp.int32, device=self.device),
             stiffness=self._broadcast(f"{one.label}.stiffness", stiffness, E),
@@ -410,15 +458,33 @@ class Model:
         points = points - np.repeat(points[:, firsts], sizes, axis=1)
         total = np.add.reduceat(weight, firsts, axis=1)
         centre = np.add.reduceat(weight[..., None] * points, firsts, axis=1) / total[..., None]
-        offsets = np.append((elements.cells[:-1] + np.arange(self.copies)[:, None] * len(vertices)).ravel(), weight.size)
         cells = Cells(
-            wp.array(offsets.astype(np.int32), dtype=wp.int32, device=self.device),
+            self._offsets(elements),
             len(sizes),
             self._put(f"{elements.label}: shape", "m", points - np.repeat(centre, sizes, axis=1), self.vec3, "element"),
         )
         rest = np.zeros((*weight.shape, elements.term.parameters))
         rest[..., -1] = weight
         return cells, rest
+
+    def _sparse_cells(self, elements, rest):
+        """:class:`SparseCells` of elements with rest states (B, C, P), and the rest states of their shares, (B, E, 4)."""
+        E, M, P = *elements.weights.shape, elements.term.parameters
+        weights = np.broadcast_to(elements.weights, (self.copies, E, M))
+        cells = SparseCells(
+            elements.term,
+            self._offsets(elements),
+            len(elements.cells) - 1,
+            self._put(f"{elements.label}: weight", "", weights, wp.types.vector(M, self.dtype), "element"),
+            self._put(f"{elements.label}: rest state", "", rest, wp.types.vector(P, self.dtype), "cell"),
+        )
+        return cells, np.zeros((self.copies, E, 4))
+
+    def _offsets(self, elements):
+        """Where the cells of all copies begin and the last ends, int32."""
+        E = elements.cells[-1]
+        offsets = np.append((elements.cells[:-1] + np.arange(self.copies)[:, None] * E).ravel(), self.copies * E)
+        return wp.array(offsets.astype(np.int32), dtype=wp.int32, device=self.device)
 
     def _broadcast(self, name, values, E):
         """(B, 1) or (B, E) values as an array (B·E,), of stride 0 where all are one value."""

@@ -28,6 +28,8 @@ def lines_of(scene):
     length = mesh.edge_lengths.mean()
     for term in scene.terms:
         found = term.elements(mesh, scene.positions)
+        if found.weights is not None:
+            continue
         if found.cells is not None:
             bodies = np.split(found.stencil[:, 0], found.cells[1:-1])
             pairs = np.concatenate([_tree(mesh.points, body[loose[body]]) for body in bodies])

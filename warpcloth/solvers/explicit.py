@@ -148,6 +148,7 @@ def _unlike(model):
     """A model of one copy for each kind of copy that has limits of its own."""
     B = model.copies
     arrays = [model.inverse_mass, *(array for each in model.terms for array in (each.stiffness, each.rest, each.damping))]
+    arrays += [each.cells.rest for each in model.terms if each.cells and each.cells.weights is not None]
     rows = [array.numpy().reshape(B, -1) for array in arrays if array is not None and 0 not in array.strides]
     first = {}
     for copy in range(B):
@@ -204,14 +205,7 @@ def _over_mass(hessian):
 
 def _bounds(hessian):
     """Gershgorin's bound of each row of the same (n,) [1/s²]."""
-    rows = np.zeros(hessian.model.count)
-    for elements, blocks in zip(hessian.terms, hessian.blocks, strict=True):
-        K = elements.term.vertices
-        sizes = np.abs(blocks.numpy().astype(np.float64))
-        # √(‖·‖₁‖·‖∞) is no less than the spectral norm, equal to it along the axes and diagonals of a grid, and cheap.
-        norms = np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)).reshape(-1, K, K).sum(axis=2)
-        np.add.at(rows, elements.stencil.numpy(), norms)
-    return rows * hessian.model.inverse_mass.numpy()
+    return hessian.norms() * hessian.model.inverse_mass.numpy()
 
 
 def _largest(matrix):

@@ -21,9 +21,10 @@ class Elements:
         term: The energy.
         stencil: Vertices of each element, (E, K) int32.
         stiffness: One value or (E,), or (C,) of cells [unit of the term].
-        rest: Rest state (E, P).
+        rest: Rest state (E, P), or with weights that of cells (C, P).
         damping: One value or (E,) [that times s].
         cells: Of elements that belong to cells, E of them from cells[c] to cells[c+1] to cell c, (C+1,); else None.
+        weights: Of cells that are elements of any number of vertices, see :mod:`.sparse`, (E, M); else None.
         refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
     """
 
@@ -35,6 +36,7 @@ class Elements:
     rest: np.ndarray
     damping: np.ndarray
     cells: np.ndarray | None = None
+    weights: np.ndarray | None = None
     refresh: Refresh | None = None
 
 

@@ -1,0 +1,65 @@
+"""Energies whose elements have any number of vertices: y = Dx by a sparse matrix."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..kernels import sparse as kernels
+from .declared import Declared, Elements
+from .refresh import EVALUATION, Refresh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sparse(Declared):
+    """An energy U = Σ_c k A u(y_c) of cells with any number of vertices, y = Dx linear in all of them.
+
+    It defines ``operator`` and ``rest`` in place of a stencil and the weights of its ``term``, whose ``vertices`` are 0 and
+    whose ``weight`` is None. Explicit and Newton take it.
+    """
+
+    def operator(self, mesh):
+        """D as a scipy sparse matrix (C·M, n): rows cM to cM + M of the vertices of ``mesh`` are y of cell c."""
+        raise NotImplementedError  # every energy has its own
+
+    def rest(self, mesh, positions, stencil):
+        """Rest state (C, P) of the cells, from the rest shape of the mesh."""
+        raise NotImplementedError
+
+    def elements(self, mesh, positions):
+        from scipy.sparse import coo_array
+
+        D, M, n = coo_array(self.operator(mesh)), self.term.rows, len(mesh.points)
+        if D.shape[1] != n or D.shape[0] % M:
+            raise ValueError(
+                f"{self.label}: the operator has shape {D.shape}; it must be {M} rows for each cell and {n} columns"
+            )
+        # Each vertex of a cell once, with the weights of all rows.
+        keys, where = np.unique(D.row.astype(np.int64) // M * n + D.col, return_inverse=True)
+        weights = np.zeros((len(keys), M))
+        np.add.at(weights, (where, D.row % M), D.data)
+        cells = np.searchsorted(keys, np.arange(D.shape[0] // M + 1) * n)
+        if not (np.diff(cells) > 0).all():
+            raise ValueError(
+                f"{self.label}: cell {np.flatnonzero(np.diff(cells) == 0)[0]} has no vertex; each must have one or more"
+            )
+        stencil, count = (keys % n).astype(np.int32)[:, None], len(cells) - 1
+        return Elements(
+            label=self.label,
+            kind=type(self).__name__,
+            term=self.term,
+            stencil=stencil,
+            stiffness=self.of_elements("stiffness", count),
+            rest=self.rest(mesh, positions, stencil),
+            damping=np.zeros(()),
+            cells=cells,
+            weights=weights,
+            refresh=Refresh(EVALUATION, _evaluate),
+        )
+
+
+def _evaluate(model, elements, moment):
+    """Sets the shares of the vertices at x, or at x + d."""
+    cells, d = elements.cells, moment.correction
+    kernel = model.kernel(kernels.evaluate, cells.term, model.dtype, d is not None)
+    given = [cells.offsets, elements.stencil, cells.weights, cells.rest, moment.x, d]
+    model.launch(kernel, cells.count, given, [elements.rest])
