@@ -103,7 +103,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
     Q = wp.constant(rows_of(term, scalar, curved))
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     slope = slope_type(term, dtype, scalar, curved)
-    y_of, weight, measure, slack = local_coordinate(term, dtype, True), term.weight, term.measure, term.slack
+    y_of, weight, measure, dead_zone = local_coordinate(term, dtype, True), term.weight, term.measure, term.dead_zone
     gradient, constraint, constraint_gradient = term.gradient, term.constraint, term.constraint_gradient
     stiffening, share_of, row_of = term.stiffening, to_corner(term, dtype), covector_row(term, dtype, scalar, curved)
 
@@ -214,7 +214,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
         c = gradient(y_of(stencil, e, r, x, d), r)  # y − p(y), as u = ½‖y − p(y)‖²
         alpha = dtype(1.0) / (stiffness[e] * measure(r) * h * h)
         active = wp.isfinite(alpha)
-        if wp.static(slack):
+        if wp.static(dead_zone):
             active = active and wp.ddot(c, c) != dtype(0.0)
         slopes[e] = wp.where(active, dtype(1.0), dtype(0.0))
         if not active:

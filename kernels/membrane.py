@@ -1,4 +1,4 @@
-"""What energies of a triangle's deformation gradient share: F itself, and Hessians from its singular values.
+"""Functions of a triangle's deformation gradient that its energies share: F itself, and Hessians from its singular values.
 
 Stencil: a triangle (x₀, x₁, x₂). F (3×2) = [x₁ − x₀, x₂ − x₀] Dm⁻¹ with Dm the rest edges in the triangle's own tangent frame,
 the first along an axis; the rows of y are the columns of F. The first numbers of a rest state are Dm⁻¹, which is upper
@@ -152,22 +152,22 @@ def isotropic_hessian(U: Any, V: Any, stretch: Any, twist: Any, flip: Any, out1:
 
 
 @wp.func
-def clamped(S: Any, least: Any, most: Any):
-    return wp.vector(wp.min(wp.max(S[0], least), most), wp.min(wp.max(S[1], least), most))
+def clamped(S: Any, sigma_min: Any, sigma_max: Any):
+    return wp.vector(wp.min(wp.max(S[0], sigma_min), sigma_max), wp.min(wp.max(S[1], sigma_min), sigma_max))
 
 
 @wp.func
-def range_energy(y: Any, least: Any, most: Any):
+def range_energy(y: Any, sigma_min: Any, sigma_max: Any):
     _U, S, _V = decompose(y)
-    excess = S - clamped(S, least, most)
+    excess = S - clamped(S, sigma_min, sigma_max)
     return y.dtype(0.5) * wp.dot(excess, excess)
 
 
 @wp.func
-def range_gradient(y: Any, least: Any, most: Any):
+def range_gradient(y: Any, sigma_min: Any, sigma_max: Any):
     """F − p, exactly 0 inside the range. What has no direction, σ = 0, takes that of U."""
     U, S, V = decompose(y)
-    excess = S - clamped(S, least, most)
+    excess = S - clamped(S, sigma_min, sigma_max)
     return wp.transpose(U * wp.diag(excess) * wp.transpose(V))
 
 
@@ -183,24 +183,24 @@ def secant(excess: Any, size: Any, target: Any):
 
 
 @wp.func
-def tangent(size: Any, least: Any, most: Any):
+def tangent(size: Any, sigma_min: Any, sigma_max: Any):
     """∂(σ − c)/∂σ: 1, and 0 inside the range."""
     k = type(size)(1.0)
-    if size > least and size < most:
+    if size > sigma_min and size < sigma_max:
         k = type(size)(0.0)
     return k
 
 
 @wp.func
-def range_hessian(y: Any, least: Any, most: Any, policy: int):
+def range_hessian(y: Any, sigma_min: Any, sigma_max: Any, policy: int):
     """∂²u/∂y²; on the edge of the range that of outside. Only twist and the last two can be negative."""
     U, S, V = decompose(y)
-    c = clamped(S, least, most)
+    c = clamped(S, sigma_min, sigma_max)
     excess = S - c
     stretch = wp.matrix(shape=(2, 2), dtype=y.dtype)
-    stretch[0, 0] = tangent(S[0], least, most)
-    stretch[1, 1] = tangent(S[1], least, most)
-    flip = tangent(S[0], least, most)
+    stretch[0, 0] = tangent(S[0], sigma_min, sigma_max)
+    stretch[1, 1] = tangent(S[1], sigma_min, sigma_max)
+    flip = tangent(S[0], sigma_min, sigma_max)
     if S[0] > S[1]:
         flip = y.dtype(1.0) - (c[0] - c[1]) / (S[0] - S[1])
     twist = secant(excess[0] + excess[1], S[0] + S[1], c[0] + c[1])

@@ -7,7 +7,7 @@ from typing import Any
 
 
 class HessianPolicy(IntEnum):
-    """What ``hessian`` makes of the negative curvature of an energy.
+    """The ways in which ``hessian`` treats the negative curvature of an energy.
 
     ``RAW`` returns ∂²u/∂y² as it is. ``CLAMP`` drops the negative part, ``ABSOLUTE`` turns its sign; both are
     semi-definite, and equal to ``RAW`` where that is. Closed forms, no numerical eigenvalues.
@@ -61,8 +61,8 @@ class Term:
         energy: (y, rest) → u.
         gradient: (y, rest) → ∂u/∂y (M, 3).
         hessian: (y, rest, policy) → ∂²u/∂y² (3M, 3M), y row by row, see :class:`HessianPolicy`.
-        slack: Whether there is a range about the rest shape without energy; ``rest_state`` then takes the ratios ``least`` and
-            ``most`` of its ends.
+        dead_zone: Whether there is a range about the rest shape without energy; ``rest_state`` then takes the ratios
+            ``least`` and ``most`` of its ends.
         reach: NumPy function (points (n, 3) [m], stencil (E, K), rest (E, P)) → (pairs (E·m, 2), lengths (E·m,) [m], factors
             (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it does
             not), and how stiff a spring between them would be, kₑ = 1; or None.
@@ -90,7 +90,7 @@ class Term:
     energy: Any
     gradient: Any
     hessian: Any
-    slack: bool = False
+    dead_zone: bool = False
     reach: Callable | None = None
     cells: bool = False
     project: Any = None

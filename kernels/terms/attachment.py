@@ -1,4 +1,4 @@
-"""Attachment: U = Σ ½k‖x − target‖², k in N/m: a spring of no length to a fixed place.
+"""Attachment: U = Σ ½k‖x − target‖², k in N/m: a spring of no length to a fixed position.
 
 Stencil (x₀), y = x₀, rest state the target (3,) [m], measure 1. Not invariant to translation: it holds on to the world.
 """
@@ -11,7 +11,7 @@ from ..term import Dissipation, Term
 
 
 def rest_state(points, stencil):
-    """Targets [m] (E, 3): the places of the vertices ``stencil`` (E, 1) in ``points``."""
+    """Targets [m] (E, 3): the positions of the vertices ``stencil`` (E, 1) in ``points``."""
     return points[stencil[:, 0]].copy()
 
 
@@ -52,7 +52,7 @@ def hessian(y: Any, rest: Any, policy: int):
 
 @wp.func
 def change(y: Any, other: Any, rest: Any):
-    """Of s = y itself: the place that it holds on to does not turn with it."""
+    """Of s = y itself: the position that it holds on to does not turn with it."""
     return other[0] - y[0]
 
 

@@ -2,7 +2,7 @@
 shape matching*; Chao et al. 2010 for the energy).
 
 The only term of cells of variable size: c is the centre of mass of a cell's vertices and R the rotation nearest to
-Σ mᵢ(xᵢ − c)qᵢᵀ (Kabsch 1976), qᵢ the rest places about their own centre of mass. As c and R are the best there are,
+Σ mᵢ(xᵢ − c)qᵢᵀ (Kabsch 1976), qᵢ the rest positions about their own centre of mass. As c and R are the best there are,
 ∂U/∂xᵢ = κmᵢ(xᵢ − c − R qᵢ), as if they stood still. So each vertex of each cell is an element of its own, (x₀), y = x₀, whose
 rest state is where it is to go, t = c + R q − x₀ [m], and mᵢ [kg]; the measure is mᵢ. t is set by :mod:`..clusters` wherever a
 gradient, an energy or a projection is asked for, and only good there.

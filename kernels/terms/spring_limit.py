@@ -68,7 +68,7 @@ SPRING_LIMIT = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
-    slack=True,
+    dead_zone=True,
     reach=spring.reach,
     project=project,
 )

@@ -57,7 +57,7 @@ STRAIN_LIMIT = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
-    slack=True,
+    dead_zone=True,
     reach=reach,
     project=project,
 )

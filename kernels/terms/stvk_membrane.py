@@ -3,7 +3,7 @@
 F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area. The stiffness is k = Et in N/m,
 Young's modulus times thickness, and with Poisson's ratio ν: μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
 
-A polynomial, so it has no singular place, and also no resistance to being crushed: under pressure the force has its maximum at
+A polynomial: it is singular nowhere, but gives way when it is crushed. Under pressure the force has its maximum at
 σ = 1/√3 and vanishes at σ = 0, where the triangle passes through.
 """
 

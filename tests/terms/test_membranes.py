@@ -210,7 +210,7 @@ BOTH, MOST, LEAST, NO_STRETCH = {"least": 0.95, "most": 1.05}, {"most": 1.05}, {
 
 
 def measured(limit, mesh, x):
-    """What a limit limits, at places x."""
+    """The lengths or stretches that a limit limits, at positions x."""
     if isinstance(limit, wc.SpringLimit):
         return np.linalg.norm(x[mesh.edges[:, 1]] - x[mesh.edges[:, 0]], axis=1) / mesh.edge_lengths
     return stretches(mesh, x)

@@ -65,7 +65,7 @@ def named(terms):
 
 every_term = pytest.mark.parametrize("term", **named(CATALOGUE))
 MEMBRANES = tuple(term.name for term in DECLARABLE if term.vertices == 3)
-LIMITS = tuple(term.name for term in DECLARABLE if term.slack)
+LIMITS = tuple(term.name for term in DECLARABLE if term.dead_zone)
 
 
 def term_of(name):
@@ -634,8 +634,8 @@ def test_correction_solves_the_local_step(term, dtype, hard, device):
 @every_dtype
 def test_without_stiffness_nothing_is_corrected(term, dtype, device):
     elements = stencils(term, "random", 1.0, dtype, device)
-    slack = elements._replace(stiffness=np.zeros(len(elements.x)))
-    assert (slack.correction(np.ones(elements.x.shape[:2]), 0.1) == 0.0).all()
+    loose = elements._replace(stiffness=np.zeros(len(elements.x)))
+    assert (loose.correction(np.ones(elements.x.shape[:2]), 0.1) == 0.0).all()
 
 
 @every_dtype
@@ -1155,7 +1155,7 @@ def test_bending_that_gathers_by_element_has_no_net_force(device):
 
 
 def elastic(term, dtype, stencil, stiffness, x, d):
-    """What the forces of a term are computed from."""
+    """The arrays that the forces of a term are computed from."""
     data = assemble.elastic(term, dtype)()
     data.stencil, data.stiffness, data.x = stencil, stiffness, x
     if d is not None:

@@ -454,7 +454,7 @@ def without(*names):
 
 
 def own(name, type_name, value):
-    """What is needed, and one attribute more."""
+    """A cloth with the attributes that it needs, and one more."""
     return OWN | {f"warpcloth:{name}": (type_name, value)}
 
 

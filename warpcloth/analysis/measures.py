@@ -1,4 +1,4 @@
-"""What can be measured of a deforming surface: names, shapes, units and what each is."""
+"""The measures of a deforming surface: names, shapes, units and what each is."""
 
 from dataclasses import dataclass
 

@@ -199,9 +199,9 @@ class DeviceElements:
         refresh = self.refresh and self.refresh.with_arrays(lambda array: array[chosen])
         return replace(self, **changed, stencil=self.stencil[: count * E], cells=cells, refresh=refresh)
 
-    def taut(self, points):
+    def at_limit(self, points):
         """Of a limit the same elements with no range at all about the rest shape ``points`` of one copy; else these."""
-        if not self.term.slack:
+        if not self.term.dead_zone:
             return self
         rest = self.term.rest_state(points, self.stencil.numpy() % len(points), least=1.0, most=1.0)
         held = rest.astype(wp.dtype_to_numpy(self.stiffness.dtype))

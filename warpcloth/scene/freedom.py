@@ -90,9 +90,9 @@ def rank_of(pairs, free):
     points = np.random.default_rng(0).normal(size=(len(free), 3))
     along = points[pairs[:, 1]] - points[pairs[:, 0]]
     along /= np.linalg.norm(along, axis=1)[:, None]
-    values, places = np.stack([-along, along], axis=1), 3 * pairs[:, :, None] + np.arange(3)
+    values, columns_of = np.stack([-along, along], axis=1), 3 * pairs[:, :, None] + np.arange(3)
     shape = len(pairs), 3 * len(free)
-    J = csr_array((values.ravel(), places.ravel(), 6 * np.arange(len(pairs) + 1)), shape=shape)[:, columns]
+    J = csr_array((values.ravel(), columns_of.ravel(), 6 * np.arange(len(pairs) + 1)), shape=shape)[:, columns]
     shifted = (J.T @ J - _ZERO * identity(len(columns))).tocsc()
     options = {"SymmetricMode": True, "Equil": False}
     factors = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)

@@ -1,4 +1,4 @@
-"""What is declared: a scene is data, and holds no solver. Any solver that supports its terms runs it unchanged."""
+"""Scenes: a scene is data, and holds no solver. Any solver that supports its terms runs it unchanged."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -23,7 +23,7 @@ class Pins:
 
     Attributes:
         vertices: Indices (p,), or a selection of the mesh such as ``"x<0.01"``.
-        keyframes: Places (F, p, 3) [m] at the scene's frames 0 … F−1, linear between them, at rest after the last; in the
+        keyframes: Positions (F, p, 3) [m] at the scene's frames 0 … F−1, linear between them, at rest after the last; in the
             order of ``vertices``. Without them the pins stay where they start.
     """
 

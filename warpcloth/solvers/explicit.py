@@ -159,7 +159,7 @@ def _unlike(model):
 def _linearised(model):
     """∂²U/∂x² about the rest shape, and that of the dissipation, or None, each an assembled :class:`Hessian`."""
     x = model.array(model.rest_points, model.vec3)
-    found = [Hessian(model, terms=[elements.taut(model.rest_points) for elements in model.terms]), None]
+    found = [Hessian(model, terms=[elements.at_limit(model.rest_points) for elements in model.terms]), None]
     damping = dissipations(model, 1.0)  # of stiffness β, and at rest the Hessian is that of a linear damper
     if damping:
         model.refresh(STEP, Moment(x), damping)

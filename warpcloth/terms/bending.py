@@ -1,4 +1,4 @@
-"""What energies of bending share: a hinge is an edge and the two triangles at it."""
+"""The base of energies of bending: a hinge is an edge and the two triangles at it."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What the records of all energies share: fields that say what they take, checks, and the elements on a mesh."""
+"""The base of the records of energies: fields that say what they take, checks, and the elements on a mesh."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
@@ -87,7 +87,7 @@ FINITE_FROM_0 = quantity("must be finite, 0 or more", lambda values: (values >= 
 
 @dataclass(frozen=True, kw_only=True)
 class Declared:
-    """What all terms have: a stiffness, and a name to tell two terms of one kind apart.
+    """The base of all terms: a stiffness, and a name to tell two terms of one kind apart.
 
     An energy derives from it, sets ``term`` and defines ``stencil``; its numeric fields have the metadata of :func:`quantity`.
 
@@ -184,7 +184,7 @@ class Declared:
 
 @dataclass(frozen=True, kw_only=True)
 class Damped(Declared):
-    """What terms have that can be damped: β, of a dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖² a step, s the term's own invariant.
+    """The base of terms that can be damped by β, of a dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖² a step, s the term's own invariant.
 
     ``term.dissipation`` says what a damped term becomes.
 

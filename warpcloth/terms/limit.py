@@ -1,4 +1,4 @@
-"""What limits share: a range about the rest shape without energy."""
+"""The base of limits: a range about the rest shape without energy."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What membranes share: energies of the deformation gradient F (3×2) of each triangle."""
+"""The base of membranes: energies of the deformation gradient F (3×2) of each triangle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What a solver needs of every term, and the one sentence that refuses a term which lacks it.
+"""The needs that a solver may have of every term, and the one sentence that refuses a term which lacks it.
 
 The :class:`..kernels.term.Term` says whether it projects, has a scalar constraint or a prox of its own, is made of cells, and
 how its damping enters; its elements say whether a stiffness is infinite and whether they are damped.
