@@ -119,6 +119,13 @@ def test_files_that_are_named_exist(page):
             value = getattr(value, part)
 
 
+def test_the_drawing_of_the_packages_is_what_the_linter_checks():
+    checked = re.search(r"^layers = \[(.*)\]$", (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)[1]
+    (drawing,) = (text for language, text in blocks(PAGES["docs/architecture.md"]) if language == "text")
+    packages = re.findall(r"[a-z]+", checked)
+    assert [word for word in re.findall(r"(?<= )[a-z]+(?=  )", drawing) if word in packages] == packages
+
+
 def _exists(module):
     try:
         return importlib.util.find_spec(module) is not None
