@@ -1,24 +1,31 @@
 """Measures of an animated cloth: deformation, strain, rotation and their rates, frame by frame or of all frames at once."""
 
 import warnings
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.checks import choice, number
+from ..base.types import FilePath, Precision
 from ..mesh.mesh import Mesh, same_topology
-from ..mesh.sequences import Sequence, as_sequence, open_sequence
+from ..mesh.sequences import HasPoints, Sequence, as_sequence, open_sequence
 from ..model.model import DTYPES
+from ..terms.membrane import Membrane
 from .frame_pairs import pairs_of
 from .measures import chosen
 from .samples import Analysis, Exclusion, Sample
 from .surfaces import RATES, Neighbourhoods, Triangles, check_material, material_directions
 
+# Frames as `analyze` takes them; an `Animation` or a `Deformation` has them as `points`.
+Frames = FilePath | Sequence | ArrayLike | HasPoints
 _MOST = 100  # missing frames that have a sentence each
 
 
-def analyze(frames, mesh=None, dt=None, **options):
+def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, **options: Any) -> Analysis:
     """Measures an animation.
 
     With a ``neighbourhood`` of each vertex, else of each triangle: see :data:`warpcloth.analysis.measures.MEASURES` for all
@@ -94,21 +101,21 @@ class Analyzer:
 
     def __init__(
         self,
-        frames,
-        mesh=None,
-        dt=None,
-        measures=("stretch",),
-        reference=None,
-        pairs=None,
-        lag=None,
-        every=1,
-        neighbourhood=None,
-        rates="midpoint",
-        directions=None,
-        material=None,
-        device="cpu",
-        dtype="float64",
-    ):
+        frames: Frames,
+        mesh: Mesh | None = None,
+        dt: float | None = None,
+        measures: str | Iterable[str] = ("stretch",),
+        reference: str | float | None = None,
+        pairs: str | Iterable[tuple[float, float]] | None = None,
+        lag: int | None = None,
+        every: int = 1,
+        neighbourhood: str | Iterable[ArrayLike] | None = None,
+        rates: Literal["midpoint", "forward", "logarithm"] = "midpoint",
+        directions: str | ArrayLike | None = None,
+        material: Membrane | None = None,
+        device: str = "cpu",
+        dtype: Precision = "float64",
+    ) -> None:
         frames, mesh = _frames_first("Analyzer", frames, mesh)
         self._given = {name: value for name, value in locals().items() if name != "self"}
         choice("rates", rates, tuple(RATES))
@@ -122,6 +129,7 @@ class Analyzer:
         self.pairs, self._left_out = pairs_of(self.sequence.labels, reference, pairs, lag, every)
         self.rates, self.dtype = rates, DTYPES[dtype][1]
         self._check_times()
+        self._elements: Triangles | Neighbourhoods
         if self.on == "triangle":
             if material is not None:
                 check_material(material)
@@ -161,32 +169,34 @@ class Analyzer:
                 if not least <= dt <= 1.0 / least:
                     raise ValueError(f"dt: {dt:g} s to frame {self._label(pair.frame):g}, {rule}")
 
-    def of(self, *measures):
+    def of(self, *measures: str) -> "Analyzer":
         """The same analysis of other measures."""
         return Analyzer(**(self._given | {"frames": self.sequence, "dt": None, "measures": measures}))
 
     @property
-    def areas(self):
+    def areas(self) -> np.ndarray:
         """Rest areas (E,) of triangles, or lumped ones of vertices [m²]."""
         return self.mesh.triangle_areas if self.on == "triangle" else self.mesh.vertex_areas
 
-    def places(self, points):
+    def places(self, points: np.ndarray) -> np.ndarray:
         """Where the elements are among points (n, 3): the centroids of triangles, or the vertices, (E, 3)."""
         if self.on == "vertex":
             return points
         a, b, c = self.mesh.triangles.T
         return (points[a] + points[b] + points[c]) / 3.0
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.pairs)
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Sample]:
         elements, sequence = self._elements, self.sequence
         labels, times = sequence.labels, sequence.times
         excluded = _missing(sequence.missing)
         excluded += [_frame(label, reason) for label, reason in self._left_out]
         rates = ", ".join(measure.name for measure in self.measures if measure.rate)
-        held, seen, referred = {}, set(), set()
+        held: dict[int | None, _Held] = {}
+        seen: set[int | None] = set()
+        referred: set[int | None] = set()
         for row, pair in enumerate(self.pairs):
             places = {pair.reference, pair.frame} | ({pair.before} if pair.before is not None else set())
             held = {place: held[place] if place in held else self._read(place) for place in places}
@@ -210,7 +220,7 @@ class Analyzer:
                 elements.rates(times[pair.frame] - times[pair.before], self.rates, rounding)
             values = elements.read()
             known = without | held[pair.reference].lost | held[pair.frame].lost
-            undefined = {}
+            undefined: dict[tuple[str, bytes], tuple[np.ndarray, list[str]]] = {}
             for measure in self.measures:
                 lost = self._exclude(measure, pair, values[measure.name], known, held)
                 if len(lost):

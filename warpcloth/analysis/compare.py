@@ -2,17 +2,21 @@
 
 from dataclasses import dataclass, replace
 from os import PathLike
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.checks import choice, number, shown, whole
-from ..mesh.mesh import UP_AXES, same_topology
-from ..mesh.sequences import Sequence, as_sequence, open_sequence
+from ..base.types import FilePath, Progress, UpAxis
+from ..mesh.mesh import UP_AXES, Mesh, same_topology
+from ..mesh.sequences import HasPoints, Sequence, as_sequence, open_sequence
 from .distances import surface_distances, triangle_areas
 from .measures import MEASURES
 from .samples import Exclusion
 from .surfaces import Triangles
 
+Compared = FilePath | Sequence | tuple[Mesh, FilePath | ArrayLike | HasPoints]
 _SAME_TIME = 1e-6  # of the shortest frame
 
 
@@ -52,12 +56,12 @@ class Comparison:
     """
 
     same_topology: bool
-    up_axes: tuple
+    up_axes: tuple[UpAxis | None, UpAxis | None]
     times: np.ndarray
     frames: np.ndarray
     labels: np.ndarray
-    unmatched: tuple
-    excluded: tuple
+    unmatched: tuple[np.ndarray, ...]
+    excluded: tuple[list[Exclusion], ...]
     sizes: np.ndarray
     surface_mean: np.ndarray
     surface_rms: np.ndarray
@@ -71,7 +75,7 @@ class Comparison:
     stretch_largest: np.ndarray | None = None
 
     @property
-    def relative_rms(self):
+    def relative_rms(self) -> np.ndarray | None:
         """``rms`` by ``sizes`` (F,), NaN where a is a point; None where ``rms`` is."""
         if self.rms is None:
             return None
@@ -79,20 +83,20 @@ class Comparison:
 
 
 def compare(
-    a,
-    b,
-    prim_a=None,
-    prim_b=None,
-    fps=None,
-    fps_a=None,
-    fps_b=None,
-    frames=None,
-    device="cpu",
-    progress=None,
-    up_axis=None,
-    up_axis_a=None,
-    up_axis_b=None,
-):
+    a: Compared,
+    b: Compared,
+    prim_a: str | None = None,
+    prim_b: str | None = None,
+    fps: float | None = None,
+    fps_a: float | None = None,
+    fps_b: float | None = None,
+    frames: int | None = None,
+    device: str = "cpu",
+    progress: Progress | None = None,
+    up_axis: UpAxis | None = None,
+    up_axis_a: UpAxis | None = None,
+    up_axis_b: UpAxis | None = None,
+) -> Comparison:
     """Compares two animations frame by frame, those frames that both have.
 
     One frame of each is in memory at a time. Frames belong together by time: where times differ by no more than 1e-6 of the
@@ -124,34 +128,33 @@ def compare(
     """
     if frames is not None:
         whole("frames", frames, least=0)
-    a = opened("a", a, prim_a, fps if fps_a is None else fps_a)
-    b = opened("b", b, prim_b, fps if fps_b is None else fps_b)
-    for name, sequence in (("a", a), ("b", b)):
+    one = opened("a", a, prim_a, fps if fps_a is None else fps_a)
+    other = opened("b", b, prim_b, fps if fps_b is None else fps_b)
+    for name, sequence in (("a", one), ("b", other)):
         if sequence.times is None:
             where = name if sequence.path is None else sequence.path
             raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
-    up_axes = tuple(
-        up_axis_of(*given) for given in (("up_axis_a", a, up_axis_a or up_axis), ("up_axis_b", b, up_axis_b or up_axis))
-    )
-    b = _turned(b, *up_axes)
-    pairs = _matching(a, b)
-    unmatched = tuple(np.setdiff1d(np.arange(len(s)), places) for s, places in zip((a, b), pairs.T, strict=True))
+    up_axes = up_axis_of("up_axis_a", one, up_axis_a or up_axis), up_axis_of("up_axis_b", other, up_axis_b or up_axis)
+    other = _turned(other, *up_axes)
+    pairs = _matching(one, other)
+    unmatched = tuple(np.setdiff1d(np.arange(len(s)), partners) for s, partners in zip((one, other), pairs.T, strict=True))
     pairs = pairs if frames is None else pairs[: frames + 1]
-    pair = _Pair(a, b, device)
+    pair = _Pair(one, other, device)
     rows = []
-    for frame, places in enumerate(pairs):
-        rows.append(pair.measure(*places))
+    for frame, (i, j) in enumerate(pairs):
+        rows.append(pair.measure(i, j))
         if progress is not None:
             progress(frame, len(pairs) - 1)
     if not any(rows):
-        why = next(one for excluded in pair.excluded for one in excluded if one.kind == "vertex")
+        why = next(first for excluded in pair.excluded for first in excluded if first.kind == "vertex")
         raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
-    labels = np.column_stack([s.labels[places] for s, places in zip((a, b), pairs.T, strict=True)])
-    excluded = tuple(pair.excluded)
-    return Comparison(pair.same, up_axes, a.times[pairs[:, 0]], pairs, labels, unmatched, excluded, **_columns(rows))
+    labels = np.column_stack([one.labels[pairs[:, 0]], other.labels[pairs[:, 1]]])
+    return Comparison(
+        pair.same, up_axes, np.asarray(one.times)[pairs[:, 0]], pairs, labels, unmatched, tuple(pair.excluded), **_columns(rows)
+    )
 
 
-def opened(name, source, prim=None, fps=None):
+def opened(name: str, source: Any, prim: str | None = None, fps: float | None = None) -> Sequence:
     """The `Sequence` of one of the two, as `compare` takes it; ``name`` is for errors."""
     if isinstance(source, Sequence):
         return source

@@ -1,6 +1,7 @@
 """The measures of a deforming surface: names, shapes, units and what each is."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,8 +37,8 @@ class Measure:
 
 _TURNED = "turns by 180° or more, or has collapsed"
 _EQUAL = "has stretches that are equal but for rounding, and so no principal directions"
-_FORCES = {"needs": "material"}
-_THREADS = {"needs": "directions", "undefined": "has collapsed, or has no such directions"}
+_FORCES: dict[str, Any] = {"needs": "material"}
+_THREADS: dict[str, Any] = {"needs": "directions", "undefined": "has collapsed, or has no such directions"}
 _RATES = (
     Measure("velocity_gradient", (3, 3), "1/s", "L = ḞF⁻¹", 0.0, True, undefined=_TURNED),
     Measure("rate_of_strain", (3, 3), "1/s", "D = ½(L + Lᵀ) in the tangent plane", 0.0, True, undefined=_TURNED),

@@ -1,9 +1,12 @@
 """What an analysis gives: rows of measures, and what could not be measured."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from ..mesh.mesh import Mesh
+from .measures import Measure
 
 _SHOWN = 8  # elements that a sentence names
 
@@ -24,7 +27,7 @@ class Exclusion:
     elements: np.ndarray
     reason: str
 
-    def __str__(self):
+    def __str__(self) -> str:
         where = "rest shape" if self.frame is None else f"frame {self.frame:g}"
         if self.kind == "frame":
             return f"{where} {self.reason}"
@@ -55,12 +58,12 @@ class Sample:
     place: int
     time: float
     points: np.ndarray
-    values: dict
-    excluded: list
+    values: dict[str, np.ndarray]
+    excluded: list[Exclusion]
 
 
 @dataclass(frozen=True, eq=False)
-class Analysis(Mapping):
+class Analysis(Mapping[str, np.ndarray]):
     """Measures of all rows, arrays (rows, E, *shape) by name: ``analysis["stretch"]``.
 
     Attributes:
@@ -74,25 +77,25 @@ class Analysis(Mapping):
         arrays: The arrays.
     """
 
-    mesh: object
+    mesh: Mesh
     on: str
-    measures: dict
-    references: list
+    measures: dict[str, Measure]
+    references: list[float | None]
     frames: np.ndarray
     times: np.ndarray
-    excluded: list
-    arrays: dict = field(repr=False)
+    excluded: list[Exclusion]
+    arrays: dict[str, np.ndarray] = field(repr=False)
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> np.ndarray:
         return self.arrays[name]
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[str]:
         return iter(self.arrays)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.arrays)
 
     @property
-    def pairs(self):
+    def pairs(self) -> list[tuple[float | str, float]]:
         """(reference, frame) of each row, "rest" for the rest shape."""
         return [("rest" if start is None else start, frame) for start, frame in zip(self.references, self.frames, strict=True)]

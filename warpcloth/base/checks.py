@@ -2,8 +2,11 @@
 
 import math
 import reprlib
+from collections.abc import Collection
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .limits import MOST
 
@@ -11,12 +14,12 @@ _SHORT = reprlib.Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
 
 
-def shown(value):
+def shown(value: object) -> str:
     """A value in one line that is not long, for the sentence of an error."""
     return " ".join(_SHORT.repr(value.item() if isinstance(value, np.generic) else value).split())
 
 
-def number(name, value, above=None, least=None):
+def number(name: str, value: Any, above: float | None = None, least: float | None = None) -> None:
     """Checks that an option is a finite number."""
     rule = "that is finite" if above is least is None else f"above {above:g}" if above is not None else f"of {least:g} or more"
     if isinstance(value, float) and math.isinf(value) and value > 0.0 and rule != "that is finite":
@@ -34,7 +37,7 @@ def _is_finite(value):
         return False
 
 
-def whole(name, value, least, most=MOST):
+def whole(name: str, value: Any, least: int, most: int = MOST) -> None:
     """Checks that an option is a whole number from ``least`` to ``most``."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name} is {shown(value)}; it must be a whole number of {least} or more")
@@ -42,13 +45,13 @@ def whole(name, value, least, most=MOST):
         raise ValueError(f"{name} is {shown(value)}; it must be {most:,} or less")
 
 
-def choice(name, value, allowed):
+def choice(name: str, value: object, allowed: Collection[str]) -> None:
     """Checks that an option is one of some words."""
     if not isinstance(value, str) or value not in allowed:
         raise ValueError(f"{name} is {shown(value)}; it must be one of {', '.join(map(repr, allowed))}")
 
 
-def numeric(name, value, rule):
+def numeric(name: str, value: object, rule: str) -> np.ndarray:
     """``value`` as a read-only float64 array of its own.
 
     Raises:
@@ -65,7 +68,7 @@ def numeric(name, value, rule):
     return array
 
 
-def array(name, value, shape):
+def array(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
     """``value`` as a read-only float64 array of ``shape``, all finite."""
     found = numeric(name, value, f"have shape {shape}")
     if found.shape != shape:
@@ -74,7 +77,7 @@ def array(name, value, shape):
     return found
 
 
-def refuse(name, values, wrong, rule):
+def refuse(name: str, values: np.ndarray, wrong: ArrayLike, rule: str) -> None:
     """Refuses an array where ``wrong`` is true anywhere, naming the first such entry."""
     where = np.argwhere(wrong)
     if len(where):

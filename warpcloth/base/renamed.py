@@ -3,9 +3,9 @@
 import functools
 import warnings
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
-Record = TypeVar("Record", bound=type)
+Record = TypeVar("Record")
 
 
 def renamed(**names: str) -> Callable[[Record], Record]:
@@ -14,7 +14,7 @@ def renamed(**names: str) -> Callable[[Record], Record]:
     The record keeps the names in ``renamed_fields``, new name by old name.
     """
 
-    def decorate(record: Record) -> Record:
+    def decorate(record: Any) -> Any:
         make = record.__init__
 
         @functools.wraps(make)
@@ -26,13 +26,17 @@ def renamed(**names: str) -> Callable[[Record], Record]:
         record.renamed_fields = names
         record.__init__ = with_old_names
         for old in names:
-            setattr(record, old, property(lambda self, old=old: getattr(self, new_name(type(self), old))))
+            setattr(record, old, property(functools.partial(_read, old)))
         return record
 
     return decorate
 
 
-def new_name(record, name, stacklevel=3):
+def _read(old: str, record: object) -> Any:
+    return getattr(record, new_name(type(record), old))
+
+
+def new_name(record: Any, name: str, stacklevel: int = 3) -> str:
     """Returns the present name of a field of a record, with a warning if ``name`` is its old one."""
     new = getattr(record, "renamed_fields", {}).get(name, name)
     if new != name:

@@ -13,6 +13,8 @@ import threading
 from contextlib import contextmanager
 from functools import wraps
 
+from .types import Call
+
 
 class _Turn:
     """The turn of one thread, and of those that work for it."""
@@ -47,7 +49,7 @@ if hasattr(os, "register_at_fork"):  # a child process has only this thread, and
     os.register_at_fork(before=TURN.__enter__, after_in_parent=TURN.__exit__, after_in_child=TURN.__exit__)
 
 
-def in_turn(function):
+def in_turn(function: Call) -> Call:
     """Wraps a function so that it waits for its thread's turn."""
 
     @wraps(function)
@@ -55,7 +57,7 @@ def in_turn(function):
         with TURN:
             return function(*args, **kwargs)
 
-    return waiting
+    return waiting  # type: ignore[return-value]  # which has the parameters of the function
 
 
 def methods_in_turn(kind, *names):

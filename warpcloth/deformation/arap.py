@@ -3,24 +3,30 @@
 import importlib.util
 import warnings
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from ..base.checks import choice, number, numeric, shown, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
+from ..base.types import Precision
 from ..core.capture import Mirror, Segment
 from ..core.sums import CHUNKS
 from ..kernels import arap_cells as cells
 from ..kernels import reduce
 from ..kernels.vectors import types
+from ..mesh.mesh import Mesh
 from ..mesh.ordering import worthwhile_order
 from ..mesh.selection import distinct_vertices
 from ..model.model import DTYPES
 from ..numerics.linear import constant_factor
 from ..numerics.rotation import kabsch
 
+Weights = Literal["cotangent", "clamped", "intrinsic", "uniform"]
+CellEnergy = Literal["spokes", "spokes_and_rims"]
 # A weight below this share of the largest is one of rounding.
 _ROUNDING = 1e-12
 
@@ -90,7 +96,15 @@ class Arap:
     """
 
     @in_turn
-    def __init__(self, mesh, handles, weights="cotangent", energy="spokes", device="cpu", dtype="float64"):
+    def __init__(
+        self,
+        mesh: Mesh,
+        handles: str | ArrayLike,
+        weights: Weights = "cotangent",
+        energy: CellEnergy = "spokes",
+        device: str = "cpu",
+        dtype: Precision = "float64",
+    ) -> None:
         from scipy.sparse import coo_matrix, diags
 
         choice("weights", weights, ("cotangent", "clamped", "intrinsic", "uniform"))
@@ -161,7 +175,9 @@ class Arap:
         self._local = self._record(mesh, pairs, w, rims)
 
     @in_turn
-    def solve(self, positions, iterations=100, tolerance=1e-6, initial=None):
+    def solve(
+        self, positions: ArrayLike, iterations: int = 100, tolerance: float = 1e-6, initial: ArrayLike | None = None
+    ) -> Deformed:
         """Moves the handles and lets the rest follow. Reuses the factors and all arrays of earlier calls.
 
         Args:
@@ -227,7 +243,7 @@ class Arap:
         return energy
 
     @in_turn
-    def carry(self, points, before, after):
+    def carry(self, points: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Points moved along with the handles: each part of the mesh rigidly, as fits best how its handles went.
 
         Args:

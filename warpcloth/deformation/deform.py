@@ -2,15 +2,18 @@
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..base.checks import number, refuse, shown, whole
 from ..base.interrupts import recording
+from ..base.types import FilePath, Precision, Progress, UpAxis
 from ..mesh.mesh import Mesh
-from ..scene.scene import checked_pins
+from ..mesh.stage_mesh import StageMesh
+from ..scene.scene import Pins, checked_pins
 from ..usd import AnimationWriter, FrameSequence
-from .arap import Arap
+from .arap import Arap, CellEnergy, Weights
 
 PRIMVAR = "rotationAngle"
 
@@ -32,17 +35,17 @@ class Deformation:
         output: Path of the USD file, or None.
     """
 
-    points: np.ndarray
-    angles: np.ndarray
+    points: np.ndarray | FrameSequence
+    angles: np.ndarray | FrameSequence
     largest_angles: np.ndarray
     energies: np.ndarray
     iterations: np.ndarray
     converged: np.ndarray
     times: np.ndarray
-    timings: dict
-    output: str | None = None
+    timings: dict[str, Any]
+    output: FilePath | None = None
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         frames, vertices, _ = self.points.shape
         late = np.count_nonzero(~self.converged)
         result = f"{late} frames did not converge" if late else "converged"
@@ -51,21 +54,21 @@ class Deformation:
 
 
 def deform(
-    mesh,
-    pins,
-    fps=24.0,
-    weights="cotangent",
-    energy="spokes",
-    iterations=500,
-    tolerance=1e-6,
-    device="cpu",
-    dtype="float64",
-    output=None,
-    single_file=False,
-    progress=None,
-    stage=None,
-    up_axis=None,
-):
+    mesh: Mesh,
+    pins: Pins,
+    fps: float = 24.0,
+    weights: Weights = "cotangent",
+    energy: CellEnergy = "spokes",
+    iterations: int = 500,
+    tolerance: float = 1e-6,
+    device: str = "cpu",
+    dtype: Precision = "float64",
+    output: FilePath | None = None,
+    single_file: bool = False,
+    progress: Progress | None = None,
+    stage: StageMesh | None = None,
+    up_axis: UpAxis | None = None,
+) -> Deformation:
     """Deforms a mesh as rigidly as its moved handles allow (Sorkine & Alexa 2007).
 
     Each solve starts from the frame before it, carried along with the handles (:meth:`warpcloth.Arap.carry`): they may turn
@@ -146,7 +149,7 @@ def _refuse_beyond_float32(keyframes, fps):
     refuse("velocities of pins.keyframes", velocities, ~(np.abs(velocities) <= limit), rule)
 
 
-def rotation_angles(rotations):
+def rotation_angles(rotations: np.ndarray) -> np.ndarray:
     """Angles of rotation matrices (n, 3, 3) → (n,) [rad], 0 to π, as precise near both ends as the matrices are."""
     R = rotations
     axial = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)

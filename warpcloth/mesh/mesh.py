@@ -1,21 +1,27 @@
 """The mesh of a cloth: NumPy arrays, validated once, and the topology that energies and solvers read."""
 
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.checks import choice, shown
 from ..base.limits import refuse_memory
+from ..base.types import Converted, FilePath, UpAxis, default
 from ..kernels.deformation import FLATTEST
 from .selection import select
 
 # By the ending of a file, what reads a mesh from it: (path, name of the geometry, class) → mesh. Modules that read files enter
 # theirs: `loading`, and `usd` for stages.
-READERS = {}
+READERS: dict[str, Callable[[FilePath, str | None, Any], Any]] = {}
 UP_AXES = ("Y", "Z")
+Own = TypeVar("Own", bound="Mesh")
+Pattern = Literal["diagonal", "alternating", "equilateral"]
 _MOST_VERTICES = 2**31 - 1  # indices are int32
 # Least memory to build a grid: float64 positions and texture coordinates, int64 corners of two triangles.
 _BYTES_OF_A_VERTEX = 24 + 16 + 48
@@ -43,14 +49,14 @@ class Mesh:
             another.
     """
 
-    points: np.ndarray
-    triangles: np.ndarray | None = None
-    edges: np.ndarray | None = None
-    texture_coordinates: np.ndarray | None = None
+    points: Converted[ArrayLike, np.ndarray] = default(MISSING)
+    triangles: Converted[ArrayLike | None, np.ndarray] = default(None)
+    edges: Converted[ArrayLike | None, np.ndarray] = default(None)
+    texture_coordinates: Converted[ArrayLike | None, np.ndarray | None] = default(None)
     grid_shape: tuple[int, int] | None = None
-    up_axis: str | None = None
+    up_axis: UpAxis | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.up_axis is not None:
             choice("up_axis", self.up_axis, UP_AXES)
         points = _numbers("points", self.points, 3)
@@ -84,11 +90,11 @@ class Mesh:
                 raise ValueError(f"grid_shape = {self.grid_shape}: {nx}·{ny} must be the number of points, {n}")
             keep(self, "grid_shape", (nx, ny))
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self.points)} points, {len(self.triangles)} triangles, {len(self.edges)} edges)"
 
     @classmethod
-    def grid(cls, nx, ny, size=1.0, pattern="diagonal"):
+    def grid(cls: type[Own], nx: int, ny: int, size: float | tuple[float, float] = 1.0, pattern: Pattern = "diagonal") -> Own:
         """A flat grid in the plane y = 0, its first corner at the origin, triangle normals along +y.
 
         Vertex i + nx·j stands in column i along +x and row j along +z. Patterns:
@@ -128,18 +134,18 @@ class Mesh:
             points[..., 2] = edge * np.sqrt(0.75) * row
         else:
             points[..., 0], points[..., 2] = np.meshgrid(np.linspace(0, width, nx), np.linspace(0, depth, ny))
-        points = points.reshape(-1, 3)
-        st = points[:, [0, 2]] / points[:, [0, 2]].max(axis=0)
+        st = points.reshape(-1, 3)[:, [0, 2]]
 
         a = (column + nx * row)[:-1, :-1]
         b, c, d = a + 1, a + nx, a + nx + 1
         mirrored = {"diagonal": column < 0, "alternating": (column + row) % 2 == 1, "equilateral": row % 2 == 0}[pattern]
         straight = np.stack([a, c, d, a, d, b], axis=-1)
         triangles = np.where(mirrored[:-1, :-1, None], np.stack([a, c, b, b, c, d], axis=-1), straight).reshape(-1, 3)
-        return cls(points, triangles, texture_coordinates=st, grid_shape=None if equilateral else (nx, ny))
+        st = st / st.max(axis=0)
+        return cls(points.reshape(-1, 3), triangles, texture_coordinates=st, grid_shape=None if equilateral else (nx, ny))
 
     @classmethod
-    def chain(cls, n, length=1.0, direction=(0, -1, 0)):
+    def chain(cls: type[Own], n: int, length: float = 1.0, direction: ArrayLike = (0, -1, 0)) -> Own:
         """A straight chain: n vertices evenly spaced from the origin, n−1 edges from each to the next.
 
         Args:
@@ -157,12 +163,12 @@ class Mesh:
         refuse_memory(f"n = {n}", _BYTES_OF_A_VERTEX * n)
         along = _coordinates("direction", [direction], 3)[0]
         if not along.any():
-            raise ValueError(f"direction = {direction}: must not be zero")
+            raise ValueError(f"direction = {shown(direction)}: must not be zero")
         points = np.linspace(0, length, n)[:, None] * (along / np.linalg.norm(along))
         return cls(points, edges=np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
 
     @classmethod
-    def load(cls, path, prim=None):
+    def load(cls: type[Own], path: FilePath, prim: str | None = None) -> Own:
         """Reads the mesh in a file: see `loading.read_file`, and for USD stages `usd.read_mesh`, which say what is raised.
 
         Args:
@@ -177,7 +183,7 @@ class Mesh:
             raise ValueError(f"{path}: the ending must be one of {' '.join(READERS)}")
         return read(path, prim, cls)
 
-    def select(self, text):
+    def select(self, text: str) -> np.ndarray:
         """Vertices described by a text such as "z == 0 and not corners": see `selection.select`.
 
         Args:
@@ -191,7 +197,7 @@ class Mesh:
         """
         return select(self, text)
 
-    def corners(self):
+    def corners(self) -> np.ndarray:
         """Vertices at the corners.
 
         Of a grid the four corners (0, 0), (nx−1, 0), (0, ny−1), (nx−1, ny−1). Of other triangle meshes the boundary
@@ -219,7 +225,7 @@ class Mesh:
         nearest = np.linalg.norm(points[None, :, plane] - box[:, None], axis=2).argmin(axis=1)
         return self.boundary[list(dict.fromkeys(nearest.tolist()))]
 
-    def springs(self, kind):
+    def springs(self, kind: str) -> np.ndarray:
         """Pairs of vertices that springs of one kind join (Provot 1995, "Deformation constraints in a mass-spring model").
 
         | kind | a grid with `grid_shape` | other triangle meshes | edge meshes |
@@ -267,7 +273,7 @@ class Mesh:
         return self._unique(pairs)
 
     @cached_property
-    def hinges(self):
+    def hinges(self) -> np.ndarray:
         """The four vertices of every pair of triangles that share an edge (H, 4), int32, in the order of the edges.
 
         [x₀, x₁, x₂, x₃]: the first triangle, that of the lower index, runs along the shared edge from x₀ to x₁, so its
@@ -296,43 +302,43 @@ class Mesh:
         return _read_only(hinges)
 
     @cached_property
-    def boundary_edges(self):
+    def boundary_edges(self) -> np.ndarray:
         """Edges of exactly one triangle (B, 2), int32, rows of `edges`; of an edge mesh none."""
         return _read_only(self.edges[self._sides[2] == 1] if len(self.triangles) else self.edges[:0])
 
     @cached_property
-    def boundary(self):
+    def boundary(self) -> np.ndarray:
         """Sorted vertices of the boundary edges, int32; of an edge mesh the ends, vertices of exactly one edge."""
         if len(self.triangles):
             return _read_only(np.unique(self.boundary_edges))
         return _read_only(np.flatnonzero(np.bincount(self.edges.ravel()) == 1).astype(np.int32))
 
     @cached_property
-    def isolated(self):
+    def isolated(self) -> np.ndarray:
         """Sorted vertices that no triangle (of an edge mesh: no edge) uses, int32; they have no area and no length."""
         used = np.bincount(self.edges.ravel(), minlength=len(self.points))
         return _read_only(np.flatnonzero(used == 0).astype(np.int32))
 
     @cached_property
-    def edge_lengths(self):
+    def edge_lengths(self) -> np.ndarray:
         """Rest lengths (E,) [m]."""
         return _read_only(np.linalg.norm(self.points[self.edges[:, 1]] - self.points[self.edges[:, 0]], axis=1))
 
     @cached_property
-    def triangle_areas(self):
+    def triangle_areas(self) -> np.ndarray:
         """Rest areas (T,) [m²], ½‖(x₁−x₀)×(x₂−x₀)‖."""
         x0, x1, x2 = (self.points[corner] for corner in self.triangles.T)
         with np.errstate(invalid="ignore", over="ignore"):  # points of a `Surface` may be infinite
             return _read_only(np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) / 2)
 
     @cached_property
-    def vertex_areas(self):
+    def vertex_areas(self) -> np.ndarray:
         """Lumped areas (n,) [m²]: a third of the adjacent triangles' areas that are finite; zero without any."""
         third = np.repeat(np.where(np.isfinite(self.triangle_areas), self.triangle_areas, 0.0) / 3, 3)
         return _read_only(np.bincount(self.triangles.ravel(), weights=third, minlength=len(self.points)))
 
     @cached_property
-    def vertex_lengths(self):
+    def vertex_lengths(self) -> np.ndarray:
         """Lumped lengths (n,) [m]: half of the adjacent edges' lengths."""
         half = np.repeat(self.edge_lengths / 2, 2)
         return _read_only(np.bincount(self.edges.ravel(), weights=half, minlength=len(self.points)))
@@ -388,7 +394,7 @@ class Surface(Mesh):
     """
 
     @cached_property
-    def degenerate(self):
+    def degenerate(self) -> np.ndarray:
         """Sorted triangles (k,), int32, that a `Mesh` would refuse."""
         return _read_only(np.flatnonzero(self._flat()).astype(np.int32))
 
@@ -396,7 +402,7 @@ class Surface(Mesh):
         """Refuses nothing."""
 
 
-def same_topology(one, other):
+def same_topology(one: Mesh, other: Mesh) -> bool:
     """Whether two meshes have as many vertices and the same triangles."""
     return len(one.points) == len(other.points) and np.array_equal(one.triangles, other.triangles)
 

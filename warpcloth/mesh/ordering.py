@@ -1,12 +1,16 @@
 """Numbering vertices so that neighbours lie near one another in memory."""
 
+from typing import Any
+
 import numpy as np
+
+from .mesh import Mesh
 
 # Fewer stay in caches whatever their order is, and gain less in a second of motion than loading SciPy takes.
 LEAST = 4096
 
 
-def near_order(mesh):
+def near_order(mesh: Mesh) -> np.ndarray:
     """The vertices of a mesh in an order that keeps neighbours near: reverse Cuthill–McKee of its edges.
 
     (Cuthill and McKee 1969, *Reducing the bandwidth of sparse symmetric matrices*; George 1971.)
@@ -26,13 +30,13 @@ def near_order(mesh):
     return reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int32)
 
 
-def spread(mesh, order=None):
+def spread(mesh: Mesh, order: np.ndarray | None = None) -> float:
     """The mean of |i − j| over the edges of a mesh, as its vertices are numbered or in an ``order`` of them (n,)."""
     places = np.arange(len(mesh.points)) if order is None else np.argsort(order)
     return float(np.abs(np.diff(places[mesh.edges], axis=1)).mean())
 
 
-def worthwhile_order(mesh):
+def worthwhile_order(mesh: Mesh) -> np.ndarray | None:
     """`near_order` of a mesh of :data:`LEAST` vertices or more where edges then span less than half as much, else None."""
     if len(mesh.points) < LEAST:
         return None
@@ -40,7 +44,7 @@ def worthwhile_order(mesh):
     return order if spread(mesh, order) < 0.5 * spread(mesh) else None
 
 
-def order_of_run(scene, solver):
+def order_of_run(scene: Any, solver: Any) -> np.ndarray | None:
     """The order of vertices that a run of a scene has, see `worthwhile_order`; None where it keeps that of the scene.
 
     Methods whose result depends on the order of elements, Gauss–Seidel sweeps, keep it, for theirs would change by more than

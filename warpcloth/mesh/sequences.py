@@ -24,18 +24,29 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, SupportsIndex
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base import checks
+from ..base.types import FilePath, UpAxis
 from .loading import ENDINGS, WELDED, read_arrays
 from .mesh import Mesh, Surface
+from .stage_mesh import StageMesh
 
 # By the ending of a file, what opens the sequence in it: (path, prim, fps) → :class:`Sequence`; `usd` enters that of stages.
-OPENERS = {}
+OPENERS: dict[str, Callable[[FilePath, str | None, float | None], Any]] = {}
 _MOST_MISSING = 1_000_000
 _FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
+
+
+class HasPoints(Protocol):
+    """A result that has its frames as ``points``: an `Animation`, a `Deformation`."""
+
+    @property
+    def points(self) -> Any:
+        """(F, n, 3) [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,31 +76,31 @@ class Sequence:
     mesh: Mesh
     labels: np.ndarray
     times: np.ndarray | None
-    read: Callable
-    path: str | None = None
-    stage: Any = None
+    read: Callable[[int], np.ndarray]
+    path: FilePath | None = None
+    stage: StageMesh | None = None
     declared: bool = True
     precision: type = np.float64
-    files: tuple = ()
-    up_axis: str | None = None
+    files: tuple[Any, ...] = ()
+    up_axis: UpAxis | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not len(self.mesh.triangles):
             where = "mesh" if self.path is None else self.path
             raise ValueError(f"{where}: has edges and no triangles; it must have triangles, over which a sequence is measured")
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.labels)
 
-    def __getitem__(self, frame):
+    def __getitem__(self, frame: SupportsIndex) -> np.ndarray:
         return np.array(self.read(range(len(self))[operator.index(frame)]), dtype=np.float64)
 
-    def rounding(self, points):
+    def rounding(self, points: np.ndarray) -> float:
         """What points (n, 3) in the numbers of the input are rounded by [m]; of those that are not finite it tells nothing."""
         return np.finfo(self.precision).eps * np.abs(points).max(initial=0.0, where=np.isfinite(points))
 
     @cached_property
-    def missing(self):
+    def missing(self) -> list[float]:
         """Labels that a gap in the numbering leaves out, a list.
 
         The spacing is the smallest interval; nothing is missing where some other is no multiple of it. Time codes that are not
@@ -109,7 +120,7 @@ class Sequence:
         return [(self.labels[gap] + k * spacing).item() for gap in gaps for k in range(1, int(multiples[gap]))]
 
 
-def open_sequence(path, prim=None, fps=None, mesh=None):
+def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = None, mesh: Mesh | None = None) -> Sequence:
     """Opens a mesh sequence; see the top of this module for what there is.
 
     Polygons are cut into triangles as `usd.read_stage_mesh` and `loading.read_file` do. A prim in a space that moves is taken
@@ -153,7 +164,7 @@ def open_sequence(path, prim=None, fps=None, mesh=None):
     raise ValueError(f"{path}: must be a folder or pattern of mesh files, or end with {' '.join(OPENERS)} .npz .npy")
 
 
-def as_sequence(mesh, frames, dt=None, times=None):
+def as_sequence(mesh: Mesh, frames: ArrayLike | HasPoints, dt: float | None = None, times: ArrayLike | None = None) -> Sequence:
     """The same for frames that Python holds.
 
     Args:
@@ -178,11 +189,8 @@ def as_sequence(mesh, frames, dt=None, times=None):
     elif times is None:
         times = getattr(frames, "times", None)
     count, read, precision = _array("frames", getattr(frames, "points", frames), mesh)
-    if dt is not None:
-        times = dt * np.arange(count)
-    elif times is not None:
-        times = _increasing(times, count)
-    return Sequence(mesh, np.arange(count), times, read, precision=precision, up_axis=mesh.up_axis)
+    given = dt * np.arange(count) if dt is not None else None if times is None else _increasing(times, count)
+    return Sequence(mesh, np.arange(count), given, read, precision=precision, up_axis=mesh.up_axis)
 
 
 def _open_files(path, found, prim, fps):

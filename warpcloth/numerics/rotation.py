@@ -1,7 +1,11 @@
 """Singular values, polar decomposition and best rotations of arrays of small matrices and points, on the CPU and on CUDA."""
 
+from collections.abc import Sequence
+from typing import Literal, TypeVar
+
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from ..base.checks import choice, numeric, refuse, shown
 from ..base.quiet import find_device
@@ -9,6 +13,7 @@ from ..base.turns import in_turn
 from ..kernels import arap_cells as cells
 from ..kernels import decompose, rotation
 
+Array = TypeVar("Array", np.ndarray, wp.array)
 _TYPES = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 _SVD = {
     "plain": {(3, 3): rotation.svd3, (3, 2): rotation.svd3x2, (2, 2): rotation.svd2},
@@ -18,7 +23,7 @@ _POLAR = {(3, 3): rotation.polar3, (3, 2): rotation.polar3x2, (2, 2): rotation.p
 
 
 @in_turn
-def svd(A, convention="plain"):
+def svd(A: Array, convention: Literal["plain", "rotation"] = "plain") -> tuple[Array, Array, Array]:
     """Singular value decompositions A = U diag(S) Vᵀ of many small matrices, S descending.
 
     The error is a few ε of the largest singular value, whatever the size or the rank of A, in float32 as in float64.
@@ -44,7 +49,7 @@ def svd(A, convention="plain"):
 
 
 @in_turn
-def polar(A):
+def polar(A: Array) -> tuple[Array, Array]:
     """Polar decompositions A = R P of many small matrices.
 
     Args:
@@ -63,7 +68,12 @@ def polar(A):
 
 
 @in_turn
-def kabsch(P, Q, weights=None, neighbours=None):
+def kabsch(
+    P: Array,
+    Q: Array,
+    weights: ArrayLike | wp.array | None = None,
+    neighbours: ArrayLike | Sequence[ArrayLike] | None = None,
+) -> Array:
     """The rotations R that turn points P to Q best, about their centroids: min Σ w ‖(q − q̄) − R(p − p̄)‖² (Kabsch 1976).
 
     With p̄ = Σ w p / Σ w. Reflections are never taken; of points on a line R is the least of the best rotations, of one point

@@ -1,14 +1,16 @@
 """Rest shapes: where the energy of a scene and of its weight is least, without inertia."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from ..base.checks import choice, number, whole
 from ..base.turns import in_turn
+from ..base.types import Precision
 from ..core.status import Residual, Result, Status, digits, sentence
 from ..numerics.minimise import Minimiser
+from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
@@ -40,7 +42,15 @@ class Equilibrium(NamedTuple):
 
 
 @in_turn
-def equilibrium(scene, tolerance=1e-8, load_steps=1, iterations=1000, device="cpu", dtype="float64", linear="factorised"):
+def equilibrium(
+    scene: Scene,
+    tolerance: float = 1e-8,
+    load_steps: int = 1,
+    iterations: int = 1000,
+    device: str = "cpu",
+    dtype: Precision = "float64",
+    linear: Literal["factorised", "cg"] = "factorised",
+) -> Equilibrium:
     """Finds the shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins in their final positions.
 
     Pins with keyframes end at the last keyframe; all others stay where they start.

@@ -2,18 +2,25 @@
 
 import os
 import time
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from ..base.checks import choice, whole
 from ..base.interrupts import recording
 from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
+from ..base.types import FilePath, Precision, Progress
 from ..core.status import Status
 from ..mesh.ordering import order_of_run
 from ..model.model import DTYPES
+from ..scene.scene import Scene
+from ..solvers.step import Step
+from ..usd import FrameSequence
 from .frames import state_of
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
@@ -40,15 +47,15 @@ class Animation:
         output: Path of the USD file, or None.
     """
 
-    points: np.ndarray
-    velocities: np.ndarray
+    points: np.ndarray | FrameSequence
+    velocities: np.ndarray | FrameSequence
     times: np.ndarray
     status: Status
-    timings: dict
+    timings: dict[str, Any]
     worst_strain: float | np.ndarray
-    output: str | None = None
+    output: FilePath | None = None
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
         of = f"{copies[0]} copies of {vertices} vertices" if copies else f"{vertices} vertices"
         where = "" if self.output is None else f", in {self.output}"
@@ -56,18 +63,18 @@ class Animation:
 
 
 def simulate(
-    scene,
-    solver,
-    output=None,
-    device="cpu",
-    dtype="float32",
-    frames=None,
-    copies=1,
-    vary=None,
-    single_file=False,
-    progress=None,
-    threads=1,
-):
+    scene: Scene,
+    solver: Step,
+    output: FilePath | None = None,
+    device: str = "cpu",
+    dtype: Precision = "float32",
+    frames: int | None = None,
+    copies: int = 1,
+    vary: Mapping[str, ArrayLike] | None = None,
+    single_file: bool = False,
+    progress: Progress | None = None,
+    threads: int = 1,
+) -> Animation:
     """Runs a scene with a solver.
 
     Large meshes whose neighbours are far apart in memory are renumbered for the run, see

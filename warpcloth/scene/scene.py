@@ -1,14 +1,18 @@
 """Scenes: a scene is data, and holds no solver. Any solver that supports its terms runs it unchanged."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.checks import array, number, refuse, shown
+from ..base.types import Converted, Precision, UpAxis, default
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
+from ..mesh.stage_mesh import StageMesh
 from ..model.model import Model
 from ..terms.declared import Declared
 
@@ -27,10 +31,10 @@ class Pins:
             order of ``vertices``. Without them the pins stay where they start.
     """
 
-    vertices: str | Sequence[int] | np.ndarray
-    keyframes: np.ndarray | None = None
+    vertices: Converted[str | ArrayLike, np.ndarray] = default(MISSING)
+    keyframes: Converted[ArrayLike | None, np.ndarray | None] = default(None)
 
-    def refuse_far(self, positions, copy=""):
+    def refuse_far(self, positions: np.ndarray, copy: str = "") -> None:
         """Refuses pins whose first keyframe is not where their vertices start, at ``positions`` (n, 3) [m].
 
         Raises:
@@ -72,23 +76,23 @@ class Scene:
 
     mesh: Mesh
     density: float | None = None
-    masses: np.ndarray | None = None
-    positions: np.ndarray | None = None
-    velocities: np.ndarray | None = None
-    terms: Sequence = ()
-    pins: Pins | str | Sequence[int] | np.ndarray | None = None
-    gravity: Sequence[float] | None = None
+    masses: Converted[ArrayLike | None, np.ndarray | None] = default(None)
+    positions: Converted[ArrayLike | None, np.ndarray] = default(None)
+    velocities: Converted[ArrayLike | None, np.ndarray] = default(None)
+    terms: Converted[Iterable[Declared], tuple[Declared, ...]] = default(())
+    pins: Converted[Pins | str | ArrayLike | None, Pins] = default(None)
+    gravity: Converted[ArrayLike | None, np.ndarray] = default(None)
     duration: float = 1.0
     fps: float = 60.0
     name: str = "scene"
-    stage: object | None = None
+    stage: StageMesh | None = None
 
     @property
-    def parts(self):
+    def parts(self) -> tuple[object, ...]:
         """All that it declares beside the cloth itself, any of which may put energy in."""
         return (self.pins, *self.terms)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not isinstance(self.mesh, Mesh):
             raise ValueError(f"mesh is {shown(self.mesh)}; it must be a Mesh, such as Mesh.grid(32, 32)")
         n = len(self.mesh.points)
@@ -143,7 +147,7 @@ class Scene:
         refuse("masses", masses, ~((masses >= 0.0) & np.isfinite(masses)), "must be 0 or more, pinned or not")
 
     @cached_property
-    def vertex_masses(self):
+    def vertex_masses(self) -> np.ndarray:
         """Mass of each vertex, given or lumped from the density, (n,) [kg]."""
         if self.masses is not None:
             return self.masses
@@ -153,22 +157,30 @@ class Scene:
         return masses
 
     @property
-    def frames(self):
+    def frames(self) -> int:
         """Number of frames after the first."""
         return round(self.duration * self.fps)
 
     @property
-    def up_axis(self):
+    def up_axis(self) -> UpAxis:
         """The axis along which gravity acts, "Y" or "Z"; without gravity the up axis of the mesh."""
         if not self.gravity[1:].any():
             return self.mesh.up_axis or "Y"
         return "Z" if abs(self.gravity[2]) > abs(self.gravity[1]) else "Y"
 
-    def build(self, device="cpu", dtype="float32", copies=1, vary=None, order=None, threads=1):
+    def build(
+        self,
+        device: str = "cpu",
+        dtype: Precision = "float32",
+        copies: int = 1,
+        vary: Mapping[str, ArrayLike] | None = None,
+        order: ArrayLike | None = None,
+        threads: int = 1,
+    ) -> Model:
         """The scene on a device, see :class:`warpcloth.model.model.Model`."""
         return Model(self, device=device, dtype=dtype, copies=copies, vary=vary, order=order, threads=threads)
 
-    def __str__(self):
+    def __str__(self) -> str:
         mesh, pins = self.mesh, self.pins
         lines = [
             f"{self.name}: {len(mesh.points)} vertices, {len(mesh.triangles)} triangles, {len(mesh.edges)} edges",
@@ -179,7 +191,7 @@ class Scene:
         return "\n".join(lines + [f"  {_described(term)}" for term in self.terms])
 
 
-def checked_pins(pins, mesh):
+def checked_pins(pins: Any, mesh: Mesh) -> Pins:
     """`Pins` whose vertices are indices of a mesh, int32, from all that a scene takes as pins.
 
     Raises:

@@ -124,7 +124,7 @@ class ChunkWriter:
             finally:
                 self._lock.release()
 
-    def saved(self):
+    def saved(self) -> str:
         """Says how many frames there are, and in which file."""
         if not self.kept:
             return "nothing was saved"
@@ -134,7 +134,7 @@ class ChunkWriter:
         packing = f", and {self._given} was not made" if path != self._given else f", with {self._folder.name} beside it"
         return f"frames 0 to {self.kept - 1} are in {path}" + (packing if self._packing else "")
 
-    def close(self, single_file=False):
+    def close(self, single_file: bool = False) -> None:
         """Writes what is pending. Without a single frame nothing is written.
 
         Args:

@@ -1,10 +1,13 @@
 """The frames of an animation, read from its file one at a time."""
 
 import os
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
+from ..base.types import FilePath
 from ..mesh.mesh import Surface
 from ..mesh.sequences import Sequence
 from .layers import files_of
@@ -63,7 +66,7 @@ class FrameSequence:
 
     dtype = np.dtype(np.float32)
 
-    def __init__(self, path, prim=None, attribute="points", scale=1.0):
+    def __init__(self, path: FilePath, prim: str | None = None, attribute: str = "points", scale: float = 1.0) -> None:
         """Opens the file.
 
         Args:
@@ -123,25 +126,25 @@ class FrameSequence:
         self.shape = (len(self.time_codes), count, 3)[: 3 if vectors else 2]
 
     @property
-    def files(self):
+    def files(self) -> tuple[str, ...]:
         """Real paths of the files that the stage is made of."""
         return tuple(sorted(files_of(self._stage)))
 
     @property
-    def ndim(self):
+    def ndim(self) -> int:
         """Three, of a primvar two."""
         return len(self.shape)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.shape[0]
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"FrameSequence(shape={self.shape}, {self._attribute.GetPath()})"
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[np.ndarray]:
         return (self._read(frame) for frame in range(len(self)))
 
-    def __getitem__(self, key):
+    def __getitem__(self, key: Any) -> np.ndarray:
         """Frames as NumPy has them: an integer gives (n, 3), a slice or list (k, n, 3), more indices a part of that."""
         frames, rest = (key[0], key[1:]) if isinstance(key, tuple) and key else (key, ())
         if frames is Ellipsis or isinstance(frames, tuple):
@@ -154,13 +157,13 @@ class FrameSequence:
             result[row] = self._read(int(frame))
         return result[(slice(None), *rest)]
 
-    def __array__(self, dtype=None, copy=None):
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         if copy is False:
             raise ValueError("copy = False: the frames are in a file, so an array of them is always a copy")
         result = self[:]
         return result if dtype is None else result.astype(dtype, copy=False)
 
-    def exact(self, frame):
+    def exact(self, frame: int) -> np.ndarray:
         """One frame of points or velocities in float64, which holds more of what a transform makes of the file's float32.
 
         Args:

@@ -2,8 +2,15 @@
 
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.types import FilePath, UpAxis
+from ..mesh.mesh import Mesh
+from ..mesh.stage_mesh import StageMesh
 from .chunks import ChunkWriter, check_scene
 from .directions import check_directions, define_directions, free_place, middle, segments, to_metres
 from .layers import (
@@ -18,7 +25,7 @@ from .layers import (
 )
 from .modules import Sdf, Usd, UsdGeom, UsdShade
 from .stage import read_stage_mesh
-from .targets import DISPLAY_COLOUR, check_primvars
+from .targets import DISPLAY_COLOUR, Interpolation, check_primvars
 
 
 class MeasureWriter(ChunkWriter):
@@ -43,17 +50,17 @@ class MeasureWriter(ChunkWriter):
 
     def __init__(
         self,
-        output,
-        mesh,
-        primvars,
-        coloured=None,
-        directions=None,
-        source=None,
-        fps=24.0,
-        up_axis=None,
-        chunk=10,
-        metadata=None,
-    ):
+        output: FilePath,
+        mesh: Mesh,
+        primvars: Mapping[str, Interpolation],
+        coloured: str | None = None,
+        directions: Mapping[str, Interpolation] | None = None,
+        source: StageMesh | None = None,
+        fps: float = 24.0,
+        up_axis: UpAxis | None = None,
+        chunk: int = 10,
+        metadata: Mapping[str, object] | None = None,
+    ) -> None:
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
         Args:
@@ -106,7 +113,14 @@ class MeasureWriter(ChunkWriter):
         targets = define_directions(stage, target.prim, mesh, directions, material, self._nowhere) if directions else []
         self._put_on(rest, [target, *targets], facts, metadata, path, files, refit)
 
-    def append(self, time_code, primvars, colours=None, directions=None, points=None):
+    def append(
+        self,
+        time_code: float,
+        primvars: Mapping[str, ArrayLike],
+        colours: ArrayLike | None = None,
+        directions: Mapping[str, ArrayLike] | None = None,
+        points: np.ndarray | None = None,
+    ) -> None:
         """Adds a frame; every `chunk` frames they are written.
 
         Args:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.limits import MOST_FRAMES
+from ..base.types import FilePath
 from ..mesh.mesh import Mesh
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
@@ -20,7 +21,7 @@ from .values import array_of, refuse_unknown, sentences, shown, time_codes_of
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none
 
 
-def read_scene(path, prim: str | None = None):
+def read_scene(path: FilePath, prim: str | None = None) -> Scene:
     """Reads a scene from a stage; `simulate` then writes its animation as a layer over that stage.
 
     Args:
@@ -266,7 +267,7 @@ def _gravity(stage, values, up_axis):
     return magnitude * direction.astype(np.float64) / np.linalg.norm(direction)
 
 
-def write_scene(scene, path):
+def write_scene(scene: Scene, path: FilePath) -> str:
     """Writes a scene as a stage of its own: /World/Cloth at rest, in metres, with all of the scene as attributes.
 
     Args:

@@ -2,11 +2,12 @@
 
 import os
 import warnings
-from dataclasses import dataclass
 
 import numpy as np
 
+from ..base.types import FilePath
 from ..mesh.mesh import Mesh
+from ..mesh.stage_mesh import StageMesh
 from .modules import Sdf, Tf, Usd, UsdGeom
 from .values import (
     array_of,
@@ -28,43 +29,7 @@ METADATA_KEY = "warpcloth"
 VERTEX_PRIMVAR = "warpcloth:vertex"
 
 
-@dataclass(frozen=True, eq=False)
-class StageMesh:
-    """The mesh of one prim, with what its stage says about space and time.
-
-    Attributes:
-        mesh: Rest shape in the stage's world space [m]; vertex i is point i of a Mesh prim.
-        path: The file.
-        prim: Path of the prim.
-        transform: (4, 4) float64; row vectors: x = [p, 1]·transform, from the prim's own space and units to world space [m].
-        meters_per_unit: Metres in one unit of the stage; USD says 0.01 where the stage does not.
-        up_axis: "Y" or "Z".
-        fps: Frames per second, None where the stage does not say.
-        time_codes_per_second: Time codes in a second; USD says 24 where the stage does not.
-        start: First time code, None where the stage does not say.
-        pins: Sorted vertex indices (p,) int32 by name, of every GeomSubset of points.
-        point_vertices: Curves: the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
-        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), where vertices on seams have several
-            and the mesh has none; else None.
-        rest: Whether the stage says a rest shape, the default points; else the mesh is that of one time code.
-    """
-
-    mesh: Mesh
-    path: str
-    prim: str
-    transform: np.ndarray
-    meters_per_unit: float
-    up_axis: str
-    fps: float | None
-    time_codes_per_second: float
-    start: float | None
-    pins: dict
-    point_vertices: np.ndarray | None = None
-    corner_coordinates: np.ndarray | None = None
-    rest: bool = True
-
-
-def read_mesh(path, prim=None, kind=Mesh):
+def read_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh) -> Mesh:
     """The rest shape of a cloth: see `read_stage_mesh`, which also tells what the stage says about it.
 
     Args:
@@ -78,7 +43,7 @@ def read_mesh(path, prim=None, kind=Mesh):
     return read_stage_mesh(path, prim, kind).mesh
 
 
-def read_stage_mesh(path, prim=None, kind=Mesh, time=None):
+def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh, time: float | None = None) -> StageMesh:
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
     The points at the default time are the rest shape. A stage with time samples alone is read at its first sample, with a
@@ -196,7 +161,7 @@ def open_stage(path):
     return stage
 
 
-def flattened(path):
+def flattened(path: FilePath) -> str:
     """The text of one .usda file with all that a stage takes from others, but for value clips.
 
     Raises:

@@ -1,12 +1,14 @@
 """A prim whose attributes are sampled, and how a frame is expressed in its own space and units."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from .modules import Sdf, Vt
 from .stage import VERTEX_PRIMVAR
 
+Interpolation = Literal["vertex", "uniform"]
 # Types of the attributes with one sample for each frame.
 SAMPLED = {"points": "point3f[]", "velocities": "vector3f[]", "normals": "normal3f[]", "extent": "float3[]"}
 DISPLAY_COLOUR = "primvars:displayColor"

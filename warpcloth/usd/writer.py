@@ -1,11 +1,17 @@
 """Writing an animation: the motion of a cloth, and numbers that go with it."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.types import FilePath, UpAxis
+from ..mesh.mesh import Mesh
 from .chunks import ChunkWriter, check_scene
 from .layers import artist_prim, define_lines, over_layer, scene_layer
 from .stage import read_stage_mesh
-from .targets import check_primvars
+from .targets import Interpolation, check_primvars
 
 
 class AnimationWriter(ChunkWriter):
@@ -30,18 +36,18 @@ class AnimationWriter(ChunkWriter):
 
     def __init__(
         self,
-        output,
-        mesh,
-        fps,
-        source=None,
-        prim=None,
-        pins=None,
-        up_axis=None,
-        chunk=10,
-        metadata=None,
-        primvars=None,
-        lines=None,
-    ):
+        output: FilePath,
+        mesh: Mesh,
+        fps: float,
+        source: FilePath | None = None,
+        prim: str | None = None,
+        pins: Mapping[str, ArrayLike] | None = None,
+        up_axis: UpAxis | None = None,
+        chunk: int = 10,
+        metadata: Mapping[str, object] | None = None,
+        primvars: Mapping[str, Interpolation] | None = None,
+        lines: Mapping[str, tuple[np.ndarray, float]] | None = None,
+    ) -> None:
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
         Args:
@@ -91,7 +97,7 @@ class AnimationWriter(ChunkWriter):
         root_metadata |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
         self._put_on(rest, targets, root_metadata, metadata, source, files, refit)
 
-    def append(self, points, velocities, primvars=None):
+    def append(self, points: np.ndarray, velocities: np.ndarray, primvars: Mapping[str, ArrayLike] | None = None) -> None:
         """Adds a frame; every `chunk` frames they are written.
 
         Args:

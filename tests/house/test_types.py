@@ -1,0 +1,105 @@
+"""Types of the public API: all of it is annotated, the package passes mypy, and a wrong argument in a program of a user is found."""
+
+import inspect
+import subprocess
+import sys
+from dataclasses import is_dataclass
+from pathlib import Path
+
+import pytest
+
+import warpcloth as wc
+from warpcloth import usd
+
+ROOT = Path(__file__).parents[2]
+RIGHT = """
+from dataclasses import replace
+
+import numpy as np
+
+import warpcloth as wc
+from warpcloth import usd
+
+mesh = wc.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+terms = [wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-5)]
+scene = wc.Scene(wc.Mesh.grid(3, 3), density=0.1, terms=terms, pins="corners", gravity=(0, 0, -9.81))
+moved = replace(scene, pins=wc.Pins([0, 1], keyframes=np.zeros((2, 2, 3))), gravity=[0, 0, 1])
+first: np.int32 = scene.pins.vertices[0]
+weight = scene.gravity @ scene.gravity
+where = None if scene.stage is None else scene.stage.prim
+animation = wc.simulate(scene, wc.Newton(dt=1 / 240), output="out.usdc", frames=3)
+highest = animation.points[-1].max()
+finished: bool = animation.status.ok
+stepper = wc.PBD(substeps=3, sweep="jacobi").bind(scene.build(copies=2, vary={"Spring.stiffness": [1.0, 2.0]}))
+stepper.step()
+rest = wc.equilibrium(scene).points.max()
+stretches = wc.analyze(animation, scene.mesh, measures="stretch")["stretch"].max()
+for sample in wc.Analyzer("out.usdc", measures=("stretch",)):
+    largest = sample.values["stretch"].max()
+apart = wc.compare("out.usdc", (scene.mesh, animation)).surface_mean.max()
+turned = wc.deform(scene.mesh, wc.Pins([0], np.zeros((2, 1, 3)))).largest_angles.max()
+solved = wc.Arap(mesh, [0]).solve([[0.0, 0.0, 1.0]]).points.max()
+R = wc.kabsch(mesh.points, mesh.points) @ np.eye(3)
+frame = wc.open_sequence("out.usdc")[0].max()
+name = usd.write_scene(usd.read_scene("in.usda"), "out.usda").upper()
+"""
+# Every line is wrong by itself.
+WRONG = """
+wc.simulate(scene, wc.Newton(dt="small"))
+wc.simulate(scene.mesh, wc.Newton(dt=1 / 240))
+wc.simulate(scene, wc.Newton(dt=1 / 240), dtype="float16")
+wc.Mesh.grid("3", 3)
+wc.Mesh.grid(3, 3, pattern="hexagonal")
+wc.Scene(mesh, densty=1.0)
+wc.Scene(mesh, density=1.0, terms=wc.Spring(stiffness=1.0))
+wc.Spring(stiffness="stiff")
+wc.PBD(substeps=2, stiffness="per-step")
+wc.Pins([0], keyframes=0.5).vertices.nothing
+wc.analyze(scene.mesh)
+wc.equilibrium(scene, linear="cholesky")
+scene.stage.prim
+"""
+
+
+def mypy(*arguments):
+    command = [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+
+
+def calls():
+    """Public functions, constructors and methods by name."""
+    for module in (wc, usd):
+        for name in module.__all__:
+            found = getattr(module, name)
+            if inspect.isfunction(found):
+                yield name, found
+            if inspect.isclass(found):
+                for method, function in vars(found).items():
+                    function = getattr(function, "__func__", getattr(function, "fget", getattr(function, "func", function)))
+                    made = method == "__init__" and not is_dataclass(found)
+                    if inspect.isfunction(function) and (method[0] != "_" or made):
+                        yield f"{name}.{method}", function
+
+
+@pytest.mark.parametrize(("name", "function"), calls())
+def test_the_public_api_is_annotated(name, function):
+    signature = inspect.signature(function)
+    parameters = [parameter for parameter in signature.parameters.values() if parameter.name not in ("self", "cls")]
+    assert not [parameter.name for parameter in parameters if parameter.annotation is parameter.empty]
+    assert signature.return_annotation is not signature.empty
+
+
+@pytest.mark.slow
+def test_types_of_the_package_and_of_programs_agree(tmp_path):
+    cache = ("--cache-dir", tmp_path / "cache")
+    checked = mypy(*cache)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    program = tmp_path / "program.py"
+    program.write_text(RIGHT)
+    checked = mypy(*cache, program)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    program.write_text(RIGHT + WRONG)
+    found = mypy(*cache, "--no-error-summary", program).stdout.splitlines()
+    lines = {int(line.split(":")[1]) for line in found if ": error:" in line}
+    first = RIGHT.count("\n") + 2
+    assert lines == set(range(first, first + WRONG.count("\n") - 1)), "\n".join(found)
