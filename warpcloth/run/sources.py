@@ -25,7 +25,7 @@ class Source:
     """
 
     name = "a source"
-    carried = ()
+    carried: tuple[str, ...] = ()
 
     def energy(self, frame, speed):
         """Energy that it has put in up to a frame, (B,) [J]; called once for each frame, in order from 1.

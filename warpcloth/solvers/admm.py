@@ -13,6 +13,7 @@ from ..core.sums import Sums
 from ..core.transpose import Transpose
 from ..kernels import admm as kernels
 from ..kernels.accelerate import plain_step
+from ..model.model import Model
 from ..numerics.inertia import Inertia
 from ..numerics.iterate import GravityScale
 from ..numerics.linear import CopyFactors
@@ -21,6 +22,7 @@ from ..terms.needs import ELEMENTS, FINITE
 from ..terms.refresh import EVALUATION, Moment
 from .facts import Benchmark, Facts, grid
 from .implicit import ImplicitStepper
+from .solver import Stepper
 from .step import ImplicitStep
 
 # n times the smallest r for n iterations. A small weight needs many iterations, and what a step leaves unfinished becomes a
@@ -111,7 +113,7 @@ class ADMM(ImplicitStep):
         if self.weight != "auto":
             number("weight", self.weight, above=0.0)
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.
 
         Raises:

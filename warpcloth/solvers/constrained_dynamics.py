@@ -10,6 +10,7 @@ from ..core.capture import Mirror, Segment
 from ..core.status import Residual, Result
 from ..core.sums import RowSums, Sums
 from ..kernels import constraint_step as kernels
+from ..model.model import Model
 from ..numerics.constraints import Constraints
 from ..numerics.iterate import GravityScale
 from ..numerics.linear import ConjugateGradients, FactorisedRows
@@ -17,6 +18,7 @@ from ..numerics.search import Search
 from ..terms.needs import FINITE, MERGED_DAMPING, ROWS, STEADY_ROWS
 from .facts import Benchmark, Facts, grid
 from .implicit import ImplicitStepper
+from .solver import Stepper
 from .step import ImplicitStep
 
 STABILISATIONS = ("none", "geometric-stiffness", "line-search")
@@ -97,7 +99,7 @@ class ConstrainedDynamics(ImplicitStep):
         choice("stabilisation", self.stabilisation, STABILISATIONS)
         choice("linear", self.linear, ("cg", "factorised"))
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.
 
         Raises:

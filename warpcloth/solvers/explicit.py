@@ -12,10 +12,11 @@ from ..core.hessian import Hessian
 from ..fast.gather_step import Gather, Sweep, is_fine
 from ..fast.subdomains import Ranges
 from ..model.damping import dissipations
+from ..model.model import Model
 from ..terms.needs import FINITE
 from ..terms.refresh import STEP, Moment
 from .facts import Benchmark, Facts
-from .solver import LaunchedStepper
+from .solver import LaunchedStepper, Stepper
 from .step import Step
 
 
@@ -54,24 +55,24 @@ class Explicit(Step):
         choice("above_limit", self.above_limit, ("refuse", "allow"))
 
     @property
-    def divides(self):
+    def divides(self) -> bool:
         return True
 
     @property
-    def staggered(self):
+    def staggered(self) -> bool:
         return self.scheme == "symplectic"
 
     @classmethod
-    def step_limits(cls, model):
+    def step_limits(cls, model: Model) -> tuple[float, float]:
         return step_limits(model)
 
-    def stable(self, h, limit):
+    def stable(self, h: float, limit: float) -> bool:
         return self.scheme == "symplectic" and h < limit
 
-    def without_limits(self):
+    def without_limits(self) -> Step:
         return replace(self, above_limit="allow")
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.
 
         Warns:

@@ -7,11 +7,12 @@ import warp as wp
 
 from ..base.checks import number, whole
 from ..kernels.hierarchy import follow
+from ..model.model import Model
 from ..numerics.hierarchy import levels, on_device
 from ..numerics.sweeps import Sweep
 from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
-from .solver import LaunchedStepper
+from .solver import LaunchedStepper, Stepper
 from .step import Step
 
 
@@ -70,10 +71,10 @@ class HierarchicalPBD(Step):
         number("relaxation", self.relaxation, above=0.0)
 
     @property
-    def divides(self):
+    def divides(self) -> bool:
         return True
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.
 
         Raises:

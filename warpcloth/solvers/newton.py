@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from ..base.checks import choice, number, whole
 from ..core.capture import Segment
 from ..core.status import UNBALANCED, Residual
+from ..model.model import Model
 from ..numerics.minimise import LINEAR, POLICIES, Minimiser
 from ..terms.needs import FINITE
 from .facts import Benchmark, Facts
 from .implicit import ImplicitStepper
+from .solver import Stepper
 from .step import ImplicitStep
 
 
@@ -61,7 +63,7 @@ class Newton(ImplicitStep):
         choice("hessian", self.hessian, tuple(POLICIES))
         choice("linear", self.linear, LINEAR)
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.
 
         Raises:

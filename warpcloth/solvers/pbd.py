@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 from ..base.checks import choice, number, whole
 from ..base.renamed import renamed
+from ..model.model import Model
 from ..numerics.sweeps import IN_PLACE, SWEEPS, Sweep
 from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
-from .solver import LaunchedStepper
+from .solver import LaunchedStepper, Stepper
 from .step import Step
 
 
@@ -78,14 +79,14 @@ class PBD(Step):
             raise ValueError(f"alpha is {self.alpha:g}; it belongs to sweep='vertex-averaged' and must be 0 without")
 
     @property
-    def ordered(self):
+    def ordered(self) -> bool:
         return self.sweep in IN_PLACE
 
     @property
-    def divides(self):
+    def divides(self) -> bool:
         return self.sweep == "coloured"
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.
 
         Raises:

@@ -12,6 +12,7 @@ from ..core.status import UNBALANCED, Residual
 from ..core.sums import Sums
 from ..fast.gradient import gradient
 from ..kernels.accelerate import plain_step
+from ..model.model import Model
 from ..numerics.accelerated_step import AcceleratedStep
 from ..numerics.acceleration import accelerated
 from ..numerics.inertia import Inertia
@@ -20,6 +21,7 @@ from ..numerics.linear import CopyFactors, DiagonalScaling
 from ..terms.needs import FINITE, MERGED_DAMPING, PROJECTION
 from .facts import Benchmark, Facts, grid
 from .implicit import ImplicitStepper
+from .solver import Stepper
 from .step import ImplicitStep
 
 ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")
@@ -84,7 +86,7 @@ class ProjectiveDynamics(ImplicitStep):
         whole("window", self.window, 1)
         choice("linear", self.linear, ("factorised", "jacobi"))
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.
 
         Raises:

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from ..base.checks import choice, number, shown, whole
 from ..base.limits import MOST
 from ..base.turns import methods_in_turn
+from ..core.status import Residual
 from ..model.model import Model
 from ..numerics.integrators import INTEGRATORS
 from ..scene.scene import Scene
 from ..terms.needs import refuse_unmet
 from .facts import Facts
+from .solver import Stepper
 from .threaded import ThreadedStepper
 
 # The records by their names, in the order in which lists and charts have them.
@@ -73,16 +75,16 @@ class Step:
     dt: float | None = None
     substeps: int | None = None
 
-    def residual_on(self, model):
+    def residual_on(self, model: Model) -> Residual | None:
         """Returns the residual that its steps report on a model, which may depend on the terms."""
         return self.residual
 
     @property
-    def divides(self):
+    def divides(self) -> bool:
         """Whether several threads can share the steps of one cloth."""
         return False
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """Returns the solver on ``model``, all scratch allocated.
 
         Raises:
@@ -112,15 +114,15 @@ class Step:
             refuse_unmet(model.terms, f"{cls.__name__} with {options}", needs, {instead: ()})
 
     @classmethod
-    def step_limits(cls, model):
+    def step_limits(cls, model: Model) -> tuple[float, float]:
         """Returns the largest stable steps [s] on a model, about the rest shape and in motion, of a ``limited`` solver."""
         raise NotImplementedError
 
-    def stable(self, h, limit):
+    def stable(self, h: float, limit: float) -> bool:
         """Returns whether a step h [s] below the smaller of :meth:`step_limits` is stable."""
         return h < limit
 
-    def without_limits(self):
+    def without_limits(self) -> "Step":
         """Returns the record without its check of limits, for maps, which go beyond them, and where they are kept anyway."""
         return self
 
@@ -151,7 +153,7 @@ class Step:
         else:
             whole("substeps", self.substeps, 1)
 
-    def per_frame(self, fps):
+    def per_frame(self, fps: float) -> int:
         """Steps a frame at ``fps``."""
         if self.substeps is not None:
             return self.substeps

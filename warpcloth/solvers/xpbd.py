@@ -12,11 +12,12 @@ from ..core.sums import Sums
 from ..fast.gradient import gradient
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
+from ..model.model import Model
 from ..numerics.iterate import GravityScale
 from ..numerics.sweeps import IN_PLACE, Sweep
 from ..terms.needs import FINITE, LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
-from .solver import LaunchedStepper
+from .solver import LaunchedStepper, Stepper
 from .step import ImplicitStep
 
 
@@ -90,19 +91,19 @@ class XPBD(ImplicitStep):
             )
 
     @property
-    def ordered(self):
+    def ordered(self) -> bool:
         return self.sweep in IN_PLACE
 
-    def residual_on(self, model):
+    def residual_on(self, model: Model) -> Residual | None:
         if any(elements.hard for elements in model.terms):
             return self.residual._replace(measure="largest move of a vertex in the last sweep, over h²,")
         return self.residual
 
     @property
-    def divides(self):
+    def divides(self) -> bool:
         return self.sweep == "coloured"
 
-    def bind(self, model):
+    def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.
 
         Raises:

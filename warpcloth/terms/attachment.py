@@ -8,6 +8,7 @@ import numpy as np
 
 from ..kernels.term import Term
 from ..kernels.terms import ATTACHMENT
+from ..mesh.mesh import Mesh
 from .declared import Damped, indices, own_stencil, quantity
 
 
@@ -28,11 +29,11 @@ class Attachment(Damped):
     vertices: str | Sequence[int] | np.ndarray = field(default=(), metadata=indices(text="selection"))
     targets: Sequence | np.ndarray | None = field(default=None, metadata=quantity("must be finite", np.isfinite, shape=(3,)))
 
-    def stencil(self, mesh):
+    def stencil(self, mesh: Mesh) -> np.ndarray:
         vertices = mesh.select(self.vertices) if isinstance(self.vertices, str) else self.vertices
         return own_stencil(self.label, "vertices", vertices, 1, len(mesh.points))
 
-    def rest(self, mesh, positions, stencil):
+    def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         if self.targets is None:
             return super().rest(mesh, positions, stencil) if positions is None else positions[stencil[:, 0]]
         return np.broadcast_to(self.of_elements("targets", len(stencil)), (len(stencil), 3)).copy()

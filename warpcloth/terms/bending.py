@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from ..mesh.mesh import Mesh
 from .declared import Damped
 
 
@@ -13,5 +16,5 @@ class Bending(Damped):
         stiffness: D, the bending stiffness of the plate [N·m], one or (E,) in the order of ``mesh.hinges``.
     """
 
-    def stencil(self, mesh):
+    def stencil(self, mesh: Mesh) -> np.ndarray:
         return mesh.hinges

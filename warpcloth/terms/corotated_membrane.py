@@ -1,11 +1,13 @@
 """The corotated membrane."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from ..kernels.term import Term
 from ..kernels.terms import COROTATED_MEMBRANE
 from .membrane import Membrane, product
+
+Own = TypeVar("Own", bound="CorotatedMembrane")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +27,6 @@ class CorotatedMembrane(Membrane):
     material: ClassVar[str] = "corotated"
 
     @classmethod
-    def from_material(cls, youngs_modulus, thickness, **fields):
+    def from_material(cls: type[Own], youngs_modulus: float, thickness: float, **fields: Any) -> Own:
         """Of a material with E [Pa] and ν = 0, ``thickness`` t [m] thick."""
         return cls(stiffness=product(cls, youngs_modulus, thickness), **fields)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..base.checks import numeric, refuse, shown
 from ..kernels.term import Term
+from ..mesh.mesh import Mesh
 from .refresh import Refresh
 
 
@@ -114,19 +115,19 @@ class Declared:
                 refuse(f"{self.label}.{name}", values, ~of_field.holds(values), of_field.rule)
 
     @classmethod
-    def quantities(cls):
+    def quantities(cls) -> dict[str, Quantity]:
         """:class:`Quantity` of each numeric field by its name."""
         return {field.name: field.metadata["quantity"] for field in fields(cls) if "quantity" in field.metadata}
 
     @property
-    def label(self):
+    def label(self) -> str:
         """The name, or else that of the class."""
         return self.name or type(self).__name__
 
     def _numeric(self, field):
         return numeric(f"{self.label}.{field}", getattr(self, field), "be a number or an array of numbers")
 
-    def of_elements(self, field, count):
+    def of_elements(self, field: str, count: int) -> np.ndarray:
         """A numeric field as one value or one for each element (count, …).
 
         Raises:
@@ -143,11 +144,11 @@ class Declared:
     def _stiffness(self, count):
         return self.of_elements("stiffness", count)
 
-    def stencil(self, mesh):
+    def stencil(self, mesh: Mesh) -> np.ndarray:
         """Vertices of each element on ``mesh``, (E, K) int32."""
         raise NotImplementedError  # every energy has its own
 
-    def elements(self, mesh, positions):
+    def elements(self, mesh: Mesh, positions: np.ndarray) -> Elements:
         """The elements of this term on a mesh.
 
         Args:
@@ -169,11 +170,11 @@ class Declared:
         rest = self.rest(mesh, positions, stencil)
         return Elements(self.label, type(self).__name__, self.term, stencil, stiffness, rest, damping)
 
-    def rest(self, mesh, positions, stencil):
+    def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         """Rest state (E, P) of the elements, from the rest shape of the mesh."""
         return self.term.rest_state(mesh.points, stencil)
 
-    def held(self, mesh, positions):
+    def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The pairs of vertices that it keeps from stretching, and how stiff, on a mesh as in :meth:`elements`.
 
         Returns:

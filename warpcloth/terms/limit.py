@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..base.checks import refuse
+from ..mesh.mesh import Mesh
 from .declared import FROM_0, Declared, quantity
 
 FINITE_ABOVE_0 = quantity("must be finite, above 0", lambda values: (values > 0.0) & np.isfinite(values))
@@ -34,6 +35,6 @@ class Limit(Declared):
             least, most = np.broadcast_arrays(*given)
             refuse(f"{self.label}.least", least, ~(least <= most), "must be no more than most")
 
-    def rest(self, mesh, positions, stencil):
+    def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         given = {name: self.of_elements(name, len(stencil)) for name in ("least", "most") if getattr(self, name) is not None}
         return self.term.rest_state(mesh.points, stencil, **given)

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from ..base.checks import numeric, refuse
+from ..mesh.mesh import Mesh
 from .declared import Damped, quantity
+
+Own = TypeVar("Own", bound="IsotropicMembrane")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,10 +25,10 @@ class Membrane(Damped):
 
     material: ClassVar[str]
 
-    def stencil(self, mesh):
+    def stencil(self, mesh: Mesh) -> np.ndarray:
         return mesh.triangles
 
-    def held(self, mesh, positions):
+    def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The edges of the triangles, K = Et."""
         found = self.elements(mesh, positions)
         pairs = found.stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -45,19 +48,19 @@ class IsotropicMembrane(Membrane):
     )
 
     @classmethod
-    def from_material(cls, youngs_modulus, poisson_ratio, thickness, **fields):
+    def from_material(cls: type[Own], youngs_modulus: float, poisson_ratio: float, thickness: float, **fields: Any) -> Own:
         """Of a material with E [Pa] and ν, ``thickness`` t [m] thick: μ = Et/(2(1 + ν)), λ = Eνt/(1 − ν²) [N/m]."""
         return cls(stiffness=product(cls, youngs_modulus, thickness), poisson_ratio=poisson_ratio, **fields)
 
     @classmethod
-    def from_moduli(cls, mu, lam, **fields):
+    def from_moduli(cls: type[Own], mu: float, lam: float, **fields: Any) -> Own:
         """Of Lamé's moduli of the membrane, μ above 0 and λ above −μ [N/m]: ν = λ/(λ + 2μ), k = 2μ(1 + ν)."""
-        mu, lam = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in (("mu", mu), ("lam", lam)))
-        refuse(f"{cls.__name__}.mu", mu, ~(mu > 0.0), "must be above 0")
-        ratio = lam / (lam + 2.0 * mu)
-        return cls(stiffness=2.0 * mu * (1.0 + ratio), poisson_ratio=ratio, **fields)
+        first, second = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in (("mu", mu), ("lam", lam)))
+        refuse(f"{cls.__name__}.mu", first, ~(first > 0.0), "must be above 0")
+        ratio = second / (second + 2.0 * first)
+        return cls(stiffness=2.0 * first * (1.0 + ratio), poisson_ratio=ratio, **fields)
 
-    def rest(self, mesh, positions, stencil):
+    def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         return self.term.rest_state(mesh.points, stencil, poisson_ratio=self.of_elements("poisson_ratio", len(stencil)))
 
 

@@ -11,8 +11,9 @@ from ..base.checks import shown
 from ..kernels.clusters import fit_targets
 from ..kernels.term import Term
 from ..kernels.terms import RIGID_CLUSTER
+from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
-from .declared import FROM_0, Declared, indices, own_indices
+from .declared import FROM_0, Declared, Elements, indices, own_indices
 from .refresh import EVALUATION, Refresh
 
 
@@ -86,7 +87,7 @@ class RigidCluster(Declared):
             )
         return np.split(vertices, np.cumsum(sizes)[:-1])
 
-    def stencil(self, mesh):
+    def stencil(self, mesh: Mesh) -> np.ndarray:
         bodies = [
             distinct_vertices(f"{self.label}.vertices, body {c}", body, mesh) for c, body in enumerate(self._bodies(mesh))
         ]
@@ -96,7 +97,7 @@ class RigidCluster(Declared):
         bodies = (len(self._selections) or 1) if self.sizes is None else len(self.sizes)
         return self.of_elements("stiffness", bodies)
 
-    def elements(self, mesh, positions):
+    def elements(self, mesh: Mesh, positions: np.ndarray) -> Elements:
         found = super().elements(mesh, positions)
         cells = np.cumsum([0, *(len(body) for body in self._bodies(mesh))])
         return replace(found, cells=cells, refresh=Refresh(EVALUATION, _fit))

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..kernels.term import Term
 from ..kernels.terms import SPRING
+from ..mesh.mesh import Mesh
 from .declared import FINITE_FROM_0, Damped, indices, own_stencil
 
 
@@ -33,16 +34,16 @@ class Spring(Damped):
     pairs: str | tuple | np.ndarray = field(default="edges", metadata=indices(each=2, text="word"))
     rest_lengths: float | Sequence[float] | np.ndarray | None = field(default=None, metadata=FINITE_FROM_0)
 
-    def stencil(self, mesh):
+    def stencil(self, mesh: Mesh) -> np.ndarray:
         return pairs_on(mesh, self.label, self.pairs)
 
-    def rest(self, mesh, positions, stencil):
+    def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         if self.rest_lengths is None:
             return super().rest(mesh, positions, stencil)
         lengths = self.of_elements("rest_lengths", len(stencil))
         return np.broadcast_to(lengths, len(stencil))[:, None].copy()
 
-    def held(self, mesh, positions):
+    def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The pairs themselves; a net of them is as stiff as a sheet of K = 2k/√3."""
         found = self.elements(mesh, positions)
         return found.stencil, 2.0 / np.sqrt(3.0) * np.broadcast_to(found.stiffness, len(found.stencil))

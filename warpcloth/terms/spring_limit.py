@@ -7,6 +7,7 @@ import numpy as np
 
 from ..kernels.term import Term
 from ..kernels.terms import SPRING_LIMIT
+from ..mesh.mesh import Mesh
 from .declared import indices
 from .limit import Limit
 from .spring import pairs_on
@@ -28,5 +29,5 @@ class SpringLimit(Limit):
 
     pairs: str | tuple | np.ndarray = field(default="edges", metadata=indices(each=2, text="word"))
 
-    def stencil(self, mesh):
+    def stencil(self, mesh: Mesh) -> np.ndarray:
         return pairs_on(mesh, self.label, self.pairs)

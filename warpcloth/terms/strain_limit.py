@@ -3,8 +3,11 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
 from ..kernels.term import Term
 from ..kernels.terms import STRAIN_LIMIT
+from ..mesh.mesh import Mesh
 from .limit import Limit
 
 
@@ -22,5 +25,5 @@ class StrainLimit(Limit):
 
     term: ClassVar[Term] = STRAIN_LIMIT
 
-    def stencil(self, mesh):
+    def stencil(self, mesh: Mesh) -> np.ndarray:
         return mesh.triangles
