@@ -13,7 +13,7 @@ from ..local import from_corner
 from ..memory import load, load_shared, store
 from ..transpose import to_corner
 from ..vectors import types
-from .parts import Part, chain_of, elements_of, local_gradient
+from .parts import Part, chain_of, elements_struct, local_gradient
 
 
 @cache
@@ -34,7 +34,7 @@ def gather_piece(part: Part, dtype, corrected: bool = False):
 
     @wp.func
     def gather(
-        elements: elements_of(part, dtype),
+        elements: elements_struct(part, dtype),
         first: int,
         count: int,
         base: int,
@@ -91,7 +91,7 @@ def compute_forces(part: Part, dtype, corrected: bool = False):
 
     @wp.func
     def compute(
-        elements: elements_of(part, dtype),
+        elements: elements_struct(part, dtype),
         first: int,
         last: int,
         h: dtype,
@@ -130,7 +130,7 @@ def scatter_piece(part: Part, dtype):
 
     @wp.func
     def scatter(
-        elements: elements_of(part, dtype),
+        elements: elements_struct(part, dtype),
         first: int,
         count: int,
         base: int,
@@ -170,7 +170,7 @@ def add_block(part: Part, dtype, corrected: bool = False):
 
     @wp.func
     def add(
-        elements: elements_of(part, dtype),
+        elements: elements_struct(part, dtype),
         block: int,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -201,8 +201,8 @@ def add_block(part: Part, dtype, corrected: bool = False):
 
 
 @cache
-def add_blocks(parts: tuple[Part, ...], dtype, corrected: bool = False):
-    """The same of all terms."""
+def add_block_forces(parts: tuple[Part, ...], dtype, corrected: bool = False):
+    """As :func:`add_block`, of all terms."""
     vec3, _ = types(dtype)
     chain_type = chain_of(parts, dtype)
 
@@ -222,7 +222,7 @@ def add_blocks(parts: tuple[Part, ...], dtype, corrected: bool = False):
             return
 
         return add_nothing
-    first, others = add_block(parts[0], dtype, corrected), add_blocks(parts[1:], dtype, corrected)
+    first, others = add_block(parts[0], dtype, corrected), add_block_forces(parts[1:], dtype, corrected)
 
     @wp.func
     def add(

@@ -14,10 +14,10 @@ from ..memory import load, load_shared, store
 from ..project import multiplier, multiplier_type
 from ..transpose import to_corner
 from ..vectors import types
-from .parts import Part, chain_of, elements_of
+from .parts import Part, chain_of, elements_struct
 
 
-def rows_of(slots):
+def slot_rows(slots):
     """How many rows of how many slots a vertex has of pairs: 2 or 4 that a thread reads at once, some of them empty.
 
     Numbers are stored row by row, of a row vertex by vertex, of a vertex slot by slot. A sweep over springs takes 0.8 of the
@@ -52,7 +52,7 @@ def load_row(dtype, scalar, width):
 def row_functions(part: Part, dtype):
     """The device functions of pairs: (codes, q) → codes of row q; (a, q) → numbers of row q; (rest, row, i, N) → rest states
     (P, width) of a row of vertex i; (those, k) → that of the k-th slot."""
-    P, (_rows, width) = wp.constant(part.term.parameters), rows_of(sum(part.pairs))
+    P, (_rows, width) = wp.constant(part.term.parameters), slot_rows(sum(part.pairs))
     rest_type = wp.types.vector(part.term.parameters, dtype)
     rests_type = wp.types.matrix((part.term.parameters, width), dtype)
     row_of_rest = load_row(rest_type, dtype, width)
@@ -75,10 +75,10 @@ def row_functions(part: Part, dtype):
 
 
 class Projected(NamedTuple):
-    """What a sweep needs to know of the elements of one term.
+    """Facts about the elements of one term by which the kernel of a sweep is compiled.
 
     Attributes:
-        part: Their :class:`.elements.Part`; all that is not shared is in rows of :func:`rows_of` for pairs.
+        part: Their :class:`.elements.Part`; all that is not shared is in rows of :func:`slot_rows` for pairs.
         scalar, multipliers, per_step: As in :mod:`.project`.
         even: Whether all elements share one factor.
     """
@@ -101,7 +101,7 @@ def constraints_of(of: Projected, dtype):
 
     @wp.struct
     class Constraints:
-        elements: elements_of(of.part, dtype)
+        elements: elements_struct(of.part, dtype)
         factor: wp.array(dtype=dtype)
         before: wp.array(dtype=lambda_type)
         after: wp.array(dtype=lambda_type)
@@ -110,14 +110,16 @@ def constraints_of(of: Projected, dtype):
 
 
 @cache
-def pack(dtype):
+def set_vertex_rows(dtype):
     """Kernel over vertices: rows = (x̃, 1/m), d = 0."""
     vec3, _ = types(dtype)
     vec4 = wp.types.vector(4, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def pack_vertices(
+    def set_rows(
+        # elements
         inverse_mass: wp.array(dtype=dtype),
+        # state in
         x: wp.array(dtype=vec3),
         # out
         rows: wp.array(dtype=vec4),
@@ -127,7 +129,7 @@ def pack(dtype):
         rows[i] = vec4(x[i][0], x[i][1], x[i][2], inverse_mass[i])
         d[i] = vec3()
 
-    return pack_vertices
+    return set_rows
 
 
 @cache
@@ -200,10 +202,10 @@ def correct_elements(of: Projected, dtype):
 
 @cache
 def correct_pairs(of: Projected, dtype):
-    """The same of pairs, as :func:`.gather.gather_pairs`; without λ, which no incidence has beside it."""
+    """As :func:`correct_elements`, of pairs as in :func:`.gather_forces.gather_pairs`; without λ, which no incidence has."""
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     term, (firsts, seconds) = of.term, of.part.pairs
-    (rows_each, width), firsts = map(wp.constant, rows_of(firsts + seconds)), wp.constant(firsts)
+    (rows_each, width), firsts = map(wp.constant, slot_rows(firsts + seconds)), wp.constant(firsts)
     measure, change = term.measure, multiplier(term, dtype, of.scalar, of.per_step, False)
     shared, even, row_type = of.part.shared, of.even, wp.types.vector(int(width), dtype)
     corners, lambda_type = wp.types.vector(2, dtype), multiplier_type(term, dtype, of.scalar)
@@ -224,7 +226,7 @@ def correct_pairs(of: Projected, dtype):
         elements = constraints.elements
         total = vec3()
         here = quad(rows, i)
-        place = vec3(here[0], here[1], here[2])
+        position = vec3(here[0], here[1], here[2])
         move = vector(d, i)
         k = row_type()
         if wp.static(shared):
@@ -243,7 +245,7 @@ def correct_pairs(of: Projected, dtype):
                 j = wp.max(codes[n], 0)
                 r = rest_of(rests, n)
                 there = quad(rows, j)
-                y = part_of(r, corner, place) + part_of(r, 1 - corner, vec3(there[0], there[1], there[2]))
+                y = part_of(r, corner, position) + part_of(r, 1 - corner, vec3(there[0], there[1], there[2]))
                 dy = part_of(r, corner, move) + part_of(r, 1 - corner, vector(d, j))
                 w = corners()
                 w[corner] = here[3]
@@ -260,7 +262,7 @@ def correct_pairs(of: Projected, dtype):
 
 @cache
 def correct_terms(parts: tuple[Projected, ...], dtype):
-    """The same of all terms."""
+    """As :func:`correct_elements`, of all terms."""
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     chain_type = chain_of(parts, dtype, constraints_of)
 
@@ -298,23 +300,26 @@ def correct_terms(parts: tuple[Projected, ...], dtype):
 
 
 @cache
-def sweep(parts: tuple[Projected, ...], dtype, fast: bool):
-    """Kernel over vertices: d_after = d + scaleᵢ Σ Δx, with scaleᵢ as in :func:`.project.apply_correction`.
+def gather_corrections(parts: tuple[Projected, ...], dtype, fast: bool):
+    """Kernel over vertices: d_after = d + scaleᵢ Σ Δx, with scaleᵢ as in :func:`.jacobi.move_vertices`.
 
-    ``fast`` as in :func:`.explicit.gather`.
+    ``fast`` as in :func:`.gather_step.gather_step`.
     """
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     total_of = correct_terms(parts, dtype)
     vector, quad, number, put = load(vec3), load_row(vec4, dtype, 4), load_shared(dtype), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": fast})
-    def sweep_vertices(
+    def correct_vertices(
+        # elements
         chain: chain_of(parts, dtype, constraints_of),
         scale: wp.array(dtype=dtype),
+        # state in
         rows: wp.array(dtype=vec4),
+        d: wp.array(dtype=vec3),
+        # parameters
         h: dtype,
         sweeps: int,
-        d: wp.array(dtype=vec3),
         # out
         d_after: wp.array(dtype=vec3),
     ):
@@ -322,4 +327,4 @@ def sweep(parts: tuple[Projected, ...], dtype, fast: bool):
         total = total_of(chain, i, d.shape[0], rows, d, h, sweeps)
         put(d_after, i, vector(d, i) + number(scale, i) * (quad(rows, i)[3] * total))  # the scale may be huge where total is 0
 
-    return sweep_vertices
+    return correct_vertices

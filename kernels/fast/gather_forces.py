@@ -8,8 +8,8 @@ from ..local import from_corner
 from ..memory import load, load_shared, store
 from ..transpose import to_corner
 from ..vectors import types
-from .packed_residual import unpack
-from .parts import Part, chain_of, elements_of, local_gradient
+from .packed_residual import unpack_residual
+from .parts import Part, chain_of, elements_struct, local_gradient
 
 
 @cache
@@ -36,7 +36,7 @@ def move_of(dtype, ahead):
 
         @wp.func
         def unpacked(v: wp.array(dtype=wp.int32), i: int, unit: dtype):
-            return unpack(whole(v, i), unit)
+            return unpack_residual(whole(v, i), unit)
 
         return unpacked
     vector = load(vec3)
@@ -56,7 +56,7 @@ def gather_term(part: Part, dtype, ahead=None, lanes: int = 1):
     for a vertex each takes every so manieth element.
     """
     if part.rows:
-        return gather_rows(part, dtype, ahead, lanes)
+        return gather_matrix_rows(part, dtype, ahead, lanes)
     if part.pairs:
         return gather_pairs(part, dtype, ahead, lanes)
     vec3, _ = types(dtype)
@@ -72,7 +72,7 @@ def gather_term(part: Part, dtype, ahead=None, lanes: int = 1):
 
     @wp.func
     def total_of(
-        elements: elements_of(part, dtype),
+        elements: elements_struct(part, dtype),
         i: int,
         lane: int,
         count: int,
@@ -119,7 +119,7 @@ def gather_term(part: Part, dtype, ahead=None, lanes: int = 1):
 
 @cache
 def gather_pairs(part: Part, dtype, ahead, lanes: int):
-    """The same of pairs, without a branch: an empty slot pairs the vertex with itself, where forces are 0 in any direction.
+    """As :func:`gather_term`, of pairs, without a branch: an empty slot pairs the vertex with itself, where forces are 0.
 
     So all slots are read at once; one after another they take 1.2 times as long (H200, 64² vertices).
     """
@@ -138,7 +138,7 @@ def gather_pairs(part: Part, dtype, ahead, lanes: int):
 
     @wp.func
     def total_of(
-        elements: elements_of(part, dtype),
+        elements: elements_struct(part, dtype),
         i: int,
         lane: int,
         count: int,
@@ -148,7 +148,7 @@ def gather_pairs(part: Part, dtype, ahead, lanes: int):
     ):
         total = vec3()
         beta = dtype(0.0)
-        place = vector(x, i)
+        position = vector(x, i)
         move = vec3()
         if wp.static(moved):
             move = moves(v, i, h)
@@ -163,7 +163,7 @@ def gather_pairs(part: Part, dtype, ahead, lanes: int):
             if wp.static(ragged):
                 code = wp.where(n * lanes + lane < slots, code, i)
             r = rest_of(elements.rest, slot)
-            y = part_of(r, corner, place) + part_of(r, 1 - corner, vector(x, code))
+            y = part_of(r, corner, position) + part_of(r, 1 - corner, vector(x, code))
             dy = y_type()
             if wp.static(moved):
                 dy = part_of(r, corner, move) + part_of(r, 1 - corner, moves(v, code, h))
@@ -180,8 +180,8 @@ def gather_pairs(part: Part, dtype, ahead, lanes: int):
 
 
 @cache
-def gather_rows(part: Part, dtype, ahead, lanes: int):
-    """The same of a quadratic energy by the rows of its matrix Q: ∂U/∂xᵢ = Σⱼ Qᵢⱼ (xⱼ − xᵢ), for rows that add up to 0."""
+def gather_matrix_rows(part: Part, dtype, ahead, lanes: int):
+    """As :func:`gather_term`, by the rows of the matrix Q of a quadratic energy, which add up to 0: Σⱼ Qᵢⱼ (xⱼ − xᵢ)."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     vector, whole, number, moves = load(vec3), load(wp.int32), load(dtype), move_of(dtype, ahead)
@@ -190,23 +190,23 @@ def gather_rows(part: Part, dtype, ahead, lanes: int):
 
     @wp.func
     def pull_of(
-        elements: elements_of(part, dtype),
+        elements: elements_struct(part, dtype),
         slot: int,
-        place: vec3,
+        position: vec3,
         move: vec3,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=v_type),
         h: dtype,
     ):
         j = whole(elements.codes, slot)
-        apart = vector(x, j) - place
+        apart = vector(x, j) - position
         if wp.static(moved):
             apart += moves(v, j, h) - move
         return number(elements.stiffness, slot) * apart
 
     @wp.func
     def total_of(
-        elements: elements_of(part, dtype),
+        elements: elements_struct(part, dtype),
         i: int,
         lane: int,
         count: int,
@@ -215,7 +215,7 @@ def gather_rows(part: Part, dtype, ahead, lanes: int):
         h: dtype,
     ):
         total = vec3()
-        place = vector(x, i)
+        position = vector(x, i)
         move = vec3()
         if wp.static(moved):
             move = moves(v, i, h)
@@ -223,9 +223,9 @@ def gather_rows(part: Part, dtype, ahead, lanes: int):
             s = n * lanes + lane
             if wp.static(ragged):
                 if s < slots:
-                    total += pull_of(elements, s * count + i, place, move, x, v, h)
+                    total += pull_of(elements, s * count + i, position, move, x, v, h)
             else:
-                total += pull_of(elements, s * count + i, place, move, x, v, h)
+                total += pull_of(elements, s * count + i, position, move, x, v, h)
         return total
 
     return total_of
@@ -233,7 +233,7 @@ def gather_rows(part: Part, dtype, ahead, lanes: int):
 
 @cache
 def gather_terms(parts: tuple[Part, ...], dtype, ahead=None, lanes: int = 1):
-    """The same of all terms."""
+    """As :func:`gather_term`, of all terms."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     chain_type = chain_of(parts, dtype)
@@ -283,7 +283,7 @@ def sum_at_vertices(parts: tuple[Part, ...], dtype, ahead=None, lanes: int = 1):
 
 
 @cache
-def gather_gradient(parts: tuple[Part, ...], dtype, corrected: bool = False, lanes: int = 1):
+def gather_forces(parts: tuple[Part, ...], dtype, corrected: bool = False, lanes: int = 1):
     """Kernel over vertices, ``lanes`` threads each: adds ∂U/∂x [N] of all terms, at x or if ``corrected`` at x + d, to out."""
     vec3, _ = types(dtype)
     total_of = sum_at_vertices(parts, dtype, vec3 if corrected else None, lanes)
@@ -291,9 +291,12 @@ def gather_gradient(parts: tuple[Part, ...], dtype, corrected: bool = False, lan
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather(
+        # elements
         chain: chain_of(parts, dtype),
+        # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
+        # in and out
         out: wp.array(dtype=vec3),
     ):
         thread = wp.tid()

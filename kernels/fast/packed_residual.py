@@ -1,4 +1,4 @@
-"""What places are rounded by, packed: three numbers of 10 bits in the four bytes of an int32, from −512 to 511 units each.
+"""Position residuals of compensated summation, packed: three numbers of 10 bits in an int32, from −512 to 511 units each.
 
 Beside x in float32 these take a third of the memory of a vector, of which large cloth on a GPU never has enough. A unit is a
 power of two [m]. Numbers are changed as the last bits of floats, of which the least is a unit: a GPU converts whole numbers
@@ -18,7 +18,7 @@ def unpack_one(code: int, unit: float):
 
 
 @wp.func
-def unpack(code: int, unit: float):
+def unpack_residual(code: int, unit: float):
     """The three numbers times the unit [m]."""
     return wp.vec3(unpack_one(code, unit), unpack_one(code >> 10, unit), unpack_one(code >> 20, unit))
 
@@ -31,6 +31,6 @@ def pack_one(value: float, unit: float):
 
 
 @wp.func
-def pack(value: wp.vec3, unit: float):
+def pack_residual(value: wp.vec3, unit: float):
     """The numbers nearest to value [m]; what is more than 511 units away is lost, and NaN is 0 or so, for x is NaN as well."""
     return pack_one(value[0], unit) | (pack_one(value[1], unit) << 10) | (pack_one(value[2], unit) << 20)

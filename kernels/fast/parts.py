@@ -12,7 +12,7 @@ from ..term import Term
 
 
 class Part(NamedTuple):
-    """What a kernel needs to know of the elements of one term.
+    """Facts about the elements of one term by which a kernel is compiled.
 
     Attributes:
         term: The :class:`.term.Term`.
@@ -71,7 +71,7 @@ def local_gradient(part: Part, dtype, corrected: bool = False):
 
 
 @cache
-def elements_of(part: Part, dtype):
+def elements_struct(part: Part, dtype):
     """The struct of what a kernel reads of one term.
 
     Swept: block b has the pieces from offsets[b] to offsets[b+1], and ``codes`` are the first element of each and how many,
@@ -98,11 +98,11 @@ class Nothing:
     unused: int
 
 
-def chain_of(parts: tuple[Part, ...], dtype, struct_of=elements_of):
+def chain_of(parts: tuple[Part, ...], dtype, struct_of=elements_struct):
     """The struct of what a kernel reads of all terms: that of the first, and the chain of the others.
 
     Args:
-        parts: What tells the terms apart.
+        parts: The facts of each term.
         dtype: A Warp scalar type.
         struct_of: (part, dtype) → the struct of one.
     """

@@ -117,7 +117,7 @@ def test_ranges_move_as_the_whole(name, dtype, launches, device, monkeypatch):
         stepper.step()
         stepper.frame()
     assert same(steppers[1:3])
-    # As in test_passes, of 43 steps.
+    # As in test_backends, of 43 steps.
     tolerance = 43 * 64 * np.finfo(dtype).eps / steppers[0].h
     for stepper in steppers[1:]:
         assert np.abs(stepper.state.v.numpy() - steppers[0].state.v.numpy()).max() < tolerance
@@ -134,7 +134,7 @@ def test_ranges_far_from_the_origin_move_as_the_whole(device):
         for _ in range(20):
             stepper.frame()
     one, two, three, other = (stepper.state.x.numpy().copy() for stepper in steppers)
-    # As in test_passes, each within two roundings of x.
+    # As in test_backends, each within two roundings of x.
     assert all(np.abs(x - one).max() < 4.0 * np.spacing(np.float32(128.0)) for x in (two, three))
     assert np.array_equal(three, other)
     steppers[2].reset()

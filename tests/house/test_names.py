@@ -16,7 +16,6 @@ MODULES = {
     "distances": "the pictures of warpcloth.analysis.distances",
     "failures": "the pictures of warpcloth.lab.failures",
     "panels": "the pictures of warpcloth.lab.panels",
-    "gradient": "the backends of warpcloth.core.gradient",
     "measures": "what writes warpcloth.analysis.measures into a stage",
     "scene": "what reads and writes warpcloth.scene.scene as a stage",
 }
@@ -28,7 +27,6 @@ NAMES = {
     "write_csv": "each table has one",
     "run": "runs what it is given",
     "constant_blocks": "the launch of the kernel",
-    "gather_gradient gradient": "the core's and that of a backend",
     "open_sequence": "reads any sequence, and one of a stage",
     "vertex_normals": "on the host and as a kernel",
     "scene": "each file of scenes/ has its own",
@@ -38,9 +36,9 @@ NAMES = {
 TERMS = ("kernels/terms/", "kernels/membrane.py", "kernels/fast/quadratic_pair.py")
 # To be renamed.
 PENDING = {
-    "frames", "step", "Benchmark", "Gather", "Pins", "Source", "Sweep", "Trial", "add_blocks", "advance", "as_json", "choose",
-    "chosen", "elements_of", "files_of", "flatten", "gather", "gather_rows", "indices", "kept", "left_out", "pack", "place",
-    "product", "register", "rows_of", "spread", "sweep", "undefined", "unpack", "weight",
+    "frames", "step", "Benchmark", "Source", "Trial", "as_json", "choose",
+    "chosen", "files_of", "flatten", "gather", "kept", "left_out", "place",
+    "product", "register", "rows_of", "spread", "undefined", "weight",
 }  # fmt: skip
 
 

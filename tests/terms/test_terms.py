@@ -32,12 +32,14 @@ from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
 from warpcloth.core.sums import Sums
 from warpcloth.fast import quadratic_pairs as quadratic
-from warpcloth.fast.gather_layout import chain, gathered
+from warpcloth.fast.gather_layout import gathered
+from warpcloth.fast.structs import chained
 from warpcloth.kernels import admm as splitting
-from warpcloth.kernels import assemble, project
+from warpcloth.kernels import assemble
 from warpcloth.kernels import constraint_jacobian as jacobian
 from warpcloth.kernels import constraint_rows as constrain
 from warpcloth.kernels.fast import gather_forces as gather
+from warpcloth.kernels.fast import scatter_corrections
 from warpcloth.kernels.fast.parts import chain_of
 from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.kernels.vectors import types
@@ -157,8 +159,8 @@ class Stencils(NamedTuple):
         out = self.places(np.zeros_like(self.x))
         masses, zero = self.array(inverse_mass.ravel(), self.scalar), self.places(np.zeros_like(self.x))
         factor = self.array(np.ones(len(self.x)), self.scalar)
-        kernel = project.scatter_correction(self.term, self.scalar, self.term.project is None)
-        self.launch(kernel, *self.elements, masses, self.places(), zero, h, 1, factor, None, out)
+        kernel = scatter_corrections.scatter_correction(self.term, self.scalar, self.term.project is None)
+        self.launch(kernel, *self.elements, masses, factor, self.places(), zero, h, 1, None, out)
         return out.numpy().reshape(self.x.shape)
 
     def weights(self):
@@ -268,7 +270,7 @@ def constraint_of(term, dtype):
 
 @cache
 def gradient_by_lanes(part, dtype, lanes):
-    """:func:`gather.gather_gradient` with one thread in place of the lanes of a vertex, which only CUDA can add up."""
+    """:func:`gather.gather_forces` with one thread in place of the lanes of a vertex, which only CUDA can add up."""
     vec3, total_of = wp.types.vector(3, dtype), gather.gather_terms((part,), dtype, lanes=lanes)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -1093,13 +1095,13 @@ def test_gathering_is_scattering(term, dtype, device, monkeypatch):
     def forces(factory, *key):
         out = model.vectors()
         out.fill_(model.vec3(1.0, 2.0, 3.0))
-        given = [chain([part], [arrays], scalar), model.positions, model.vectors()]
+        given = [chained([part], [arrays], scalar), model.positions, model.vectors()]
         model.launch(factory(*key), model.count, given, [out])
         return out.numpy()
 
     scattered = sums_of_core(other, assemble.scatter_gradient)
     gathered_in_core = sums_of_core(model, assemble.gather_gradient, model.terms[0].incidences)
-    found, again = (forces(gather.gather_gradient, (part,), scalar) for _ in range(2))
+    found, again = (forces(gather.gather_forces, (part,), scalar) for _ in range(2))
     # Only the order of the sum differs, and the compiler's use of fused multiplication.
     size = np.abs(mesh.points).max() + 1.0
     for each in (found, gathered_in_core, *(forces(gradient_by_lanes, part, scalar, lanes) for lanes in (3, 4))):
@@ -1124,8 +1126,8 @@ def test_a_copy_gathers_the_bits_of_a_model_of_its_own(name, dtype, device):
     for model, elements in [*batches, *((model, model.terms[0]) for model in alone)]:
         part, arrays = gathered(model, elements)
         out = model.vectors()
-        given = [chain([part], [arrays], model.dtype), model.positions, model.vectors()]
-        model.launch(gather.gather_gradient((part,), model.dtype), model.count, given, [out])
+        given = [chained([part], [arrays], model.dtype), model.positions, model.vectors()]
+        model.launch(gather.gather_forces((part,), model.dtype), model.count, given, [out])
         found.append(out.numpy())
     for forces in found[:2]:
         for again in (found[2:5], found[5:]):
@@ -1147,8 +1149,8 @@ def test_bending_that_gathers_by_element_has_no_net_force(device):
         part, arrays = gathered(model, model.terms[0], rows=rows)
         assert bool(part.rows) == rows
         out = model.vectors()
-        given = [chain([part], [arrays], model.dtype), model.positions, model.vectors()]
-        model.launch(gather.gather_gradient((part,), model.dtype), model.count, given, [out])
+        given = [chained([part], [arrays], model.dtype), model.positions, model.vectors()]
+        model.launch(gather.gather_forces((part,), model.dtype), model.count, given, [out])
         nets[rows] = np.linalg.norm(out.numpy().astype(np.float64).sum(axis=0))
     forces = np.linalg.norm(out.numpy(), axis=1)
     assert nets[False] <= FEW * eps("float32") * forces.sum() < 0.1 * nets[True]

@@ -3,18 +3,16 @@
 See :mod:`warpcloth.kernels.fast.block_forces` for what is done with them.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
-from .gather_layout import indices
+from .structs import int32_array
 
 NUMBERS = 6144  # of scratch, if no vertex needs more: 2048 springs, which fit into the first cache
 RUN = 8  # elements, from which on a run is faster than looking stencils up
 
 
-def in_blocks(terms, per_copy, copies):
-    """The first vertex of each block, and the terms in the order of the blocks with their pieces.
+def block_layout(terms, per_copy, copies):
+    """The first vertex of each block, the terms in the order of the blocks, and what kernels read of each.
 
     A block ends before the coordinates of one of the terms are more than :data:`NUMBERS`; it has one vertex at least.
 
@@ -24,7 +22,8 @@ def in_blocks(terms, per_copy, copies):
         copies: How many there are.
 
     Returns:
-        (vertices (blocks + 1,), terms, the most numbers that a term has in a block)
+        (vertices (blocks + 1,), terms, the arrays of each term by the names of
+        :func:`warpcloth.kernels.fast.parts.elements_struct`, the most numbers that a term has in a block)
     """
     totals = [_numbers_before(elements, per_copy) for elements in terms]
     vertices = [0]
@@ -34,7 +33,8 @@ def in_blocks(terms, per_copy, copies):
     blocks = np.array(vertices)
     most = max((int(np.diff(total[blocks]).max()) for total in totals), default=0)
     firsts = (blocks[:-1] + per_copy * np.arange(copies)[:, None]).ravel()
-    return np.append(firsts, per_copy * copies), [_with_pieces(elements, blocks, copies) for elements in terms], most
+    found = [_in_pieces(elements, blocks, copies) for elements in terms]
+    return np.append(firsts, per_copy * copies), [each for each, _ in found], [arrays for _, arrays in found], most
 
 
 def _one(elements):
@@ -48,8 +48,8 @@ def _numbers_before(elements, per_copy):
     return 3 * elements.term.rows * np.append(0, np.cumsum(counts))
 
 
-def _with_pieces(elements, blocks, copies):
-    """The elements block by block, runs first, and their pieces."""
+def _in_pieces(elements, blocks, copies):
+    """The elements block by block, runs first, and what kernels read of them."""
     stencil = _one(elements)
     lowest = stencil.min(axis=1)
     block = np.searchsorted(blocks, lowest, side="right") - 1
@@ -70,11 +70,13 @@ def _with_pieces(elements, blocks, copies):
         counts = np.tile(counts, copies)
     if (np.diff(order) < 0).any():
         elements = elements.reordered(order)
-    pieces = indices(elements, offsets), indices(elements, np.column_stack([firsts, counts]).ravel())
-    return replace(elements, pieces=pieces)
+    device = elements.stencil.device
+    arrays = {"offsets": int32_array(offsets, device), "codes": int32_array(np.column_stack([firsts, counts]).ravel(), device)}
+    arrays |= {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
+    return elements, arrays if elements.damping is None else arrays | {"damping": elements.damping}
 
 
 def _changes(values):
-    """Where a row differs from the last; the first does."""
+    """Whether each row differs from the one before; the first does."""
     values = values.reshape(len(values), -1)
     return np.append(np.full(min(len(values), 1), True), (values[1:] != values[:-1]).any(axis=1))

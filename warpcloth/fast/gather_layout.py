@@ -3,9 +3,10 @@
 import numpy as np
 import warp as wp
 
-from ..kernels.fast.gather_corrections import rows_of
-from ..kernels.fast.parts import Part, chain_of, elements_of
-from .quadratic_pairs import entries
+from ..kernels.fast.gather_corrections import slot_rows
+from ..kernels.fast.parts import Part
+from .quadratic_pairs import matrix_entries
+from .structs import int32_array
 
 SLOTS = 16  # of pairs, which are compiled one by one
 # On CUDA so many threads take a vertex of meshes of so many vertices or less: a step of the springs of 64² takes 2.0 µs, not
@@ -18,11 +19,10 @@ def gathered(model, elements, damped=False, rows=True):
 
     Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
     than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and what the element has
-    beside it at hand, unless elements are refreshed. A stiffness that all pairs of a copy share is
-    stored once per vertex, so that a copy gets the same bits as a model of its own. For a quadratic energy without damping the
-    incidences are the rows of its matrix, if ``rows`` allows it. Rows take a third of the time, but their rounding errors do
-    not cancel between vertices: in float32 this noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as
-    with elements.
+    beside it at hand, unless elements are refreshed. A stiffness that all pairs of a copy share is stored once per vertex, so
+    that a copy gets the same bits as a model of its own. For a quadratic energy without damping the incidences are the rows of
+    its matrix, if ``rows`` allows it. Rows take a third of the time, but their rounding errors do not cancel between vertices:
+    in float32 this noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as with elements.
     """
     part = Part(elements.term, damped, shared=0 in elements.stiffness.strides)
     arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
@@ -36,7 +36,7 @@ def gathered(model, elements, damped=False, rows=True):
         if own is not None:
             part = part._replace(shared=True)
             others["stiffness"] = model.array(np.repeat(own, model.per_copy), model.dtype)
-        return part._replace(pairs=slots), {**others, "codes": indices(elements, codes.ravel())}
+        return part._replace(pairs=slots), {**others, "codes": int32_array(codes.ravel(), elements.stencil.device)}
     if rows and elements.term.quadratic and not (damped or elements.refresh) and (found := _of_matrix(model, elements)):
         slots, numbers = found
         return part._replace(rows=slots), numbers
@@ -44,21 +44,21 @@ def gathered(model, elements, damped=False, rows=True):
 
 
 def gathered_in_rows(elements, count, pairs, **others):
-    """The same for Jacobi sweeps: incidences of pairs in rows, see :func:`rows_of`, or by
-    element.
+    """As :func:`gathered`, for Jacobi sweeps: incidences of pairs are in rows, see
+    :func:`warpcloth.kernels.fast.gather_corrections.slot_rows`.
 
     Args:
         elements: :class:`warpcloth.model.model.DeviceElements`.
         count: Vertices, N.
         pairs: Whether incidences may name the other vertex in place of the element.
-        others: What else goes along, by name, numbers (B·E,) of the elements.
+        others: Other numbers (B·E,) of the elements, by name.
     """
     part = Part(elements.term, shared=0 in elements.stiffness.strides)
     arrays = {"stiffness": elements.stiffness, "rest": elements.rest, **others}
     if not pairs or not (found := _pairs(elements, count)):
         return _by_element(elements, count, part, {"stencil": elements.stencil, **arrays})
     slots, codes, source = found
-    rows, width = rows_of(sum(slots))
+    rows, width = slot_rows(sum(slots))
     empty = ((0, rows * width - sum(slots)), (0, 0))
     codes, source = np.pad(codes, empty, constant_values=-1), np.pad(source, empty)
 
@@ -67,7 +67,7 @@ def gathered_in_rows(elements, count, pairs, **others):
         parts = values.reshape(rows, width, count, -1).transpose(0, 3, 2, 1)
         return np.ascontiguousarray(parts).reshape(-1, *values.shape[2:])
 
-    found = {"codes": indices(elements, in_rows(codes))}
+    found = {"codes": int32_array(in_rows(codes), elements.stencil.device)}
     for name, array in arrays.items():
         shared = 0 in array.strides
         found[name] = array if shared else wp.array(in_rows(array.numpy()[source]), dtype=array.dtype, device=array.device)
@@ -78,7 +78,7 @@ def _by_element(elements, count, part, arrays):
     """The part and the arrays of incidences that name elements."""
     order, vertices, offsets = _rows(elements.stencil.numpy().ravel(), count)
     codes, padded = _slots(order, vertices, offsets, count)
-    arrays |= {"offsets": indices(elements, offsets), "codes": indices(elements, codes)}
+    arrays |= {"offsets": int32_array(offsets, elements.stencil.device), "codes": int32_array(codes, elements.stencil.device)}
     return part._replace(padded=padded), arrays
 
 
@@ -97,8 +97,8 @@ def _pairs(elements, count):
         return None
     codes, source = np.full((sum(slots), count), -1), np.zeros((sum(slots), count), dtype=np.int64)
     for corner, (order, vertices, offsets) in enumerate(columns):
-        place = corner * slots[0] + np.arange(len(order)) - offsets[vertices], vertices
-        codes[place], source[place] = stencil[order, 1 - corner], order
+        slot = corner * slots[0] + np.arange(len(order)) - offsets[vertices], vertices
+        codes[slot], source[slot] = stencil[order, 1 - corner], order
     return slots, codes, source
 
 
@@ -124,7 +124,7 @@ def _of_matrix(model, elements):
     None if that makes them more than twice as many, or there are none.
     """
     n, count = model.per_copy, model.count
-    rows, columns, entries_of_copies = entries(model, elements)
+    rows, columns, entries_of_copies = matrix_entries(model, elements)
     firsts = np.searchsorted(rows, np.arange(n + 1))
     slots = int(np.diff(firsts).max())
     if slots * n > 2 * len(rows) or not slots:
@@ -133,7 +133,10 @@ def _of_matrix(model, elements):
     codes, numbers = np.tile(np.arange(count), (slots, 1)), np.zeros((slots, count))
     for copy, own in enumerate(entries_of_copies):
         codes[slot, copy * n + rows], numbers[slot, copy * n + rows] = copy * n + columns, own
-    return slots, {"codes": indices(elements, codes.ravel()), "stiffness": model.array(numbers.ravel(), model.dtype)}
+    return slots, {
+        "codes": int32_array(codes.ravel(), elements.stencil.device),
+        "stiffness": model.array(numbers.ravel(), model.dtype),
+    }
 
 
 def _of_incidences(array, source):
@@ -143,28 +146,6 @@ def _of_incidences(array, source):
     return wp.array(array.numpy()[source], dtype=array.dtype, device=array.device)
 
 
-def indices(elements, values):
-    """Whole numbers (n,) on the device."""
-    return wp.array(values.astype(np.int32), dtype=wp.int32, device=elements.stencil.device)
-
-
-def lanes(model):
+def lanes_of(model):
     """How many threads take a vertex."""
     return LANES if model.device.is_cuda and model.count <= LANED else 1
-
-
-def chain(parts, arrays, dtype, struct_of=elements_of):
-    """The struct of all terms: that of the first, and the chain of the others."""
-    made = chain_of(tuple(parts), dtype, struct_of)()
-    if parts:
-        made.first = filled(struct_of(parts[0], dtype), arrays[0])
-        made.others = chain(parts[1:], arrays[1:], dtype, struct_of)
-    return made
-
-
-def filled(struct, values):
-    """A struct of these values, by name."""
-    made = struct()
-    for name, value in values.items():
-        setattr(made, name, value)
-    return made

@@ -15,7 +15,7 @@ PAIRS = 4
 ZERO = 1e-12
 
 
-def entries(model, elements):
+def matrix_entries(model, elements):
     """The entries of Q off the diagonal, row by row, where elements of a copy share one stiffness without those that cancel.
 
     Returns:
@@ -68,7 +68,7 @@ def as_pairs(model, elements):
     """The pairs of vertices that have the same forces as elements of a quadratic energy, or these where they are no faster."""
     if not elements.term.quadratic or elements.damping is not None or elements.refresh:
         return elements
-    rows, columns, numbers = entries(model, elements)
+    rows, columns, numbers = matrix_entries(model, elements)
     upper = rows < columns
     per_copy = int(upper.sum())
     if not 0 < per_copy <= PAIRS * elements.per_copy:

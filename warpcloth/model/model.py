@@ -111,8 +111,6 @@ class DeviceElements:
         damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
         refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
         cells: :class:`Cells` or :class:`SparseCells` that the elements are the vertices of, or None.
-        pieces: Of elements in blocks where the pieces of each begin, and the first element and the count of each; or None. See
-            :mod:`warpcloth.kernels.fast.block_forces`.
     """
 
     label: str
@@ -126,7 +124,6 @@ class DeviceElements:
     damping: wp.array | None = None
     refresh: Refresh | None = None
     cells: Cells | SparseCells | None = None
-    pieces: tuple[wp.array, wp.array] | None = None
 
     @property
     def arguments(self):
@@ -137,7 +134,7 @@ class DeviceElements:
     def arrays(self):
         """All arrays of the term."""
         cells = self.cells.arrays if self.cells else []
-        return self.arguments + ([] if self.damping is None else [self.damping]) + [*(self.pieces or ())] + cells
+        return self.arguments + ([] if self.damping is None else [self.damping]) + cells
 
     @property
     def count(self):

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..core.energy import Energy
-from ..fast.gradient import gradient
+from ..fast.plan import plan
 from ..kernels import minimise as kernels
 from .inertia import Inertia
 
@@ -31,7 +31,7 @@ class Search:
 
     def __init__(self, model, base, sums, s, load=0.0):
         self.model, self.base, self.sums, self.inertia = model, base, sums, Inertia(model, s, load)
-        self.gradient_of, self.energy_of = gradient(model, corrected=True), Energy(model, sums, corrected=True)
+        self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), Energy(model, sums, corrected=True)
         self.correction, self.trial, self.gradient, self.direction = (model.vectors() for _ in range(4))
 
         def per_copy(dtype):

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..core.thread_pool import ThreadPool
-from ..fast.jacobi_sweeps import Gather, Scatter
+from ..fast.plan import plan
 from ..kernels import project as kernels
 from ..kernels.clusters import correct_clusters
 from ..terms.refresh import EVALUATION, Moment
@@ -61,6 +61,7 @@ class Sweep:
         spread: The number of sweeps that finite stiffness is spread over, or None.
         correction: The d to move on, if not one of its own.
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares Gauss–Seidel sweeps by colour; None for one thread.
+        backend: Of Jacobi sweeps, see :func:`warpcloth.fast.plan.plan`.
 
     Attributes:
         correction: d (N,) [m].
@@ -82,6 +83,7 @@ class Sweep:
         spread=None,
         correction=None,
         pool=None,
+        backend="auto",
     ):
         self.model, self.x, self.h, self.relaxation, self.pool = model, x, h, relaxation, pool or ThreadPool(1)
         self.spread = spread or 1
@@ -101,8 +103,9 @@ class Sweep:
             for elements, key in zip(model.terms, keys, strict=True)
         ]
         if not self.in_place:
-            way = Gather if model.device.is_cuda else Scatter
-            self._jacobi = way(model, x, h, self.correction, self.multipliers, keys, *self._weights(kind, alpha), spread)
+            self._jacobi = plan(model, backend).jacobi_sweeps(
+                x, h, self.correction, self.multipliers, keys, *self._weights(kind, alpha), spread
+            )
             return
         # Cells fit themselves as they are swept.
         self._fresh = [elements for elements in self.elements if elements.refresh and not elements.cells]

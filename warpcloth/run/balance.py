@@ -19,8 +19,8 @@ import warp as wp
 
 from ..base.turns import TURN
 from ..core.energy import Energy
-from ..core.gradient import Gradient
 from ..core.sums import Sums
+from ..fast.plan import plan
 from .sources import source_of
 
 # A run has diverged when it has this many times the energy that its sources can have put in. Stable runs reach up to 1.4 times
@@ -50,7 +50,7 @@ class Elastic:
 
     @cached_property
     def _gradient(self):
-        return Gradient(self.model, terms=self.soft)
+        return plan(self.model).gradient(terms=self.soft)
 
     def energy(self, x, most=np.inf):
         """U [J] of the soft terms of each copy at x, (B,), with no more than ``most`` of each term."""

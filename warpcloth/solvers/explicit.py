@@ -9,8 +9,7 @@ import numpy as np
 from ..base.checks import choice
 from ..base.turns import in_turn
 from ..core.hessian import Hessian
-from ..fast.gather_step import Gather, Sweep, is_fine
-from ..fast.subdomains import Ranges
+from ..fast.plan import plan
 from ..model.damping import dissipations
 from ..model.model import Model
 from ..terms.needs import FINITE
@@ -230,42 +229,20 @@ def _largest(matrix):
 class ExplicitStepper(LaunchedStepper):
     """:class:`Explicit` on a model.
 
+    Args:
+        options, model: As of every stepper.
+        backend: See :func:`warpcloth.fast.plan.plan`.
+
     Attributes:
-        passes: The :class:`Sweep` or :class:`Gather` that a step is, or for several
-            threads the :class:`warpcloth.fast.subdomains.Ranges`.
+        steps: The steps that the plan makes; its ``record`` is a :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
-    def __init__(self, options, model):
+    def __init__(self, options, model, backend="auto"):
         super().__init__(options, model)
         symplectic = options.scheme == "symplectic"
-        if self.pool.threads > 1:
-            _refuse_undivided(model)
-            self.passes = Ranges(self.pool, model, tuple(self.state), self.h, symplectic, self.count, is_fine(model))
-        else:
-            self.passes = (Gather if model.device.is_cuda else Sweep)(
-                model, tuple(self.state), self.h, symplectic, is_fine(model)
-            )
-        self.model = self.passes.model
-        self.state.add("position residual", self.passes.low)
+        self.steps = plan(model, backend).explicit_step(tuple(self.state), self.h, symplectic, self.count, self.pool)
+        self.state.add("position residual", self.steps.residual)
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):
-        if isinstance(self.passes, Ranges):
-            self.passes.launch(steps, self.launch_pins_of)
-        else:
-            self.passes.launch(steps, lambda x, v: self.launch_pins(x=x, v=v))
-
-
-def _refuse_undivided(model):
-    """Refuses one cloth with terms that ranges do not have.
-
-    Raises:
-        ValueError: Naming the term.
-    """
-    threads = model.threads
-    for elements in model.terms:
-        if elements.cells:
-            raise ValueError(
-                f"threads is {threads} with one copy, whose {elements.label} Explicit cannot divide; threads=1 can, or PBD "
-                "and XPBD, and copies are shared out with every solver"
-            )
+        self.steps.launch(steps, self.launch_pins_of)

@@ -10,7 +10,7 @@ from ..core.capture import Mirror, Segment
 from ..core.constant_matrix import constant_matrices
 from ..core.status import UNBALANCED, Residual
 from ..core.sums import Sums
-from ..fast.gradient import gradient
+from ..fast.plan import plan
 from ..kernels.accelerate import plain_step
 from ..model.model import Model
 from ..numerics.accelerated_step import AcceleratedStep
@@ -113,7 +113,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._sizes = np.stack([np.asarray(abs(matrix).sum(axis=1)).ravel() for matrix in matrices])
         self._linear = CopyFactors(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
         self.factorise_seconds = self._linear.seconds
-        self._gradient_of = gradient(model, corrected=True)
+        self._gradient_of = plan(model).gradient(corrected=True)
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
         self._acceleration = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))
         self._active = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))

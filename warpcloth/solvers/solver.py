@@ -78,15 +78,16 @@ class Stepper:
     def launch_pins(self, parts=1, x=None, v=None):
         """Moves the pins that have keyframes on by h/``parts``, the same in all calls, in x and v if not in the state."""
         x, v = self.state.x if x is None else x, self.state.v if v is None else v
-        self.launch_pins_of(self.model, self.count, x, v, parts)
+        self.launch_pins_of(self.model.pins, self.model.keyframes, self.count, x, v, parts)
 
-    def launch_pins_of(self, model, count, x, v, parts=1):
-        """The same of a model, whose count of steps and whose x and v these are."""
-        if model.pins is None:
+    def launch_pins_of(self, pins, keyframes, count, x, v, parts=1):
+        """Moves these pins, or none, on in x and v (N,) as `launch_pins` does; ``count`` counts their steps."""
+        if pins is None:
             return
-        dim = (model.copies, len(model.pins))
+        model = self.model
+        dim = (model.copies, len(pins))
         move, add_one = model.kernel(kernels.move_pins, model.dtype), model.kernel(kernels.count_step)
-        given = [model.pins, model.keyframes, count, parts * self.steps_per_frame, model.per_copy, self.h / parts]
+        given = [pins, keyframes, count, parts * self.steps_per_frame, model.per_copy, self.h / parts]
         model.launch(move, dim, given, [x, v])
         model.launch(add_one, model.copies, [], [count])
 

@@ -9,7 +9,7 @@ from ..base.checks import choice, number, whole
 from ..core.capture import Mirror
 from ..core.status import UNBALANCED, Residual, Result
 from ..core.sums import Sums
-from ..fast.gradient import gradient
+from ..fast.plan import plan
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..model.model import Model
@@ -139,7 +139,7 @@ class XPBDStepper(LaunchedStepper):
         self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
-        self._gradient = gradient(model, corrected=True, terms=self.sweep.elements) if soft else None
+        self._gradient = plan(model).gradient(corrected=True, terms=self.sweep.elements) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
         self._acceleration = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
         largest = wp.zeros(model.copies, dtype=wp.float64, device=model.device)

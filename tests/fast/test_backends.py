@@ -1,4 +1,4 @@
-"""The explicit step in one pass against forces and update apart, and frames against steps, to the bit."""
+"""Every backend against the core, the core against NumPy, and frames against steps, to the bit."""
 
 import itertools
 from dataclasses import replace
@@ -13,18 +13,14 @@ from support.setups import SOLVERS, allocations, square
 from support.sheets import SPRINGS, TERMS, N, declared
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
-from warpcloth.fast import block_layout as blocks
-from warpcloth.fast import gather_layout as incidences
-from warpcloth.fast import gather_step as passes
-from warpcloth.fast import jacobi_sweeps as jacobi
-from warpcloth.fast.block_layout import in_blocks
+from warpcloth.fast import block_layout, gather_layout, gather_step
+from warpcloth.fast.block_layout import block_layout as layout_of
 from warpcloth.fast.gather_layout import gathered
-from warpcloth.fast.gather_step import Gather, Sweep
-from warpcloth.fast.jacobi_sweeps import Scatter
+from warpcloth.fast.plan import plan
 from warpcloth.model.damping import damped_terms
-from warpcloth.numerics import sweeps
-from warpcloth.solvers import explicit, solver
-from warpcloth.solvers.explicit import step_limits
+from warpcloth.numerics.sweeps import Sweep
+from warpcloth.solvers import solver
+from warpcloth.solvers.explicit import ExplicitStepper, step_limits
 from warpcloth.terms.refresh import STEP, Moment
 
 
@@ -54,38 +50,116 @@ def apart(model, stepper, scheme, steps):
     return x, v
 
 
+# Each on the CPU, which runs what is for CUDA too.
+BACKENDS = ["core", "blocks", "small blocks", "gather"]
+
+
+@pytest.fixture
+def backend(request, device, monkeypatch):
+    """The name of a backend that the device has."""
+    name = request.param
+    if name == "small blocks":  # of which the sheet has several, with runs of few elements
+        monkeypatch.setattr(block_layout, "NUMBERS", 60)
+        monkeypatch.setattr(block_layout, "RUN", 3)
+        name = "blocks"
+    if name == "blocks" and not wp.get_device(device).is_cpu:
+        pytest.skip("blocks are for the CPU")
+    return name
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("scheme", ["symplectic", "forward"])
-@pytest.mark.parametrize("way", ["own", "small blocks", "gathered"])
+@pytest.mark.parametrize("backend", BACKENDS, indirect=True)
 @pytest.mark.parametrize("name", TERMS)
-def test_one_pass_is_forces_and_update(name, way, scheme, dtype, device, monkeypatch):
-    if way == "gathered":  # of CUDA, but right on the CPU too
-        monkeypatch.setattr(explicit, "Sweep", Gather)
-    if way == "small blocks":
-        monkeypatch.setattr(blocks, "NUMBERS", 60)
-        monkeypatch.setattr(blocks, "RUN", 3)
+def test_explicit_steps_are_those_of_the_core(name, backend, scheme, dtype, device):
+    """And those of the core are forces, and the update in NumPy."""
     scene, steps = declared(TERMS[name], fps=250.0), 5
     vary = {"gravity": [[0.0, -9.81, 0.0], [1.0, 2.0, 3.0]]}
     model = scene.build(device=device, dtype=dtype, copies=2, vary=vary)
-    stepper = wc.Explicit(substeps=4, scheme=scheme, above_limit="allow").bind(model)
-    assert stepper.h <= step_limits(model)[1]
-    for _ in range(steps):
-        stepper.step()
+    options = wc.Explicit(substeps=4, scheme=scheme, above_limit="allow")
+    stepper, core = (ExplicitStepper(options, model, each) for each in (backend, "core"))
+    assert stepper.h <= step_limits(model)[1] and stepper.steps.record.backend == backend
+    for each in (stepper, core):
+        for _ in range(steps):
+            each.step()
     x, v = (array.numpy() for array in stepper.state)
-    exact_x, exact_v = apart(model, stepper, scheme, steps)
-    # Below the limit h²k/m + 2hc/m ≤ 4, so that a few roundings of places and moves of size 1, 16 of them here, change v by
+    expected = apart(model, core, scheme, steps) if backend == "core" else [array.numpy() for array in core.state]
+    # Below the limit h²k/m + 2hc/m ≤ 4, so that a few roundings of positions and moves of size 1, 16 of them here, change v by
     # no more than 16·4ε/h a step.
     tolerance = steps * 64 * np.finfo(dtype).eps / stepper.h
-    assert np.abs(v - exact_v).max() < tolerance
-    assert np.abs(x - exact_x).max() < steps * stepper.h * tolerance
+    assert np.abs(v - expected[1]).max() < tolerance
+    assert np.abs(x - expected[0]).max() < steps * stepper.h * tolerance
+
+
+def record(scene, device, backend="auto", threads=1):
+    """How explicit steps of a scene are taken."""
+    model = scene.build(device=device, threads=threads)
+    return ExplicitStepper(wc.Explicit(substeps=500, above_limit="allow"), model, backend).steps.record
+
+
+BENDING = wc.QuadraticBending(stiffness=1e-3)
+HINGE = wc.Scene(wc.Mesh.grid(2, 2), density=0.1, terms=[BENDING])
+
+
+@pytest.mark.parametrize(
+    ("scene", "pairs"),
+    [
+        (declared([SPRINGS, BENDING]), ("QuadraticBending",)),
+        (declared([replace(BENDING, name="folds")]), ("folds",)),
+        (declared(TERMS["damped quadratic bending"]), ()),
+        (declared(TERMS["dihedral bending"]), ()),
+        (HINGE, ()),  # whose six pairs are slower than itself
+        (declared([]), ()),
+    ],
+)
+def test_quadratic_terms_are_pairs_where_these_are_faster(scene, pairs):
+    assert record(scene, "cpu", "blocks").pairs == pairs
+
+
+def test_the_plan_takes_the_fast_backend_of_the_device(device):
+    scene, cpu = declared([SPRINGS, BENDING]), wp.get_device(device).is_cpu
+    found = record(scene, device)
+    assert plan(scene.build(device=device)).backend == found.backend == ("blocks" if cpu else "gather")
+    assert (found.threads, found.lanes, found.block, found.compensated) == (1, 1 if cpu else 4, 0, False)
+    assert found.pairs == record(scene, device, "gather").pairs == ("QuadraticBending",)
+    assert record(scene, device, "core") == found._replace(backend="core", lanes=1, pairs=())
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("way", ["own", "gathered"])
-def test_a_soft_crease_joins_stiff_parts(way, dtype, device, monkeypatch):
+@pytest.mark.parametrize("name", TERMS)
+def test_gradients_are_those_of_the_core(name, dtype, device):
+    """At x, and at x + d."""
+    model = declared(TERMS[name]).build(device=device, dtype=dtype)
+    d, found = model.array(np.random.default_rng(6).normal(scale=0.01, size=(N, 3)), model.vec3), {}
+    for backend in ("core", "gather"):
+        out = model.vectors(), model.vectors()
+        plan(model, backend).gradient().add(model.positions, out[0])
+        plan(model, backend).gradient(corrected=True).add(model.positions, out[1], d)
+        found[backend] = np.array([each.numpy() for each in out])
+    assert found["core"].any() or name == "nothing"
+    # A vertex has at most 24 elements here, whose forces are k times what a few roundings of positions of size 1 change.
+    size = 24 * 8 * max(np.abs(found["core"]).max(), *(elements.stiffness.numpy().max() for elements in model.terms), 0.0)
+    assert np.abs(found["gather"] - found["core"]).max() <= np.finfo(dtype).eps * size
+
+
+@pytest.mark.parametrize(
+    ("backend", "threads", "message"),
+    [
+        ("fastest", 1, "backend is 'fastest'"),
+        ("core", 2, "threads is 2 with backend 'core'"),
+        ("gather", 2, "threads is 2 with backend 'gather'"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:threads is . on . cores")
+def test_backends_that_are_not_there_are_refused(backend, threads, message):
+    with pytest.raises(ValueError, match=message):
+        record(declared([]), "cpu", backend, threads)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("backend", ["core", "blocks", "gather"], indirect=True)
+def test_a_soft_crease_joins_stiff_parts(backend, dtype, device):
     """What is left out of a matrix is not what is small beside all else at its vertices: the torque that unfolds is there."""
-    if way == "gathered":
-        monkeypatch.setattr(explicit, "Sweep", Gather)
     sheet, eps = wc.Mesh.grid(9, 9), float(np.finfo(dtype).eps)
     x, _y, z = sheet.points.T
     mean = x.mean()
@@ -96,7 +170,9 @@ def test_a_soft_crease_joins_stiff_parts(way, dtype, device, monkeypatch):
     for stiff in (0.0, 64.0 / eps):
         terms = [wc.QuadraticBending(stiffness=np.where(crease, 1.0, stiff))]
         scene = wc.Scene(sheet, density=1.0, terms=terms, positions=folded, gravity=[0.0, 0.0, 0.0], fps=100.0, duration=1.0)
-        stepper = wc.Explicit(substeps=1, above_limit="allow").bind(scene.build(device=device, dtype=dtype))
+        stepper = ExplicitStepper(
+            wc.Explicit(substeps=1, above_limit="allow"), scene.build(device=device, dtype=dtype), backend
+        )
         stepper.step()
         momenta = scene.vertex_masses[far, None] * stepper.state.v.numpy()[far]
         torques.append(np.cross(folded[far] - [mean, 0.0, 0.0], momenta)[:, 2].sum())
@@ -110,19 +186,18 @@ def test_a_soft_crease_joins_stiff_parts(way, dtype, device, monkeypatch):
 )
 def test_steps_of_one_launch_are_steps(name, dtype, device, monkeypatch):
     """Of CUDA, but right on the CPU too: an even number and an odd one, of the CPU to the bit those of a launch each."""
-    monkeypatch.setattr(explicit, "Sweep", Gather)
-    monkeypatch.setattr(incidences, "LANED", 0)  # as of many copies
+    monkeypatch.setattr(gather_layout, "LANED", 0)  # as of many copies
     vary = {"gravity": [[0.0, -9.81, 0.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]}
     model = declared(TERMS[name], pins=[0, 6], fps=250.0).build(device=device, dtype=dtype, copies=3, vary=vary)
     states, launches = [], []
     for sizes in ([4, 5], [1] * 9):
-        stepper = wc.Explicit(substeps=4, above_limit="allow").bind(model)
+        stepper = ExplicitStepper(wc.Explicit(substeps=4, above_limit="allow"), model, "gather")
         before = model.launches[0]
         for steps in sizes:
             stepper.launch_steps(steps)
         launches.append(model.launches[0] - before)
         states.append([array.numpy() for array in stepper.state])
-        monkeypatch.setattr(passes, "block_of", lambda model, parts: 0)
+        monkeypatch.setattr(gather_step, "block_of", lambda model, parts: 0)
     assert launches == [2, 9]
     # Compilers of GPUs contract the products of the two kernels as each allows: a few roundings a step, as above.
     tolerance = 9 * 64 * np.finfo(dtype).eps / stepper.h if model.device.is_cuda else 0.0
@@ -140,14 +215,9 @@ def test_steps_of_one_launch_are_steps(name, dtype, device, monkeypatch):
     ],
 )
 def test_which_copies_are_blocks(scene, one, device, monkeypatch):
-    model = scene.build(device=device)
-
-    def threads():
-        return Gather(model, (model.vectors(), model.vectors()), 1e-3, True)._threads
-
-    assert wp.get_device(device).is_cpu or not threads()
-    monkeypatch.setattr(incidences, "LANED", 0)
-    assert bool(threads()) == one
+    assert wp.get_device(device).is_cpu or not record(scene, device, "gather").block
+    monkeypatch.setattr(gather_layout, "LANED", 0)
+    assert bool(record(scene, device, "gather").block) == one
 
 
 LAUNCHED = [name for name, made in SOLVERS.items() if isinstance(made, (wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD))]
@@ -202,19 +272,17 @@ PROJECTED["corotated"] = [wc.CorotatedMembrane(stiffness=100.0)]
     ],
 )
 @pytest.mark.parametrize("name", PROJECTED)
-def test_jacobi_sweeps_gather_what_they_scatter(name, options, dtype, device, monkeypatch):
-    """d and λ, whether sweeps run one by one, which copies what they leave in the other arrays back, or in pairs."""
-    scene, steps, h, found = declared(PROJECTED[name]), 3, 0.02, []
+def test_jacobi_sweeps_are_those_of_the_core(name, options, dtype, device):
+    """d and λ, whether sweeps run one by one, which copies what they leave in other arrays back, or in pairs."""
+    scene, steps, h, found = declared(PROJECTED[name]), 3, 0.02, {}
     moves = np.random.default_rng(7).normal(scale=0.01, size=(2 * N, 3))
-    for way, pairs in ((Scatter, False), (jacobi.Gather, False), (jacobi.Gather, True)):
+    for backend, pairs in (("core", False), ("blocks", False), ("gather", False), ("gather", True)):
         # Scattering is for one thread, of the CPU.
-        model = scene.build(device="cpu" if way is Scatter else device, dtype=dtype, copies=2)
+        model = scene.build(device="cpu" if backend == "blocks" else device, dtype=dtype, copies=2)
         model = model.with_terms(damped_terms(model, h))
         model.refresh(STEP, Moment(model.positions))  # sets the rest state of what is damped, by element
         d = model.array(moves, model.vec3)
-        monkeypatch.setattr(sweeps, "Scatter", way)
-        monkeypatch.setattr(sweeps, "Gather", way)
-        made = sweeps.Sweep(model, model.positions, h, relaxation=0.1, **options)
+        made = Sweep(model, model.positions, h, relaxation=0.1, backend=backend, **options)
         made.correction.assign(d)
         made.launch_start()
         assert not made.correction.numpy().any()
@@ -222,31 +290,33 @@ def test_jacobi_sweeps_gather_what_they_scatter(name, options, dtype, device, mo
         for launch, times in made.parts(steps) if pairs else [(made.launch, steps)]:
             for _ in range(times):
                 launch()
-        found.append([made.correction.numpy(), *(array.numpy() for array in made.multipliers if array is not None)])
-    assert not np.array_equal(found[0][0], d.numpy()) or name == "nothing"
-    # A sweep moves a vertex by ω of what its constraints ask for, of y that are wrong by a few roundings of places; λ is that
-    # times the mass. The same kernels make the same bits.
-    for scattered, gathered_, paired in zip(*found, strict=True):
+        found[backend, pairs] = [made.correction.numpy(), *(array.numpy() for array in made.multipliers if array is not None)]
+    core, *others = found.values()
+    assert not np.array_equal(core[0], d.numpy()) or name == "nothing"
+    # A sweep moves a vertex by ω of what its constraints ask for, of y that are wrong by a few roundings of positions; λ is
+    # that times the mass. The same kernels make the same bits.
+    for expected, scattered, gathered_, paired in zip(core, *others, strict=True):
         assert np.array_equal(gathered_, paired)
-        assert np.abs(scattered - gathered_).max() <= steps * 8 * np.finfo(dtype).eps * max(np.abs(scattered).max(), 0.1)
+        for each in (scattered, gathered_):
+            assert np.abs(each - expected).max() <= steps * 8 * np.finfo(dtype).eps * max(np.abs(expected).max(), 0.1)
 
 
 @pytest.mark.parametrize("copies", [1, 2])
 def test_blocks_have_every_element_once(copies, device, monkeypatch):
     """In the block of its lowest vertex; runs have all vertices one higher from element to element; copies are alike."""
-    monkeypatch.setattr(blocks, "NUMBERS", 60)
-    monkeypatch.setattr(blocks, "RUN", 3)
+    monkeypatch.setattr(block_layout, "NUMBERS", 60)
+    monkeypatch.setattr(block_layout, "RUN", 3)
     scene = declared([SPRINGS, wc.DihedralBending(stiffness=1e-3), wc.NeoHookeanMembrane(stiffness=100.0)])
     model = scene.build(device=device, copies=copies)
-    vertices, terms, numbers = in_blocks(model.terms, model.per_copy, copies)
+    vertices, terms, found, numbers = layout_of(model.terms, model.per_copy, copies)
     assert vertices[0] == 0 and vertices[-1] == model.count and (np.diff(vertices) > 0).all()
     assert np.isin(np.arange(copies) * N, vertices).all()
     assert numbers <= 60
     runs = 0
-    for before, after in zip(model.terms, terms, strict=True):
+    for before, after, arrays in zip(model.terms, terms, found, strict=True):
         stencil = after.stencil.numpy()
         assert sorted(map(tuple, stencil)) == sorted(map(tuple, before.stencil.numpy()))
-        offsets, codes = (array.numpy() for array in after.pieces)
+        offsets, codes = arrays["offsets"].numpy(), arrays["codes"].numpy()
         firsts, counts = codes.reshape(-1, 2).T
         assert np.array_equal(firsts, np.cumsum(np.abs(counts)) - np.abs(counts))
         assert np.abs(counts).sum() == len(stencil)
@@ -263,11 +333,9 @@ def test_blocks_have_every_element_once(copies, device, monkeypatch):
 def test_what_is_in_order_is_not_copied(device):
     """Elements are put in the order of a sweep once."""
     model = declared([SPRINGS, wc.DihedralBending(stiffness=1e-3)]).build(device=device)
-    swept = Sweep(model, (model.vectors(), model.vectors()), 1e-3, True).model
-    pieces = sum(array.size for elements in swept.terms for array in elements.pieces)
-    assert swept.report()["bytes"] == model.report()["bytes"] + 4 * pieces
-    _vertices, again, _numbers = in_blocks(swept.terms, model.per_copy, 1)
-    for elements, same in zip(swept.terms, again, strict=True):
+    _vertices, ordered, _arrays, _numbers = layout_of(model.terms, model.per_copy, 1)
+    _vertices, again, _arrays, _numbers = layout_of(ordered, model.per_copy, 1)
+    for elements, same in zip(ordered, again, strict=True):
         assert same.stencil is elements.stencil
 
 
@@ -302,25 +370,23 @@ def test_the_residual_is_that_of_the_worst_step(device):
     assert np.isnan(stepper.residual[0]) and stepper.results == [Result.DIVERGED]
 
 
-@pytest.mark.parametrize("way", ["own", "gathered"])
+@pytest.mark.parametrize("backend", ["core", "blocks", "gather"], indirect=True)
 @pytest.mark.parametrize(("away", "substeps"), [(0.0, 64), (128.0, 64), (4096.0, 512)])
-def test_motion_does_not_depend_on_where_the_origin_is(away, substeps, way, device, monkeypatch):
-    """Far from it places are kept to more digits than x has; frames are steps, and a run repeats itself, to the bit.
+def test_motion_does_not_depend_on_where_the_origin_is(away, substeps, backend, device):
+    """Far from it positions are kept to more digits than x has; frames are steps, and a run repeats itself, to the bit.
 
     Farther, steps of less than the unit of what is packed too.
     """
-    if way == "gathered":
-        monkeypatch.setattr(explicit, "Sweep", Gather)
-    sheet = wc.Mesh.grid(17, 17)  # of places that float32 has in both
+    sheet = wc.Mesh.grid(17, 17)  # of positions that float32 has in both
 
     def stepper_of(away, dtype):
         mesh = wc.Mesh(sheet.points + away, sheet.triangles)
         terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)]
         scene = wc.Scene(mesh, density=0.1, terms=terms, pins=[0, 16], duration=1.0)
-        return wc.Explicit(substeps=substeps).bind(scene.build(device=device, dtype=dtype))
+        return ExplicitStepper(wc.Explicit(substeps=substeps), scene.build(device=device, dtype=dtype), backend)
 
     exact, stepper, other = (stepper_of(*key) for key in ((0.0, "float64"), (away, "float32"), (away, "float32")))
-    assert ("position residual" in stepper.state.arrays) == (away > 0.0)
+    assert stepper.steps.record.compensated == ("position residual" in stepper.state.arrays) == (away > 0.0)
     for _ in range(20):
         exact.frame()
         stepper.frame()
@@ -351,8 +417,8 @@ def test_motion_does_not_depend_on_where_the_origin_is(away, substeps, way, devi
         ({"pins": wc.Pins([0], [[[128.0] * 3], [[4096.0] * 3]])}, {}, False),
     ],
 )
-def test_what_places_are_rounded_by_is_packed_where_that_holds_it(scene, varied, packed, device):
-    """Also at the ends that are known before a run: by units of less than what places may be rounded by there."""
+def test_the_residual_of_positions_is_packed_where_that_holds_it(scene, varied, packed, device):
+    """Also at the ends that are known before a run: by units of less than positions may be rounded by there."""
     sheet = wc.Mesh.grid(17, 17)
     mesh = wc.Mesh(sheet.points + 128.0, sheet.triangles)
     if "velocities" in scene:
@@ -361,5 +427,5 @@ def test_what_places_are_rounded_by_is_packed_where_that_holds_it(scene, varied,
     first = {"positions": mesh.points, "velocities": 0.0 * mesh.points, "gravity": np.array(scene.gravity)}
     vary = {name: np.stack([first[name], first[name] + more]) for name, more in varied.items()}
     model = scene.build(device=device, copies=2, vary=vary)
-    low = Gather(model, (model.vectors(), model.vectors()), 1e-3, True, passes.is_fine(model)).low
-    assert (low.dtype is wp.int32) == packed
+    found = ExplicitStepper(wc.Explicit(substeps=64), model, "gather").steps.record
+    assert found.compensated and found.packed == packed

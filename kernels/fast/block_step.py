@@ -1,0 +1,74 @@
+"""Factories of the explicit step by blocks: one thread a copy takes the forces of all terms and the update in one pass.
+
+It handles each element in the block of its lowest vertex. When a block is done no later element adds to the forces on its
+vertices or reads their positions, so that x, v move on in place.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ..explicit_step import kick_and_drift
+from ..memory import load, store
+from ..vectors import types
+from .block_forces import add_block_forces
+from .parts import Part, chain_of
+
+
+@cache
+def block_step(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str, compensated: bool = False):
+    """Kernel over copies, each block by block: v, x after a step, a = g − ∇U/m.
+
+    ``gradient`` is that of other terms, and 0 afterwards. ``flags`` are those of the compiler, on the CPU. ``compensated`` is
+    as in :func:`.explicit_step.kick_and_drift`, for terms without damping, and takes forces at x + residual.
+    """
+    vec3, _ = types(dtype)
+    add, step = add_block_forces(parts, dtype, compensated), kick_and_drift(dtype, symplectic, compensated)
+    vector, number, whole, put = load(vec3), load(dtype), load(wp.int32), store(vec3)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
+    def step_blocks(
+        # elements
+        chain: chain_of(parts, dtype),
+        vertices: wp.array(dtype=wp.int32),
+        inverse_mass: wp.array(dtype=dtype),
+        gravity: wp.array(dtype=vec3),
+        # parameters
+        h: dtype,
+        # in and out, the first two scratch
+        y: wp.array(dtype=dtype),
+        dy: wp.array(dtype=dtype),
+        gradient: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        residual: wp.array(dtype=vec3),
+    ):
+        copy = wp.tid()
+        g = gravity[copy]
+        blocks = (vertices.shape[0] - 1) // gravity.shape[0]
+        b = copy * blocks
+        last = b + blocks
+        while b < last:
+            if wp.static(compensated):
+                add(chain, b, x, residual, dtype(1.0), y, dy, gradient)
+            else:
+                add(chain, b, x, v, h, y, dy, gradient)
+            i = whole(vertices, b)
+            end = whole(vertices, b + 1)
+            while i < end:
+                w = number(inverse_mass, i)
+                before = vector(x, i)
+                speed = vector(v, i)
+                rest = vec3()
+                if wp.static(compensated):
+                    rest = vector(residual, i)
+                position, more, velocity = step(before, rest, speed, g - w * vector(gradient, i), h)
+                put(x, i, wp.where(w > dtype(0.0), position, before))
+                put(v, i, wp.where(w > dtype(0.0), velocity, speed))
+                if wp.static(compensated):
+                    put(residual, i, wp.where(w > dtype(0.0), more, rest))
+                put(gradient, i, vec3())
+                i += 1
+            b += 1
+
+    return step_blocks

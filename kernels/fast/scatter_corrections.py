@@ -1,0 +1,83 @@
+"""Factories of a Jacobi sweep that scatters corrections while it computes them, in order, as one thread of the CPU can.
+
+They have the key (term, dtype, scalar, multipliers, per_step) of :mod:`..project`.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ..memory import load, load_shared, store
+from ..project import element_change, multiplier_type
+from ..term import Term
+from ..transpose import to_corner
+from ..vectors import types
+
+
+@cache
+def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
+    """Kernel over elements: adds factorₑ Δxᵢ [m] of every element to out, factorₑ Δλ to λ.
+
+    For the CPU, in order: nothing is atomic. One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
+    """
+    vec3, _ = types(dtype)
+    K = wp.constant(term.vertices)
+    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
+    change, share_of = element_change(term, dtype, scalar, per_step), to_corner(term, dtype)
+    number, shared, vector, vertex = load(dtype), load_shared(dtype), load(vec3), load(wp.int32, 2)
+    rest_of, put = load(rest_type), store(vec3)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        inverse_mass: wp.array(dtype=dtype),
+        factor: wp.array(dtype=dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # parameters
+        h: dtype,
+        sweeps: int,
+        # in and out
+        lambdas: wp.array(dtype=lambda_type),
+        out: wp.array(dtype=vec3),
+    ):
+        e = wp.tid()
+        r = rest_of(rest, e)
+        before = lambda_type(dtype(0.0))
+        if wp.static(multipliers):
+            before = lambdas[e]
+        more, rows = change(stencil, e, shared(stiffness, e), r, inverse_mass, x, d, h, before, sweeps)
+        if wp.static(multipliers):
+            lambdas[e] = before + factor[e] * more
+        for i in range(K):
+            v = vertex(stencil, K * e + i)
+            put(out, v, vector(out, v) + (number(inverse_mass, v) * shared(factor, e)) * share_of(r, i, rows))
+
+    return scatter
+
+
+@cache
+def apply_correction(dtype):
+    """Kernel over vertices: d += scaleᵢ Σ Δx, and the sum back to 0.
+
+    scaleᵢ is 1, or 1/(nᵢ + α) when averaged over the nᵢ constraints of the vertex.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def apply(
+        # elements
+        scale: wp.array(dtype=dtype),
+        # in and out
+        total: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        correction[i] = correction[i] + scale[i] * total[i]
+        total[i] = vec3()
+
+    return apply

@@ -1,0 +1,75 @@
+"""The explicit step as it is written: the gradient, then v += h(g − M⁻¹∇U), x += h v. Faster backends are compared with it."""
+
+from typing import NamedTuple
+
+from ..kernels import explicit_step as kernels
+from ..model.damping import dissipations
+from ..terms.refresh import STEP, Moment
+from .gradient import Gradient
+
+
+class StepRecord(NamedTuple):
+    """How explicit steps are taken.
+
+    Attributes:
+        backend: ``"core"``, ``"blocks"`` or ``"gather"``.
+        threads: Threads of the CPU that share the steps of one cloth.
+        lanes: Threads of a GPU that take one vertex.
+        block: Threads of the block that takes a copy through several steps in one launch, or 0.
+        pairs: Labels of the quadratic terms that are taken by the entries of their matrix.
+        compensated: Whether x is moved on by compensated summation.
+        packed: Whether its residual is packed into four bytes.
+    """
+
+    backend: str
+    threads: int = 1
+    lanes: int = 1
+    block: int = 0
+    pairs: tuple[str, ...] = ()
+    compensated: bool = False
+    packed: bool = False
+
+
+class ExplicitStep:
+    """Steps of several launches, on any device.
+
+    Damping D is taken at x + h v about the state x, see :class:`warpcloth.kernels.term.Dissipation`; with compensated positions
+    forces are taken at x + residual.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        state: x and v (N,), which steps move on.
+        h: Step [s].
+        symplectic: Whether x moves on by the v after the step.
+        count: Steps that moved pins have made (B,) int32, or None.
+        compensated: Whether x is moved on by compensated summation.
+
+    Attributes:
+        residual: What x is rounded by (N,) [m], or None.
+        record: :class:`StepRecord`.
+    """
+
+    def __init__(self, model, state, h, symplectic, count, compensated=False):
+        self.model, self.state, self.record = model, state, StepRecord("core", compensated=compensated)
+        self.residual = model.vectors() if compensated else None
+        self._pins = model.pins, model.keyframes, count
+        self._gradient, self._elastic = model.vectors(), Gradient(model, corrected=compensated)
+        self._damped = dissipations(model, h)
+        self._dissipative = Gradient(model, corrected=True, terms=self._damped)
+        self._ahead = model.vectors() if self._damped else None
+        self._move_ahead = model.kernel(kernels.move_ahead, model.dtype)
+        self._step = model.kernel(kernels.explicit_step, model.dtype, symplectic, compensated)
+        self._given = [model.inverse_mass, model.gravity, model.per_copy, h]
+
+    def launch(self, steps, move_pins):
+        """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        model, (x, v) = self.model, self.state
+        for _ in range(steps):
+            model.refresh(STEP, Moment(x))
+            model.refresh(STEP, Moment(x), self._damped)
+            self._elastic.add(x, self._gradient, self.residual)
+            if self._damped:
+                model.launch(self._move_ahead, model.count, [v, self._given[-1]], [self._ahead])
+                self._dissipative.add(x, self._gradient, self._ahead)
+            model.launch(self._step, model.count, self._given, [self._gradient, x, v, self.residual])
+            move_pins(*self._pins, x, v)

@@ -1,0 +1,59 @@
+"""Jacobi sweeps as they are written: local steps of the elements, the transpose, a move. Faster ones are compared with it."""
+
+import warp as wp
+
+from ..kernels import jacobi as kernels
+from ..kernels.transpose import stored
+from ..terms.refresh import EVALUATION, Moment
+from .transpose import Transpose
+
+
+class JacobiSweeps:
+    """Sweeps of several launches, on any device.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        x: x̃, (N,) vectors [m]; read only.
+        h: Step [s].
+        correction: d (N,) [m], which sweeps move on.
+        multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, or Nones.
+        keys: Of each term (term, dtype, whether it is taken by its scalar constraint).
+        factors: Factors of Δλ, of each term (B·E,).
+        scale: Factors of the moves of vertices (N,).
+        spread: The number of sweeps that finite stiffness is spread over, or None.
+    """
+
+    def __init__(self, model, x, h, correction, multipliers, keys, factors, scale, spread):
+        self.model, self.x, self.correction, self.multipliers = model, x, correction, multipliers
+        more = any(array is not None for array in multipliers), spread is not None
+        self._move, self._total = model.kernel(kernels.move_vertices, model.dtype), model.vectors()
+        self._given, self._scale, self._terms = [h, spread or 1], scale, []
+        factories = kernels.scatter_moves, kernels.gather_moves
+        for elements, key, factor, lambdas in zip(model.terms, keys, factors, multipliers, strict=True):
+            data = stored(elements.term, model.dtype).data()
+            z = wp.zeros(elements.count, dtype=wp.types.matrix((elements.term.rows, 3), model.dtype), device=model.device)
+            data.z = z
+            kernel = model.kernel(kernels.local_steps, *key, *more)
+            transpose = Transpose(model, elements, *factories, elements.term, model.dtype)
+            self._terms.append((elements, kernel, factor, lambdas, z, transpose, data))
+
+    def launch_start(self):
+        """Launches d = 0, λ = 0."""
+        for array in (self.correction, self._total, *self.multipliers):
+            if array is not None:
+                array.zero_()
+
+    def launch(self, sweeps=1):
+        """Launches so many sweeps."""
+        model, d = self.model, self.correction
+        for _ in range(sweeps):
+            model.refresh(EVALUATION, Moment(self.x, d))
+            for elements, kernel, factor, lambdas, z, transpose, data in self._terms:
+                given = [*elements.arguments, model.inverse_mass, factor, self.x, d, *self._given]
+                model.launch(kernel, elements.count, given, [lambdas, z])
+                transpose.add(data, self._total)
+            model.launch(self._move, model.count, [model.inverse_mass, self._scale], [self._total, d])
+
+    def parts(self, sweeps):
+        """Returns pairs of a function that launches and of how many times it runs, for so many sweeps."""
+        return [(self.launch, sweeps)]

@@ -1,0 +1,83 @@
+"""Explicit steps by blocks of vertices, for the CPU: one launch a step, of one thread a copy."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import warp as wp
+
+from ..core.explicit_step import StepRecord
+from ..core.gradient import Gradient
+from ..kernels.fast import block_step as kernels
+from ..kernels.fast.parts import Part
+from ..terms.refresh import STEP, Moment
+from .block_layout import block_layout
+from .quadratic_pairs import as_pairs
+from .structs import chained, int32_array
+
+
+class Window(NamedTuple):
+    """What a step reads of consecutive vertices of a model, which are numbered from the first of them.
+
+    Attributes:
+        terms: Their :class:`warpcloth.model.model.DeviceElements`.
+        inverse_mass: (N,) [1/kg].
+        pins, keyframes: Those of the moved pins that are among them, or None.
+    """
+
+    terms: Sequence
+    inverse_mass: wp.array
+    pins: wp.array | None
+    keyframes: wp.array | None
+
+
+class BlockStep:
+    """Steps of one launch, see :func:`warpcloth.kernels.fast.block_step.block_step`. Terms that are refreshed are added before.
+
+    Elements of a quadratic energy that is not damped are taken as the pairs of their matrix, see
+    :mod:`warpcloth.fast.quadratic_pairs`.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        state: x and v (N,), which steps move on.
+        h: Step [s].
+        symplectic: Whether x moves on by the v after the step.
+        count: Steps that moved pins have made (B,) int32, or None.
+        compensated: Whether x is moved on by compensated summation.
+        window: The :class:`Window` of the vertices of ``state``, if these are not all of the model.
+
+    Attributes:
+        residual: What x is rounded by (N,) [m], or None.
+        record: :class:`warpcloth.core.explicit_step.StepRecord`.
+    """
+
+    def __init__(self, model, state, h, symplectic, count, compensated=False, window=None):
+        self.model, self.state = model, state
+        window = window or Window(model.terms, model.inverse_mass, model.pins, model.keyframes)
+        self._pins = window.pins, window.keyframes, count
+        refreshed, others = ([each for each in window.terms if (each.refresh is not None) == apart] for apart in (True, False))
+        self._refreshed, self._gradient = Gradient(model, terms=refreshed), wp.zeros_like(state[0])
+        swept = [as_pairs(model, elements) for elements in others]
+        pairs = tuple(now.label for now, before in zip(swept, others, strict=True) if now is not before)
+        self.record = StepRecord("blocks", pairs=pairs, compensated=compensated)
+        vertices, swept, arrays, numbers = block_layout(swept, len(state[0]) // model.copies, model.copies)
+        damped = [elements.damping is not None for elements in swept]
+        parts = [Part(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
+        # Contracted as on CUDA, where a product is added without being rounded: springs then take 0.8 of the time.
+        flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
+        self._kernel = model.kernel(kernels.block_step, tuple(parts), model.dtype, symplectic, flags, compensated)
+        self.residual = wp.zeros_like(state[0]) if compensated else None
+        self._arrays = arrays  # whose memory the structs do not keep
+        scratch = [
+            wp.zeros(size, dtype=model.dtype, device=model.device) for size in (numbers, numbers * (compensated or any(damped)))
+        ]
+        chain = chained(parts, arrays, model.dtype)
+        self._given = [chain, int32_array(vertices, model.device), window.inverse_mass, model.gravity, h, *scratch]
+
+    def launch(self, steps, move_pins):
+        """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        model, (x, v) = self.model, self.state
+        for _ in range(steps):
+            model.refresh(STEP, Moment(x), self._refreshed.terms)
+            self._refreshed.add(x, self._gradient)
+            model.launch(self._kernel, model.copies, self._given, [self._gradient, x, v, self.residual])
+            move_pins(*self._pins, x, v)

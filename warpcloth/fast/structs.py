@@ -1,0 +1,35 @@
+"""Structs of the arrays of all terms, which fast kernels read in one launch."""
+
+import numpy as np
+import warp as wp
+
+from ..kernels.fast.parts import chain_of, elements_struct
+
+
+def chained(parts, arrays, dtype, struct_of=elements_struct):
+    """The struct of all terms: that of the first, and the chain of the others.
+
+    Args:
+        parts: What ``struct_of`` takes, of each term.
+        arrays: The values of each struct, by name.
+        dtype: A Warp scalar type.
+        struct_of: As :func:`warpcloth.kernels.fast.parts.chain_of` takes it.
+    """
+    made = chain_of(tuple(parts), dtype, struct_of)()
+    if parts:
+        made.first = filled(struct_of(parts[0], dtype), arrays[0])
+        made.others = chained(parts[1:], arrays[1:], dtype, struct_of)
+    return made
+
+
+def filled(struct, values):
+    """A struct of these values, by name."""
+    made = struct()
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made
+
+
+def int32_array(values, device):
+    """Whole numbers (n,) on the device."""
+    return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=device)
