@@ -1,0 +1,76 @@
+"""The descent that Newton's method and equilibrium share: when it has done what a precision allows, and which steps it takes."""
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.core.status import Result
+from warpcloth.numerics.minimise import Minimiser
+
+EPS = float(np.finfo(np.float32).eps)
+LENGTH = 0.25
+
+
+def sagging(stiffness, apart):
+    """A crumpled sheet, which descends slowly, beside a spring at rest and one between pins that is too long by ``apart`` [m].
+
+    The first of these has no force but what its length is rounded by, the other one has a large energy that stays.
+    """
+    grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
+    corner = LENGTH * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    points = np.concatenate([grid.points, corner + [3.0, 0.0, 0.0], corner + [6.0, 0.0, 0.0]])
+    mesh = wc.Mesh(points, np.concatenate([grid.triangles, [[25, 26, 27], [28, 29, 30]]]))
+    start = points.copy()
+    start[:25, 1] = 1e-3 * np.random.default_rng(0).normal(size=25)
+    start[28, 0] -= apart
+    terms = [wc.QuadraticBending(stiffness=1e-3), wc.Spring(pairs=[[25, 26], [28, 29]], stiffness=[stiffness, 1e4])]
+    return wc.Scene(mesh, masses=np.full(31, 0.01), positions=start, terms=terms, pins=[28, 29, 30])
+
+
+def descent(scene, device, iterations=1000):
+    """By one iteration of conjugate gradients a time, from the positions of a scene, with hardly any inertia."""
+    model = scene.build(device=device)
+    minimiser = Minimiser(model, model.positions, "raw", "cg", s=1e-6, linear_iterations=1)
+    return minimiser, minimiser.minimise(1e-30, iterations)[0]
+
+
+def test_a_descent_ends_where_it_gains_what_rounding_loses(device):
+    """The force kε of a length at both ends of a spring loses ε²kl² at worst; roundings are even in ±½ε, and lose 1/12 of it."""
+    scene, stiffness = sagging(1e4, 0.0), 1e4
+    minimiser, result = descent(scene, device)
+    assert result is Result.ROUNDED
+    before, _ = descent(scene, device, minimiser.iterations - 1)
+    gain = before.search.energy.numpy()[0] - minimiser.search.energy.numpy()[0]
+    # From one iteration to the next gains become less by some per cent.
+    assert 0.5 < gain / (EPS**2 * stiffness * LENGTH**2 / 12.0) < 2.0
+
+
+def test_a_descent_goes_on_where_a_large_energy_hides_its_gains(device):
+    """Until the gradient is what is rounded of the forces of both ends of a spring.
+
+    That is εkl of the length and of the coordinates each, and as much again of the strain, the product and the sum.
+    """
+    stiffness = 10.0
+    minimiser, result = descent(sagging(stiffness, 1.0), device)
+    assert result is Result.ROUNDED and minimiser.iterations > 10
+    roundings = np.linalg.norm(minimiser.search.gradient.numpy()) / (np.sqrt(2.0) * EPS * stiffness * LENGTH)
+    assert 4.0 < roundings <= 8.0
+
+
+@pytest.mark.parametrize("apart", [1e-4, 1e-3])
+def test_a_quadratic_energy_takes_one_whole_step(apart, device):
+    """Of copies pulled to two sides, whose energy k(1 + s²) has no digits for s²: its rounding may not halve the step."""
+    copies, random = 64, np.random.default_rng(1)
+    targets = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    terms = [wc.Attachment(vertices=[0], targets=targets[[side]], stiffness=100.0, name=f"side {side}") for side in (0, 1)]
+    mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), edges=[[0, 1]])
+    scene = wc.Scene(mesh, masses=[1.0, 1.0], terms=terms, pins=[1])
+    start = np.repeat(mesh.points[None], copies, axis=0)
+    start[:, 0] = apart * random.uniform(-1.0, 1.0, (copies, 3))
+    model = scene.build(device=device, copies=copies, vary={"positions": start})
+    minimiser = Minimiser(model, model.positions, "raw", "cg", s=0.0)
+    minimiser.minimise(1e-30, 1)
+    assert (minimiser.search.step.numpy() == 1.0).all()
+    found = (model.positions.numpy() + minimiser.correction.numpy()).reshape(copies, 2, 3)[:, 0]
+    # Each of two forces of 100 N is rounded by ε of it.
+    assert np.abs(found).max() < 2.0 * EPS
