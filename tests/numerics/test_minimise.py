@@ -1,4 +1,4 @@
-"""The descent that Newton's method and equilibrium share: when it has done what a precision allows, and which steps it takes."""
+"""The descent that Newton's method and equilibrium share: where it ends for its precision, and which steps it takes."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def sagging(stiffness, apart):
     """
     grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
     corner = LENGTH * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    points = np.concatenate([grid.points, corner + [3.0, 0.0, 0.0], corner + [6.0, 0.0, 0.0]])
+    points = np.concatenate([grid.points, np.add(corner, [3.0, 0.0, 0.0]), np.add(corner, [6.0, 0.0, 0.0])])
     mesh = wc.Mesh(points, np.concatenate([grid.triangles, [[25, 26, 27], [28, 29, 30]]]))
     start = points.copy()
     start[:25, 1] = 1e-3 * np.random.default_rng(0).normal(size=25)
@@ -35,7 +35,7 @@ def descent(scene, device, iterations=1000):
 
 
 def test_a_descent_ends_where_it_gains_what_rounding_loses(device):
-    """The force kε of a length at both ends of a spring loses ε²kl² at worst; roundings are even in ±½ε, and lose 1/12 of it."""
+    """Of a spring of length l both ends lose ε²kl² where forces are off by εkl; roundings are even in ±½ε, and lose 1/12 of it."""
     scene, stiffness = sagging(1e4, 0.0), 1e4
     minimiser, result = descent(scene, device)
     assert result is Result.ROUNDED

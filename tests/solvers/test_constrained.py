@@ -319,6 +319,19 @@ def test_rounding_is_no_contradiction(linear, device):
         assert stepper.results[0] in (Result.CONVERGED, Result.ROUNDED)
 
 
+@each_linear
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_what_the_least_compliance_leaves_open_is_no_contradiction(dtype, linear, device):
+    """Of n hard links at rest the first carries n masses: α̃λ = 2ε^0.7/m · nmgh², at any tolerance."""
+    mesh = wc.Mesh.chain(21)
+    hard = [wc.Spring(stiffness=np.inf)]
+    declared = wc.Scene(mesh, masses=np.full(21, 0.1), terms=hard, pins=[0], fps=60.0)
+    eps = float(np.finfo(dtype).eps)
+    stepper, x = after(declared, constrained(tolerance=eps, linear=linear), device, dtype)
+    assert stepper.results[0] in (Result.ROUNDED, Result.ITERATIONS_USED_UP)
+    assert 0.0 < -1.0 - x[-1, 1] < 20 * 2.0 * 20 * eps**0.7 * 9.81 / 60.0**2 + 20 * eps
+
+
 # --- statics and edges of what is allowed
 
 
