@@ -35,7 +35,7 @@ def descent(scene, device, iterations=1000):
 
 
 def test_a_descent_ends_where_it_gains_what_rounding_loses(device):
-    """Of a spring of length l both ends lose ε²kl² where forces are off by εkl; roundings are even in ±½ε, and lose 1/12 of it."""
+    """A force εkl at both ends of a spring of length l loses ε²kl²; of roundings, which are even in ±½ε, 1/12 of it."""
     scene, stiffness = sagging(1e4, 0.0), 1e4
     minimiser, result = descent(scene, device)
     assert result is Result.ROUNDED
