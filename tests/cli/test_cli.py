@@ -19,6 +19,7 @@ import warpcloth.cli.run
 import warpcloth.usd
 from support.command_line import refused, run
 from warpcloth.base.outputs import Lock
+from warpcloth.base.texts import convert
 from warpcloth.run import scene_files
 from warpcloth.scene.scene import Scene
 from warpcloth.solvers import explicit
@@ -470,7 +471,7 @@ def test_no_command_and_help(capfd):
     ],
 )
 def test_texts_become_values(text, kinds, value):
-    found = scene_files.convert("x", text, kinds)
+    found = convert("x", text, kinds)
     assert found == value and type(found) is type(value)
 
 

@@ -16,8 +16,9 @@ from warpcloth.chart.maps import _PLAIN, plot_maps, write_table
 from warpcloth.cli import _parser, main
 from warpcloth.cli.stability import _survey
 from warpcloth.lab import machine, stability
-from warpcloth.lab.axes import AXES, FIXED, applied, record_at, scene_at, vary
+from warpcloth.lab.axes import AXES, FIXED
 from warpcloth.lab.campaign import Store, sweep
+from warpcloth.lab.cells import applied, record_at, scene_at, vary
 from warpcloth.lab.failures import FAILURES
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.stability import Survey, boundary, measure

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .extensions import extensions
+
 
 def scene_digest(scene):
     """A hash of all of a scene that its motion depends on, whatever it is called and how long it goes on.
@@ -43,9 +45,20 @@ def _add(digest, value):
         raise ValueError(f"a scene has {value!r}, a {type(value).__name__}; a key needs numbers, texts, lists and arrays")
 
 
-@cache
 def source_digest():
-    """A hash of the code of this package: what another version measured is measured again."""
+    """A hash of the code of this package and of the extensions that are used: what another version measured is measured again."""
+    files = [file for files in extensions().values() for file in files]
+    if not files:
+        return package_digest()
+    digest = hashlib.sha256(package_digest().encode())
+    for file in sorted(files, key=lambda file: file.name):
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def package_digest():
+    """A hash of the code of this package."""
     root, digest = Path(__file__).parents[1], hashlib.sha256()
     folders = os.walk(root, followlinks=True)  # in a checkout the folder of kernels is a link
     files = [Path(folder) / name for folder, _, names in folders for name in names if name.endswith(".py")]

@@ -77,7 +77,7 @@ class Interrupts:
     """
 
     def __init__(self):
-        self.code, self.over = 128 + signal.SIGINT, False
+        self.code, self.over, self._loading = 128 + signal.SIGINT, False, False
 
     def __enter__(self):
         self._before = {}
@@ -104,7 +104,18 @@ class Interrupts:
             again.daemon = True
             again.start()
 
+    @contextmanager
+    def loading(self):
+        """Makes an interrupt end the process at once, because an import may swallow an exception."""
+        self._loading = True
+        try:
+            yield
+        finally:
+            self._loading = False
+
     def _interrupt(self, number, _frame):
+        if self._loading and not self.over:
+            leave(number, _frame)
         if not self.over:
             self.code = 128 + number
             raise KeyboardInterrupt

@@ -10,6 +10,8 @@ import warnings
 
 from .interrupts import deferred
 
+# Of the files that USD writes and reads as stages.
+STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 TEXT = {"encoding": "utf-8", "newline": ""}
 
 

@@ -6,15 +6,20 @@ import tempfile
 from functools import cache
 
 from .checks import shown
-from .kernel_cache import described
+from .kernel_cache import described, mend
 
 
-def leave_out_news():
-    """Sets Warp's log level to warnings if it is still Warp's default; a level that the user sets, before or later, is kept."""
+@cache
+def prepare_warp():
+    """Makes Warp leave out its news, and repair its cache of kernels: once, before it is initialised.
+
+    Its log level is set to warnings if it is still the default; a level that the user sets, before or later, is kept.
+    """
     import warp as wp
 
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
+    mend()
 
 
 def find_device(name):
@@ -35,13 +40,14 @@ def find_device(name):
 
 @cache
 def initialise_warp():
-    """Initialises Warp, without its line about a missing driver if only the CPU is asked for.
+    """Initialises Warp after :func:`prepare_warp`, without its line about a missing driver if only the CPU is asked for.
 
     Raises:
         OSError: The folder of compiled kernels cannot be made.
     """
     import warp as wp
 
+    prepare_warp()
     try:
         sys.stderr.flush()
         before = os.dup(2)

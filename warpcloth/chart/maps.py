@@ -6,7 +6,8 @@ import math
 import numpy as np
 
 from ..base.outputs import TEXT, Output
-from ..lab.axes import AXES, FRAMES
+from ..lab.axes import AXES
+from ..lab.cells import FRAMES
 from ..lab.stability_limits import DIVERGES, KNOWN
 from ..picture.figures import GREY, PICTURES, check_path, save
 

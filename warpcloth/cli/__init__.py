@@ -5,6 +5,9 @@ Exit codes: 0 success (converged, completed, or iterations used up, which the su
 saved), 2 wrong use (one line on stderr), 130 interrupted by Ctrl-C and 143 by SIGTERM, as in shells (a line says what is
 saved). Any other error ends with 2 and one line as well, because most come from a scene file; ``--debug`` prints the traceback
 above the line.
+
+Help and completion answer without Warp: modules of commands import what loads it where they use it, and `main` imports it all
+at once before it runs a command. No other part of the package defers an import of its own modules.
 """
 
 import argparse
@@ -17,7 +20,7 @@ import numpy as np
 
 from ..base.interrupts import Interrupts
 from . import analyze, bench, chart, choose, compare, deform, options, run
-from .terminal import Printable, say, show_warning
+from .terminal import DTYPES, Printable, say, show_warning
 
 
 def main(argv=None):
@@ -36,6 +39,7 @@ def main(argv=None):
         warnings.filterwarnings("default", category=DeprecationWarning, module=r"warpcloth\.")  # an option has another name now
         debug = False
         try:
+            options.load_extensions(sys.argv[1:] if argv is None else argv)
             parser = _parser()
             options.complete(parser)
             try:
@@ -46,6 +50,8 @@ def main(argv=None):
                 parser.print_help(sys.stderr)
                 return 2
             debug = arguments.debug
+            with interrupts.loading():
+                from .. import api  # noqa: F401
             if options.asks_for_help(arguments):
                 return options.show_help(arguments)
             return arguments.command(arguments)
@@ -87,9 +93,6 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser():
-    from ..model.model import DTYPES
-    from ..solvers import SOLVERS
-
     parser = _Parser(prog="warpcloth", description="Cloth simulation, written as USD.", allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"warpcloth {_version()}")
     parser.set_defaults(command=None)
@@ -100,6 +103,7 @@ def _parser():
         sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False, formatter_class=form, **more)
         sub.set_defaults(command=command)
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        options.add_import(sub)
         return sub
 
     runs = add("run", run.run, "Run a scene and write its animation as USD.", epilog=run.EPILOG)
@@ -118,7 +122,7 @@ def _parser():
     bench.add_arguments(benches)
     for sub in (runs, info):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-        sub.add_argument("--solver", choices=SOLVERS, help="the solver; newton if not given")
+        sub.add_argument("--solver", choices=options.solvers(), help="the solver; newton if not given")
         for option, of, text in (("-s", "option", "options of the solver"), ("-p", "parameter", "parameters of the scene")):
             text = f"{text}; '{option} help' lists them"
             sub.add_argument(option, nargs="+", action="extend", default=[], metavar=f"{of}=value", help=text)

@@ -6,8 +6,7 @@ from pathlib import Path
 from ..base.checks import choice
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
-from ..mesh.mesh import UP_AXES
-from ..run import scene_files
+from ..base.texts import convert
 from .terminal import Progress, as_json, check_writable, frames_folder_of, place
 
 EPILOG = """\
@@ -59,7 +58,7 @@ def add_arguments(parser):
         metavar=("LOW", "HIGH"),
         help="range of the colours (default: that of all frames, without the last 1 %%)",
     )
-    add("--up-axis", choices=UP_AXES, help="up axis of an input that does not say (default: Y)")
+    add("--up-axis", choices=("Y", "Z"), help="up axis of an input that does not say (default: Y)")
     add("--curves", action="store_true", help="show the principal directions as curves")
     add("--csv", metavar="FILE", help="a table: percentiles of every frame, the worst element and its position")
     add("--report", metavar="FILE", help="the same, with what could not be measured, as JSON")
@@ -154,7 +153,7 @@ def _analyzer(arguments):
     sequence = open_sequence(arguments.input, arguments.prim, arguments.fps, rest)
     directions = arguments.directions
     if directions is not None and directions != "st":
-        directions = [scene_files.convert("--directions", number, (float,)) for number in directions.split(",")]
+        directions = [convert("--directions", number, (float,)) for number in directions.split(",")]
     return Analyzer(
         sequence,
         rest,

@@ -5,7 +5,8 @@ from datetime import datetime, timezone
 from ..base.checks import whole
 from ..base.outputs import Output, check_apart
 from ..base.quiet import find_device
-from ..run.scene_files import assignments, options
+from ..base.texts import assignments, options
+from .options import DEFAULT, solvers
 from .run import named_scene, solver_setup
 from .terminal import Interrupted, as_json, check_writable, open_bar, say
 
@@ -32,12 +33,10 @@ _OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": 
 
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
-    from ..solvers import SOLVERS
-
     add = parser.add_argument
     add("scene", nargs="?", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
     add("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
-    add("--solver", choices=SOLVERS, help="the solver; newton if not given")
+    add("--solver", choices=solvers(), help="the solver; newton if not given")
     add("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
     add("--sizes", nargs="+", type=int, default=[], metavar="N", help="resolutions of the scene, values of its parameter")
     add(
@@ -90,7 +89,7 @@ def _benchmarks(arguments, device):
     """
     from ..lab.benchmarks import Benchmark, standard
     from ..lab.measurements import SceneRef, Setup
-    from ..solvers import DEFAULT, SOLVERS
+    from ..solvers import SOLVERS
 
     given = {
         "device": str(device),

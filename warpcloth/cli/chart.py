@@ -6,13 +6,16 @@ from collections import Counter
 
 from ..base.checks import number, whole
 from ..base.quiet import find_device
+from ..base.texts import assignments
 from ..picture.figures import PICTURES
-from ..run.scene_files import assignments
 from . import stability
+from .options import add_import, solvers
 from .run import named_scene
-from .terminal import add_dask, as_json, check_outputs, measuring
+from .terminal import DTYPES, add_dask, as_json, check_outputs, measuring
 
 TEXT = "Chart speed against accuracy, stability and failures."
+# Those of :data:`warpcloth.lab.failures.FAILURES`, which loads Warp.
+FAILURES = ("locking", "isometry", "slivers", "cotangents", "rank")
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
 
 EPILOG = """\
@@ -62,18 +65,16 @@ def add(charts, name, command, text, epilog):
     sub.add_argument("--csv", metavar="FILE", help="write a table")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
     sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_import(sub)
     return sub
 
 
 def _add_work_precision(charts):
-    from ..model.model import DTYPES
-    from ..solvers import SOLVERS
-
     sub = add(charts, "work-precision", work_precision, "Error over time, of settings of all solvers.", EPILOG)
     sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
     sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
     sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="which diagram")
-    sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=SOLVERS, help="measure these solvers only")
+    sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure these solvers only")
     sub.add_argument("--frames", type=int, metavar="N", help="frames to run (default: half), or before a step (a third)")
     sub.add_argument("--dtype", choices=DTYPES, help="default: float32 for motion, float64 for a step")
     sub.add_argument(
@@ -82,8 +83,6 @@ def _add_work_precision(charts):
 
 
 def _add_failure(charts):
-    from ..lab.failures import FAILURES
-
     sub = add(charts, "failure", failure, "Chart where terms, weights and fits fail, beside theory.", FAILURE_EPILOG)
     sub.add_argument("failure", metavar="FAILURE", choices=FAILURES, help=f"one of {', '.join(FAILURES)}")
 

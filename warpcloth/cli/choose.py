@@ -4,7 +4,7 @@ import shlex
 import sys
 
 from ..base.quiet import find_device
-from ..run import scene_files
+from ..base.texts import assignments, milliseconds, share
 from .run import named_scene
 from .terminal import Interrupted, Settings, add_dask, as_json, executing
 
@@ -47,13 +47,13 @@ def chosen(arguments, device):
     from ..lab.measurements import SceneRef
 
     _source, values, _scene = named_scene(arguments)
-    tolerance = None if arguments.tolerance is None else scene_files.share("tolerance", arguments.tolerance)
-    budget = None if arguments.budget is None else scene_files.milliseconds("budget", arguments.budget)
+    tolerance = None if arguments.tolerance is None else share("tolerance", arguments.tolerance)
+    budget = None if arguments.budget is None else milliseconds("budget", arguments.budget)
     progress = Settings()
     try:
         with executing(arguments) as executor:
             choice, found, exact = choose(
-                SceneRef(arguments.scene, scene_files.assignments(arguments.p), getattr(arguments, "pins", None)),
+                SceneRef(arguments.scene, assignments(arguments.p), getattr(arguments, "pins", None)),
                 tolerance,
                 budget,
                 arguments.solvers,
@@ -94,7 +94,7 @@ def take_choice(arguments, device):
 def command_line(arguments, values, setup):
     """The command that runs a scene with a setup."""
     words = ["warpcloth", "run", arguments.scene]
-    given = [f"{name}={value}" for name, value in values.items() if name in scene_files.assignments(arguments.p)]
+    given = [f"{name}={value}" for name, value in values.items() if name in assignments(arguments.p)]
     words += ["-p", *given] if given else []
     words += ["--solver", setup.solver, "-s", *(f"{name}={value}" for name, value in setup.options.items())]
     words += [] if arguments.frames is None else ["--frames", str(arguments.frames)]

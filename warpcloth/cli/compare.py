@@ -7,7 +7,6 @@ import numpy as np
 from ..base.checks import whole
 from ..base.outputs import TEXT, Output, check_apart
 from ..base.quiet import find_device
-from ..mesh.mesh import UP_AXES
 from ..picture.figures import PICTURES, check_path
 from .terminal import Progress, as_json, check_writable
 
@@ -31,9 +30,9 @@ def add_arguments(parser):
         parser.add_argument(f"--prim-{name}", metavar="PRIM", help=f"path or name of the prim of {of}, if it has several")
         parser.add_argument(f"--rest-{name}", metavar="MESH", help=f"mesh file with the rest shape of {of}")
         parser.add_argument(f"--fps-{name}", type=float, metavar="FPS", help=f"frames per second of {of} alone")
-        parser.add_argument(f"--up-axis-{name}", choices=UP_AXES, help=f"up axis of {of} alone")
+        parser.add_argument(f"--up-axis-{name}", choices=("Y", "Z"), help=f"up axis of {of} alone")
     parser.add_argument("--fps", type=float, help="frames per second of both, if they do not say")
-    parser.add_argument("--up-axis", choices=UP_AXES, help="up axis of both, which overrides their own")
+    parser.add_argument("--up-axis", choices=("Y", "Z"), help="up axis of both, which overrides their own")
     parser.add_argument("--frames", type=int, metavar="N", help="frames after the first (default: all)")
     parser.add_argument("--csv", metavar="FILE", help="write a line for each frame")
     parser.add_argument("--plot", metavar="FILE", help=f"draw the distances over time, as {', '.join(PICTURES)}")

@@ -11,8 +11,9 @@ import numpy as np
 
 from ..base.checks import whole
 from ..base.limits import refuse_memory
+from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
-from ..run import scene_files
+from ..base.texts import convert
 from .run import named_scene
 from .terminal import Progress, as_json, check_writable, frames_folder_of, place
 
@@ -100,7 +101,7 @@ def _last(namespace, option, field):
 
 
 def _number(name, text):
-    value = scene_files.convert(name, text, (float,))
+    value = convert(name, text, (float,))
     if not math.isfinite(value):
         raise ValueError(f"{name} is {text!r}; it must be finite")
     return value
@@ -188,7 +189,7 @@ def _given(arguments):
         given = {"mesh": scene.mesh, "pins": pins, "fps": scene.fps, "stage": scene.stage, "up_axis": scene.up_axis}
         return scene.name, values, given
     _refuse(arguments, ("p",), "is a mesh and has no parameters")
-    if path.suffix.lower() in scene_files.STAGES:
+    if path.suffix.lower() in STAGE_ENDINGS:
         from ..usd import read_stage_mesh
 
         stage = read_stage_mesh(arguments.mesh, arguments.prim)
@@ -209,7 +210,9 @@ def _refuse(arguments, names, why):
 
 
 def _handles(mesh, fixes, moves, frames):
-    """Vertices (p,) that are held or moved, and their places (frames + 1, p, 3)."""
+    """Returns vertices (p,) that are held or moved, and their positions (frames + 1, p, 3)."""
+    from ..mesh.selection import some_vertices
+
     if not moves:
         raise ValueError("nothing moves; give --move SELECTION and after it --rotate or --translate")
     for move in moves:
@@ -217,7 +220,7 @@ def _handles(mesh, fixes, moves, frames):
             raise ValueError(f"--move {move.selection!r} does not say how; --rotate or --translate must follow it")
     named = [(f"--fix {text!r}", text, None) for text in fixes]
     named += [(f"--move {move.selection!r}", move.selection, move) for move in moves]
-    groups = [(option, scene_files.some_vertices(option, text, mesh), move) for option, text, move in named]
+    groups = [(option, some_vertices(option, text, mesh), move) for option, text, move in named]
     owners = np.full(len(mesh.points), -1)
     for number, (option, vertices, move) in enumerate(groups):
         taken = vertices[owners[vertices] >= 0]

@@ -1,13 +1,24 @@
-"""Lists options of solvers and parameters of scenes for ``-s help`` and ``-p help``, and completes them in a shell."""
+"""Lists options of solvers and parameters of scenes for ``-s help`` and ``-p help``, and completes them in a shell.
 
+Completion reads them from source files, so that it need not wait for Warp; the words that a parameter of a scene takes, alone,
+it has from running the scene.
+"""
+
+import argparse
 import os
+import sys
 import warnings
+from dataclasses import fields
 from functools import partial
 
-from ..run import scene_files
+from ..base.extensions import load, load_installed
+from ..base.outputs import STAGE_ENDINGS
+from ..base.texts import WORDS, kinds_of_parameter, parameters_of, words_of
+from ..run.listing import folders, list_scenes, list_solvers
 from .terminal import as_json
 
 _HELP = "help"
+DEFAULT = "newton"  # solver
 
 
 def asks_for_help(arguments):
@@ -27,16 +38,18 @@ def show_help(arguments):
 
 
 def _of_solver(name):
-    from ..solvers import DEFAULT, SOLVERS
+    from ..solvers import SOLVERS
 
     name = name or DEFAULT
     record = SOLVERS[name]
-    found = _listed(f"-s of {name}", record.__doc__, record, scene_files.parameters_of(record))
+    found = _listed(f"-s of {name}", record.__doc__, record, parameters_of(record))
     return found | {"note": "give dt or substeps, not both; without either a step is chosen"}
 
 
 def _of_scene(name):
-    source = scene_files.find_source(name)
+    from ..run.scene_files import find_source
+
+    source = find_source(name)
     return _listed(f"-p of {source.path}", source.function.__doc__, source.function, source.parameters)
 
 
@@ -80,7 +93,7 @@ class _Refused:
 
 def _allowed(call, name, parameter):
     """Returns the allowed values: from the error for a value that the solver or scene refuses, or else from the type."""
-    kinds = scene_files.kinds_of_parameter(parameter)
+    kinds = kinds_of_parameter(parameter)
     refused = "?" if str in kinds else _Refused()
     for more in ({}, {"substeps": 1}):  # a record checks the step before the rest
         try:
@@ -92,8 +105,29 @@ def _allowed(call, name, parameter):
             if rule and said.startswith(f"{name} is "):
                 break
     else:
-        rule = " or ".join(words for kind, words in scene_files.WORDS.items() if kind in kinds) or "nothing written as text"
+        rule = " or ".join(words for kind, words in WORDS.items() if kind in kinds) or "nothing written as text"
     return rule.replace("'", "") + (", or none" if type(None) in kinds else "")
+
+
+def add_import(parser):
+    """Adds the option that names modules from outside the package."""
+    text = "a module, or a .py file, that registers energies or solvers; see docs/extending.md"
+    parser.add_argument("--import", dest="imports", action="append", default=[], metavar="MODULE", help=text)
+
+
+def load_extensions(argv):
+    """Imports the modules that a command line names, before its parser is built, and those that installed packages name.
+
+    Raises:
+        ValueError: A module of the command line cannot be imported.
+    """
+    if "_ARGCOMPLETE" in os.environ:
+        argv = os.environ.get("COMP_LINE", "").split()
+    only = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    add_import(only)
+    load_installed()
+    for name in only.parse_known_args(argv)[0].imports:
+        load(name)
 
 
 def complete(parser):
@@ -102,7 +136,7 @@ def complete(parser):
         return
     import argcomplete
 
-    files = {"scene": argcomplete.FilesCompleter((*scene_files.STAGES, ".py")), "mesh": argcomplete.FilesCompleter()}
+    files = {"scene": argcomplete.FilesCompleter((*STAGE_ENDINGS, ".py")), "mesh": argcomplete.FilesCompleter()}
     _add_completers(parser, files)
     argcomplete.autocomplete(parser)
 
@@ -120,24 +154,38 @@ def _add_completers(parser, files):
             action.completer = _scene_words
 
 
+def solvers():
+    """Returns the options of each solver by its name: by option the words that it takes, or ()."""
+    found, loaded = list_solvers(), sys.modules.get("warpcloth.solvers")
+    for name, record in loaded.SOLVERS.items() if loaded else ():  # those of extensions too
+        found.setdefault(name, dict.fromkeys((field.name for field in fields(record)), ()) | words_of(record))
+    return found
+
+
 def _scenes(files, prefix, **_):
-    known = {listed.name for folder in scene_files.folders() for listed in scene_files.list_scenes(folder)}
+    known = {listed.name for folder in folders() for listed in list_scenes(folder)}
     return [*sorted(known), *files(prefix)]
 
 
 def _solver_words(prefix, parsed_args, **_):
-    return _words(prefix, _of_solver(getattr(parsed_args, "solver", None)))
+    return _words(prefix, solvers()[getattr(parsed_args, "solver", None) or DEFAULT])
 
 
 def _scene_words(prefix, parsed_args, **_):
-    return _words(prefix, _of_scene(_scene_name(parsed_args)))
+    name, sign, _value = prefix.partition("=")
+    scene = _scene_name(parsed_args)
+    if sign:
+        (rule,) = [row["allowed"] for row in _of_scene(scene)["rows"] if row["name"] == name] or [""]
+        words = rule.removeprefix("one of ").split(", ") if rule.startswith("one of ") else []
+        return _words(prefix, {name: [word.removeprefix("or ") for word in words]})
+    listed = {listed.name: listed for folder in folders()[::-1] for listed in list_scenes(folder)}
+    known = listed[scene].parameters if scene in listed else [row["name"] for row in _of_scene(scene)["rows"]]
+    return _words(prefix, dict.fromkeys((text.partition("=")[0] for text in known), ()))
 
 
-def _words(prefix, found):
-    """Completes ``name=`` for each name, or ``name=value`` for each allowed word once the name is typed."""
+def _words(prefix, options):
+    """Completes ``name=`` for each name, or ``name=value`` for each of its words once the name is typed."""
     name, sign, _value = prefix.partition("=")
     if not sign:
-        return [f"{row['name']}=" for row in found["rows"]] + [_HELP]
-    (rule,) = [row["allowed"] for row in found["rows"] if row["name"] == name] or [""]
-    words = rule.removeprefix("one of ").split(", ") if rule.startswith("one of ") else []
-    return [f"{name}={word.removeprefix('or ')}" for word in words]
+        return [f"{name}=" for name in options] + [_HELP]
+    return [f"{name}={word}" for word in options.get(name, ())]

@@ -8,10 +8,11 @@ import time
 import warnings
 from dataclasses import asdict, dataclass, replace
 
+from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
-from ..core.status import digits
-from ..run import scene_files
-from ..scene.freedom import freedom
+from ..base.texts import assignments, options
+from ..run.listing import folders, list_scenes
+from .options import DEFAULT
 from .terminal import Progress, as_json, check_writable, frames_folder_of, place, say
 
 # A step that all solvers without a limit take well; where no step is given the substeps come nearest to it.
@@ -96,6 +97,8 @@ def _own_output(scene):
 
 
 def _summary(facts):
+    from ..core.status import digits
+
     threads, measured = facts["threads"], facts["residual_measure"] is not None
     residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none, the method does not compute one"
     return "\n".join(
@@ -113,6 +116,8 @@ def _summary(facts):
 
 
 def info(arguments):
+    from ..scene.freedom import freedom
+
     source, values, scene = named_scene(arguments)
     device = find_device(arguments.device)
     if arguments.advise:
@@ -184,27 +189,29 @@ def _info_text(facts):
 
 
 def scenes(arguments):
-    folders = [arguments.folder] if arguments.folder else scene_files.folders()
-    for folder, scenes in [(folder, scene_files.list_scenes(folder)) for folder in folders]:
+    found = [arguments.folder] if arguments.folder else folders()
+    for folder, scenes in [(folder, list_scenes(folder)) for folder in found]:
         print(f"{folder}:")
         for listed in scenes:
             details = [listed.summary, ", ".join(listed.parameters), listed.meaning]
             print(f"  {listed.name}")
             print("".join(f"      {detail}\n" for detail in details if detail), end="")
-    if not folders:
+    if not found:
         print("no folder ./scenes, and none that came with the package; give a folder")
     return 0
 
 
 def named_scene(arguments):
     """(source, values of its parameters, scene) that the arguments name."""
-    source = scene_files.find_source(arguments.scene, getattr(arguments, "pins", None))
+    from ..run.scene_files import find_source
+
+    source = find_source(arguments.scene, getattr(arguments, "pins", None))
     prim = getattr(arguments, "prim", None)
     if prim is not None:  # a parameter of a stage like others, so measurements in other processes get it too
-        if source.path.suffix not in scene_files.STAGES:
+        if source.path.suffix not in STAGE_ENDINGS:
             raise ValueError(f"--prim is given, but {arguments.scene} is not a stage; leave it out")
         arguments.p, arguments.prim = [*arguments.p, f"prim={prim}"], None
-    values = source.values(scene_files.assignments(arguments.p))
+    values = source.values(assignments(arguments.p))
     return source, values, source.scene(values)
 
 
@@ -245,11 +252,11 @@ class _Built:
 
 def solver_setup(arguments, scene, device, limits=False):
     """Returns the solver that the arguments name; ``limits`` asks for those of a limited one even where its step is given."""
-    from ..solvers import DEFAULT, SOLVERS
+    from ..solvers import SOLVERS
 
     arguments.solver = arguments.solver or DEFAULT
     record = SOLVERS[arguments.solver]
-    given = scene_files.options(record, scene_files.assignments(arguments.s))
+    given = options(record, assignments(arguments.s))
     step_given = "dt" in given or "substeps" in given
     solver = record(**given, **({} if step_given else {"substeps": 1}))  # a wrong option is said before anything is built
     if not record.limited:
@@ -284,8 +291,6 @@ def _fewest(fps, limit):
 
 def _hint(arguments, setup, scene):
     """A line for those who may wait longer than they need, or None."""
-    from ..solvers import DEFAULT
-
     substeps = setup.solver.per_frame(scene.fps)
     if not setup.solver.limited or substeps <= _MANY_SUBSTEPS:
         return None

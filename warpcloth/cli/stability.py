@@ -4,15 +4,9 @@ from collections import Counter
 
 from ..base.checks import number, whole
 from ..base.quiet import find_device
-from ..lab.axes import AXES, FIXED, SEED
-from ..lab.campaign import kept, sweep
-from ..lab.machine import machine
-from ..lab.measurements import SceneRef, Setup
-from ..lab.stability import ACCURACY, VERDICTS, Survey
-from ..model.model import DTYPES
-from ..run.scene_files import assignments, convert, options
-from ..solvers import SOLVERS
-from .terminal import as_json, check_outputs, measuring
+from ..base.texts import assignments, convert, options
+from ..lab.axes import ACCURACY, AXES, FIXED, SEED
+from .terminal import DTYPES, as_json, check_outputs, measuring
 
 _COUNT = 9
 
@@ -41,9 +35,7 @@ def add_arguments(parser):
             f"--{of}-range", nargs=3, metavar=("LOW", "HIGH", "N"), help="ends and number of values, a constant factor apart"
         )
     parser.add_argument("--at", nargs="+", action="extend", default=[], metavar="axis=value", help="of other axes (dt=1/60)")
-    parser.add_argument(
-        "--solvers", nargs="+", default=list(SOLVERS), metavar="METHOD", help="methods, see below; all if not given"
-    )
+    parser.add_argument("--solvers", nargs="+", metavar="METHOD", help="methods, see below; all if not given")
     parser.add_argument(
         "--duration", type=float, metavar="SECONDS", help="time of motion that is compared (default: half of that of the scene)"
     )
@@ -56,6 +48,10 @@ def add_arguments(parser):
 
 
 def chart(arguments):
+    from ..lab.campaign import kept, sweep
+    from ..lab.machine import machine
+    from ..lab.stability import VERDICTS
+
     check_outputs(arguments, [arguments.scene])
     device = find_device(arguments.device)
     survey = _survey(arguments)
@@ -91,9 +87,13 @@ def chart(arguments):
 
 
 def _survey(arguments):
-    """What the arguments name."""
+    """Returns what the arguments name."""
+    from ..lab.measurements import SceneRef, Setup
+    from ..lab.stability import Survey
+    from ..solvers import SOLVERS
+
     setups = []
-    for text in arguments.solvers:
+    for text in arguments.solvers or SOLVERS:
         name, _, given = text.partition(":")
         if name not in SOLVERS:
             raise ValueError(f"solver is {name!r}; it must be one of {', '.join(SOLVERS)}")

@@ -17,6 +17,8 @@ from ..base.interrupts import Interrupted
 from ..base.outputs import Output, check_apart
 from ..picture.figures import PICTURES, check_path
 
+# Those of :data:`warpcloth.model.model.DTYPES`, which loads Warp.
+DTYPES = ("float32", "float64")
 # Unicode categories that are escaped: control, format (which can reverse the direction of text), surrogates, ends of lines.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
 

@@ -1,21 +1,12 @@
-"""Axes of a map: what a value of each makes of a scene and of a solver."""
+"""Axes of a map of stability, and what holds where a map has no axis."""
 
-import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..base.checks import number, whole
-from ..run.scene_files import find_source
-from .measurements import Setup
 
-# Approximate number of frames that are compared; a frame has as many steps as that needs.
-FRAMES = 64
-# Noise of the start, over the median edge: what is unstable grows out of it, a hundredfold in energy while springs are linear.
-NOISE = 1e-6
 SEED = 0
-# Parameters of scenes that say how fine they are.
-_RESOLUTIONS = ("n", "links", "elements")
 
 
 @dataclass(frozen=True)
@@ -65,111 +56,5 @@ VARIED = ("stiffness", "mass-ratio", "compression")
 OPTIONS = ("iterations", "relaxation", "weight")
 # Where the map has no axis of that name.
 FIXED = {"dt": 1 / 60}
-
-
-def scene_at(ref, values, steps, duration=None):
-    """Returns the scene of a cell, with frames of one step or more and noise at the start.
-
-    Args:
-        ref: :class:`warpcloth.lab.measurements.SceneRef`.
-        values: Values by name of the axis, ``dt`` among them.
-        steps: Least number of steps, rounded up to whole frames.
-        duration: Least time of motion [s], which has about :data:`FRAMES` frames; by default that of ``steps``.
-
-    Raises:
-        ValueError: The scene cannot have such a value.
-    """
-    number("dt", values["dt"], above=0.0)
-    if "resolution" in values:
-        ref = refined(ref, values["resolution"])
-    scene = ref.load()
-    if scene.pins.keyframes is not None:
-        raise ValueError(
-            f"{scene.name}: its pins move, frame by frame; a map needs pins at rest, for it changes the frame rate"
-        )
-    for name in VARIED:
-        if name in values:
-            scene = applied(scene, name, values[name])
-    compared = steps if duration is None else steps_in(duration, values["dt"])
-    each = -(-compared // FRAMES)
-    frame, frames = each * values["dt"], -(-max(steps, compared) // each)
-    noise = np.random.default_rng(SEED).normal(size=scene.positions.shape)
-    noise *= NOISE * np.median(scene.mesh.edge_lengths)
-    noise[scene.pins.vertices] = 0.0
-    return replace(scene, positions=scene.positions + noise, fps=1.0 / frame, duration=frames * frame)
-
-
-def steps_in(duration, dt):
-    """Returns the fewest steps that last a duration, at least 1, ignoring rounding."""
-    return max(math.ceil(duration / dt * (1.0 - 1e-9)), 1)
-
-
-def refined(ref, value):
-    """The :class:`SceneRef` with a resolution.
-
-    Raises:
-        ValueError: The scene has no parameter for that.
-    """
-
-    known = find_source(ref.name).parameters
-    for name in _RESOLUTIONS:
-        if name in known:
-            return replace(ref, parameters={**ref.parameters, name: int(value)})
-    raise ValueError(f"{ref.name} has no resolution to vary; its scene() must take {' or '.join(_RESOLUTIONS)}")
-
-
-def applied(scene, name, value):
-    """The scene with a value of one of :data:`VARIED`."""
-    if name == "stiffness":
-        return replace(scene, terms=[replace(term, stiffness=value * np.asarray(term.stiffness)) for term in scene.terms])
-    if name == "compression":
-        # About the middle of the pins, so that a cloth that hangs stays where it is held.
-        held = scene.positions[scene.pins.vertices] if len(scene.pins.vertices) else scene.positions
-        middle = held.mean(axis=0)
-        return replace(scene, positions=middle + (1.0 - value) * (scene.positions - middle))
-    masses = scene.vertex_masses.copy()
-    masses[_furthest(scene)] *= value
-    return replace(scene, density=None, masses=masses)
-
-
-def vary(scene, name, values):
-    """``vary`` of a model whose copies differ in one of :data:`VARIED`, from the scene of :func:`scene_at` without it."""
-    each = [applied(scene, name, value) for value in values]
-    if name == "stiffness":
-        stiffness = [[np.asarray(term.stiffness) for term in one.terms] for one in each]
-        return {
-            f"{term.label}.stiffness": np.array(column)
-            for term, column in zip(scene.terms, zip(*stiffness, strict=True), strict=True)
-        }
-    if name == "compression":
-        return {"positions": np.array([one.positions for one in each])}
-    return {"masses": np.array([one.vertex_masses for one in each])}
-
-
-def together(scene, name):
-    """Whether copies of one model can differ in it: terms of one name cannot be told apart."""
-    labels = [term.label for term in scene.terms]
-    return name in VARIED and (name != "stiffness" or len(set(labels)) == len(labels))
-
-
-def record_at(setup, values):
-    """The options record of a cell.
-
-    Raises:
-        ValueError: The solver has no option of that name, or a value breaks its rule.
-    """
-    record = Setup(setup.solver, {**setup.options, "dt": values.get("dt", FIXED["dt"])}).record()
-    known = {field.name for field in fields(record)}
-    for name in OPTIONS:
-        if name in values:
-            if name not in known:
-                raise ValueError(f"{setup.solver} has no {name}")
-            record = replace(record, **{name: values[name]})
-    return record.without_limits()
-
-
-def _furthest(scene):
-    """The vertex furthest from the pins, or without pins from the middle."""
-    points = scene.mesh.points
-    pins = points[scene.pins.vertices] if len(scene.pins.vertices) else points.mean(axis=0)[None]
-    return int(np.linalg.norm(points[:, None] - pins, axis=-1).min(axis=1).argmax())
+# RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
+ACCURACY = 0.01

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from ..base.quiet import initialise_warp
 from ..solvers import SOLVERS
 from . import bandwidth
-from .axes import refined
 from .campaign import sweep
+from .cells import refined
 from .measurements import SceneRef, Setup, task
 from .setups import label, setups_of_runs
 from .timing import measure
@@ -23,7 +23,7 @@ class Benchmark:
     Attributes:
         scene: Of any size.
         setup: Of a limited solver without a step, the fewest stable substeps of each size.
-        sizes: Resolutions of the scene, see :func:`warpcloth.lab.axes.refined`; without any the scene as it is.
+        sizes: Resolutions of the scene, see :func:`warpcloth.lab.cells.refined`; without any the scene as it is.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
         frames: To time at most.

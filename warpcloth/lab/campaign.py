@@ -5,12 +5,14 @@ import json
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from ..base.digest import source_digest
+from ..base.extensions import extensions, load
 from ..base.quiet import initialise_warp
 from .measurements import run
 
@@ -141,7 +143,7 @@ def _processes(workers):
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
     try:
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin, initargs=(_own(),)) as pool:
             try:
                 yield pool
             except BaseException:
@@ -155,14 +157,22 @@ def _processes(workers):
                 os.environ[name] = value
 
 
-def _begin():
-    """In each process: an interruption ends it without a word, as the first process says what there is to say.
+def _own():
+    """Returns the extensions that a process must load; those of a script it has by running that again."""
+    script = getattr(sys.modules["__main__"], "__file__", None)
+    return [name for name in extensions() if name != script]
+
+
+def _begin(modules):
+    """In each process: loads extensions. An interruption ends it without a word, as the first process says what there is.
 
     It also ends when that was killed, which leaves it waiting for ever.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     initialise_warp()
+    for module in modules:
+        load(module)
 
 
 def _end_with(parent):

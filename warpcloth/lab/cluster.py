@@ -14,9 +14,12 @@ from concurrent.futures import CancelledError, Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from ..base.digest import source_digest
+from ..base.digest import package_digest
+from ..base.extensions import extensions, load
+from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import initialise_warp
-from ..run import scene_files
+from ..run.listing import folders
+from ..run.scene_files import find_source
 from ..usd import flattened
 from .machine import processor
 
@@ -41,18 +44,19 @@ class Cluster(Executor):
     def submit(self, function, task, *arguments):
         """The future of ``function(task, *arguments)``."""
         files = {name: self._send(path) for name, path in files_of(task).items()}
+        modules = {name: self._send(Path(name)) if name.endswith(".py") else None for name in extensions()}
 
-        def measure(packed, files):  # by value, and all else packed: so the scheduler needs none of this package
+        def measure(packed, files, modules):  # by value, and all else packed: so the scheduler needs none of this package
             from warpcloth.lab.cluster import unpack
 
-            return unpack(packed, files)
+            return unpack(packed, files, modules)
 
-        return self._executor.submit(measure, pickle.dumps((function, task, arguments)), files)
+        return self._executor.submit(measure, pickle.dumps((function, task, arguments)), files, modules)
 
     def _send(self, path):
         """Name and content of a file, which each worker gets once."""
         if path not in self._sent:
-            if path.suffix in scene_files.STAGES:
+            if path.suffix in STAGE_ENDINGS:
                 name, content = f"{path.stem}.usda", flattened(path).encode()
             else:
                 name, content = path.name, path.read_bytes()
@@ -135,9 +139,9 @@ def _check(client, address):
     for worker, facts in found.items():
         if isinstance(facts, Exception):
             raise ValueError(f"the Dask worker {worker} cannot import this warpcloth, install it there: {facts}")
-        if facts["source"] != source_digest():
+        if facts["source"] != package_digest():
             raise ValueError(
-                f"the Dask worker {worker} has code of warpcloth {facts['source']}, and this process {source_digest()}; "
+                f"the Dask worker {worker} has code of warpcloth {facts['source']}, and this process {package_digest()}; "
                 "install the same on all machines and start the workers again"
             )
         if facts["arithmetic"] != "1":
@@ -160,7 +164,7 @@ def _fitness(dask_worker):
     """In a worker: what it must be checked for. Its log need not have all that Warp loads."""
     initialise_warp()
     return {
-        "source": source_digest(),
+        "source": package_digest(),
         "arithmetic": os.environ.get("OMP_NUM_THREADS"),
         "threads": dask_worker.state.nthreads,
         "processor": processor(),
@@ -173,29 +177,34 @@ def files_of(task):
     found = {}
     if scene:
         name = scene["name"]
-        path = Path(name if Path(name).suffix else scene_files.find_source(name).path).resolve()
-        if Path(name).suffix or scene_files.folders()[-1].resolve() not in path.parents:
+        path = Path(name if Path(name).suffix else find_source(name).path).resolve()
+        if Path(name).suffix or folders()[-1].resolve() not in path.parents:
             found[name] = path
     if isinstance(reference, str):
         found[reference] = Path(reference)
     return found
 
 
-def unpack(packed, files):
-    """In a worker: calls what :meth:`Cluster.submit` packed, on files of its own."""
+def unpack(packed, files, modules):
+    """In a worker: calls what :meth:`Cluster.submit` packed, on files of its own and with the extensions of who asks."""
+    for name, sent in modules.items():
+        load(name if sent is None else _kept(*sent))
+    function, task, arguments = pickle.loads(packed)
+    here = {name: _kept(*sent) for name, sent in files.items()}
+    return function(replace(task, arguments=_moved(task.arguments, here)), *arguments)
+
+
+def _kept(file, content):
+    """Returns the path of a file of this worker with some content."""
     from distributed import get_worker
 
-    function, task, arguments = pickle.loads(packed)
-    folder, here = Path(get_worker().local_directory) / "warpcloth", {}
-    for name, (file, content) in files.items():
-        path = folder / hashlib.sha256(content).hexdigest()[:24] / file
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part = path.with_name(f"{file}.{threading.get_ident()}")
-            part.write_bytes(content)
-            part.replace(path)
-        here[name] = str(path)
-    return function(replace(task, arguments=_moved(task.arguments, here)), *arguments)
+    path = Path(get_worker().local_directory) / "warpcloth" / hashlib.sha256(content).hexdigest()[:24] / file
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f"{file}.{threading.get_ident()}")
+        part.write_bytes(content)
+        part.replace(path)
+    return str(path)
 
 
 def _moved(arguments, here):

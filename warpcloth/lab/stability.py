@@ -13,13 +13,12 @@ from ..base.digest import scene_digest
 from ..core.status import Result
 from ..run.watch import Watch, watched_frames
 from ..solvers import Newton
-from .axes import AXES, FIXED, OPTIONS, record_at, refined, scene_at, steps_in, together, vary
+from .axes import ACCURACY, AXES, FIXED, OPTIONS
+from .cells import record_at, refined, scene_at, steps_in, together, vary
 from .measurements import SceneRef, Setup, task
 from .stability_limits import KNOWN, rules
 
 VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
-# RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
-ACCURACY = 0.01
 # Steps of the reference per step of the map, and the most steps that it takes in all (or as many as frames). A run with half as
 # many steps gives the error of the reference.
 _FINER, _MOST = 4, 2000

@@ -217,3 +217,16 @@ class _Reader:
 
     def next_is_number(self):
         return self.tokens[self.position][0] == "number"
+
+
+def some_vertices(option, selection, mesh):
+    """Returns the vertices that an option selects.
+
+    Raises:
+        ValueError: It selects none, or does not follow the grammar of selections.
+    """
+    vertices = mesh.select(selection)
+    if not len(vertices):
+        low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in (mesh.points.min(0), mesh.points.max(0)))
+        raise ValueError(f"{option} names no vertex; the mesh reaches from ({low}) to ({high})")
+    return vertices

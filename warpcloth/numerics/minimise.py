@@ -26,8 +26,6 @@ POLICIES = {
     "absolute": HessianPolicy.ABSOLUTE,
 }
 
-LINEAR = ("cg", "factorised")
-
 
 class Minimiser:
     """Finds the d that minimises φ for each copy, from d = 0 (for the equation see the module).

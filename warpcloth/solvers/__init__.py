@@ -12,7 +12,6 @@ from .hierarchical_pbd import HierarchicalPBD
 from .newton import Newton
 from .pbd import PBD
 from .projective_dynamics import ProjectiveDynamics
-from .step import DEFAULT as DEFAULT
 from .step import SOLVERS as SOLVERS
 from .step import register as register
 from .xpbd import XPBD

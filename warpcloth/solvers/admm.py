@@ -1,6 +1,7 @@
 """ADMM: implicit Euler split into the elements and the vertices, which meet by multipliers."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -102,7 +103,7 @@ class ADMM(ImplicitStep):
 
     iterations: int = 20
     tolerance: float = 1e-3
-    weight: float | str = "auto"
+    weight: float | Literal["auto"] = "auto"
 
     def __post_init__(self):
         super().__post_init__()

@@ -1,11 +1,12 @@
 """Constrained dynamics with dual variables: implicit Euler for positions and the multipliers of compliant constraints."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import warp as wp
 
-from ..base.checks import choice, number, whole
+from ..base.checks import number, whole
 from ..core.capture import Mirror, Segment
 from ..core.status import Residual, Result
 from ..core.sums import RowSums, Sums
@@ -21,7 +22,6 @@ from .implicit import ImplicitStepper
 from .solver import Stepper
 from .step import ImplicitStep
 
-STABILISATIONS = ("none", "geometric-stiffness", "line-search")
 # The most iterations of one solve by conjugate gradients.
 LINEAR_ITERATIONS = 10_000
 # By what acceleration, over gravity's, a hard constraint may stay open at the end before it counts as contradicted.
@@ -89,15 +89,13 @@ class ConstrainedDynamics(ImplicitStep):
 
     iterations: int = 20
     tolerance: float = 1e-3
-    stabilisation: str = "geometric-stiffness"
-    linear: str = "cg"
+    stabilisation: Literal["none", "geometric-stiffness", "line-search"] = "geometric-stiffness"
+    linear: Literal["cg", "factorised"] = "cg"
 
     def __post_init__(self):
         super().__post_init__()
         whole("iterations", self.iterations, 1)
         number("tolerance", self.tolerance, above=0.0)
-        choice("stabilisation", self.stabilisation, STABILISATIONS)
-        choice("linear", self.linear, ("cg", "factorised"))
 
     def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.

@@ -3,10 +3,10 @@
 import warnings
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from typing import Literal
 
 import numpy as np
 
-from ..base.checks import choice
 from ..base.turns import in_turn
 from ..core.hessian import Hessian
 from ..fast.plan import plan
@@ -45,13 +45,8 @@ class Explicit(Step):
         style=("tab:gray", "s"),
     )
 
-    scheme: str = "symplectic"
-    above_limit: str = "refuse"
-
-    def __post_init__(self):
-        super().__post_init__()
-        choice("scheme", self.scheme, ("symplectic", "forward"))
-        choice("above_limit", self.above_limit, ("refuse", "allow"))
+    scheme: Literal["symplectic", "forward"] = "symplectic"
+    above_limit: Literal["refuse", "allow"] = "refuse"
 
     @property
     def divides(self) -> bool:

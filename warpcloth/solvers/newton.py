@@ -1,12 +1,13 @@
 """Implicit Euler as the minimisation of 1/(2h²)‖x − x̃‖²_M + U(x), by Newton's method."""
 
 from dataclasses import dataclass
+from typing import Literal
 
-from ..base.checks import choice, number, whole
+from ..base.checks import number, whole
 from ..core.capture import Segment
 from ..core.status import UNBALANCED, Residual
 from ..model.model import Model
-from ..numerics.minimise import LINEAR, POLICIES, Minimiser
+from ..numerics.minimise import Minimiser
 from ..terms.needs import FINITE
 from .facts import Benchmark, Facts
 from .implicit import ImplicitStepper
@@ -53,15 +54,13 @@ class Newton(ImplicitStep):
 
     tolerance: float = 1e-3
     iterations: int = 100
-    hessian: str = "adaptive"
-    linear: str = "cg"
+    hessian: Literal["adaptive", "raw", "clamp", "absolute"] = "adaptive"
+    linear: Literal["cg", "factorised"] = "cg"
 
     def __post_init__(self):
         super().__post_init__()
         number("tolerance", self.tolerance, above=0.0)
         whole("iterations", self.iterations, 1)
-        choice("hessian", self.hessian, tuple(POLICIES))
-        choice("linear", self.linear, LINEAR)
 
     def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.

@@ -1,11 +1,12 @@
 """Position based dynamics: predict, then move the vertices onto their constraints, and call the move a velocity."""
 
 from dataclasses import dataclass
+from typing import Literal
 
-from ..base.checks import choice, number, whole
+from ..base.checks import number, whole
 from ..base.renamed import renamed
 from ..model.model import Model
-from ..numerics.sweeps import IN_PLACE, SWEEPS, Sweep
+from ..numerics.sweeps import IN_PLACE, Sweep
 from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
@@ -63,18 +64,16 @@ class PBD(Step):
     )
 
     iterations: int = 20
-    sweep: str = "coloured"
+    sweep: Literal["vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential"] = "coloured"
     alpha: float = 0.0
     relaxation: float = 1.0
-    correction: str = "per-sweep"
+    correction: Literal["per-sweep", "per-step"] = "per-sweep"
 
     def __post_init__(self):
         super().__post_init__()
         whole("iterations", self.iterations, 1)
-        choice("sweep", self.sweep, SWEEPS)
         number("alpha", self.alpha, least=0.0)
         number("relaxation", self.relaxation, above=0.0)
-        choice("correction", self.correction, ("per-sweep", "per-step"))
         if self.sweep != "vertex-averaged" and self.alpha != 0.0:
             raise ValueError(f"alpha is {self.alpha:g}; it belongs to sweep='vertex-averaged' and must be 0 without")
 

@@ -1,11 +1,12 @@
 """Projective dynamics: implicit Euler by projections of the elements and one constant matrix, factorised once."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import warp as wp
 
-from ..base.checks import choice, number, whole
+from ..base.checks import number, whole
 from ..core.capture import Mirror, Segment
 from ..core.constant_matrix import constant_matrices
 from ..core.status import UNBALANCED, Residual
@@ -74,17 +75,15 @@ class ProjectiveDynamics(ImplicitStep):
 
     iterations: int = 20
     tolerance: float = 1e-3
-    acceleration: str = "anderson"
+    acceleration: Literal["none", "chebyshev", "anderson", "l-bfgs"] = "anderson"
     window: int = 5
-    linear: str = "factorised"
+    linear: Literal["factorised", "jacobi"] = "factorised"
 
     def __post_init__(self):
         super().__post_init__()
         whole("iterations", self.iterations, 1)
         number("tolerance", self.tolerance, above=0.0)
-        choice("acceleration", self.acceleration, ACCELERATIONS)
         whole("window", self.window, 1)
-        choice("linear", self.linear, ("factorised", "jacobi"))
 
     def bind(self, model: Model) -> Stepper:
         """The solver on ``model``, all scratch allocated.

@@ -2,13 +2,15 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from ..base.checks import choice, number, shown, whole
+from ..base.extensions import note
 from ..base.limits import MOST
+from ..base.texts import words_of
 from ..base.turns import methods_in_turn
 from ..core.status import Residual
 from ..model.model import Model
-from ..numerics.integrators import INTEGRATORS
 from ..scene.scene import Scene
 from ..terms.needs import refuse_unmet
 from .facts import Facts
@@ -17,8 +19,6 @@ from .threaded import ThreadedStepper
 
 # The records by their names, in the order in which lists and charts have them.
 SOLVERS = {}
-# The name of the one that is taken where none is given.
-DEFAULT = "newton"
 
 
 def register(record):
@@ -41,6 +41,7 @@ def register(record):
     if known.__module__ != record.__module__:
         raise ValueError(f"{record.name!r} is the name of a solver of {known.__module__}; {record.__name__} must have another")
     SOLVERS[record.name] = record
+    note(record)
     return record
 
 
@@ -152,6 +153,8 @@ class Step:
             number("dt", self.dt, above=0.0)
         else:
             whole("substeps", self.substeps, 1)
+        for name, words in words_of(type(self)).items():
+            choice(name, getattr(self, name), words)
 
     def per_frame(self, fps: float) -> int:
         """Steps a frame at ``fps``."""
@@ -185,11 +188,7 @@ class ImplicitStep(Step):
         ValueError: If an option breaks a rule.
     """
 
-    integrator: str = "euler"
-
-    def __post_init__(self):
-        super().__post_init__()
-        choice("integrator", self.integrator, tuple(INTEGRATORS))
+    integrator: Literal["euler", "midpoint", "bdf2"] = "euler"
 
 
 def fewest_substeps(fps, rest, motion):

@@ -1,11 +1,12 @@
 """Extended position based dynamics: projections with compliance and multipliers, whose stiffness is that of the material."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import warp as wp
 
-from ..base.checks import choice, number, whole
+from ..base.checks import number, whole
 from ..core.capture import Mirror
 from ..core.status import UNBALANCED, Residual, Result
 from ..core.sums import Sums
@@ -74,15 +75,13 @@ class XPBD(ImplicitStep):
     )
 
     iterations: int = 20
-    sweep: str = "coloured"
-    form: str = "vector"
+    sweep: Literal["coloured", "sequential", "constraint-averaged"] = "coloured"
+    form: Literal["vector", "scalar"] = "vector"
     relaxation: float = 1.0
 
     def __post_init__(self):
         super().__post_init__()
         whole("iterations", self.iterations, 1)
-        choice("sweep", self.sweep, ("coloured", "sequential", "constraint-averaged"))
-        choice("form", self.form, ("vector", "scalar"))
         number("relaxation", self.relaxation, above=0.0)
         if self.integrator == "midpoint" and self.sweep != "constraint-averaged" and self.iterations % 2:
             raise ValueError(

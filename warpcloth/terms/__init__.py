@@ -3,6 +3,7 @@
 What takes an energy by name, such as a stage, finds those of :data:`TERMS`; :func:`register` adds one from elsewhere.
 """
 
+from ..base.extensions import note
 from .attachment import Attachment
 from .corotated_membrane import CorotatedMembrane
 from .declared import Declared
@@ -49,4 +50,5 @@ def register(energy):
     if known.__module__ != energy.__module__:
         raise ValueError(f"{energy.__name__} is the name of an energy of {known.__module__}; it must have another")
     TERMS[energy.__name__] = energy
+    note(energy)
     return energy

@@ -3,19 +3,19 @@
 Nothing else here imports pxr, and that is loaded when a stage is first touched.
 """
 
+from ..base.outputs import STAGE_ENDINGS
 from ..mesh.mesh import READERS
 from ..mesh.sequences import OPENERS
 from .frames import FrameSequence, open_sequence
 from .measures import MeasureWriter
 from .scene import read_scene, write_scene
-from .stage import ENDINGS, StageMesh, flattened, read_mesh, read_stage_mesh
+from .stage import StageMesh, flattened, read_mesh, read_stage_mesh
 from .writer import AnimationWriter
 
-READERS.update(dict.fromkeys(ENDINGS, read_mesh))
-OPENERS.update(dict.fromkeys(ENDINGS, open_sequence))
+READERS.update(dict.fromkeys(STAGE_ENDINGS, read_mesh))
+OPENERS.update(dict.fromkeys(STAGE_ENDINGS, open_sequence))
 
 __all__ = [
-    "ENDINGS",
     "AnimationWriter",
     "FrameSequence",
     "MeasureWriter",

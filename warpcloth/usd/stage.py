@@ -22,7 +22,6 @@ from .values import (
     token_of,
 )
 
-ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 # Where an animation keeps, in the root layer's customLayerData, the prim that it animates.
 METADATA_KEY = "warpcloth"
 # Primvar of curves: the mesh vertex of each curve point, for curves repeat the vertices where several of them meet.

@@ -1,0 +1,92 @@
+"""What the command line can name, read from source files without running them: scenes, solvers and the options of these.
+
+Nothing here loads Warp, so that help and the completion of a shell answer at once.
+"""
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+def folders():
+    """Folders of scenes that are known by their names: ./scenes, then those that come with the package."""
+    found = [Path("scenes"), _PACKAGE / "scenes"]
+    return list({folder.resolve(): folder for folder in reversed(found) if folder.is_dir()})[::-1]
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A scene file as :func:`list_scenes` shows it: the first lines of two docstrings, and ``name=default`` texts."""
+
+    name: str
+    summary: str
+    parameters: tuple = ()
+    meaning: str = ""
+
+
+def list_scenes(folder):
+    """The Python files of a folder that have a function ``scene``, read without running them.
+
+    Raises:
+        FileNotFoundError: There is no such folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: there is no such folder")
+    listed = []
+    for path in sorted(folder.glob("*.py")):
+        try:
+            tree = ast.parse(path.read_bytes())
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # the last two from too deep nesting
+            listed.append(Listed(path.stem, f"cannot be read: {error}"))
+            continue
+        function = next((n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "scene"), None)
+        if function is not None:
+            listed.append(Listed(path.stem, _first_line(tree), _defaults(function.args), _first_line(function)))
+    return listed
+
+
+def _first_line(node):
+    return (ast.get_docstring(node) or "").partition("\n")[0]
+
+
+def _defaults(arguments):
+    names = arguments.posonlyargs + arguments.args
+    values = [None] * (len(names) - len(arguments.defaults)) + arguments.defaults
+    pairs = zip(names + arguments.kwonlyargs, values + arguments.kw_defaults, strict=True)
+    return tuple(name.arg if value is None else f"{name.arg}={ast.unparse(value)}" for name, value in pairs)
+
+
+def list_solvers():
+    """Returns the options of each solver of this package by its name: by option the words that it takes, or ()."""
+    folder, classes = _PACKAGE / "solvers", {}
+    for path in folder.glob("*.py"):
+        classes |= {node.name: node for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ClassDef)}
+    records = [classes[name] for name in _assigned(ast.parse((folder / "__init__.py").read_bytes()), "__all__")]
+    return {_assigned(record, "name"): _options(record, classes) for record in records}
+
+
+def _assigned(node, name):
+    """What the body of a module or class assigns to a name."""
+    found = (each for each in node.body if isinstance(each, ast.Assign))
+    return next(ast.literal_eval(each.value) for each in found if getattr(each.targets[0], "id", None) == name)
+
+
+def _options(record, classes):
+    found = {}
+    for base in record.bases:
+        found |= _options(classes[base.id], classes) if getattr(base, "id", None) in classes else {}
+    fields = [node for node in record.body if isinstance(node, ast.AnnAssign)]
+    return found | {field.target.id: _words(field.annotation) for field in fields}
+
+
+def _words(annotation):
+    """The words of each Literal[…] in an annotation."""
+    found = [node for node in ast.walk(annotation) if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal"]
+    return tuple(word for literal in found for word in ast.literal_eval(ast.Tuple(_elements(literal.slice), ast.Load())))
+
+
+def _elements(node):
+    return node.elts if isinstance(node, ast.Tuple) else [node]
