@@ -67,7 +67,7 @@ def options():
     for name, command in commands(_parser()):
         rows = []
         for action in command._actions:
-            if isinstance(action, argparse._HelpAction) or "--debug" in action.option_strings:
+            if isinstance(action, argparse._HelpAction) or action.dest in ("debug", "imports"):
                 continue
             values = action.metavar or (
                 "" if action.nargs == 0 else (action.dest.upper() if action.choices is None else "NAME")

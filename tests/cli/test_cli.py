@@ -643,7 +643,7 @@ def test_an_interrupt_that_python_makes_another_error_of_is_one(capfd, monkeypat
         def __set_name__(self, *_):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(scene_files, "folders", lambda: type("New", (), {"field": Field()}))
+    monkeypatch.setattr(warpcloth.cli.run, "folders", lambda: type("New", (), {"field": Field()}))
     assert run(capfd, "scenes") == (130, "", "warpcloth: interrupted\n")
 
 
