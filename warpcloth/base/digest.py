@@ -46,7 +46,7 @@ def _add(digest, value):
 
 
 def source_digest():
-    """A hash of the code of this package and of the extensions that are used: what another version measured is measured again."""
+    """A hash of the code of this package and of extensions: what another version measured is measured again."""
     files = [file for files in extensions().values() for file in files]
     if not files:
         return package_digest()
