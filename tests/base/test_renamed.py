@@ -7,7 +7,7 @@ import pytest
 
 import warpcloth as wc
 from support.command_line import run
-from warpcloth.run.scene_files import options
+from warpcloth.base.texts import options
 
 SPREAD = wc.PBD(substeps=2, correction="per-step")
 

@@ -24,12 +24,12 @@ def load_installed():
     """
     for point in entry_points(group=GROUP):
         try:
-            load(point.module)
+            load_extension(point.module)
         except ValueError as error:
             warnings.warn(f"{point.name} of the entry points {GROUP}: {error}", stacklevel=2)
 
 
-def load(name):
+def load_extension(name):
     """Imports a module that registers energies and solvers.
 
     Args:
@@ -69,8 +69,8 @@ def extensions():
     """Returns the files of the modules that registered an energy or a solver.
 
     Returns:
-        dict: The :class:`pathlib.Path`\\s of each by what :func:`load` takes: the name of a module of a package, which stands
-        for all files of that package, or the path of the only file; sorted.
+        dict: The :class:`pathlib.Path`\\s of each by what :func:`load_extension` takes: the name of a module of a package, which
+        stands for all files of that package, or the path of the only file; sorted.
     """
     found = {}
     for name in sorted(_names & set(sys.modules)):

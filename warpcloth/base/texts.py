@@ -82,7 +82,7 @@ def convert(name, text, kinds):
     raise ValueError(f"{name} is {text!r}; it must be {' or '.join(WORDS[kind] for kind in known)}")
 
 
-def share(name, text):
+def fraction(name, text):
     """A share of the whole, written as 1% or 0.01; above 1 it is refused, as a percentage without its sign."""
     value = convert(name, text.removesuffix("%"), (float,)) / (100.0 if text.endswith("%") else 1.0)
     number(name, value, above=0.0)

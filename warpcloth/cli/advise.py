@@ -3,7 +3,7 @@
 import contextlib
 from dataclasses import asdict
 
-from ..base.texts import share
+from ..base.texts import fraction
 from .run import solver_setup
 from .terminal import Progress, as_json
 
@@ -12,7 +12,7 @@ def advise_on(arguments, source, values, scene, device):
     """Says which terms, precision and resolution matter, by leaving out or changing each."""
     from ..lab.advice import advise
 
-    tolerance = 0.01 if arguments.tolerance is None else share("tolerance", arguments.tolerance)
+    tolerance = 0.01 if arguments.tolerance is None else fraction("tolerance", arguments.tolerance)
     solver = solver_setup(arguments, scene, device).checked
     resolutions = _resolutions(source, values, len(scene.mesh.points))
     progress = Progress(None, first="trying")

@@ -4,7 +4,7 @@ import shlex
 import sys
 
 from ..base.quiet import find_device
-from ..base.texts import assignments, milliseconds, share
+from ..base.texts import assignments, fraction, milliseconds
 from .run import named_scene
 from .terminal import Interrupted, Settings, add_dask, as_json, executing
 
@@ -47,7 +47,7 @@ def chosen(arguments, device):
     from ..lab.measurements import SceneRef
 
     _source, values, _scene = named_scene(arguments)
-    tolerance = None if arguments.tolerance is None else share("tolerance", arguments.tolerance)
+    tolerance = None if arguments.tolerance is None else fraction("tolerance", arguments.tolerance)
     budget = None if arguments.budget is None else milliseconds("budget", arguments.budget)
     progress = Settings()
     try:

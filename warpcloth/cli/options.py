@@ -11,7 +11,7 @@ import warnings
 from dataclasses import fields
 from functools import partial
 
-from ..base.extensions import load, load_installed
+from ..base.extensions import load_extension, load_installed
 from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import WORDS, kinds_of_parameter, parameters_of, words_of
 from ..run.listing import folders, list_scenes, list_solvers
@@ -127,7 +127,7 @@ def load_extensions(argv):
     add_import(only)
     load_installed()
     for name in only.parse_known_args(argv)[0].imports:
-        load(name)
+        load_extension(name)
 
 
 def complete(parser):

@@ -12,7 +12,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from ..base.digest import source_digest
-from ..base.extensions import extensions, load
+from ..base.extensions import extensions, load_extension
 from ..base.quiet import initialise_warp
 from .measurements import run
 
@@ -172,7 +172,7 @@ def _begin(modules):
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     initialise_warp()
     for module in modules:
-        load(module)
+        load_extension(module)
 
 
 def _end_with(parent):
