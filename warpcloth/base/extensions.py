@@ -69,8 +69,8 @@ def extensions():
     """Returns the files of the modules that registered an energy or a solver.
 
     Returns:
-        dict: The :class:`pathlib.Path`\\s of each by what :func:`load_extension` takes: the name of a module of a package, which
-        stands for all files of that package, or the path of the only file; sorted.
+        dict: The paths of each by what :func:`load_extension` takes: the name of a module of a package, which stands for all
+        files of that package, or the path of the only file; sorted.
     """
     found = {}
     for name in sorted(_names & set(sys.modules)):
