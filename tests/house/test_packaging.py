@@ -106,8 +106,9 @@ def test_a_wheel_has_all_files_and_no_others(wheel):
 def test_an_archive_has_its_tests_and_pictures(archive):
     with tarfile.open(archive) as packed:
         names = {name.partition("/")[2] for name in packed.getnames()}
-    wanted = [path for folder in ("tests", "docs") for path in (ROOT / folder).iterdir() if path.is_file()]
-    assert {str(path.relative_to(ROOT)) for path in wanted} | {"LICENSE", "CHANGELOG.md", "README.md"} <= names
+    there = [path for folder in ("tests", "docs") for path in (ROOT / folder).rglob("*") if path.is_file()]
+    wanted = {str(path.relative_to(ROOT)) for path in there if "__pycache__" not in path.parts}
+    assert wanted | {"LICENSE", "CHANGELOG.md", "README.md"} <= names
 
 
 def test_an_installed_wheel_runs_its_kernels(environment, bare, tmp_path):
