@@ -44,6 +44,15 @@ def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, *
 
     Raises:
         ValueError: As :class:`Analyzer`; or a frame is broken.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> mesh = wc.Mesh.grid(3, 3)
+        >>> measured = wc.analyze([mesh.points, 1.5 * mesh.points], mesh, measures=("stretch", "area_ratio"))
+        >>> measured["stretch"].shape
+        (2, 8, 2)
+        >>> round(float(measured["area_ratio"][1, 0]), 6)
+        2.25
     """
     frames, mesh = _frames_first("analyze", frames, mesh)
     analyzer = Analyzer(frames, mesh, dt, **options)

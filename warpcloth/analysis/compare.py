@@ -125,6 +125,13 @@ def compare(
     Raises:
         ValueError: An input is refused or has no times, a frame cannot be read, no two frames have one time, or none of those
             that do can be compared.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> mesh = wc.Mesh.grid(3, 3)
+        >>> apart = wc.compare((mesh, [mesh.points]), (mesh, [mesh.points + [0, 0.1, 0]]), fps=24)
+        >>> apart.rms.round(6).tolist(), apart.stretch_largest.round(6).tolist()
+        ([0.1], [[0.0, 0.0]])
     """
     if frames is not None:
         whole("frames", frames, least=0)

@@ -93,6 +93,14 @@ class Arap:
         ValueError: An argument is none of those above, a vertex is isolated, a part of the mesh has no handle, or the weights
             leave a matrix that is not definite.
         ImportError: "intrinsic" without libigl.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> mesh = wc.Mesh.grid(3, 3)
+        >>> arap = wc.Arap(mesh, "corners")
+        >>> found = arap.solve(mesh.points[arap.handles] + [0, 1, 0])
+        >>> round(float((found.points - mesh.points)[:, 1].min()), 6)
+        1.0
     """
 
     @in_turn

@@ -100,6 +100,13 @@ def deform(
         BlockingIOError, Interrupted, OSError: As :func:`warpcloth.simulate`.
         ValueError: If an argument breaks a rule, as :class:`warpcloth.Arap` has them too, or a frame overflows; the frames
             before it are in ``output``.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> mesh = wc.Mesh.grid(3, 3)
+        >>> start = mesh.points[mesh.corners()]
+        >>> wc.deform(mesh, wc.Pins("corners", keyframes=[start, start + [0, 1, 0]]))
+        Deformation(2 frames of 9 vertices, 0.0416667 s, converged)
     """
     if not isinstance(mesh, Mesh):
         raise ValueError(f"mesh is {shown(mesh)}; it must be a Mesh, such as Mesh.load(path)")

@@ -47,6 +47,16 @@ class Mesh:
         ValueError: An array has the wrong shape or type, is empty, or has an element (named by its index) that is not
             finite, refers to no vertex, repeats a vertex, has no area or length, or (edges) occurs twice; or the up axis is
             another.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> mesh = wc.Mesh.grid(3, 3, size=0.5)
+        >>> mesh
+        Mesh(9 points, 8 triangles, 16 edges)
+        >>> mesh.select("x == 0").tolist()
+        [0, 3, 6]
+        >>> mesh.springs("shear").shape
+        (8, 2)
     """
 
     points: Converted[ArrayLike, np.ndarray] = default(MISSING)

@@ -93,6 +93,14 @@ def kabsch(
     Raises:
         ValueError: An array has the wrong shape or type, a set is empty or has another index than 0 to n − 1, or a weight is
             negative, or they are all 0.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> points = wc.Mesh.grid(3, 3).points
+        >>> turned = points[:, [1, 0, 2]] * [-1, 1, 1]  # by 90° about z
+        >>> R = wc.kabsch(points, turned)
+        >>> round(float(R[1] @ [1, 0, 0]), 6)  # the axis x turns to the axis y
+        1.0
     """
     rest, turned = _Batch("P", P, ((3,),)), _Batch("Q", Q, ((3,),))
     if (rest.warp, rest.scalar, rest.device) != (turned.warp, turned.scalar, turned.device):

@@ -78,6 +78,15 @@ def equilibrium(
 
     Raises:
         ValueError: If an argument breaks a rule, or a stiffness is infinite.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> scene = wc.Scene(wc.Mesh.chain(2), masses=[1, 1], terms=[wc.Spring(stiffness=1e3)], pins=[0])
+        >>> rest = wc.equilibrium(scene)
+        >>> round(float(-1 - rest.points[1, 1]), 6)  # the weight over the stiffness
+        0.00981
+        >>> rest.stable
+        True
     """
     number("tolerance", tolerance, above=0.0)
     whole("load_steps", load_steps, 1)

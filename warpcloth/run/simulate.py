@@ -104,6 +104,15 @@ def simulate(
         Interrupted: A KeyboardInterrupt, if the user interrupts; the message says which frames are in ``output``.
         OSError: If a file cannot be written; the message also says which frames are in ``output``.
         ValueError: If an argument breaks a rule, or the scene's stage has changed and no longer fits the frames.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> scene = wc.Scene(wc.Mesh.chain(2), masses=[1, 1], terms=[wc.Spring(stiffness=1e3)], pins=[0])
+        >>> animation = wc.simulate(scene, wc.Newton(dt=1 / 240), frames=30)
+        >>> animation
+        Animation(31 frames of 2 vertices, 0.5 s, converged)
+        >>> animation.points.shape
+        (31, 2, 3)
     """
     frames = scene.frames if frames is None else frames
     whole("frames", frames, 1, MOST_FRAMES)

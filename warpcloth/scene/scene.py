@@ -29,6 +29,14 @@ class Pins:
         vertices: Indices (p,), or a selection of the mesh such as ``"x<0.01"``.
         keyframes: Positions (F, p, 3) [m] at the scene's frames 0 … F−1, linear between them, at rest after the last; in the
             order of ``vertices``. Without them the pins stay where they start.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> mesh = wc.Mesh.grid(3, 3)
+        >>> start = mesh.points[mesh.corners()]
+        >>> pins = wc.Pins("corners", keyframes=[start, start + [0, 0.1, 0]])
+        >>> wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=10)], pins=pins).pins.vertices.tolist()
+        [0, 2, 6, 8]
     """
 
     vertices: Converted[str | ArrayLike, np.ndarray] = default(MISSING)
@@ -72,6 +80,13 @@ class Scene:
 
     Raises:
         ValueError: If a value breaks a rule; the sentence names it.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> terms = [wc.Spring(pairs=("structural", "shear"), stiffness=1e3), wc.QuadraticBending(stiffness=1e-5)]
+        >>> scene = wc.Scene(wc.Mesh.grid(3, 3), density=0.15, terms=terms, pins="corners", duration=2.0)
+        >>> scene.frames, round(float(scene.vertex_masses.sum()), 3)
+        (120, 0.15)
     """
 
     mesh: Mesh

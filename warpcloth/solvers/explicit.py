@@ -33,6 +33,13 @@ class Explicit(Step):
 
     Raises:
         ValueError: If an option breaks a rule.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> scene = wc.Scene(wc.Mesh.chain(2), masses=[1, 1], terms=[wc.Spring(stiffness=1e3)], pins=[0])
+        >>> about_rest, in_motion = wc.Explicit.step_limits(scene.build(dtype="float64"))
+        >>> round(about_rest, 6)  # 2/ω, ω² = k/m
+        0.063246
     """
 
     name = "explicit"

@@ -35,6 +35,14 @@ class Newton(ImplicitStep):
 
     Raises:
         ValueError: If an option breaks a rule.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> scene = wc.Scene(wc.Mesh.chain(2), masses=[1, 1], terms=[wc.Spring(stiffness=1e3)], pins=[0])
+        >>> stepper = wc.Newton(substeps=4).bind(scene.build(dtype="float64"))
+        >>> stepper.frame()
+        >>> stepper.results[0].value
+        'converged'
     """
 
     name = "newton"

@@ -42,6 +42,14 @@ class PBD(Step):
 
     Raises:
         ValueError: If an option breaks a rule.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> scene = wc.Scene(wc.Mesh.chain(2), masses=[1, 1], terms=[wc.Spring(stiffness=float("inf"))], pins=[0])
+        >>> stepper = wc.PBD(substeps=4, iterations=1).bind(scene.build(dtype="float64"))
+        >>> stepper.frame()
+        >>> round(float(stepper.state.x.numpy()[1, 1]), 9)  # the length of the spring
+        -1.0
     """
 
     name = "pbd"

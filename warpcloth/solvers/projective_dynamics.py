@@ -56,6 +56,12 @@ class ProjectiveDynamics(ImplicitStep):
 
     Raises:
         ValueError: If an option breaks a rule.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> scene = wc.Scene(wc.Mesh.chain(2), masses=[1, 1], terms=[wc.Spring(stiffness=1e3)], pins=[0])
+        >>> wc.simulate(scene, wc.ProjectiveDynamics(substeps=4, tolerance=1e-3), frames=10, dtype="float64").status.ok
+        True
     """
 
     name = "projective-dynamics"

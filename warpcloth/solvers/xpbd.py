@@ -57,6 +57,15 @@ class XPBD(ImplicitStep):
 
     Raises:
         ValueError: If an option breaks a rule.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> scene = wc.Scene(wc.Mesh.chain(2), masses=[1, 1], terms=[wc.Spring(stiffness=1e3)], pins=[0])
+        >>> stepper = wc.XPBD(substeps=10, iterations=1).bind(scene.build(dtype="float64"))
+        >>> for _ in range(600):
+        ...     stepper.frame()
+        >>> round(float(-1 - stepper.state.x.numpy()[1, 1]), 6)  # the weight over the stiffness
+        0.00981
     """
 
     name = "xpbd"

@@ -19,6 +19,13 @@ class QuadraticBending(Bending):
             The equilateral mesh has a Poisson's ratio of −1/3; the other meshes are not isotropic plates.
         damping: β [N·m·s], of the rate of ‖y‖, which for a small angle θ is |e|·|θ|.
         name: To tell two terms of one kind apart.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> mesh = wc.Mesh.grid(3, 3)
+        >>> bending = wc.QuadraticBending(stiffness=1e-5)
+        >>> bending.stencil(mesh).shape == mesh.hinges.shape
+        True
     """
 
     term: ClassVar[Term] = QUADRATIC_BENDING

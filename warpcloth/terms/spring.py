@@ -27,6 +27,13 @@ class Spring(Damped):
         rest_lengths: L [m], one or (E,), if not those of the mesh.
         damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.
         name: To tell two terms of one kind apart.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> mesh = wc.Mesh.grid(3, 3)
+        >>> springs = wc.Spring(pairs=("structural", "shear"), stiffness=1e3)
+        >>> springs.stencil(mesh).shape
+        (20, 2)
     """
 
     term: ClassVar[Term] = SPRING
