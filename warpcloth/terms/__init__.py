@@ -35,6 +35,8 @@ TERMS = {name: globals()[name] for name in __all__}
 def register(energy):
     """Adds the record of an energy to :data:`TERMS`, so that stages, charts and tests know it by its name.
 
+    One of that name from elsewhere, such as the same file loaded before, is replaced.
+
     Args:
         energy: A frozen dataclass that derives from :class:`warpcloth.terms.declared.Declared`.
 
@@ -42,13 +44,12 @@ def register(energy):
         The same class, so that this is a decorator too.
 
     Raises:
-        ValueError: If it is no such class, or another one of that name is registered.
+        ValueError: If it is no such class, or has the name of an energy of the package.
     """
     if not (isinstance(energy, type) and issubclass(energy, Declared)):
         raise ValueError(f"{energy!r} is no energy; it must be a class that derives from warpcloth.terms.declared.Declared")
-    known = TERMS.get(energy.__name__, energy)
-    if known.__module__ != energy.__module__:
-        raise ValueError(f"{energy.__name__} is the name of an energy of {known.__module__}; it must have another")
+    if energy.__name__ in __all__ and energy is not globals()[energy.__name__]:
+        raise ValueError(f"{energy.__name__} is the name of an energy of warpcloth; it must have another")
     TERMS[energy.__name__] = energy
     note(energy)
     return energy

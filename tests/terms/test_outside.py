@@ -1,0 +1,120 @@
+"""The energy of docs/extending.md, one file outside the package, through all that takes one; identities in test_terms.py."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from support.command_line import run
+from support.outside import FILES, Plane
+from support.steps import after_one_step, newton_step
+from warpcloth import terms
+from warpcloth.solvers import SOLVERS
+from warpcloth.terms.declared import Declared
+from warpcloth.usd import read_scene, write_scene
+
+NORMAL = np.array([1.0, 2.0, 2.0]) / 3.0
+# A scene in a file that defines the energy too.
+FILE = (
+    FILES["plane.py"]
+    + """
+
+def scene(n: int = 6):
+    mesh = wc.Mesh.grid(n, n, size=0.5)
+    plane = Plane(vertices="boundary", stiffness=300.0, normal=(1.0, 2.0, 2.0))
+    return wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=50.0), plane], pins=[0], duration=0.1)
+"""
+)
+
+
+@pytest.fixture
+def registered():
+    terms.register(Plane)
+    yield
+    del terms.TERMS["Plane"]
+
+
+def sheet(**fields):
+    mesh = wc.Mesh.grid(6, 5, size=0.5)
+    start = mesh.points + np.random.default_rng(3).normal(scale=0.01, size=mesh.points.shape)
+    plane = Plane(vertices="boundary", stiffness=300.0, normal=NORMAL)
+    energies = [wc.Spring(stiffness=50.0), plane]
+    return wc.Scene(mesh, density=0.1, terms=energies, positions=start, pins=[0], **fields)
+
+
+ITERATED = {
+    "newton": {"tolerance": 1e-10},
+    "projective-dynamics": {"tolerance": 1e-11, "iterations": 3000},
+    "admm": {"tolerance": 1e-11, "iterations": 3000, "weight": 1.0},
+    "xpbd": {"iterations": 3000},
+    "constrained-dynamics": {"tolerance": 1e-10, "iterations": 3000},
+}
+
+
+@pytest.mark.parametrize("name", ITERATED)
+def test_solvers_that_minimise_meet(name, device):
+    solver = SOLVERS[name](substeps=1, **ITERATED[name])
+    x, _ = after_one_step(sheet(), solver, device)
+    assert np.abs(x - newton_step(sheet(), device)).max() < 1e-8
+
+
+@pytest.mark.parametrize("name", sorted(set(SOLVERS) - set(ITERATED)))
+def test_the_others_keep_to_the_plane(name, device):
+    """Stiff, at the boundary: from 1 cm on; falling for 0.1 s is 5 cm."""
+    declared = sheet(duration=0.1)
+    animation = wc.simulate(declared, SOLVERS[name](substeps=64), device=device)
+    found = declared.mesh.select("boundary")
+    distance = (animation.points[-1] - declared.mesh.points)[found] @ NORMAL
+    assert animation.status.ok and np.abs(distance).max() < 0.02
+
+
+def test_it_varies_between_copies(device):
+    normals = np.array([NORMAL, [0.0, 1.0, 0.0]])
+    both = sheet().build(
+        device=device, dtype="float64", copies=2, vary={"Plane.normal": normals, "Plane.stiffness": [1.0, 2.0]}
+    )
+    rest = both.terms[1].rest.numpy().reshape(2, -1, 4)
+    assert np.allclose(rest[:, :, :3], normals[:, None])
+
+
+@pytest.mark.usefixtures("registered")
+@pytest.mark.parametrize("ending", ["usda", "usdc"])
+def test_a_stage_holds_it(tmp_path, ending):
+    declared = sheet()
+    normals = np.random.default_rng(4).normal(size=(len(declared.terms[1].stencil(declared.mesh)), 3))
+    every = replace(declared.terms[1], normal=normals, name="by vertex")
+    read = read_scene(write_scene(replace(declared, terms=[*declared.terms, every]), tmp_path / f"plane.{ending}"))
+    for given, found in zip([*declared.terms, every], read.terms, strict=True):
+        assert type(found) is type(given) and found.name == given.name
+        assert found.elements(declared.mesh, None).rest.tolist() == given.elements(declared.mesh, None).rest.tolist()
+    assert read.terms[1].vertices == "boundary" and read.terms[1].normal.shape == (3,)
+
+
+def test_a_stage_with_an_unknown_energy_is_refused(tmp_path):
+    terms.register(Plane)
+    path = write_scene(sheet(), tmp_path / "plane.usda")
+    del terms.TERMS["Plane"]
+    with pytest.raises(ValueError, match=r"is no attribute of a cloth|type is 'Plane', must be one of"):
+        read_scene(path)
+
+
+def test_a_scene_file_runs_on_the_command_line(tmp_path, capfd):
+    file = tmp_path / "slope.py"
+    file.write_text(FILE, encoding="utf-8")
+    assert run(capfd, "run", file, "--solver", "xpbd", "-o", tmp_path / "slope.usdc")[0] == 0
+    assert "Plane" in run(capfd, "info", file)[1]
+    assert len(wc.open_sequence(tmp_path / "slope.usdc").labels) == 7
+    del terms.TERMS["Plane"]
+
+
+def test_what_is_no_energy_is_not_registered():
+    @dataclass(frozen=True, kw_only=True)
+    class Spring(Declared):
+        term = Plane.term
+
+    with pytest.raises(ValueError, match="Spring is the name of an energy of warpcloth"):
+        terms.register(Spring)
+    with pytest.raises(ValueError, match="must be a class that derives from"):
+        terms.register(Plane(stiffness=1.0))
+    assert terms.register(terms.Spring) is terms.TERMS["Spring"]
