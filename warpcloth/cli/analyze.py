@@ -10,9 +10,9 @@ from ..base.texts import convert
 from .terminal import Progress, as_json, check_writable, frames_folder_of, place
 
 EPILOG = """\
-INPUT is a USD stage, a folder of .obj, .ply or .off files or a pattern such as "frames/*.obj", or arrays, .npz or .npy.
-Measures are listed by --measure help. What is coloured is one number of a measure: stretch_1, area_ratio, rate_of_strain_norm.
-What cannot be measured is left out and listed, as points that are not finite or triangles without area.
+INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays, .npz or .npy.
+--measure help lists the measures. --colour shows one number of a measure: stretch_1, area_ratio, rate_of_strain_norm. What
+cannot be measured, such as triangles without area or points that are not finite, is left out and listed.
 
   warpcloth analyze cache.usdc --measure stretch area_ratio -o measured.usdc --plot measured.png
   warpcloth analyze frames/ --fps 24 --rest pattern.obj --neighbourhood 1-ring --measure rotation residual --csv table.csv

@@ -11,16 +11,23 @@ from .run import named_scene, solver_setup
 from .terminal import Interrupted, as_json, check_writable, open_bar, say
 
 EPILOG = """\
-Without SCENE every solver runs hanging of growing sizes, and PBD Jacobi sweeps over the springs of net, in a few minutes. Each
-row is measured in a process of its own, one after another; where no step is given it is that of run.
+Without SCENE, every solver runs hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of net; this takes
+a few minutes. Each row is measured in a process of its own, one after another. If no step is given it is that of run.
 
-ms: a warm frame with its points on the host, median and quartiles; cloths/s: copies that make a frame in a second. ns: the same
-over elements of all terms × iterations (of Newton's method Newton iterations, of hierarchical PBD sweeps over all terms) ×
-substeps. GB/s: bytes that a step moves at least over its time; positions in and out once, inverse masses and the arrays of all
-terms once an iteration, velocities in and out once. share: of what the faster of the two copies moves on this device; small
-scenes stay in its caches, and may have more than 100 %. launches: of a step, kernels, fills and copies. start: from the start
-of a process to its first frame, with all kernels in the cache; compile: what it takes longer with none there. factor: constant
-matrices. MB: most memory, of the process on a CPU, of Warp's pool on CUDA.
+Columns:
+  ms         a warm frame with its points on the host, median and quartiles
+  cloths/s   cloths of a batch that make a frame in a second
+  ns         a frame over elements of all terms × iterations × substeps (Newton iterations; of hierarchical PBD sweeps over
+             all terms)
+  GB/s       the bytes that a step has to move, over its time: positions in and out once, inverse masses and the arrays of all
+             terms once an iteration, velocities in and out once
+  share      GB/s over that of the faster of two ways to copy on this device; small scenes stay in its caches and may exceed
+             100 %
+  launches   of a step: kernels, fills and copies
+  start      from the start of a process to its first frame, with all kernels in the cache
+  compile    how much longer that takes with none there
+  factor     constant matrices
+  MB         most memory, of the process on a CPU, of Warp's pool on CUDA
 
   warpcloth bench --json > before.json
   warpcloth bench hanging --solver xpbd -s substeps=4 iterations=20 --sizes 32 64 128

@@ -19,25 +19,29 @@ FAILURES = ("locking", "isometry", "slivers", "cotangents", "rank")
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
 
 EPILOG = """\
-Diagrams, each by itself:
-time: the error of a trajectory, RMS over vertices and frames against a reference solution of the same mesh, over the time of a
-second of motion, for steps and iterations of all solvers. solver: what methods that minimise one and the same step leave of its
-objective, over iterations and time. spectrum: errors of projective dynamics beside those that the spectrum of its matrix
-relative to the true Hessian predicts, for few vertices. physics: errors of rest shapes to closed forms over mesh size and
-time, for cantilever (on nets of four patterns, turned), chain and catenary. What diverges, is refused or takes too long is
-listed with the reason.
+Diagrams:
+  time       the error of a motion against the time for a second of it, for steps and iterations of all solvers; RMS over
+             vertices and frames, relative to a reference solution of the same mesh
+  solver     how much of the objective of one step is left by methods that minimise it, against iterations and time
+  physics    errors of rest shapes relative to closed forms, against mesh size and time, for cantilever (on meshes of four
+             patterns, turned), chain and catenary
+  spectrum   errors of projective dynamics beside those that the spectrum of its matrix predicts, for few vertices
+Settings that diverge, are refused or take too long are listed with the reason.
 
-Settings that are measured are kept in WARPCLOTH_CACHE, or ~/.cache/warpcloth, and not measured again by the same code; after an
-interruption the same command goes on. Times are those of processes side by side, one thread each; compare them within a chart.
+Measurements are kept in WARPCLOTH_CACHE, or ~/.cache/warpcloth, and not repeated by the same code; after an interruption the
+same command goes on. Several processes measure at the same time, one thread each, so compare times only within a chart.
 
   warpcloth chart work-precision hanging -p n=16 --solvers newton xpbd -o chart.png --csv chart.csv
 """
 
 FAILURE_EPILOG = """\
-locking: irregular nets strain, wrinkle or stay flat. isometry: quadratic bending of what stretches or is curved at rest.
-slivers: gradient and explicit step of thin triangles, and hinges folded flat. cotangents: negative weights, and what
-deformation makes of them. rank: rotations of points in a plane, on a line, in one place. Points are measured by the terms,
-solvers and fits themselves, lines are closed forms; what is measured is kept, as of work-precision.
+Failures:
+  locking      irregular meshes strain, wrinkle or stay flat
+  isometry     quadratic bending of cloth that stretches, or is curved at rest
+  slivers      gradient and explicit step of thin triangles, and hinges folded flat
+  cotangents   negative weights, and what deformation makes of them
+  rank         rotations of points in a plane, on a line, at one position
+Points are measured with the terms, solvers and fits themselves; lines are closed forms. Measurements are kept.
 
   warpcloth chart failure slivers -o slivers.png --csv slivers.csv
 """

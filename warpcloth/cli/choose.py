@@ -9,8 +9,9 @@ from .run import named_scene
 from .terminal import Interrupted, Settings, add_dask, as_json, executing
 
 EPILOG = """\
-Each solver climbs from coarse settings to fine ones until it meets the tolerance or is dearer than what does; errors are RMS
-distances over vertices and frames from a reference solution, over the longest side of the cloth. What is measured is kept.
+Each solver goes from coarse settings to fine ones, until it meets the tolerance or costs more than one that does. Errors are
+RMS distances over vertices and frames to a reference solution, divided by the longest side of the cloth. Measurements are
+kept.
 
   warpcloth choose hanging -p n=32 --tolerance 1%
   warpcloth choose hanging --budget 16ms

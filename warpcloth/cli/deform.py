@@ -20,11 +20,12 @@ from .terminal import Progress, as_json, check_writable, frames_folder_of, place
 _FRAMES, _FPS = 24, 24.0
 
 EPILOG = """\
---fix holds vertices where they are. --move takes others along, as the --rotate and --translate after it say, up to the next
---move: over the frames it turns them by DEGREES about AXIS through (CX, CY, CZ), where not given their centroid, and shifts
-them, both evenly from rest. So --rotate comes first, whichever stands first, and 720 degrees are two turns. AXIS is x, y, z or
-a vector such as 1,0,-1. In a frame a turn must be less than 180 degrees. A selection is a text such as "y < 0.1 and not
-boundary" or "nearest(0, 1.5, 0, 40)", in metres and in world space, whatever the units of the file.
+--fix holds vertices where they are. --move moves others, by the --rotate and --translate that follow it, up to the next
+--move. --rotate turns them by DEGREES about AXIS through (CX, CY, CZ), or through their centroid; --translate shifts them.
+Both are spread evenly over the frames. The rotation is applied first, in whatever order the two are given; 720 degrees are
+two turns. AXIS is x, y, z or a vector such as 1,0,-1. A turn between two frames must be less than 180 degrees. A SELECTION is
+a text such as "y < 0.1 and not boundary" or "nearest(0, 1.5, 0, 40)", in metres and in world space, whatever the units of the
+file.
 
   warpcloth deform bunny.usd --fix "y < 0.2" --move "y > 1.3" --rotate 60 x --translate 0 0 0.3 -o out.usdc
 """

@@ -21,9 +21,9 @@ _STEPS_A_SECOND = 240
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
-Where neither dt nor substeps is given: solvers with a limit of stability take the fewest substeps that are 10 % below the limit
-about the rest shape and below the bound for motion (exact for springs; hinges count as at rest), all others those that come
-nearest to 1/240 s.
+If neither dt nor substeps is given, solvers with a limit of stability, such as explicit, take the fewest substeps that are
+10 % below the limit about the rest shape and below the bound for motion (exact for springs; hinges count as at rest). All
+others take those whose step is nearest to 1/240 s.
 """
 
 

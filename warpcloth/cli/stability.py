@@ -12,13 +12,14 @@ _COUNT = 9
 
 EPILOG = f"""\
 Axes: {", ".join(AXES)}.
-Stiffness and mass-ratio are factors of what the scene has, compression is 1 − l/L of the start, resolution a parameter n, links
-or elements of the scene. A method is NAME or NAME:option=value,option=value. All cells are compared over the same time of
-motion. Runs with large steps go on for --steps, to show whether they diverge; small steps cost the most. A run is diverged if
-it has three times the energy that its start, falling and moving pins can have put in. It is inaccurate if it is further than
---accuracy, RMS over vertices and frames and over the size of the cloth, from Newton's method with BDF2 and a quarter of the
-step, in float64, by more than the error of that reference. It is unsure if the reference cannot tell. Rows that are measured
-are kept, and not measured again.
+Stiffness and mass-ratio are factors of what the scene has, compression is 1 − l/L at the start, and resolution is a parameter
+n, links or elements of the scene. A METHOD is NAME or NAME:option=value,option=value.
+
+All cells are compared over the same time of motion. Runs with large steps go on for --steps, to show whether they diverge;
+small steps cost the most. A run has diverged if it has three times the energy that its start, falling and moving pins can
+have put in. It is inaccurate if its distance to the reference, RMS over vertices and frames and divided by the size of the
+cloth, exceeds --accuracy by more than the error of the reference. It is unsure if the reference cannot tell. The reference is
+Newton's method with BDF2 and a quarter of the step, in float64. Rows that are measured are kept, and not measured again.
 
   warpcloth chart stability hanging -p n=8 --x stiffness --y dt -o map.png
   warpcloth chart stability net -p n=12 stiffness=inf --x resolution --y relaxation --solvers pbd:sweep=jacobi -o jacobi.png
