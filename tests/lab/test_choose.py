@@ -134,7 +134,6 @@ SCENES = [
     ("hanging", {"n": 6}, 12),
     ("chain", {"links": 5}, 12),
     pytest.param("hanging", {"n": 32}, 20, marks=pytest.mark.slow),
-    pytest.param("hanging", {"n": 64}, 15, marks=pytest.mark.slow),
     pytest.param("cantilever", {}, 20, marks=pytest.mark.slow),
     pytest.param("chain", {}, 60, marks=pytest.mark.slow),
 ]
