@@ -1,12 +1,14 @@
 """The energy of docs/extending.md, one file outside the package, through all that takes one; identities in test_terms.py."""
 
+import json
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 import warpcloth as wc
-from support.command_line import run
+from support.command_line import refused, run
 from support.outside import FILES, Plane
 from support.steps import after_one_step, newton_step
 from warpcloth import terms
@@ -106,6 +108,36 @@ def test_a_scene_file_runs_on_the_command_line(tmp_path, capfd):
     assert "Plane" in run(capfd, "info", file)[1]
     assert len(wc.open_sequence(tmp_path / "slope.usdc").labels) == 7
     del terms.TERMS["Plane"]
+
+
+@pytest.fixture
+def stage(tmp_path):
+    """A stage with the energy, and the file that defines it, which nothing has imported."""
+    terms.register(Plane)
+    path = write_scene(sheet(duration=0.1), tmp_path / "slope.usda")
+    del terms.TERMS["Plane"]
+    file = tmp_path / "plane.py"
+    file.write_text(FILES["plane.py"], encoding="utf-8")
+    yield path, "--import", file
+    terms.TERMS.pop("Plane", None)
+    sys.modules.pop("plane", None)
+
+
+def test_the_command_line_imports_it_for_a_stage(stage, tmp_path, capfd):
+    refused(capfd, ["info", stage[0]], "must be one of")
+    assert "Plane" in run(capfd, "info", *stage)[1]
+    assert run(capfd, "run", *stage, "--frames", 2, "-o", tmp_path / "moved.usdc")[0] == 0
+
+
+@pytest.mark.slow
+def test_benchmarks_and_charts_take_it(stage, tmp_path, capfd):
+    """In processes of their own, which import it too."""
+    code, out, err = run(capfd, "bench", *stage, "--solver", "xpbd", "-s", "substeps=2", "--frames", 3, "--json")
+    assert code == 0 and json.loads(out), err
+    chart = tmp_path / "chart.csv"
+    options = ["--diagram", "solver", "--solvers", "xpbd", "newton", "--frames", 1, "--csv", chart]
+    code, out, err = run(capfd, "chart", "work-precision", *stage, *options)
+    assert code == 0 and {"newton", "xpbd"} <= {row.split(",")[0] for row in chart.read_text().splitlines()}, err
 
 
 def test_what_is_no_energy_is_not_registered():
