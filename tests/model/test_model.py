@@ -192,6 +192,10 @@ BAD_BUILDS = {
     "no copies": ({"copies": 0}, "copies is 0"),
     "half a copy": ({"copies": 1.5}, "copies is 1.5"),
     "unknown": ({"vary": {"wind": [1.0]}}, "vary['wind'] names nothing in this scene"),
+    "time": (
+        {"copies": 2, "vary": {"duration": [1.0, 2.0]}},
+        "vary['duration'] is the same for all copies, which share their time",
+    ),
     "term that is not there": ({"vary": {"DihedralBending.stiffness": [1.0]}}, "names nothing in this scene"),
     "parameter that is not there": ({"vary": {"Spring.colour": [1.0]}}, "names nothing in this scene"),
     "rest length below 0": ({"copies": 2, "vary": {"Spring.rest_lengths": [1.0, -1.0]}}, "rest_lengths is -1.0 in copy 1; it"),

@@ -89,6 +89,11 @@ class Vary:
     def refuse_rest(self):
         """Refuses names that nobody took."""
         rest = sorted(set(self.values) - self.taken, key=str)
+        shared = [name for name in rest if name in ("duration", "fps", "pins.keyframes")]
+        if shared:
+            raise ValueError(
+                f"vary[{shared[0]!r}] is the same for all copies, which share their time and the motion of their pins"
+            )
         if rest:
             allowed = ["gravity", "density or masses", "positions", "velocities", *dict.fromkeys(self.fields)]
             raise ValueError(f"vary[{rest[0]!r}] names nothing in this scene; allowed are {', '.join(allowed)}")
