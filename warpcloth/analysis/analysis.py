@@ -29,7 +29,7 @@ def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, *
     """Measures an animation.
 
     With a ``neighbourhood`` of each vertex, else of each triangle: see :data:`warpcloth.analysis.measures.MEASURES` for all
-    measures, or the table in the README. Everything is kept; :class:`Analyzer` gives a row at a time, in memory that does not
+    measures, or docs/measuring.md. Everything is kept; :class:`Analyzer` gives a row at a time, in memory that does not
     grow.
 
     Args:
