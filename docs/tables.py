@@ -32,7 +32,7 @@ def energies():
 
 def attributes():
     """Lists the attributes of a stage that say what a cloth is."""
-    rows = [(row.name, row.type_names, row.place, row.field) for row in every_attribute() if row.field[:6] != "terms."]
+    rows = [(row.name, row.type_names, row.location, row.field) for row in every_attribute() if row.field[:6] != "terms."]
     return table(("Attribute", "Type", "On", "Field"), [[f"`{name}`", kinds(types), *more] for name, types, *more in rows])
 
 

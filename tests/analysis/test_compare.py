@@ -451,7 +451,7 @@ def test_the_command_says_what_is_left_out(files, tmp_path, capfd):
     np.savez(tmp_path / "broken.npz", points=points, triangles=GRID.triangles)
     code, out, err = run(capfd, "compare", tmp_path / "broken.npz", files / "cloth.usdc", "--fps-a", 24)
     assert (code, err) == (0, "") and "2 of 3 common frames compared" in out
-    assert "excluded      A: frame 1, vertex 4: not at a finite place" in out
+    assert "excluded      A: frame 1, vertex 4: has no finite position" in out
     assert "not compared  1 of the frames of B, without a partner: 3" in out
     assert "from the first frame of A, where no rest shape is given" in out
     code, out, err = run(capfd, "compare", tmp_path / "broken.npz", files / "cloth.usdc", "--fps-a", 24, "--json")

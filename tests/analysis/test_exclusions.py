@@ -84,7 +84,7 @@ def test_points_that_are_not_finite(device, on, bad):
         expected = [1, 2] if MEASURES[on][name].rate else [1]
         assert np.array_equal(rows, np.isin(np.arange(4), expected)[:, None] & touched), name
         assert np.array_equal(values[~lost(values)], clean[name][~lost(values)])
-    assert [str(e) for e in found.excluded if e.frame == 1] == ["frame 1, vertex 8: is not at a finite place"]
+    assert [str(e) for e in found.excluded if e.frame == 1] == ["frame 1, vertex 8: has no finite position"]
 
 
 @pytest.mark.parametrize("reference", ["rest", 2])

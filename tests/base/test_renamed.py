@@ -40,3 +40,12 @@ def test_analyze_takes_the_mesh_first_as_it_did(capfd):
     with pytest.warns(DeprecationWarning, match=r"Analyzer\(frames, mesh\)"):
         assert len(wc.Analyzer(mesh, frames)) == 2
     assert np.array_equal(wc.analyze(mesh=mesh, frames=frames)["stretch"], expected)
+
+
+def test_old_names_of_an_analysis():
+    mesh = wc.Mesh.grid(3, 3)
+    analyzer = wc.Analyzer([mesh.points, 1.5 * mesh.points], mesh)
+    with pytest.warns(DeprecationWarning, match="places is now called positions"):
+        assert np.array_equal(analyzer.places(mesh.points), analyzer.positions(mesh.points))
+    with pytest.warns(DeprecationWarning, match="place is now called index"):
+        assert [sample.place for sample in analyzer] == [0, 1]

@@ -127,7 +127,7 @@ def test_a_scene_from_a_stage_gives_a_layer_over_it(tmp_path, device):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"pins": wc.Pins("x == 0")}, "pins.keyframes is None; a deformation needs places for its handles"),
+        ({"pins": wc.Pins("x == 0")}, "pins.keyframes is None; a deformation needs positions of its handles"),
         ({"pins": wc.Pins([0, 0], np.zeros((1, 2, 3)))}, "pins.vertices names vertex 0 twice"),
         ({"pins": wc.Pins([0], np.full((2, 1, 3), np.nan))}, "pins.keyframes.* is nan; it must be finite"),
         ({"mesh": "bunny.usd"}, "mesh is 'bunny.usd'; it must be a Mesh, such as Mesh.load"),

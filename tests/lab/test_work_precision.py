@@ -79,7 +79,7 @@ def test_state_is_that_of_the_run(name, device):
     newton = wc.Newton(substeps=2, tolerance=1e-9)
     step = OneStep(scene, 3, 2, device)
     stepper = wc.Newton(substeps=2, tolerance=1e-9).bind(scene.build(device=device, dtype="float64"))
-    step.place(stepper)
+    step.set_state(stepper)
     for _ in range(2):
         stepper.step()
     run = wc.simulate(scene, newton, frames=4, dtype="float64", device=device).points
@@ -155,7 +155,7 @@ def test_errors_of_projective_dynamics_end_at_the_floor(device):
     step = OneStep(SMALL.load(), FRAME, 16, device)
     _mu, V, A = spectrum.relative_spectrum(step)
     places, stepper = np.repeat(step.free, 3), spectrum._bound(step, 256, device)
-    step.place(stepper)
+    step.set_state(stepper)
     stepper.step()
     left, first = ((d.ravel()[places] @ A @ V) for d in (step.correction(stepper) - step.best, step.best))
     assert 0.01 * found["floor"] < np.linalg.norm(left) / np.linalg.norm(first) < found["floor"] < spectrum.RESOLVED

@@ -465,7 +465,7 @@ def test_frames_without_times(tmp_path):
 
 
 REFUSED = [  # mesh, frames, options, message
-    (MESH, np.ma.masked_less(frames(), 0.1), {}, "frames is masked in places; it must have all points"),
+    (MESH, np.ma.masked_less(frames(), 0.1), {}, "frames is partly masked; it must have all points"),
     (MESH, frames(), {"dt": 0.1, "times": np.arange(5)}, "dt, times: both are given"),
     (MESH, frames(), {"dt": 0.0}, "dt is 0.0; it must be a number above 0"),
     (MESH, frames(), {"times": [0, 1, 2, 3]}, r"times has shape \(4,\); it must be \(5,\)"),

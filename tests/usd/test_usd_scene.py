@@ -194,7 +194,7 @@ def test_every_field_has_a_row():
     assert {field.name for field in fields(wc.Scene)} <= known | elsewhere
     for term in TERMS.values():
         assert {f"terms.{field.name}" for field in fields(term)} <= known
-    assert len({(row.name, row.place) for row in attributes()}) == len(attributes())
+    assert len({(row.name, row.location) for row in attributes()}) == len(attributes())
 
 
 def test_a_limit_without_a_stiffness_is_hard(tmp_path):
@@ -489,7 +489,7 @@ def own(name, type_name, value):
         (own("positions", "Double3Array", [(0, 0, 0)]), r"positions has shape \(1, 3\); it must be \(9, 3\)"),
         (
             {**OWN, "warpcloth:pins:keyframes": ("Double3Array", [(0, 0, 0)])},
-            "has 1 places, must have one for each of 2",
+            "has 1 positions, must have one for each of 2",
         ),
         (own("gridShape", "Int2", Gf.Vec2i(2, 2)), "grid_shape = .* must be the number of points, 9"),
     ],

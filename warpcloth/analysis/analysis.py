@@ -187,12 +187,17 @@ class Analyzer:
         """Rest areas (E,) of triangles, or lumped ones of vertices [m²]."""
         return self.mesh.triangle_areas if self.on == "triangle" else self.mesh.vertex_areas
 
-    def places(self, points: np.ndarray) -> np.ndarray:
-        """Where the elements are among points (n, 3): the centroids of triangles, or the vertices, (E, 3)."""
+    def positions(self, points: np.ndarray) -> np.ndarray:
+        """Positions of the elements, (E, 3) [m]: the centroids of triangles, or the vertices, of points (n, 3) [m]."""
         if self.on == "vertex":
             return points
         a, b, c = self.mesh.triangles.T
         return (points[a] + points[b] + points[c]) / 3.0
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        """Old name of :meth:`positions`."""
+        warnings.warn("Analyzer: places is now called positions", DeprecationWarning, stacklevel=2)
+        return self.positions(points)
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -207,25 +212,25 @@ class Analyzer:
         seen: set[int | None] = set()
         referred: set[int | None] = set()
         for row, pair in enumerate(self.pairs):
-            places = {pair.reference, pair.frame} | ({pair.before} if pair.before is not None else set())
-            held = {place: held[place] if place in held else self._read(place) for place in places}
-            for place in places - seen:
-                vertices = np.flatnonzero(held[place].lost_vertices)
+            indices = {pair.reference, pair.frame} | ({pair.before} if pair.before is not None else set())
+            held = {index: held[index] if index in held else self._read(index) for index in indices}
+            for index in indices - seen:
+                vertices = np.flatnonzero(held[index].lost_vertices)
                 if len(vertices):
-                    excluded.append(Exclusion(self._label(place), "vertex", vertices, "is not at a finite place"))
+                    excluded.append(Exclusion(self._label(index), "vertex", vertices, "has no finite position"))
             without = self._refer(held[pair.reference])
             if pair.reference not in referred:
                 none = np.flatnonzero(without & ~held[pair.reference].lost)
                 if len(none):
                     excluded.append(Exclusion(self._label(pair.reference), self.on, none, elements.without))
-            seen |= places
+            seen |= indices
             referred.add(pair.reference)
             elements.measure(held[pair.frame].points)
             if rates and pair.before is None:
                 excluded.append(_frame(labels[pair.frame], f"has none before it, and so no {rates}"))
             elif rates:
                 elements.start(held[pair.before].points)
-                rounding = max(held[place].rounding for place in places)
+                rounding = max(held[index].rounding for index in indices)
                 elements.rates(times[pair.frame] - times[pair.before], self.rates, rounding)
             values = elements.read()
             known = without | held[pair.reference].lost | held[pair.frame].lost
@@ -259,8 +264,8 @@ class Analyzer:
         values[lost] = np.nan
         return np.flatnonzero(lost & ~known)
 
-    def _read(self, place):
-        points = self.mesh.points.view() if place is None else self.sequence[place]
+    def _read(self, index):
+        points = self.mesh.points.view() if index is None else self.sequence[index]
         points.flags.writeable = False  # samples share it with the frames that follow
         lost = ~np.isfinite(points).all(axis=1)
         # By the input, and by what computes about one of the points.
@@ -269,8 +274,8 @@ class Analyzer:
             rounding += np.finfo(self.dtype).eps * np.ptp(found, axis=0).max()
         return _Held(points, rounding, lost, self._elements.touched(lost) if lost.any() else np.zeros(self.count, dtype=bool))
 
-    def _label(self, place):
-        return None if place is None else self.sequence.labels[place]
+    def _label(self, index):
+        return None if index is None else self.sequence.labels[index]
 
 
 @dataclass(frozen=True, eq=False)

@@ -196,7 +196,7 @@ def _turned(b, axis_a, axis_b):
 
 
 def _matching(a, b):
-    """Places of the frames of one time (F, 2), F at least 1."""
+    """Indices of the frames of one time (F, 2), F at least 1."""
     steps = np.concatenate([np.diff(a.times), np.diff(b.times)])
     near = _SAME_TIME * (steps.min() if len(steps) else 1.0)
     after = np.searchsorted(b.times, a.times - near).clip(max=len(b) - 1)
@@ -237,13 +237,13 @@ class _Pair:
 
     def measure(self, i, j):
         """Numbers by name of frame i of a and j of b; none where a point is not finite."""
-        points = [sequence[place] for sequence, place in zip(self.sequences, (i, j), strict=True)]
-        labels = [sequence.labels[place] for sequence, place in zip(self.sequences, (i, j), strict=True)]
+        points = [sequence[index] for sequence, index in zip(self.sequences, (i, j), strict=True)]
+        labels = [sequence.labels[index] for sequence, index in zip(self.sequences, (i, j), strict=True)]
         lost = [np.flatnonzero(~np.isfinite(x).all(axis=1)) for x in points]
         for excluded, label, vertices in zip(self.excluded, labels, lost, strict=True):
             if len(vertices):
                 excluded.append(
-                    Exclusion(label, "vertex", vertices, "not at a finite place, so that the frame is not compared")
+                    Exclusion(label, "vertex", vertices, "has no finite position, so that the frame is not compared")
                 )
         if any(map(len, lost)):
             return {}

@@ -10,7 +10,7 @@ from ..base.checks import shown, whole
 
 @dataclass(frozen=True)
 class Pair:
-    """One row of an analysis, in places of frames in their sequence.
+    """One row of an analysis, by indices of frames in their sequence.
 
     Attributes:
         reference: The frame that counts as undeformed; None for the rest shape.
@@ -63,7 +63,7 @@ def pairs_of(labels, reference=None, pairs=None, lag=None, every=1):
     if named and reference in ("rest", "first"):
         start = None if reference == "rest" else 0
     else:
-        start = _place(
+        start = _index(
             labels, reference, f"reference = {shown(reference)}", '"rest", "first", "previous" or a number of a frame'
         )
     return [Pair(start, int(frame), last) for frame, last in zip(kept, before, strict=True)], []
@@ -85,13 +85,13 @@ def _listed(pairs):
 
 def _pair(labels, pair):
     where = f"pairs, {pair[0]}:{pair[1]}"
-    start, frame = (_place(labels, number, where, "numbers of frames") for number in pair)
+    start, frame = (_index(labels, number, where, "numbers of frames") for number in pair)
     if start == frame:
         raise ValueError(f"{where}: is of a frame with itself, must be of two")
     return Pair(start, frame, start)
 
 
-def _place(labels, value, where, rule):
+def _index(labels, value, where, rule):
     try:
         number = float(None if isinstance(value, (bool, np.bool_)) else value)
     except (TypeError, ValueError):
@@ -111,9 +111,9 @@ def _lagged(labels, kept, lag):
     found, left_out = [], []
     for start in kept.tolist() if later <= labels[-1] - labels[0] + 1e-6 else ():
         target = labels[start] + later
-        places = np.flatnonzero(np.isclose(labels, target, rtol=0.0, atol=1e-6))
-        if len(places):
-            found.append(Pair(start, int(places[0]), start))
+        matches = np.flatnonzero(np.isclose(labels, target, rtol=0.0, atol=1e-6))
+        if len(matches):
+            found.append(Pair(start, int(matches[0]), start))
         elif target < labels[-1]:
             left_out.append((labels[start], f"has no frame {lag} later, for {target:g} is missing"))
     if not found:

@@ -21,7 +21,7 @@ def neighbourhoods(mesh, chosen):
     """The neighbourhood of each vertex, itself among them.
 
     Rings follow edges. Nearest points are those of the rest shape, as the crow flies: of a garment they may belong to a layer
-    that only lies near, and a vertex that is not at a finite place has none. A vertex without a triangle has none, and is in
+    that only lies near, and a vertex without a finite position has none. A vertex without a triangle has none, and is in
     none.
 
     Args:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..base.renamed import renamed
 from ..mesh.mesh import Mesh
 from .measures import Measure
 
@@ -37,15 +38,16 @@ class Exclusion:
         return f"{where}, {count}{kind} {named}: {self.reason}"
 
 
+@renamed(place="index")
 @dataclass(frozen=True, eq=False)
 class Sample:
     """One row of an analysis: a frame measured against its reference.
 
     Attributes:
-        row: Its place among the rows.
+        row: Its index among the rows.
         reference: Number of the reference frame; None for the rest shape.
         frame: Number of the frame.
-        place: Place of the frame in its sequence.
+        index: Index of the frame in its sequence.
         time: Of the frame [s]; NaN where the sequence has no times.
         points: (n, 3) [m], read-only.
         values: Arrays (E, *shape) by name of measure, NaN in what is excluded; the analyzer's next sample overwrites them.
@@ -55,7 +57,7 @@ class Sample:
     row: int
     reference: float | None
     frame: float
-    place: int
+    index: int
     time: float
     points: np.ndarray
     values: dict[str, np.ndarray]

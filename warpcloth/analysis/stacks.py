@@ -75,7 +75,7 @@ class NpzWriter(Output):
                 with _member(archive, name) as member:
                     np.lib.format.write_array(member, head[: self.rows])
             for name, (shape, dtype) in self._fields.items():
-                with _member(archive, name) as member, self._parts[name] as part:  # which frees its place on the disk
+                with _member(archive, name) as member, self._parts[name] as part:  # which frees its space on the disk
                     _copy(part, member, (self.rows, *shape), dtype)
 
 

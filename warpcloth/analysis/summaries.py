@@ -51,14 +51,14 @@ class Summary:
     largest_at: tuple[float, float, float]
 
 
-def summarise(name, unit, values, places, weights, *, frame, reference, time):
+def summarise(name, unit, values, positions, weights, *, frame, reference, time):
     """The `Summary` of a scalar field.
 
     Args:
         name: Of the scalar.
         unit: Of the scalar.
         values: (E,), NaN where an element is excluded.
-        places: (E, 3) centroids of triangles or positions of vertices in this frame [m].
+        positions: (E, 3) centroids of triangles or positions of vertices in this frame [m].
         weights: (E,) rest areas of triangles, or lumped ones of vertices [m²]; those of excluded elements are not read.
         frame: Label of the frame.
         reference: Label of the frame that it is measured against; None is the rest shape.
@@ -67,9 +67,9 @@ def summarise(name, unit, values, places, weights, *, frame, reference, time):
     Raises:
         ValueError: A shape is not as above, or the weight of a measured element is negative or not finite.
     """
-    values, weights, places = np.asarray(values, dtype=np.float64), np.asarray(weights), np.asarray(places)
-    if values.ndim != 1 or weights.shape != values.shape or places.shape != (*values.shape, 3):
-        shapes = f"values {values.shape}, weights {weights.shape} and places {places.shape}"
+    values, weights, positions = np.asarray(values, dtype=np.float64), np.asarray(weights), np.asarray(positions)
+    if values.ndim != 1 or weights.shape != values.shape or positions.shape != (*values.shape, 3):
+        shapes = f"values {values.shape}, weights {weights.shape} and positions {positions.shape}"
         raise ValueError(f"{name}: {shapes} do not go together; they must be (E,), (E,) and (E, 3)")
     total, elements = len(values), np.flatnonzero(~np.isnan(values))
     values, weights = values[elements], weights[elements]
@@ -90,14 +90,14 @@ def summarise(name, unit, values, places, weights, *, frame, reference, time):
         area_mean=_weighted_mean(values, weights),
         percentiles=_percentiles(values),
         smallest=smallest,
-        smallest_at=_place(places, smallest),
+        smallest_at=_position(positions, smallest),
         largest=largest,
-        largest_at=_place(places, largest),
+        largest_at=_position(positions, largest),
     )
 
 
-def _place(places, element):
-    return (math.nan,) * 3 if element < 0 else tuple(places[element].astype(np.float64).tolist())
+def _position(positions, element):
+    return (math.nan,) * 3 if element < 0 else tuple(positions[element].astype(np.float64).tolist())
 
 
 def _weighted_mean(values, weights):
@@ -130,7 +130,7 @@ class CsvWriter(Output):
     """A table with a line for each frame and scalar: the columns of `COLUMNS`, in UTF-8.
 
     Numbers have as many digits as float64 needs; what there is no value for is an empty cell. The scalar is in its ``unit``,
-    ``time`` in s, and the places ``min_x`` to ``max_z`` in m.
+    ``time`` in s, and the positions ``min_x`` to ``max_z`` in m.
     """
 
     COLUMNS = (

@@ -40,8 +40,8 @@ class _Elements:
     def upload(self, values, kind):
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy), dtype=kind, device=self.device)
 
-    def place(self, points):
-        """Points (n, 3) on the device, in float32 about one of them: measures depend on digits, and not on the place."""
+    def centred(self, points):
+        """Points (n, 3) on the device, in float32 relative to one of them, so that a distance from the origin costs no digits."""
         if self.numpy is np.float32:
             finite = np.isfinite(points).all(axis=1)
             points = points - points[finite.argmax()] if finite.any() else points
@@ -116,7 +116,7 @@ class Triangles(_Elements):
     def refer(self, X, rounding):
         """Sets the reference X (n, 3), rounded by ``rounding`` [m]; returns which triangles have none in it, (T,)."""
         outputs = (self.frames, self.inverse_edges, self.sizes)
-        self.launch(deformation.frame_triangles(self.scalar), [self.triangles, self.place(X), self.scalar(rounding)], outputs)
+        self.launch(deformation.frame_triangles(self.scalar), [self.triangles, self.centred(X), self.scalar(rounding)], outputs)
         if self.materials is not None:
             inputs = [self.coefficients, self.inverse_edges]
             self.launch(deformation.unit_directions(self.scalar), inputs, [self.materials])
@@ -139,7 +139,7 @@ class Triangles(_Elements):
             self.launch(kernel, [self.stiffness, self.rest, self.gradients], names)
 
     def _find_gradients(self, x, out):
-        inputs = [self.triangles, self.inverse_edges, self.place(x)]
+        inputs = [self.triangles, self.inverse_edges, self.centred(x)]
         self.launch(deformation.triangle_gradients(self.scalar), inputs, [out])
 
     def touched(self, vertices):
@@ -186,7 +186,7 @@ class Neighbourhoods(_Elements):
 
         These cannot be fitted to themselves.
         """
-        self.X, self.rounding = self.place(X), self.scalar(rounding)
+        self.X, self.rounding = self.centred(X), self.scalar(rounding)
         self._find_normals(self.X, self.reference_normals)
         self._fit(X, [self.gradients, self.frames, None, None, None])
         return np.isnan(self.gradients.numpy()[:, 0, 0])
@@ -214,7 +214,7 @@ class Neighbourhoods(_Elements):
         self.launch(fits.vertex_normals(self.scalar), inputs, [out])
 
     def _fit(self, x, outputs):
-        x = self.place(x)
+        x = self.centred(x)
         if outputs[0] is not None:
             self._find_normals(x, self.normals)
         inputs = [self.offsets, self.members, self.reference_normals, self.X, self.normals, x, self.rounding]

@@ -81,5 +81,5 @@ def refuse(name: str, values: np.ndarray, wrong: ArrayLike, rule: str) -> None:
     """Refuses an array where ``wrong`` is true anywhere, naming the first such entry."""
     where = np.argwhere(wrong)
     if len(where):
-        place = where[0].tolist()
-        raise ValueError(f"{name}{place or ''} is {float(values[tuple(place)])}; it {rule}")
+        index = where[0].tolist()
+        raise ValueError(f"{name}{index or ''} is {float(values[tuple(index)])}; it {rule}")

@@ -25,10 +25,10 @@ def check_apart(outputs, inputs=()):
     for path in outputs:
         if path is None:
             continue
-        place = os.path.realpath(path)
-        if place in taken:
-            raise ValueError(f"{path}: {taken[place]}")
-        taken[place] = "is given for two outputs; each must have a file of its own"
+        real = os.path.realpath(path)
+        if real in taken:
+            raise ValueError(f"{path}: {taken[real]}")
+        taken[real] = "is given for two outputs; each must have a file of its own"
 
 
 class Output:

@@ -36,7 +36,7 @@ def plot_physics(path, results):
     panels = figure.subplots(down, 2 * across, squeeze=False, sharey=True).reshape(-1, 2)
     for (left, right), (title, lines) in zip(panels, rows.items(), strict=False):
         for k, (label, points) in enumerate(lines.items()):
-            # One that is exact to the last bit has no place on logarithmic axes either.
+            # One that is exact to the last bit cannot be drawn on logarithmic axes either.
             good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if found["error"])
             style = {"marker": _MARKS[k % len(_MARKS)], "markersize": 4, "linewidth": 1.0, "color": f"C{k}"}
             left.plot([h for h, _, _ in good], [error for _, error, _ in good], label=label, **style)

@@ -64,17 +64,17 @@ def plot_maps(path, survey, cells, accuracy=None):
     lines = math.ceil(count / columns)
     figure = Figure(figsize=(max(2.9 * columns, 6.0), 2.6 * lines + 2.0), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
-    places = [_places(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
+    coordinates = [_coordinates(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
     shown = {}
     for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
-        axes.pcolormesh(*map(_edges, places), _colours(rows), edgecolors="white", linewidth=0.4)
-        _hatch(axes, places, rows)
+        axes.pcolormesh(*map(_edges, coordinates), _colours(rows), edgecolors="white", linewidth=0.4)
+        _hatch(axes, coordinates, rows)
         for name, (dashes, _) in _STYLES.items():
             style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
-            if _line(axes, places, rows, name, style):
+            if _line(axes, coordinates, rows, name, style):
                 shown[name] = style
         axes.set_title(str(setup), fontsize=_TEXT, color=GREY)
-        for of, name, values, at in zip("xy", (survey.x, survey.y), (survey.xs, survey.ys), places, strict=True):
+        for of, name, values, at in zip("xy", (survey.x, survey.y), (survey.xs, survey.ys), coordinates, strict=True):
             ticks, numbers = _ticks(name, values, at)
             axes.set(**{f"{of}ticks": ticks, f"{of}ticklabels": numbers})
             if (of == "x" and k >= count - columns) or (of == "y" and k % columns == 0):
@@ -93,7 +93,7 @@ def plot_maps(path, survey, cells, accuracy=None):
     save(figure, path)
 
 
-def _places(name, values):
+def _coordinates(name, values):
     """Where the values stand along an axis."""
     return np.log10(values) if AXES[name].logarithmic else np.asarray(values, dtype=np.float64)
 
@@ -109,7 +109,7 @@ def _ticks(name, values, at):
 
 
 def _edges(at):
-    """Ends of cells about places (n,), (n+1,)."""
+    """Ends of cells about coordinates (n,), (n+1,)."""
     if len(at) == 1:
         return np.array([at[0] - 0.5, at[0] + 0.5])
     middle = 0.5 * (at[1:] + at[:-1])
@@ -128,18 +128,18 @@ def _colour(cell):
     return _EARLY + min(max(part, 0.0), 1.0) * (_LATE - _EARLY)
 
 
-def _hatch(axes, places, rows):
+def _hatch(axes, coordinates, rows):
     """What is stable or inaccurate in the colours of both."""
     from matplotlib.patches import Rectangle
 
-    across, up = map(_edges, places)
+    across, up = map(_edges, coordinates)
     for j, row in enumerate(rows):
         for i, cell in enumerate(row):
             if cell["verdict"] == "unsure":
                 axes.add_patch(Rectangle((across[i], up[j]), across[i + 1] - across[i], up[j + 1] - up[j], **_UNSURE))
 
 
-def _line(axes, places, rows, name, style):
+def _line(axes, coordinates, rows, name, style):
     """The line where a rule is 1, between the cells; whether there is one."""
     ratios = np.array([[cell["rules"].get(name) or np.nan for cell in row] for row in rows], dtype=float)
     if min(ratios.shape) < 2:
@@ -147,7 +147,7 @@ def _line(axes, places, rows, name, style):
     heights = np.log10(ratios)
     if not (np.nanmin(heights, initial=np.inf) < 0.0 < np.nanmax(heights, initial=-np.inf)):
         return False
-    axes.contour(*places, np.ma.masked_invalid(heights), levels=[0.0], **style)
+    axes.contour(*coordinates, np.ma.masked_invalid(heights), levels=[0.0], **style)
     return True
 
 

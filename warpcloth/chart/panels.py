@@ -31,10 +31,10 @@ def plot_panels(path, panels, rows, title):
     down = math.ceil(len(panels) / across)
     figure = Figure(figsize=(5.0 * across, 4.1 * down + 0.3), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
-    places = figure.subplots(down, across, squeeze=False).ravel()
-    for axes, panel in zip(places, panels, strict=False):
+    grid = figure.subplots(down, across, squeeze=False).ravel()
+    for axes, panel in zip(grid, panels, strict=False):
         _draw(axes, panel, [row for row in rows if row["panel"] == panel.key])
-    for axes in places[len(panels) :]:
+    for axes in grid[len(panels) :]:
         axes.remove()
     figure.suptitle(title, fontsize=10, color=GREY)
     save(figure, path)
@@ -82,5 +82,5 @@ def _draw(axes, panel, rows):
 
 
 def _between(low, high, scale):
-    """Places of a line, at equal distances on the axis."""
+    """Points of a line, at equal distances on the axis."""
     return np.geomspace(low, high, 400) if scale == "log" else np.linspace(low, high, 721)

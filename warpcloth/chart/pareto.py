@@ -62,8 +62,8 @@ def plot_time(path, found):
         x, y = ([rows[i][of] for i in fronts[name]] for of in ("ms_per_second", name))
         axes.plot(x, y, color="gold", linewidth=5.0, zorder=0, label="nothing is better in both")
         for i in fronts[name]:
-            place, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": _TEXT}
-            axes.annotate(str(best.index(i) + 1), place, (-4, -4), textcoords="offset points", **below)
+            point, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": _TEXT}
+            axes.annotate(str(best.index(i) + 1), point, (-4, -4), textcoords="offset points", **below)
         axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="quartiles of the times")
         _floor(axes, reference[name], "error of the reference")
         axes.set(xlabel="ms for a second of motion", ylabel=text)
@@ -135,7 +135,7 @@ def plot_spectrum(path, found):
         at, errors = ([point[name] for point in known] for name in ("iterations", "predicted"))
         panels[1].plot(at, errors, color=colour, linewidth=0.8)
     for k, row in enumerate(good):
-        _floor(panels[1], row["floor"], "rounding of the places", f"C{k}")
+        _floor(panels[1], row["floor"], "rounding of the positions", f"C{k}")
     panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
     panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
     title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"

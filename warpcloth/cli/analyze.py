@@ -7,7 +7,7 @@ from ..base.checks import choice
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import convert
-from .terminal import Progress, as_json, check_writable, frames_folder_of, place
+from .terminal import Progress, as_json, check_writable, frames_folder_of, location
 
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays, .npz or .npy.
@@ -251,7 +251,7 @@ def _summary(facts):
         low, high = facts["colour_range"]
         lines.append(f"  colours       {facts['coloured']}, {low:.5g} to {high:.5g}")
     if facts["file"]:
-        lines.append(f"  file          {place(facts)}")
+        lines.append(f"  file          {location(facts)}")
     lines += [f"  {name:<13} {facts[name]}" for name in ("csv", "report", "npz", "plot", "still") if facts[name]]
     if facts["excluded"]:
         lines.append("  left out")

@@ -117,7 +117,7 @@ def _facts(arguments, found, sequences):
         "rest_declared": [bool(s.declared) for s in sequences],
         "compared": int(np.isfinite(found.hausdorff).sum()),
         "unmatched": [
-            [s.labels[place].item() for place in places] for s, places in zip(sequences, found.unmatched, strict=True)
+            [s.labels[index].item() for index in partners] for s, partners in zip(sequences, found.unmatched, strict=True)
         ],
         "excluded": [[str(one) for one in excluded] for excluded in found.excluded],
         "hausdorff": _worst(found, found.hausdorff),

@@ -15,7 +15,7 @@ from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
 from ..base.texts import convert
 from .run import named_scene
-from .terminal import Progress, as_json, check_writable, frames_folder_of, place
+from .terminal import Progress, as_json, check_writable, frames_folder_of, location
 
 _FRAMES, _FPS = 24, 24.0
 
@@ -163,7 +163,7 @@ def _summary(facts):
             f"  energy        {facts['last_energy']:.4g} m² in the last frame",
             f"  method        {facts['energy']}, {facts['weights']} weights, tolerance {facts['tolerance']:g}",
             f"  device        {facts['device']}, {facts['dtype']}",
-            f"  file          {place(facts)}",
+            f"  file          {location(facts)}",
         ]
     )
 
@@ -238,12 +238,12 @@ def _handles(mesh, fixes, moves, frames):
     handles = np.flatnonzero(owners >= 0)
     _refuse_size(frames, mesh, len(handles))
     time = np.linspace(0.0, 1.0, frames + 1)
-    places = np.tile(mesh.points[handles], (frames + 1, 1, 1))
+    keyframes = np.tile(mesh.points[handles], (frames + 1, 1, 1))
     for number, (_, _, move) in enumerate(groups):
         if move is not None:
             own = owners[handles] == number
-            places[:, own] = _path(move, mesh.points[handles[own]], time)
-    return handles, places
+            keyframes[:, own] = _path(move, mesh.points[handles[own]], time)
+    return handles, keyframes
 
 
 def _refuse_size(frames, mesh, handles):
@@ -252,7 +252,7 @@ def _refuse_size(frames, mesh, handles):
 
 
 def _path(move, points, time):
-    """Places (F, p, 3) of points that a move takes along, at times (F,) from 0 to 1."""
+    """Positions (F, p, 3) of points that a move takes along, at times (F,) from 0 to 1."""
     from scipy.spatial.transform import Rotation
 
     path = np.tile(points, (len(time), 1, 1))

@@ -130,10 +130,10 @@ def write_report(
                 values = {}
                 for measure in analyzer.measures:
                     values |= scalars(measure, sample.values[measure.name])
-                places = analyzer.places(sample.points)
+                positions = analyzer.positions(sample.points)
                 about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
                 for name, numbers in values.items():
-                    summary = summarise(name, listed[name].unit, numbers, places, analyzer.areas, **about)
+                    summary = summarise(name, listed[name].unit, numbers, positions, analyzer.areas, **about)
                     report.extremes[name].add(summary)
                     if plot:
                         kept.append(summary)
@@ -148,7 +148,7 @@ def write_report(
                 if archive:
                     archive.append(sample.frame, sample.reference, sample.time, sample.values)
                 if shown:
-                    shown.append(sample, values, places)
+                    shown.append(sample, values, positions)
                 report.rows += 1
                 if progress:
                     progress(report.rows, len(analyzer))
@@ -242,9 +242,9 @@ def _range(analyzer, name, measure, given):
         summaries = []
         for sample in analyzer.of(measure.name):
             numbers = scalars(measure, sample.values[measure.name])[name]
-            places = np.zeros((len(numbers), 3))
+            positions = np.zeros((len(numbers), 3))
             about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
-            summaries.append(summarise(name, measure.unit, numbers, places, analyzer.areas, **about))
+            summaries.append(summarise(name, measure.unit, numbers, positions, analyzer.areas, **about))
         given = range_over(summaries, _neutral(measure))
     scale = Scale(*given, _neutral(measure))
     return scale.low, scale.high
@@ -302,9 +302,9 @@ class _Shown:
         if self.stills:
             from ..chart import View
 
-            places = {pair.frame for pair in analyzer.pairs if sequence.labels[pair.frame] in self.stills}
+            frames = {pair.frame for pair in analyzer.pairs if sequence.labels[pair.frame] in self.stills}
             view = replace(view or View(), up_axis=up_axis)
-            self.view = view.fit(sequence[place] for place in sorted(places))
+            self.view = view.fit(sequence[frame] for frame in sorted(frames))
         self.writer, self.rate = None, _rate(sequence)
         if usd:
             from ..usd import MeasureWriter
@@ -313,8 +313,8 @@ class _Shown:
             if len(lost) and not self.over:
                 where = "the rest shape" if sequence.declared else f"frame {sequence.labels[0]:g}, which is the rest shape,"
                 raise ValueError(
-                    f"{sequence.path or 'mesh'}: {where} has vertex {lost[0]} in no finite place, and a stage needs all; "
-                    "give another rest shape (--rest), or write no stage"
+                    f"{sequence.path or 'mesh'}: {where} has vertex {lost[0]} without a finite position; "
+                    "a stage needs all of them; give another rest shape (--rest), or write no stage"
                 )
 
             kind = "uniform" if analyzer.on == "triangle" else "vertex"
@@ -332,9 +332,9 @@ class _Shown:
             )
             stack.callback(self.writer.close, single_file=single_file)
 
-    def append(self, sample, values, places):
+    def append(self, sample, values, positions):
         """Adds a row, whose scalars (E,) are ``values``."""
-        segments = self._segments(sample, places) if self.curves else None
+        segments = self._segments(sample, positions) if self.curves else None
         finite = np.isfinite(sample.points).all()
         if self.writer and (self.over or finite):  # without a stage below it a frame needs points
             primvars = {camel(name): _single(numbers) for name, numbers in values.items()}
@@ -366,12 +366,12 @@ class _Shown:
         code = sequence.labels[0] + self.rate * (sample.time - sequence.times[0])
         return sample.frame if abs(code - sample.frame) < _EVEN else code
 
-    def _segments(self, sample, places):
+    def _segments(self, sample, positions):
         """Principal directions as long as their stretches, by name: centres and vectors (E, 3) [m]."""
         stretch, directions = sample.values["stretch"], sample.values["directions"]
         count = stretch.shape[1]
         vectors = [self.length * stretch[:, k, None] * directions[:, k] for k in range(count)]
-        return {f"principal{k + 1}": (_single(places), _single(vector)) for k, vector in enumerate(vectors)}
+        return {f"principal{k + 1}": (_single(positions), _single(vector)) for k, vector in enumerate(vectors)}
 
 
 def _single(values):

@@ -13,7 +13,7 @@ from ..base.quiet import find_device
 from ..base.texts import assignments, options
 from ..run.listing import folders, list_scenes
 from .options import DEFAULT
-from .terminal import Progress, as_json, check_writable, frames_folder_of, place, say
+from .terminal import Progress, as_json, check_writable, frames_folder_of, location, say
 
 # A step that all solvers without a limit take well; where no step is given the substeps come nearest to it.
 _STEPS_A_SECOND = 240
@@ -110,7 +110,7 @@ def _summary(facts):
             f"  residual      {residual}",
             f"  solver        {_solver_line(facts)}",
             f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),
-            f"  file          {place(facts)}",
+            f"  file          {location(facts)}",
         ]
     )
 

@@ -31,7 +31,7 @@ def frames_folder_of(arguments):
     return None if arguments.single_file or output.suffix == ".usdz" else str(frames_folder(output))
 
 
-def place(facts):
+def location(facts):
     """Where the output is, in the words of a summary."""
     if not facts["frames_folder"]:
         return facts["file"]

@@ -66,7 +66,7 @@ class Arap:
 
     - "cotangent": ½(cot α + cot β) of the angles opposite the edge; negative where α + β > 180°.
     - "clamped": the same, negative ones 0. Gives up linear precision: of a flat mesh L x = 0 no longer holds inside.
-    - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges take the place of those of the mesh (Fisher
+    - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges replace those of the mesh (Fisher
       et al. 2007); negative at most on the boundary. Of manifolds that can be oriented. Needs libigl:
       ``pip install -e '.[intrinsic]'`` in the checkout.
     - "uniform": 1 for each edge; the only ones for an edge mesh.
@@ -160,12 +160,12 @@ class Arap:
         near = worthwhile_order(mesh)
         vertices = np.arange(n) if near is None else near
         self._order = np.concatenate([vertices[~np.isin(vertices, self.handles)], self.handles])
-        self._place = np.argsort(self._order)
+        self._rank = np.argsort(self._order)
         system = self.laplacian[self._order[:f]]
         self._coupling = system[:, self.handles]
         self._factor = constant_factor(system[:, self._order[:f]], self.device, self._scalar) if f else None
 
-        # Coordinates of about unit size near the origin: nothing is lost to the place or the size of a mesh. A power of two
+        # Coordinates of about unit size near the origin: nothing is lost to the position or the size of a mesh. A power of two
         # scales without rounding.
         self._unit = 2.0 ** np.ceil(np.log2(np.ptp(mesh.points, axis=0).max()))
         self._rest = (mesh.points - mesh.points[self.handles].mean(axis=0)) / self._unit
@@ -231,9 +231,9 @@ class Arap:
                 'energy = "spokes_and_rims", or weights = "clamped"',
                 stacklevel=3,
             )
-        points = self._x.read()[self._place] * self._unit + origin
+        points = self._x.read()[self._rank] * self._unit + origin
         points[self.handles] = targets
-        rotations = self._rotations.read()[self._place].astype(np.float64)
+        rotations = self._rotations.read()[self._rank].astype(np.float64)
         return Deformed(points, rotations, np.array(energies), len(energies) - 1, bool(converged))
 
     def _fit(self, iteration):
@@ -265,7 +265,7 @@ class Arap:
         own = self.parts[self.handles]
         sets = np.split(np.argsort(own, kind="stable"), np.cumsum(np.bincount(own))[:-1])
         rotations = kabsch(before, after, neighbours=sets)
-        old, new = (np.stack([places[members].mean(axis=0) for members in sets]) for places in (before, after))
+        old, new = (np.stack([held[members].mean(axis=0) for members in sets]) for held in (before, after))
         return np.einsum("nij,nj->ni", rotations[self.parts], points - old[self.parts]) + new[self.parts]
 
     def _connected(self, adjacency):
@@ -288,7 +288,7 @@ class Arap:
 
     def _record(self, mesh, pairs, w, rims):
         """The segment that fits the rotations of the cells and finds the energy and the right-hand side."""
-        rest, place, n = self._rest, self._place, len(self._order)
+        rest, rank, n = self._rest, self._rank, len(self._order)
         vec3, _ = types(self._scalar)
         if rims:
             triangles, cotangents = mesh.triangles, _half_cotangents(mesh)
@@ -303,13 +303,13 @@ class Arap:
             moments = w[:, None] * (rest[j] - rest[i])
             entries = np.r_[i, i, j, j], np.r_[j, i, i, j], np.concatenate([moments, -moments, -moments, moments])
             elements, kernel, weights, kind = pairs, cells.edge_energy, w, self._scalar
-        cell, member, moments = _summed(place[entries[0]], place[entries[1]], entries[2].reshape(-1, 3), n)
+        cell, member, moments = _summed(rank[entries[0]], rank[entries[1]], entries[2].reshape(-1, 3), n)
         rows = self._compressed(cell, member, moments, n)
         # Every edge is in 2 cells, or every side of a triangle in 3, so that the sum over cells is that often L x = b.
         columns = self._compressed(member, cell, moments / (3 if rims else 2), n)
 
         index = wp.types.vector(elements.shape[1], wp.int32)
-        elements = place[elements].astype(np.int32)
+        elements = rank[elements].astype(np.int32)
         order = np.argsort(elements.min(axis=1), kind="stable")  # so that neighbours are read one after another
         elements, weights = wp.array(elements[order], dtype=index, device=self.device), self._array(weights[order], kind)
         energies = self._zeros(len(elements), wp.float64)
@@ -346,13 +346,13 @@ class Arap:
         return wp.zeros(shape, dtype=dtype, device=self.device)
 
 
-def _points(name, value, count, place):
-    """``value`` as finite points (count, 3), float64; ``place`` gives words for a row."""
+def _points(name, value, count, label):
+    """``value`` as finite points (count, 3), float64; ``label`` names a row."""
     found = numeric(name, value, f"have shape {(count, 3)}")
     if found.shape != (count, 3):
         raise ValueError(f"{name} has shape {found.shape}; it must be {(count, 3)}")
     for k in np.flatnonzero(~np.isfinite(found).all(axis=1))[:1]:
-        raise ValueError(f"{name}[{k}]{place(k)} is {found[k].tolist()}; it must be finite")
+        raise ValueError(f"{name}[{k}]{label(k)} is {found[k].tolist()}; it must be finite")
     return found
 
 
@@ -393,7 +393,7 @@ def _edge_weights(mesh, weights):
 
 
 def _summed(rows, columns, values, n):
-    """Entries with vectors as values: those of one place added, and those of value 0 dropped but on the diagonal."""
+    """Entries with vectors as values: those of one entry added, and those of value 0 dropped but on the diagonal."""
     keys, inverse = np.unique(rows.astype(np.int64) * n + columns, return_inverse=True)
     rows, columns = np.divmod(keys, n)
     values = np.stack([np.bincount(inverse, axis) for axis in values.T], axis=1)

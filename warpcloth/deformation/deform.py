@@ -115,7 +115,7 @@ def deform(
     number("tolerance", tolerance, least=0.0)
     pins = checked_pins(pins, mesh)
     if pins.keyframes is None:
-        raise ValueError("pins.keyframes is None; a deformation needs places for its handles, (F, p, 3), in each frame")
+        raise ValueError("pins.keyframes is None; a deformation needs positions of its handles, (F, p, 3), in each frame")
     frames = len(pins.keyframes)
     if output is not None:  # before an earlier result is replaced
         _refuse_beyond_float32(pins.keyframes, fps)
@@ -126,11 +126,11 @@ def deform(
         start = time.perf_counter()
         arap = Arap(mesh, pins.vertices, weights=weights, energy=energy, device=device, dtype=dtype)
         timings = {"factorise": time.perf_counter() - start, "frames": []}
-        for frame, places in enumerate(pins.keyframes):
+        for frame, targets in enumerate(pins.keyframes):
             start = time.perf_counter()
-            initial = None if points is None else arap.carry(points, pins.keyframes[frame - 1], places)
+            initial = None if points is None else arap.carry(points, pins.keyframes[frame - 1], targets)
             try:
-                result = arap.solve(places, iterations=iterations, tolerance=tolerance, initial=initial)
+                result = arap.solve(targets, iterations=iterations, tolerance=tolerance, initial=initial)
             except ValueError as error:
                 raise ValueError(f"frame {frame}: {error}") from error
             velocities = np.zeros_like(result.points) if points is None else (result.points - points) * fps
@@ -147,7 +147,7 @@ def deform(
 
 
 def _refuse_beyond_float32(keyframes, fps):
-    """Refuses handles whose places or velocities a file of float32 does not hold."""
+    """Refuses handles whose positions or velocities a file of float32 does not hold."""
     limit = np.finfo(np.float32).max
     rule = f"cannot be written: a file holds float32, up to {limit:.2g}"
     refuse("pins.keyframes", keyframes, ~(np.abs(keyframes) <= limit), rule)

@@ -78,7 +78,7 @@ class Run:
     Attributes:
         total: How many rows there will be.
         rows: Those that are measured: what :func:`warpcloth.lab.timing.measure` returns, with ``scene``, ``parameters``,
-            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``threads``, ``benchmark`` (its place),
+            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``threads``, ``benchmark`` (its index),
             ``share`` (``bytes_per_s`` over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with
             no kernel in any cache.
         bandwidth: What :func:`warpcloth.lab.bandwidth.measure` returns.
@@ -94,10 +94,10 @@ class Run:
         initialise_warp()  # of this process, whose cache stays as it is
         device = self.benchmarks[0].device
         self.bandwidth = _alone(task(bandwidth.measure, device=device))
-        for place, benchmark in enumerate(self.benchmarks):
+        for index, benchmark in enumerate(self.benchmarks):
             with _kernel_cache():
                 for i, scene in enumerate(benchmark.scenes()):
-                    self.rows.append({**self._row(benchmark, scene, cold=i == 0), "benchmark": place})
+                    self.rows.append({**self._row(benchmark, scene, cold=i == 0), "benchmark": index})
                     progress(len(self.rows), self.total)
 
     def _row(self, benchmark, scene, cold):

@@ -29,7 +29,7 @@ SEED = 0  # of the changes by a rounding that say how well the minimum is known
 class OneStep:
     """A step of implicit Euler from a state of a scene in motion, and φ(d) = 1/(2h²)‖d‖²_M + U(x̃ + d), d = x − x̃, in float64.
 
-    Newton leads to the state, which is rounded to float32 so that all precisions begin in the same place, and from there to
+    Newton leads to the state, which is rounded to float32 so that all precisions begin at the same positions, and from there to
     the minimiser.
 
     Args:
@@ -61,7 +61,7 @@ class OneStep:
         self._start = [np.float32(array).astype(np.float64) for array in (x, v)]
         self._count = frame * substeps
         stepper = Newton(substeps=substeps, tolerance=1e-14, iterations=500, linear="factorised").bind(model)
-        self.place(stepper)
+        self.set_state(stepper)
         stepper.step()
         if stepper.results[0] not in SETTLED:
             raise ValueError(f"the step after frame {frame} of {scene.name} ends by Newton with {stepper.results[0].value}")
@@ -78,7 +78,7 @@ class OneStep:
         self.floor = self._rounding() / (self.first - self.lowest)
 
     @in_turn
-    def place(self, stepper):
+    def set_state(self, stepper):
         """Sets a bound solver to the state."""
         model = stepper.model
         for array, values in zip(stepper.state, self._start, strict=True):
@@ -166,7 +166,7 @@ def measure(scene, digest, setup, frame, substeps, device="cpu", dtype="float64"
         if began is None:
             began, factorise = time.perf_counter(), stepper.factorise_seconds
             result |= {"compile_s": began - before - factorise, "factorise_s": factorise}
-        step.place(stepper)
+        step.set_state(stepper)
         stepper.step()
         gap = step.gap(step.correction(stepper))
         if not gap < LOST:
@@ -197,7 +197,7 @@ def _milliseconds(step, stepper, repeats):
     """Quartiles of the warm time of a step [ms]."""
     taken = []
     for _ in range(repeats):
-        step.place(stepper)
+        step.set_state(stepper)
         wp.synchronize_device(stepper.model.device)
         began = time.perf_counter()
         stepper.step()

@@ -20,7 +20,7 @@ def curve(gamma, at=None):
 
     Args:
         gamma: Γ, up to 100.
-        at: Where on the strip (k,), from 0 at the clamp to 1 at the tip; without it at 101 places.
+        at: Where on the strip (k,), from 0 at the clamp to 1 at the tip; without it at 101 positions.
     """
 
     def shoot(tip, **options):
@@ -41,7 +41,7 @@ def curve(gamma, at=None):
 
 
 def aspect(gamma, at=1.0):
-    """H/W of the tip, or of another place on the strip."""
+    """H/W of the tip, or of another position on the strip."""
     ((x, y),) = curve(gamma, [at])
     return -y / x
 

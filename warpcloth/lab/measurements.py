@@ -94,8 +94,8 @@ class Task:
     @property
     def key(self):
         """A hash of what is measured, of the code that measures it, and of the machine: on another it takes another time."""
-        place = _machine(self.arguments.get("device", "cpu"))
-        text = json.dumps([self.function, self.arguments, source_digest(), place], sort_keys=True, allow_nan=False)
+        here = _machine(self.arguments.get("device", "cpu"))
+        text = json.dumps([self.function, self.arguments, source_digest(), here], sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
     def run(self):

@@ -65,15 +65,15 @@ def growth(rows):
         :func:`exponent`.
     """
     found, known = [], [row for row in rows if row["status"] == "ok"]
-    for place in dict.fromkeys(row["benchmark"] for row in known):
-        of = [row for row in known if row["benchmark"] == place]
+    for number in dict.fromkeys(row["benchmark"] for row in known):
+        of = [row for row in known if row["benchmark"] == number]
         vertices = [row["vertices"] for row in of]
         frame = exponent(vertices, [row["ms"] for row in of])
         if frame[0] is None:
             continue
         iteration = exponent(vertices, [row["ms"] / (row["substeps"] * max(row["iterations"], 1.0)) for row in of])
         shared = {k: v for k, v in of[0]["options"].items() if all(row["options"].get(k) == v for row in of)}
-        one = {"benchmark": place, "solver": of[0]["solver"], "options": shared}
+        one = {"benchmark": number, "solver": of[0]["solver"], "options": shared}
         found.append({**one, "frame": list(frame), "iteration": list(iteration)})
     return found
 

@@ -36,15 +36,15 @@ def relative_spectrum(step):
     """
     from scipy.linalg import eigh
 
-    places = np.flatnonzero(np.repeat(step.free, 3))
-    if len(places) > MOST:
-        raise ValueError(f"{step.scene.name} has {len(places)} unknowns; a spectrum takes {MOST} at most, of a coarser mesh")
+    unknowns = np.flatnonzero(np.repeat(step.free, 3))
+    if len(unknowns) > MOST:
+        raise ValueError(f"{step.scene.name} has {len(unknowns)} unknowns; a spectrum takes {MOST} at most, of a coarser mesh")
     model, s = step.model, 1.0 / step.h**2
     (scalar,) = constant_matrices(model, s)
     hessian = Hessian(model, HessianPolicy.RAW, corrected=True)
     hessian.assemble(step.base, s, model.array(step.best, model.vec3))
     both = hessian.matrix().toarray(), np.kron(scalar.toarray(), np.eye(3))
-    H, A = (matrix[np.ix_(places, places)] for matrix in both)
+    H, A = (matrix[np.ix_(unknowns, unknowns)] for matrix in both)
     mu, V = eigh(H, A)
     return mu, V, A
 
@@ -79,15 +79,15 @@ def measure(scene, digest, frame, substeps, device="cpu", limit=20.0):
     mu, V, A = relative_spectrum(step)
     result |= {"eigenvalues": mu.tolist(), "contraction": float(np.abs(1.0 - mu).max())}
     weights = A @ V  # of an error to its parts
-    places = np.repeat(step.free, 3)
-    first = np.linalg.norm(step.best.ravel()[places] @ weights)
-    result["floor"] = max(float(np.linalg.norm(move.ravel()[places] @ weights) / first) for move in step.roundings())
+    unknowns = np.repeat(step.free, 3)
+    first = np.linalg.norm(step.best.ravel()[unknowns] @ weights)
+    result["floor"] = max(float(np.linalg.norm(move.ravel()[unknowns] @ weights) / first) for move in step.roundings())
     parts, since, began = None, 0, time.perf_counter()
     for iterations in LADDER:
         stepper = _bound(step, iterations, device)
-        step.place(stepper)
+        step.set_state(stepper)
         stepper.step()
-        found = (step.correction(stepper) - step.best).ravel()[places] @ weights
+        found = (step.correction(stepper) - step.best).ravel()[unknowns] @ weights
         error = float(np.linalg.norm(found) / first)
         if parts is None and error < LINEAR:
             parts, since = found, iterations

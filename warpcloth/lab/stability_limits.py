@@ -181,8 +181,8 @@ def largest_relaxation(scene, he, record):
 
     A sweep multiplies what is wrong by 1 − ωλ, λ the eigenvalues of C(D + α̃)⁻¹JVWJᵀ, D the diagonal of JWJᵀ, α̃ = 1/(khₑ²) and
     C and V what constraints and vertices are averaged by; of XPBD, whose multipliers count, C(D + α̃)⁻¹(JWJᵀ + α̃). It settles
-    iff ωλ_max < 2. Velocities are differences of places, so that what n sweeps multiply x̃ by, q = 1 − ρ(1 − (1 − ωλ)ⁿ) with ρ
-    the part of JWJᵀ in λ, must be below 1, and above :data:`_LEAST`: of an even n that is the same, of an odd one
+    iff ωλ_max < 2. Velocities are differences of positions, so that what n sweeps multiply x̃ by, q = 1 − ρ(1 − (1 − ωλ)ⁿ)
+    with ρ the part of JWJᵀ in λ, must be below 1, and above :data:`_LEAST`: of an even n that is the same, of an odd one
     (ωλ_max − 1)ⁿ < (1 − q_min)/ρ − 1.
 
     Args:

@@ -107,8 +107,8 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
         raise ValueError(f"nothing moves in {scene} within {frames} frames; a chart of errors needs motion")
     given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}
     rows = _measured(trajectory.measure, scene, setups, given, run)
-    for place in front(rows, exact.error):
-        rows[place]["front"] = True
+    for i in front(rows, exact.error):
+        rows[i]["front"] = True
     known = {name: getattr(exact, name) for name in ("error", "strain_error", "substeps", "seconds", "key")}
     facts = {"seed": None, "frames": frames, "reference": known}  # nothing is drawn at random
     return {**_facts("time", scene, device, dtype), **facts, "rows": rows}
@@ -226,16 +226,16 @@ def front(rows, floor=0.0, name="error"):
         floor: Error of the reference; errors below it count as equal.
         name: The error, "error" or "strain_error".
     """
-    places = [i for i, row in enumerate(rows) if row["status"] == "ok" and row[name] is not None]
-    levels, spreads = {i: max(rows[i][name], floor) for i in places}, {i: spread(rows[i]) for i in places}
-    order = {i: (rows[i]["ms_per_second"], rows[i][name], i) for i in places}
+    eligible = [i for i, row in enumerate(rows) if row["status"] == "ok" and row[name] is not None]
+    levels, spreads = {i: max(rows[i][name], floor) for i in eligible}, {i: spread(rows[i]) for i in eligible}
+    order = {i: (rows[i]["ms_per_second"], rows[i][name], i) for i in eligible}
 
     def beats(i, j):
         if levels[i] == levels[j]:
             return order[i] < order[j]
         return levels[i] < levels[j] and spreads[i][0] <= spreads[j][1]
 
-    return sorted((j for j in places if not any(beats(i, j) for i in places)), key=order.get)
+    return sorted((j for j in eligible if not any(beats(i, j) for i in eligible)), key=order.get)
 
 
 def spread(row):

@@ -217,20 +217,20 @@ def _arrays(path, geometry, transform, drop_unused):
         kept = np.unique(triangles)
         triangles = np.searchsorted(kept, triangles)
     if ending in WELDED:
-        first, place = _first_of_equals(points[kept])
-        if st is not None and not np.array_equal(st[kept], st[kept][first][place]):
+        first, group = _first_of_equals(points[kept])
+        if st is not None and not np.array_equal(st[kept], st[kept][first][group]):
             st = None
-        kept, triangles = kept[first], place[triangles]
+        kept, triangles = kept[first], group[triangles]
     return points[kept], triangles, None if st is None else st[kept]
 
 
 def _first_of_equals(points):
-    """The first row of each set of equal rows, in order, and for every row the place of its set in that order."""
+    """The first row of each set of equal rows, in order, and for every row the index of its set in that order."""
     order = np.lexsort(points.T)  # stable: equal rows stay in order
     new = np.concatenate([[True], (points[order][1:] != points[order][:-1]).any(axis=1)])
     first = order[new]
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    place = np.empty(len(points), dtype=np.int64)
-    place[order] = rank[np.cumsum(new) - 1]
-    return np.sort(first), place
+    group = np.empty(len(points), dtype=np.int64)
+    group[order] = rank[np.cumsum(new) - 1]
+    return np.sort(first), group

@@ -358,7 +358,7 @@ class Mesh:
         """The 3T triangle sides, sorted so that those of one edge are neighbours, lower triangles first.
 
         Returns:
-            Side indices in that order (3T,), the place of each edge's first side in it (E,), sides of each edge (E,).
+            Side indices in that order (3T,), the index of each edge's first side in it (E,), sides of each edge (E,).
         """
         keys = self._keys(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
         order = np.argsort(keys, kind="stable")

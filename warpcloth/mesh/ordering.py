@@ -32,8 +32,8 @@ def near_order(mesh: Mesh) -> np.ndarray:
 
 def spread(mesh: Mesh, order: np.ndarray | None = None) -> float:
     """The mean of |i − j| over the edges of a mesh, as its vertices are numbered or in an ``order`` of them (n,)."""
-    places = np.arange(len(mesh.points)) if order is None else np.argsort(order)
-    return float(np.abs(np.diff(places[mesh.edges], axis=1)).mean())
+    ranks = np.arange(len(mesh.points)) if order is None else np.argsort(order)
+    return float(np.abs(np.diff(ranks[mesh.edges], axis=1)).mean())
 
 
 def worthwhile_order(mesh: Mesh) -> np.ndarray | None:

@@ -129,7 +129,7 @@ def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = N
     Args:
         path: A stage, a folder, a pattern, an .npz or an .npy file.
         prim: Path or name of the prim, or name of the geometry in each of the files, where there are several.
-        fps: Frames a second: numbers in file names, or time codes, in place of what the stage says. Without it there are no
+        fps: Frames a second: numbers in file names, or time codes, instead of what the stage says. Without it there are no
             times where the input says none.
         mesh: The `Mesh` of an .npy file, which has no triangles; others have their own, and do not look at it.
 
@@ -212,7 +212,7 @@ def _open_files(path, found, prim, fps):
     for file in paths:
         digits = re.findall(r"\d+", file.stem)
         if not digits:
-            raise ValueError(f"{file}: has no number in its name, which must tell its place among the frames")
+            raise ValueError(f"{file}: has no number in its name, which must be the number of its frame")
         if len(digits[-1]) > 15:
             raise ValueError(f"{file}: has a number of {len(digits[-1])} digits in its name, must have 15 at most")
         other = numbered.setdefault(int(digits[-1]), file)
@@ -319,7 +319,7 @@ def _array(name, frames, mesh):
         found, dtype = (len(frames), *shape), _coarsest(frames)
     else:
         if np.ma.isMaskedArray(frames) and np.ma.is_masked(frames):
-            raise ValueError(f"{name} is masked in places; it must have all points, or NaN where one is not known")
+            raise ValueError(f"{name} is partly masked; it must have all points, or NaN where one is not known")
         frames = frames if hasattr(frames, "exact") else np.asarray(frames)
         found, dtype = frames.shape, frames.dtype
         if frames.dtype.kind not in "iuf":

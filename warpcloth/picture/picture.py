@@ -181,6 +181,6 @@ def _explain(figure, beside, scale, unit, excluded, unplaced):
         beside.plot([0.5], [-0.25], "s", color=EXCLUDED, transform=beside.transAxes, clip_on=False)
         beside.text(1.8, -0.25, "excluded", transform=beside.transAxes, va="center", fontsize=8, color=GREY)
     if unplaced:
-        text = f"{unplaced} triangle{'s' if unplaced > 1 else ''} without a place not drawn"
+        text = f"{unplaced} triangle{'s' if unplaced > 1 else ''} without a finite position not drawn"
         width, height = figure.get_size_inches()
         figure.text(_GAP / width, 1.0 - 0.75 * _TOP / height, text, va="center", fontsize=8, color=GREY)

@@ -40,7 +40,7 @@ class Attribute:
         field: Field of `Scene`, `Pins` ("pins.…"), a term ("terms.…") or `Mesh` ("mesh.…"); in brackets what a field is
             computed from.
         name: Name of the attribute; <name> is any name for a term.
-        place: Where it stands: "cloth", the prim; "body", it or the nearest prim above with PhysicsDeformableBodyAPI;
+        location: Where it stands: "cloth", the prim; "body", it or the nearest prim above with PhysicsDeformableBodyAPI;
             "material", the physics material bound to it; "physics scene".
         type_names: Types that it may have, of any precision; the first for one value, the last for several.
         kilograms, metres: Powers of kilogramsPerUnit and metersPerUnit that make it SI.
@@ -48,7 +48,7 @@ class Attribute:
 
     field: str
     name: str
-    place: str
+    location: str
     type_names: tuple
     kilograms: int = 0
     metres: int = 0
@@ -137,8 +137,8 @@ class Values:
     def __init__(self, stage, cloth):
         self.kilograms = UsdPhysics.GetStageKilogramsPerUnit(stage)
         self.metres = UsdGeom.GetStageMetersPerUnit(stage)
-        self.places = {"cloth": cloth, "body": _body(cloth)}
-        self.places["material"] = UsdShade.MaterialBindingAPI(cloth).ComputeBoundMaterial("physics")[0].GetPrim()
+        self.locations = {"cloth": cloth, "body": _body(cloth)}
+        self.locations["material"] = UsdShade.MaterialBindingAPI(cloth).ComputeBoundMaterial("physics")[0].GetPrim()
         names = [attribute.GetName() for attribute in cloth.GetAuthoredPropertiesInNamespace("warpcloth")]
         # In the order of the prim's properties, which is that of their names where nothing else is said.
         self.terms = list(dict.fromkeys(name.split(":")[2] for name in names if name.startswith(f"{TERMS_NAMESPACE}:")))
@@ -155,7 +155,7 @@ class Values:
             ValueError: An attribute has another type than its row.
         """
         for row in attributes():
-            prim = self.places.get(row.place) if row.field == field else None
+            prim = self.locations.get(row.location) if row.field == field else None
             attribute = prim and prim.GetAttribute(row.name.replace("<name>", str(key)))
             if attribute and attribute.HasAuthoredValue():
                 if _kind(attribute.GetTypeName()) not in [_kind(type_name) for type_name in row.types]:
@@ -177,10 +177,10 @@ class Values:
                 return tuple(value)
             value = np.array(value)[()]
             refuse_unknown(attribute.GetName(), np.asarray(value), infinite=row.infinite)
-            if row.place in ("body", "material") and value < 0:
+            if row.location in ("body", "material") and value < 0:
                 raise ValueError(f"{attribute.GetName()} is {value}, must be 0 or more")
             # UsdPhysics and the proposal say 0 for a mass, density or stiffness that is not given.
-            if row.place not in ("body", "material") or value != 0:
+            if row.location not in ("body", "material") or value != 0:
                 scale = self.kilograms**row.kilograms * self.metres**row.metres
                 return value if scale == 1 else value * scale
         return None

@@ -385,16 +385,16 @@ def check_scene(fps, up_axis):
         raise ValueError(f'up_axis = {up_axis!r}: must be "Y" or "Z"')
 
 
-def _facts(metadata, place="metadata"):
+def _facts(metadata, where="metadata"):
     """Metadata as a file can keep it: numbers, texts and more of such by name."""
     facts = {}
     for name, value in metadata.items():
         if isinstance(value, dict):
-            facts[name] = _facts(value, f"{place}[{name!r}]")
+            facts[name] = _facts(value, f"{where}[{name!r}]")
         else:
             facts[name] = value.item() if isinstance(value, np.generic) else value
             if not isinstance(facts[name], (bool, int, float, str)):
-                raise ValueError(f"{place}[{name!r}] = {value!r}: must be a number, a text, or a dict of those")
+                raise ValueError(f"{where}[{name!r}] = {value!r}: must be a number, a text, or a dict of those")
     return facts
 
 

@@ -40,7 +40,7 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
         list: The `Target` of each, in the space and units of the prim's parent at its first time.
 
     Raises:
-        ValueError: The stage has another prim in that place.
+        ValueError: The stage has another prim at that path.
     """
     transform = to_metres(stage, prim, Usd.TimeCode.EarliestTime())
     with np.errstate(invalid="ignore"):
@@ -51,15 +51,15 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
     targets = []
     for row, (name, interpolation) in enumerate(directions.items()):
         path = f"{prim}_{name}"
-        free_place(stage, path, "BasisCurves")
+        refuse_taken(stage, path, "BasisCurves")
         curves = UsdGeom.BasisCurves.Define(stage, path)
         target = Target(path, np.empty((0, 3), np.int32), transform, half_width=width / 2, vectors=("points", "extent"))
-        places = mesh.points if interpolation == "vertex" else mesh.points[mesh.triangles].mean(axis=1)
-        for attribute, value in target.samples({"points": segments(places, np.zeros_like(places), nowhere)}).items():
+        centres = mesh.points if interpolation == "vertex" else mesh.points[mesh.triangles].mean(axis=1)
+        for attribute, value in target.samples({"points": segments(centres, np.zeros_like(centres), nowhere)}).items():
             curves.GetPrim().GetAttribute(attribute).Set(value)
         curves.CreateTypeAttr(UsdGeom.Tokens.linear)
         curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
-        curves.CreateCurveVertexCountsAttr(Vt.IntArray(len(places), 2))
+        curves.CreateCurveVertexCountsAttr(Vt.IntArray(len(centres), 2))
         curves.CreateWidthsAttr([width])
         curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
         colour = Gf.Vec3f(*_COLOURS[row % len(_COLOURS)])
@@ -75,7 +75,7 @@ def segments(centres, vectors, nowhere):
     Args:
         centres: (E, 3) [m].
         vectors: (E, 3) [m], the segments from end to end.
-        nowhere: (3,) [m], in place of centres that are not known where none is.
+        nowhere: (3,) [m], for centres that are not known in any frame.
 
     Returns:
         np.ndarray: Finite, two rows for each element.
@@ -100,11 +100,11 @@ def to_metres(stage, prim, time):
 
 
 def middle(mesh):
-    """Where elements stand that have no place in any frame (3,) [m]: amid the rest shape, whose points need not be finite."""
+    """Position for elements that have none in any frame (3,) [m]: the middle of the finite points of the rest shape."""
     return _middle(mesh.points, np.zeros(3))
 
 
-def free_place(stage, path, kind):
+def refuse_taken(stage, path, kind):
     """Refuses a path where a stage has a prim of another type than the one to define there."""
     prim = stage.GetPrimAtPath(path)
     if prim and prim.GetTypeName() != kind:

@@ -12,7 +12,7 @@ from ..base.types import FilePath, UpAxis
 from ..mesh.mesh import Mesh
 from ..mesh.stage_mesh import StageMesh
 from .chunks import ChunkWriter, check_scene
-from .directions import check_directions, define_directions, free_place, middle, segments, to_metres
+from .directions import check_directions, define_directions, middle, refuse_taken, segments, to_metres
 from .layers import (
     artist_prim,
     artist_target,
@@ -34,7 +34,7 @@ class MeasureWriter(ChunkWriter):
     With a source the result is a layer over the stage that was measured, which it sublayers by a relative path and never
     changes. Points stay the source's own, with its time codes and rates. To the measured prim it adds `primvars:<name>` and,
     where a measure is shown in colours, `primvars:displayColor`, doubleSided, and a material below it that shows
-    displayColor, bound in place of the prim's own and those of its faces. Without a source it is a complete stage,
+    displayColor, bound instead of the prim's own and those of its faces. Without a source it is a complete stage,
     /World/Cloth, with points, normals and extent too.
 
     A value that is not known is NaN, in the file too. An artist's faces with more corners than three have the mean over
@@ -205,7 +205,7 @@ def _facts_of(stage, source):
 def _show_colours(stage, source, with_mesh):
     """A material below the prim that shows displayColor; bound to the prim and its faces, if these are coloured."""
     path = f"{source.prim}/DisplayColour"
-    free_place(stage, path, "Material")
+    refuse_taken(stage, path, "Material")
     material = define_material(stage, path)
     if not with_mesh:
         return material

@@ -218,9 +218,11 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
         # Pins of a scene that was written have a sample for each frame, even after the last frame.
         most = max(frames, len(own[1].GetTimeSamples()) - 1)
         keyframes = list(_samples(own[1], surroundings, most, fps))
-        wrong = [len(places) for places in keyframes if len(places) != len(vertices)]
+        wrong = [len(row) for row in keyframes if len(row) != len(vertices)]
         if wrong:
-            raise ValueError(f"{own[0].name} has {wrong[0]} places, must have one for each of {len(vertices)} pinned vertices")
+            raise ValueError(
+                f"{own[0].name} has {wrong[0]} positions, must have one for each of {len(vertices)} pinned vertices"
+            )
     return positions, keyframes
 
 
@@ -258,7 +260,7 @@ def _gravity(stage, values, up_axis):
     scenes = [prim for prim in stage.Traverse() if prim.IsA(UsdPhysics.Scene)]
     if len(scenes) > 1:
         raise ValueError(f"the stage has {len(scenes)} PhysicsScenes, must have one or warpcloth:gravity on the cloth")
-    values.places["physics scene"] = scenes[0] if scenes else None
+    values.locations["physics scene"] = scenes[0] if scenes else None
     direction, magnitude = values.get("(gravity direction)"), values.get("(gravity magnitude)")
     if direction is None or not direction.any():
         direction = np.array(DOWN[up_axis])
@@ -307,8 +309,8 @@ def write_scene(scene: Scene, path: FilePath) -> str:
         author(cloth, field, value)
     if scene.pins.keyframes is not None:
         order = np.argsort(scene.pins.vertices)
-        for frame, places in enumerate(scene.pins.keyframes[:, order]):
-            author(cloth, "pins.keyframes", places, time=frame)
+        for frame, positions in enumerate(scene.pins.keyframes[:, order]):
+            author(cloth, "pins.keyframes", positions, time=frame)
     keys = _term_keys(scene.terms)
     for key, term in zip(keys, scene.terms, strict=True):
         kind = type(term).__name__

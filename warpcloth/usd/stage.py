@@ -328,8 +328,8 @@ def refuse_change(name, now, fixed, code):
     if len(now) != len(fixed):
         raise ValueError(f"{len(now)} {name} at time code {code:g}, must stay {len(fixed)}")
     if not np.array_equal(now, fixed):
-        place = int(np.argmax(now != fixed))
-        raise ValueError(f"{name}[{place}] is {now[place]} at time code {code:g}, must stay {fixed[place]}")
+        first = int(np.argmax(now != fixed))
+        raise ValueError(f"{name}[{first}] is {now[first]} at time code {code:g}, must stay {fixed[first]}")
 
 
 def _refuse_moving_topology(prim):

@@ -175,8 +175,8 @@ def refuse_outside(name, numbers, count, what):
     """
     wrong = (numbers < 0) | (numbers >= count)
     if wrong.any():
-        place = int(np.argmax(wrong))
-        raise ValueError(f"{name}[{place}] = {numbers[place]}, must be a {what}, 0 to {count - 1}")
+        first = int(np.argmax(wrong))
+        raise ValueError(f"{name}[{first}] = {numbers[first]}, must be a {what}, 0 to {count - 1}")
 
 
 def refuse_unknown(name, values, where="", infinite=False):
@@ -186,9 +186,9 @@ def refuse_unknown(name, values, where="", infinite=False):
         ValueError: There is one; the message names the first.
     """
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
-    for place in np.argwhere(wrong)[:1].tolist():
-        index = "".join(f"[{i}]" for i in place)
-        raise ValueError(f"{name}{index}{where} is {values[tuple(place)]}, must be {'a number' if infinite else 'finite'}")
+    for entry in np.argwhere(wrong)[:1].tolist():
+        index = "".join(f"[{i}]" for i in entry)
+        raise ValueError(f"{name}{index}{where} is {values[tuple(entry)]}, must be {'a number' if infinite else 'finite'}")
 
 
 def time_codes_of(attribute):
