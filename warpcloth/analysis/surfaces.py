@@ -41,7 +41,7 @@ class _Elements:
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy), dtype=kind, device=self.device)
 
     def centred(self, points):
-        """Points (n, 3) on the device, in float32 relative to one of them, so that a distance from the origin costs no digits."""
+        """Points (n, 3) on the device, in float32 relative to one of them, so that no digits are lost far from the origin."""
         if self.numpy is np.float32:
             finite = np.isfinite(points).all(axis=1)
             points = points - points[finite.argmax()] if finite.any() else points

@@ -220,9 +220,7 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
         keyframes = list(_samples(own[1], surroundings, most, fps))
         wrong = [len(row) for row in keyframes if len(row) != len(vertices)]
         if wrong:
-            raise ValueError(
-                f"{own[0].name} has {wrong[0]} positions, must have one for each of {len(vertices)} pinned vertices"
-            )
+            raise ValueError(f"{own[0].name} has {wrong[0]} positions, must have one for each of {len(vertices)} pins")
     return positions, keyframes
 
 
