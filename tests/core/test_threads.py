@@ -234,10 +234,11 @@ def test_steppers_of_one_model_have_threads_of_their_own(copies, device):
 def test_threads_that_nobody_needs_end(device):
     before = threading.enumerate()
     model = square().build(device=device, threads=2, copies=2)
-    wc.PBD(substeps=1).bind(model).frame()
+    stepper = wc.PBD(substeps=1).bind(model)
+    stepper.frame()
     started = [thread for thread in threading.enumerate() if thread not in before]
     assert started
-    del model
+    del stepper
     gc.collect()
     for thread in started:
         thread.join(10.0)

@@ -10,6 +10,7 @@ import warpcloth as wc
 from support.scenes import scene
 from support.steps import after_one_step, hanging_mass, swinging
 from warpcloth.core.gradient import Gradient
+from warpcloth.core.status import Result
 from warpcloth.kernels.terms import SPRING
 from warpcloth.numerics.sweeps import Sweep, colours
 
@@ -135,7 +136,7 @@ def test_residual_is_that_of_implicit_euler(device):
     wrong = declared.velocities.copy()
     wrong[40] = 1e200
     _, stepper = after_one_step(replace(declared, velocities=wrong), wc.XPBD(substeps=1), device)
-    assert not np.isfinite(stepper.residual[0]) and stepper.results[0] is wc.status.Result.DIVERGED
+    assert not np.isfinite(stepper.residual[0]) and stepper.results[0] is Result.DIVERGED
 
 
 def test_residual_of_hard_constraints_is_the_last_move(device):

@@ -5,6 +5,7 @@ import warp as wp
 
 from ..kernels.fast.gather_corrections import slot_rows
 from ..kernels.fast.parts import Part
+from ..model.model import incidences_of
 from .quadratic_pairs import matrix_entries
 from .structs import int32_array
 
@@ -76,8 +77,9 @@ def gathered_in_rows(elements, count, pairs, **others):
 
 def _by_element(elements, count, part, arrays):
     """The part and the arrays of incidences that name elements."""
-    order, vertices, offsets = _rows(elements.stencil.numpy().ravel(), count)
-    codes, padded = _slots(order, vertices, offsets, count)
+    stencil = elements.stencil.numpy().ravel()
+    offsets, codes = incidences_of(stencil, count)
+    codes, padded = _slots(codes, stencil[codes], offsets, count)
     arrays |= {"offsets": int32_array(offsets, elements.stencil.device), "codes": int32_array(codes, elements.stencil.device)}
     return part._replace(padded=padded), arrays
 
@@ -91,21 +93,16 @@ def _pairs(elements, count):
     stencil = elements.stencil.numpy()
     if stencil.shape[1] != 2 or elements.refresh is not None:
         return None
-    columns = [_rows(stencil[:, corner], count) for corner in range(2)]
-    slots = tuple(int(np.diff(offsets).max(initial=0)) for _order, _vertices, offsets in columns)
+    columns = [incidences_of(stencil[:, corner], count) for corner in range(2)]
+    slots = tuple(int(np.diff(offsets).max(initial=0)) for offsets, _codes in columns)
     if sum(slots) > SLOTS or sum(slots) * count > 2 * stencil.size:
         return None
     codes, source = np.full((sum(slots), count), -1), np.zeros((sum(slots), count), dtype=np.int64)
-    for corner, (order, vertices, offsets) in enumerate(columns):
+    for corner, (offsets, order) in enumerate(columns):
+        vertices = stencil[order, corner]
         slot = corner * slots[0] + np.arange(len(order)) - offsets[vertices], vertices
         codes[slot], source[slot] = stencil[order, 1 - corner], order
     return slots, codes, source
-
-
-def _rows(vertices, count):
-    """The order that sorts vertices (E,), the sorted ones, and where those of each of the ``count`` vertices are in it."""
-    order = np.argsort(vertices, kind="stable")
-    return order, vertices[order], np.searchsorted(vertices[order], np.arange(count + 1))
 
 
 def _slots(values, vertices, offsets, count):

@@ -52,7 +52,7 @@ class Cells:
         """Cells of all copies, B·C."""
         return len(self.offsets) - 1
 
-    def share(self, first, count, elements):
+    def part(self, first, count, elements):
         """The cells of ``count`` of the copies from ``first`` on, whose elements are those of the slice ``elements``."""
         return replace(self, offsets=self.offsets[: count * self.per_copy + 1], shape=self.shape[elements])
 
@@ -90,7 +90,7 @@ class SparseCells:
         """Cells of all copies, B·C."""
         return len(self.offsets) - 1
 
-    def share(self, first, count, elements):
+    def part(self, first, count, elements):
         """The cells of ``count`` of the copies from ``first`` on, whose elements are those of the slice ``elements``."""
         C = self.per_copy
         rest = self.rest[first * C : (first + count) * C]
@@ -185,14 +185,14 @@ class DeviceElements:
         lowest = self.stencil.numpy().min(axis=1)
         return self.reordered(np.argsort(lowest, kind="stable")) if (np.diff(lowest) < 0).any() else self
 
-    def share(self, first, count):
+    def part(self, first, count):
         """Those of ``count`` of the copies from ``first`` on, as a model of these alone has them."""
         E = self.per_copy
         chosen = slice(first * E, (first + count) * E)
         changed = {name: getattr(self, name)[chosen] for name in ("stiffness", "rest")}
         if self.damping is not None:
             changed["damping"] = self.damping[chosen]
-        cells = self.cells and self.cells.share(first, count, chosen)
+        cells = self.cells and self.cells.part(first, count, chosen)
         refresh = self.refresh and self.refresh.with_arrays(lambda array: array[chosen])
         return replace(self, **changed, stencil=self.stencil[: count * E], cells=cells, refresh=refresh)
 
@@ -206,13 +206,24 @@ class DeviceElements:
 
     @cached_property
     def incidences(self):
-        """(offsets (N+1,), incidences (B·E·K,)): for each vertex K·element + corner, in order. Built when first asked for."""
-        stencil = self.stencil.numpy().ravel()
-        order = np.argsort(stencil, kind="stable").astype(np.int32)
-        vertices = int(stencil.max()) + 1
-        offsets = np.searchsorted(stencil[order], np.arange(vertices + 1)).astype(np.int32)
-        device = self.stencil.device
-        return wp.array(offsets, dtype=wp.int32, device=device), wp.array(order, dtype=wp.int32, device=device)
+        """(offsets (N+1,), codes (B·E·K,)), see :func:`incidences_of`, on the device. Built when first asked for."""
+        stencil, device = self.stencil.numpy().ravel(), self.stencil.device
+        offsets, codes = incidences_of(stencil, int(stencil.max()) + 1)
+        return tuple(wp.array(each.astype(np.int32), dtype=wp.int32, device=device) for each in (offsets, codes))
+
+
+def incidences_of(vertices, count):
+    """The elements of each vertex, one vertex after another.
+
+    Args:
+        vertices: (E·K,) the corners of elements, one element after another.
+        count: Vertices, N.
+
+    Returns:
+        (offsets (N+1,), codes (E·K,)): vertex i has the codes from offsets[i] to offsets[i+1], K·element + corner, in order.
+    """
+    codes = np.argsort(vertices, kind="stable")
+    return np.searchsorted(vertices[codes], np.arange(count + 1)), codes
 
 
 class Model:
@@ -244,7 +255,6 @@ class Model:
         kernels: Names of the kernels that solvers asked for.
         launches: How many launches there have been, a list of one that models of other terms share.
         threads: As given.
-        state: x and v that steps move on, if not arrays of their own; or None.
 
     Raises:
         ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
@@ -260,7 +270,7 @@ class Model:
         copies = int(copies)
         self.scene, self.copies = scene, copies
         self.device = find_device(device)
-        self.threads, self.state = threads_on(self.device, threads), None
+        self.threads = threads_on(self.device, threads)
         self.dtype, self.numpy_dtype = DTYPES[dtype]
         self.vec3, self.mat33 = types(self.dtype)
         self.per_copy = len(scene.mesh.points)
@@ -336,18 +346,17 @@ class Model:
 
     def alone(self, copy):
         """A model of one copy, whose arrays are parts of those of this one."""
-        return self if self.copies == 1 else self.share(copy, 1)
+        return self if self.copies == 1 else self.part(copy, 1)
 
-    def share(self, first, count, state=None):
-        """A model of ``count`` of the copies from ``first`` on, for one thread; x and v are theirs of ``state``, if given."""
+    def part(self, first, count):
+        """A model of ``count`` of the copies from ``first`` on, for one thread, whose arrays are parts of those of this one."""
         n = self.per_copy
         other, of_copies, of_vertices = shallow_copy(self), slice(first, first + count), slice(first * n, (first + count) * n)
         other.copies, other.count, other.threads = count, count * n, 1
         for name in ("positions", "velocities", "mass", "inverse_mass"):
             setattr(other, name, getattr(self, name)[of_vertices])
         other.gravity = self.gravity[of_copies]
-        other.state = state and tuple(array[of_vertices] for array in state)
-        other.terms = tuple(elements.share(first, count) for elements in self.terms)
+        other.terms = tuple(elements.part(first, count) for elements in self.terms)
         return other
 
     @in_turn

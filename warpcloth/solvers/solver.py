@@ -37,6 +37,7 @@ class Stepper:
     factorise_seconds = 0.0
     iterations = 1
     uniform = False  # Whether all steps have as many iterations
+    _motion = None  # x and v that are parts of those of another stepper, see `part_of`
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -47,7 +48,7 @@ class Stepper:
         self.options, self.model = options, model
         self.steps_per_frame = options.per_frame(fps)
         self.h = 1.0 / (fps * self.steps_per_frame)
-        motion = model.state or (wp.clone(model.positions), wp.clone(model.velocities))
+        motion = self._motion or (wp.clone(model.positions), wp.clone(model.velocities))
         self.state = State(*motion, model.copies)
         self.count = None if model.pins is None else wp.zeros(model.copies, dtype=wp.int32, device=model.device)
         self.state.add("steps of keyframes", self.count)
@@ -57,6 +58,14 @@ class Stepper:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he
             self.model = model.with_terms(damped_terms(model, self.he))
+
+    @classmethod
+    def part_of(cls, motion, options, model):
+        """The stepper whose x and v are the arrays ``motion``, those of the copies of ``model`` in a larger batch."""
+        stepper = cls.__new__(cls)
+        stepper._motion = motion
+        stepper.__init__(options, model)
+        return stepper
 
     @property
     def results(self):

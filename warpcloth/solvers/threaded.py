@@ -20,47 +20,51 @@ class ThreadedStepper(Stepper):
         model: The model.
 
     Attributes:
-        shares: The stepper of each thread, whose state is a part of ``state``.
+        parts: The stepper of each thread, whose state is a part of ``state``.
     """
 
     def __init__(self, options, stepper, model):
         self.options, self.model, self._reset = options, model, None
         motion = wp.clone(model.positions), wp.clone(model.velocities)
         self.pool = ThreadPool(min(model.threads, model.copies))
-        shares = self.pool.threads
-        ends = [model.copies * share // shares for share in range(shares + 1)]
-        self._copies = list(pairwise(ends))
-        self.shares = [stepper(options, model.share(first, end - first, motion)) for first, end in self._copies]
-        self.state = State(*motion, model.copies, [share.state for share in self.shares])
-        first = self.shares[0]
+        threads = self.pool.threads
+        self._copies = list(pairwise(model.copies * thread // threads for thread in range(threads + 1)))
+        self.parts = [self._part(stepper, motion, first, end) for first, end in self._copies]
+        self.state = State(*motion, model.copies, [part.state for part in self.parts])
+        first = self.parts[0]
         self.steps_per_frame, self.h, self.he, self.uniform = first.steps_per_frame, first.h, first.he, first.uniform
-        self.factorise_seconds = sum(share.factorise_seconds for share in self.shares)
+        self.factorise_seconds = sum(part.factorise_seconds for part in self.parts)
+
+    def _part(self, stepper, motion, first, end):
+        """The stepper of the copies from ``first`` to ``end``."""
+        n, model = self.model.per_copy, self.model.part(first, end - first)
+        return stepper.part_of(tuple(array[first * n : end * n] for array in motion), self.options, model)
 
     @property
     def results(self):
-        return [result for share in self.shares for result in share.results]
+        return [result for part in self.parts for result in part.results]
 
     @property
     def residual(self):
-        return np.concatenate([share.residual for share in self.shares])
+        return np.concatenate([part.residual for part in self.parts])
 
     @property
     def iterations(self):
-        return max(share.iterations for share in self.shares)
+        return max(part.iterations for part in self.parts)
 
     def step(self):
-        self.pool.run([share.step for share in self.shares])
+        self.pool.run([part.step for part in self.parts])
 
     def frame(self):
-        for share in self.shares:
-            share.prepare_frame()
-        self.pool.run([share.frame for share in self.shares])
+        for part in self.parts:
+            part.prepare_frame()
+        self.pool.run([part.frame for part in self.parts])
 
     def reset(self, mask=None, positions=None, velocities=None):
         if self._reset is None:
             self._reset = Reset(self)
         mask, positions, velocities = self._reset.on_device(mask, positions, velocities)
         n = self.model.per_copy
-        for share, (first, end) in zip(self.shares, self._copies, strict=True):
+        for part, (first, end) in zip(self.parts, self._copies, strict=True):
             places = [None if given is None else given[first * n : end * n] for given in (positions, velocities)]
-            share.reset(mask[first:end], *places)
+            part.reset(mask[first:end], *places)
