@@ -10,6 +10,8 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 import warpcloth as wc
+from support.energies import DECLARED
+from support.outside import Plane
 from support.usd_validation import validate
 from warpcloth.terms import TERMS
 from warpcloth.usd import read_scene, read_stage_mesh, write_scene
@@ -176,6 +178,18 @@ def test_a_scene_comes_back(tmp_path, make, ending):
         np.testing.assert_array_equal(one.stencil(scene.mesh), other.stencil(read.mesh))  # so that arrays mean the same
     assert validate(path) == []
     assert_same_scene(read_scene(write_scene(read, tmp_path / f"again.{ending}")), read)
+
+
+@pytest.mark.parametrize("kind", DECLARED)
+def test_every_energy_comes_back(tmp_path, kind, monkeypatch):
+    """Those of the package, and one from outside it."""
+    monkeypatch.setitem(TERMS, "Plane", Plane)
+    sheet = mesh()
+    scene = wc.Scene(sheet, density=0.1, terms=[DECLARED[kind](sheet)])
+    read = read_scene(write_scene(scene, tmp_path / "scene.usda"))
+    assert_same_scene(read, scene)
+    one, other = (each.terms[0].elements(each.mesh, each.positions) for each in (scene, read))
+    assert np.array_equal(one.rest, other.rest) and np.array_equal(one.stencil, other.stencil)
 
 
 def test_the_comparison_can_fail():
