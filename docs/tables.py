@@ -4,9 +4,12 @@ import argparse
 import inspect
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 from warpcloth.cli import _parser
+from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS
+from warpcloth.terms.needs import lacks
 from warpcloth.usd.attributes import attributes as every_attribute
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,6 +31,32 @@ def energies():
         symbol, unit = re.search(r"stiffness: (\S+?),? .*?(\[.*?\])", said, re.DOTALL).groups()
         rows.append([f"`{name}`", first.rstrip(".").replace("|", "\\|"), f"{symbol} {unit}"])
     return table(("Term", "Energy", "Stiffness"), rows)
+
+
+def solvers():
+    """Lists the solvers, with the energies that each takes, from what it needs of them."""
+    rows = []
+    for record in SOLVERS.values():
+        soft, hard = (refused(record, hard=hard) for hard in (False, True))
+        takes = "all" if not soft else f"all but {listed(soft)}"
+        hard = [name for name in hard if name not in soft]
+        if len(soft) + len(hard) == len(TERMS):
+            takes += "; finite stiffness"
+        else:
+            takes += "; infinite stiffness too" + (f", but not for {listed(hard)}" if hard else "")
+        rows.append([f"`{record.__name__}`", record.facts.method, takes])
+    return table(("Solver", "Method", "Takes"), rows)
+
+
+def refused(record, hard):
+    """The energies that lack what a solver needs, with finite or infinite stiffness."""
+    of = {name: SimpleNamespace(term=energy.term, hard=hard, damping=None) for name, energy in TERMS.items()}
+    return [name for name, elements in of.items() if lacks(elements, record.needs)]
+
+
+def listed(names):
+    names = [f"`{name}`" for name in names]
+    return ", ".join(names[:-1]) + " and " * (len(names) > 1) + names[-1]
 
 
 def attributes():
@@ -85,7 +114,13 @@ def options():
     return "".join(parts) + "\n"
 
 
-TABLES = {"energies": energies, "attributes": attributes, "term attributes": term_attributes, "options": options}
+TABLES = {
+    "energies": energies,
+    "solvers": solvers,
+    "attributes": attributes,
+    "term attributes": term_attributes,
+    "options": options,
+}
 
 
 def filled(text):

@@ -100,6 +100,7 @@ def command_line(arguments, values, setup):
     words += ["--solver", setup.solver, "-s", *(f"{name}={value}" for name, value in setup.options.items())]
     words += [] if arguments.frames is None else ["--frames", str(arguments.frames)]
     words += [] if arguments.device == "cpu" else ["--device", arguments.device]
+    words += [word for module in arguments.imports for word in ("--import", module)]
     return shlex.join([*words, "--dtype", arguments.dtype, "-o", "out.usdc"])
 
 

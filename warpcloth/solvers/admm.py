@@ -97,6 +97,7 @@ class ADMM(ImplicitStep):
     needs = (ELEMENTS, FINITE)
     residual = Residual("largest acceleration of a vertex by the primal or the dual residual", "m/s²")
     facts = Facts(
+        method="implicit Euler split by weights and multipliers, local problems in closed form or by Newton's method",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64), cuda=(32, 64, 128, 256)),),
         runs=(
             *grid([(16, 2), (32, 2), (48, 2)], integrator="midpoint"),

@@ -70,6 +70,7 @@ class ConstrainedDynamics(ImplicitStep):
     name = "constrained-dynamics"
     needs = (MERGED_DAMPING, ROWS, STEADY_ROWS)
     facts = Facts(
+        method="implicit Euler for positions and multipliers of compliant constraints, redundant ones too",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 1}, cpu=(8, 16, 32), cuda=(16, 32, 64)),),
         runs=(
             *grid([(4, 1), (8, 1), (16, 1), (32, 1)], integrator="midpoint"),

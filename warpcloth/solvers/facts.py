@@ -24,6 +24,7 @@ class Facts:
     """What is measured of a solver, and how it is drawn.
 
     Attributes:
+        method: The method, in a few words for tables.
         benchmarks: A :class:`Benchmark` each.
         runs: Options of the settings that trade speed for accuracy: about what no other setting of the solver beats in both
             error and time on ``hanging`` with 32² and 64² vertices, and around it. Substeps are of frames of 1/60 s; of a
@@ -34,6 +35,7 @@ class Facts:
         style: Colour and marker in every picture.
     """
 
+    method: str = ""
     benchmarks: tuple = (Benchmark({"substeps": 4}),)
     runs: tuple = tuple({"substeps": substeps} for substeps in (1, 4, 16, 64))
     one_step: tuple = ()

@@ -49,6 +49,7 @@ class Newton(ImplicitStep):
     needs = (FINITE,)
     residual = Residual(UNBALANCED, "times the largest at the start of its step")
     facts = Facts(
+        method="implicit Euler, minimised by Newton's method with a line search; CG or a factorisation",
         benchmarks=(Benchmark({"substeps": 4}, cpu=(16, 32, 64), cuda=(32, 64, 128)),),
         runs=(
             *({"substeps": substeps} for substeps in (1, 4, 16)),

@@ -68,6 +68,7 @@ class ProjectiveDynamics(ImplicitStep):
     needs = (FINITE, MERGED_DAMPING, PROJECTION)
     residual = Residual(UNBALANCED, "times the largest at the start of its step")
     facts = Facts(
+        method="implicit Euler by local projections and a constant matrix; plain, Chebyshev, Anderson, L-BFGS",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64), cuda=(32, 64, 128, 256)),),
         runs=(
             *grid([(8, 2), (16, 2), (24, 2), (48, 2), (96, 2)], integrator="midpoint", acceleration="none"),
