@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .api import *  # noqa: F403
 
 
-if "warp" in sys.modules:  # whose settings may be changed from here on
+if sys.modules.get("warp"):  # whose settings may be changed from here on
     prepare_warp()
 
 

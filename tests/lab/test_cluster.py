@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from warpcloth.base import extensions
 from warpcloth.base.digest import scene_digest, source_digest
 from warpcloth.cli import main
 from warpcloth.lab import cluster as clusters
@@ -23,6 +24,7 @@ from warpcloth.lab.measurements import SceneRef, task
 from warpcloth.lab.work_precision import time_diagram
 from warpcloth.run.scene_files import find_source
 from warpcloth.scenes import hanging
+from warpcloth.solvers import SOLVERS
 from warpcloth.usd import write_scene
 
 SCENE = """
@@ -140,6 +142,35 @@ def test_files_are_sent_along(address, tmp_path, monkeypatch):
             assert content == sha256(path.read_bytes()).hexdigest() and Path(place).name == path.name
             assert Path(place) == path or (Path(place).is_absolute() and tmp_path not in Path(place).parents)
     assert Path(found["hanging"][1][0]).samefile(find_source("hanging").path)  # comes with the package
+
+
+OWN = """
+import warpcloth as wc
+from warpcloth.solvers.step import Step
+
+
+@wc.solvers.register
+class Own(Step):
+    name = "own"
+"""
+
+
+def own(name):
+    """The file that a solver of this process is in."""
+    return sys.modules[SOLVERS[name].__module__].__file__
+
+
+def test_the_file_of_a_solver_is_sent(address, tmp_path, monkeypatch):
+    monkeypatch.setattr(extensions, "_names", set())
+    (tmp_path / "own_solver.py").write_text(OWN, encoding="utf-8")
+    extensions.load_extension(str(tmp_path / "own_solver.py"))
+    try:
+        with connect(address) as cluster:
+            ((_, found),) = sweep([task(own, name="own")], cluster)
+    finally:
+        del SOLVERS["own"], sys.modules["own_solver"]
+    assert Path(found).name == "own_solver.py" and tmp_path not in Path(found).parents
+    assert Path(found).read_text(encoding="utf-8") == OWN
 
 
 def test_a_stage_is_sent_with_the_layers_below_it(address, tmp_path, monkeypatch):
