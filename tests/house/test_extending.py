@@ -1,4 +1,4 @@
-"""The energy and the solver of docs/extending.md, a file each outside the package: in Python, on the command line, in charts."""
+"""The energy and the solver of docs/extending.md, each a file outside the package: in Python, commands and charts."""
 
 import json
 import sys
@@ -48,6 +48,7 @@ def outside(folder, monkeypatch, tmp_path):
         for name in {*known}:
             monkeypatch.setitem(known, name, known[name])
     monkeypatch.setattr(extensions, "_names", set())
+    monkeypatch.setattr(extensions, "_files", set())
     before = {*SOLVERS}, {*TERMS}, {*sys.modules}
     yield folder
     for known, names in zip((SOLVERS, TERMS), before, strict=False):
@@ -185,5 +186,5 @@ def test_entry_points_are_loaded(outside, monkeypatch):
     with pytest.warns(
         UserWarning, match="nothing_here of the entry points warpcloth.extensions: nothing_here cannot be imported"
     ):
-        extensions.load_installed()
+        extensions.load_installed.__wrapped__()
     assert "descent" in SOLVERS and extensions.extensions() == {str(outside / "descent.py"): [outside / "descent.py"]}

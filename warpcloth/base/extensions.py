@@ -8,16 +8,19 @@ import importlib
 import importlib.util
 import sys
 import warnings
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
 # Installed packages name their modules in this group, see docs/extending.md.
 GROUP = "warpcloth.extensions"
-_names = set()  # of modules that registered something
+_names = set()  # of modules that registered something, or were loaded to do so
+_files = set()  # names of modules that were loaded by the path of a file
 
 
+@cache
 def load_installed():
-    """Imports the modules that installed packages name in :data:`GROUP`.
+    """Imports, once, the modules that installed packages name in :data:`GROUP`.
 
     Warns:
         UserWarning: One of them cannot be imported.
@@ -33,30 +36,45 @@ def load_extension(name):
     """Imports a module that registers energies and solvers.
 
     Args:
-        name: Name of the module, or path of a .py file.
+        name: Name of the module, or path of a .py file; a file takes the place of another of its name that was loaded before.
 
     Raises:
         ValueError: It cannot be imported.
     """
     try:
-        if not name.endswith(".py"):
+        if name.endswith(".py"):
+            _run_file(Path(name).resolve())
+        else:
             importlib.import_module(name)
-            return
-        path = Path(name).resolve()
-        spec = importlib.util.spec_from_file_location(path.stem, path)
-        known = sys.modules.get(path.stem)
-        if known is not None:
-            if Path(getattr(known, "__file__", None) or "").resolve() != path:
-                raise ValueError(f"another module is called {path.stem} already; give the file another name")
-            return
-        sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[path.stem]
-            raise
+            _names.add(name)
     except Exception as error:  # whatever the module raises
         raise ValueError(f"{name} cannot be imported: {type(error).__name__}: {error}") from error
+
+
+def load_only(names):
+    """Imports modules, and forgets those that were loaded for others: a worker of a cluster measures for many."""
+    _names.clear()
+    for name in names:
+        load_extension(name)
+
+
+def _run_file(path):
+    name = path.stem
+    known = Path(getattr(sys.modules.get(name), "__file__", None) or "").resolve()
+    if name in sys.modules and name not in _files and known != path:
+        raise ValueError(f"another module is called {name} already; give the file another name")
+    if known != path:
+        spec = importlib.util.spec_from_file_location(name, path)
+        before, sys.modules[name] = sys.modules.get(name), importlib.util.module_from_spec(spec)
+        try:
+            spec.loader.exec_module(sys.modules[name])
+        except BaseException:
+            del sys.modules[name]
+            if before is not None:
+                sys.modules[name] = before
+            raise
+        _files.add(name)
+    _names.add(name)
 
 
 def note(record):
@@ -66,7 +84,7 @@ def note(record):
 
 
 def extensions():
-    """Returns the files of the modules that registered an energy or a solver.
+    """Returns the files of the modules from outside that this process uses.
 
     Returns:
         dict: The paths of each by what :func:`load_extension` takes: the name of a module of a package, which stands for all

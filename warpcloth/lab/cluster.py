@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..base.digest import package_digest
-from ..base.extensions import extensions, load_extension
+from ..base.extensions import extensions, load_only
 from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import initialise_warp
 from ..run.listing import folders
@@ -187,8 +187,7 @@ def files_of(task):
 
 def unpack(packed, files, modules):
     """In a worker: calls what :meth:`Cluster.submit` packed, on files of its own and with the extensions of who asks."""
-    for name, sent in modules.items():
-        load_extension(name if sent is None else _kept(*sent))
+    load_only(name if sent is None else _kept(*sent) for name, sent in modules.items())
     function, task, arguments = pickle.loads(packed)
     here = {name: _kept(*sent) for name, sent in files.items()}
     return function(replace(task, arguments=_moved(task.arguments, here)), *arguments)
