@@ -140,6 +140,24 @@ def test_benchmarks_and_charts_take_it(stage, tmp_path, capfd):
     assert code == 0 and {"newton", "xpbd"} <= {row.split(",")[0] for row in chart.read_text().splitlines()}, err
 
 
+def test_a_membrane_is_a_material_by_its_name(tmp_path, capfd):
+    @dataclass(frozen=True, kw_only=True)
+    class Silk(wc.StVKMembrane):
+        material = "silk"
+
+    cloth, table = tmp_path / "cloth.usdc", tmp_path / "table.csv"
+    wc.simulate(sheet(), wc.XPBD(substeps=4), output=cloth, frames=2)
+    options = ["--measure", "energy_density", "--stiffness", "10", "--poisson", "0.2", "--csv", table, "--material"]
+    refused(capfd, ["analyze", cloth, *options, "silk"], "must be one of 'corotated', 'neo-hookean', 'stvk'")
+    terms.register(Silk)
+    found = []
+    for name in ("silk", "stvk"):
+        assert run(capfd, "analyze", cloth, *options, name)[0] == 0
+        found.append(table.read_text(encoding="utf-8"))
+    del terms.TERMS["Silk"]
+    assert found[0] == found[1] and "energy_density" in found[0]
+
+
 def test_what_is_no_energy_is_not_registered():
     @dataclass(frozen=True, kw_only=True)
     class Spring(Declared):
