@@ -69,7 +69,7 @@ def rows_of(term: Term, scalar: bool, curved: bool):
 
 
 def slope_type(term: Term, dtype, scalar: bool, curved: bool):
-    """What an element keeps of its Jacobian: covectors (rows, 3M), or of constant ones whether they are active, 0 or 1."""
+    """The type of an element's Jacobian: covectors (rows, 3M), or of constant ones whether they are active, 0 or 1."""
     return wp.types.matrix((rows_of(term, scalar, curved), 3 * term.rows), dtype) if scalar else dtype
 
 
@@ -109,7 +109,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
 
     @wp.func
     def size_of(stencil: wp.array2d(dtype=wp.int32), e: int, r: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        """What y is a sum of, and so rounds to ε of."""
+        """The size of the terms that y sums up, to whose ε it rounds."""
         size = dtype(0.0)
         for i in range(K):
             away = x[stencil[e, i]]

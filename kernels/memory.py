@@ -37,7 +37,7 @@ def load(dtype, ndim=1, stored=None):
 
 @cache
 def load_shared(dtype):
-    """The same of arrays of any stride, such as 0 of what all elements share."""
+    """The device function (array, i) → its i-th entry, for arrays of any stride, such as 0 where elements share a value."""
 
     @wp.func_native("return *(decltype(a.data))((char*)a.data + size_t(i) * size_t(a.strides[0]));")
     def load_strided(a: wp.array(dtype=dtype), i: int) -> dtype: ...

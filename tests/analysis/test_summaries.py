@@ -105,7 +105,7 @@ def test_weights_of_what_is_excluded_are_not_read():
     [
         (np.zeros((2, 3)), np.ones(2), r"a: values \(2, 3\), weights \(2,\) and positions \(2, 3\) do not go together"),
         (np.zeros(2), np.ones(3), r"a: values \(2,\), weights \(3,\)"),
-        (np.zeros(3), np.ones(3), r"places \(2, 3\)"),
+        (np.zeros(3), np.ones(3), r"positions \(2, 3\)"),
         (np.zeros(2), np.array([1.0, -1.0]), "a: the weight of a measured element is negative or not finite"),
         (np.zeros(2), np.array([1.0, NAN]), "negative or not finite"),
         (np.zeros(2), np.array([1.0, INF]), "negative or not finite"),

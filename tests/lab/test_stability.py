@@ -29,8 +29,8 @@ from warpcloth.lab.stability_limits import (
     concave_rate,
     largest_ordered,
     largest_relaxation,
+    limit_ratios,
     rings,
-    rules,
 )
 from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
@@ -139,7 +139,9 @@ SOFT_JACOBI = [
 def test_limits_of_jacobi_with_compliance(solver, options, iterations, device):
     """α̃ = 1/(khₑ²) of XPBD counts twice, in D + α̃ and with λ, each integrator has its least q; "per-step" spreads it."""
     fixed, setup, scene = {"dt": 1.0, "iterations": iterations}, Setup(solver, options), net("shear", 8)
-    limit = record_at(setup, fixed).relaxation / rules(scene_at(scene, fixed, 1), record_at(setup, fixed), 1)["ω λ_max = 2"]
+    limit = (
+        record_at(setup, fixed).relaxation / limit_ratios(scene_at(scene, fixed, 1), record_at(setup, fixed), 1)["ω λ_max = 2"]
+    )
     # The mode that decides about odd numbers is taken for that which decides about even ones.
     found = boundary(scene, setup, "relaxation", limit / 2, limit * 2, 600, fixed, WIDTH, device=device)
     assert found == pytest.approx(limit, rel=0.01)
@@ -163,7 +165,7 @@ ORDERED = [
 def test_limits_of_gauss_seidel_in_its_order(kind, solver, options, iterations, stiffness, device):
     """The eigenvalues of sweeps in the order in which they go, soft and stiff (kh² of 1 and 1e4 times the mass)."""
     fixed, setup, scene = {"dt": 1.0, "iterations": iterations}, Setup(solver, options), net(kind, 8, stiffness)
-    ratios = rules(scene_at(scene, fixed, 1), record_at(setup, fixed), 600)
+    ratios = limit_ratios(scene_at(scene, fixed, 1), record_at(setup, fixed), 600)
     limit = 1.0 / ratios["Gauss–Seidel, |z| = 1"]
     found = boundary(scene, setup, "relaxation", limit / 2, limit * 1.5, 600, fixed, WIDTH, device=device)
     assert found == pytest.approx(limit, rel=0.01)
@@ -173,7 +175,7 @@ def test_limits_of_gauss_seidel_in_its_order(kind, solver, options, iterations, 
 @pytest.mark.parametrize("sweep", ["sequential", "coloured", "jacobi", "vertex-averaged"])
 def test_a_net_that_no_spring_moves_has_no_limit(stiffness, pins, sweep):
     declared = replace(net("shear", 4, stiffness).load(), pins=pins)
-    ratios = rules(declared, wc.PBD(substeps=1, iterations=1, sweep=sweep), 100)
+    ratios = limit_ratios(declared, wc.PBD(substeps=1, iterations=1, sweep=sweep), 100)
     assert "Gauss–Seidel, |z| = 1" not in ratios and ratios.get("ω λ_max = 2", 0.0) == 0.0
 
 
@@ -202,7 +204,7 @@ def test_no_line_is_drawn_where_damping_moves_it(device):
     scene = net("shear", 6).load()
     damped = replace(scene, terms=[replace(term, damping=1.0) for term in scene.terms])
     for setup in (Setup("explicit", {"scheme": "forward"}), Setup("pbd"), Setup("xpbd", {"sweep": "constraint-averaged"})):
-        names = [set(rules(one, record_at(setup, {}), 100)) & set(DIVERGES) for one in (scene, damped)]
+        names = [set(limit_ratios(one, record_at(setup, {}), 100)) & set(DIVERGES) for one in (scene, damped)]
         assert len(names[0]) == 1 and not names[1]
 
 
@@ -210,7 +212,7 @@ def test_no_line_is_drawn_where_damping_moves_it(device):
 def test_rules_of_integrators_are_of_their_effective_step(integrator, part):
     values = {"dt": 0.02, "compression": 0.2}
     ref = SceneRef("chain", {"links": 1, "stiffness": 100.0, "mass": 0.01})
-    found = rules(scene_at(ref, values, 4), record_at(Setup("newton", {"integrator": integrator}), values), 4)
+    found = limit_ratios(scene_at(ref, values, 4), record_at(Setup("newton", {"integrator": integrator}), values), 4)
     assert found["h² = m/(k(L/l − 1))"] == pytest.approx(part * 0.02 * 50.0, rel=1e-4)
 
 
@@ -252,10 +254,10 @@ def test_rules_of_one_spring():
     scene, newton = scene_at(ref, values, 4), record_at(Setup("newton"), values)
     # Noise of the start is 1e-6 of the length.
     assert concave_rate(scene.build(dtype="float64")) == pytest.approx(100.0 * (1 / 0.8 - 1) / 0.01, rel=1e-4)
-    assert rules(scene, newton, 4)["h² = m/(k(L/l − 1))"] == pytest.approx(0.02 * np.sqrt(2500.0), rel=1e-4)
+    assert limit_ratios(scene, newton, 4)["h² = m/(k(L/l − 1))"] == pytest.approx(0.02 * np.sqrt(2500.0), rel=1e-4)
     plain = record_at(Setup("projective-dynamics", {"acceleration": "none"}), {**values, "iterations": 5})
     # Gershgorin's sum over a row counts the pin too.
-    needed = rules(scene, plain, 4)["1 + Σk h²/m iterations"] * 5
+    needed = limit_ratios(scene, plain, 4)["1 + Σk h²/m iterations"] * 5
     assert 1.0 + 100.0 * 0.02**2 / 0.01 <= needed * (1 + 1e-9) <= 1.0 + 2 * 100.0 * 0.02**2 / 0.01 * (1 + 1e-9)
     assert rings(SceneRef("chain", {"links": 7}).load()) == 7
 
@@ -413,7 +415,7 @@ def test_07_weights_of_admm(device):
     assert all(1.0 / 30.0 < ratios[i, k] < 30.0 for k, i in enumerate(best))
     assert ratios[0] / ratios[0, 0] == pytest.approx(np.sqrt([1.0, 100.0, 3000.0]), rel=1e-6)
     assert ratios[:, 0] / ratios[0, 0] == pytest.approx(np.array(weights) / weights[0], rel=1e-6)
-    assert "r = 1/(2hω)" not in rules(HANGING.load(), wc.ADMM(dt=1 / 60), 10), "which auto is on by itself"
+    assert "r = 1/(2hω)" not in limit_ratios(HANGING.load(), wc.ADMM(dt=1 / 60), 10), "which auto is on by itself"
 
 
 @pytest.mark.parametrize("solver", ["pbd", "xpbd"])

@@ -12,7 +12,7 @@ import pytest
 
 import warpcloth as wc
 from warpcloth.base.digest import scene_digest
-from warpcloth.chart import pareto as fronts
+from warpcloth.chart import pareto
 from warpcloth.cli import main
 from warpcloth.lab import convergence, machine, spectrum, work_precision
 from warpcloth.lab.campaign import Store
@@ -187,7 +187,7 @@ def test_a_step_without_a_spectrum_costs_no_other(tmp_path):
         found = spectrum_diagram(SceneRef("hanging", still), frames=1, limit=0.2, executor=executor, store=Store())
         assert [row["status"] for row in found["rows"]].count("ok") in range(1, 5)
         assert "has nothing to minimise" in found["rows"][-1]["reason"] and left_out(found)
-        fronts.plot_spectrum(tmp_path / "spectrum.png", found)
+        pareto.plot_spectrum(tmp_path / "spectrum.png", found)
         hard = SceneRef("net", {"n": 4, "stiffness": "inf"})
         with pytest.raises(ValueError, match="Newton cannot take Spring with infinite stiffness"):
             spectrum_diagram(hard, frames=1, executor=executor, store=Store())
@@ -257,7 +257,7 @@ def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
     found = {"scene": "a$^$.py", "frame": 1, "rate": 60.0, "dtype": "float64", "machine": machine.machine(), "rows": rows}
     said = [("newton, 2 settings", "refused: hard"), ("newton 8", "refused: soft"), ("admm 1", "refused: hard")]
     assert left_out(found) == said
-    fronts.plot_solver(tmp_path / "solver.png", found)
+    pareto.plot_solver(tmp_path / "solver.png", found)
     (legend,) = (axes.get_legend() for axes in drawn[0].axes if axes.get_legend())
     assert [text.get_text() for text in legend.get_texts()] == ["xpbd", "rounding of the objective"]
     low, high = (ms := drawn[0].axes[1]).get_xlim()
@@ -318,8 +318,8 @@ class Nobody:
 def drawn(monkeypatch):
     """Figures that are saved."""
     figures = []
-    save = fronts.save
-    monkeypatch.setattr(fronts, "save", lambda figure, path: (figures.append(figure), save(figure, path)))
+    save = pareto.save
+    monkeypatch.setattr(pareto, "save", lambda figure, path: (figures.append(figure), save(figure, path)))
     return figures
 
 
@@ -360,7 +360,7 @@ def test_time_diagram(device, tmp_path, drawn):
     name = found["rows"][-1]["label"]
     assert (name, "diverged: diverged in frame 3") in left_out(found)
     for ending in ("png", "svg"):
-        fronts.plot_time(tmp_path / f"chart.{ending}", found)
+        pareto.plot_time(tmp_path / f"chart.{ending}", found)
     write_csv(tmp_path / "chart.csv", found)
     lines = table(tmp_path / "chart.csv")
     assert [line["label"] for line in lines] == list(rows) and lines[-1]["error"] == ""
@@ -369,8 +369,8 @@ def test_time_diagram(device, tmp_path, drawn):
     assert float(lines[0]["error"]) == found["rows"][0]["error"] and float(lines[0]["strain_error"]) > 0.0
     axes, strains, _notes = drawn[0].axes
     text = text_of(drawn[0])
-    fronts_of = {name: front(found["rows"], found["reference"][name], name) for name in ("error", "strain_error")}
-    numbered = sorted(set().union(*fronts_of.values()), key=lambda i: found["rows"][i]["ms_per_second"])
+    front_of = {name: front(found["rows"], found["reference"][name], name) for name in ("error", "strain_error")}
+    numbered = sorted(set().union(*front_of.values()), key=lambda i: found["rows"][i]["ms_per_second"])
     assert all(f"{i}  {found['rows'][place]['label']}" in text for i, place in enumerate(numbered, 1))
     assert name + ": diverged" in text
     shown = {label for _, label in zip(*axes.get_legend_handles_labels(), strict=True)}
@@ -393,7 +393,7 @@ def test_time_diagram(device, tmp_path, drawn):
         assert np.allclose(sorted(bars.tolist()), sorted(map(list, map(spread, good))))
         (joined,) = (line for line in panel.lines if line.get_label() == "nothing is better in both")
         assert joined.get_xydata().tolist() == [
-            [found["rows"][i]["ms_per_second"], found["rows"][i][name]] for i in fronts_of[name]
+            [found["rows"][i]["ms_per_second"], found["rows"][i][name]] for i in front_of[name]
         ]
 
 
@@ -433,8 +433,8 @@ def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
     # Smaller steps are nearer to their matrix.
     assert np.all(np.diff([row["contraction"] for row in other["rows"]]) < 0.0)
     one["rows"][1] |= {"status": "diverged", "reason": "a gap of 1e+07 after 8 iterations"}
-    fronts.plot_solver(tmp_path / "solver.png", one)
-    fronts.plot_spectrum(tmp_path / "spectrum.png", other)
+    pareto.plot_solver(tmp_path / "solver.png", one)
+    pareto.plot_spectrum(tmp_path / "spectrum.png", other)
     iterations, ms, _ = drawn[0].axes
     for axes, name in ((iterations, "iterations"), (ms, "ms")):
         for line, row in zip(axes.lines, one["rows"], strict=False):

@@ -179,7 +179,7 @@ class Analyzer:
                     raise ValueError(f"dt: {dt:g} s to frame {self._label(pair.frame):g}, {rule}")
 
     def of(self, *measures: str) -> "Analyzer":
-        """The same analysis of other measures."""
+        """Returns an analyzer of other measures with the options of this one."""
         return Analyzer(**(self._given | {"frames": self.sequence, "dt": None, "measures": measures}))
 
     @property

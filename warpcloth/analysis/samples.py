@@ -1,4 +1,4 @@
-"""What an analysis gives: rows of measures, and what could not be measured."""
+"""The results of an analysis: rows of measures, and the elements and frames that were left out."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ _SHOWN = 8  # elements that a sentence names
 
 @dataclass(frozen=True, eq=False)
 class Exclusion:
-    """What could not be measured.
+    """Elements or a frame that could not be measured.
 
     Attributes:
         frame: Number of the frame; None for the rest shape.

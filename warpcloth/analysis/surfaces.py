@@ -6,8 +6,7 @@ import warp as wp
 from ..base.checks import array, numeric, shown
 from ..base.quiet import find_device
 from ..base.turns import in_turn
-from ..kernels import deformation, rates
-from ..kernels import neighbourhood_fit as fits
+from ..kernels import deformation, neighbourhood_fit, rates
 from ..model.model import DTYPES
 from ..terms import TERMS
 from ..terms.membrane import Membrane
@@ -17,7 +16,7 @@ RATES = {"midpoint": rates.MIDPOINT, "forward": rates.FORWARD, "logarithm": rate
 
 
 class _Elements:
-    """What triangles and neighbourhoods share: results that are allocated once, and rates between gradients.
+    """The base of triangles and neighbourhoods: results that are allocated once, and rates between gradients.
 
     Attributes:
         values: Results (E, *shape) by name of measure, overwritten by each call; on the CPU views of what kernels wrote.
@@ -177,8 +176,8 @@ class Neighbourhoods(_Elements):
         self.rotations = self.results.get("rotation")
         if self.rotations is None and self.wanted("rotation_angle"):
             self.rotations = self.empty(self.mat33)
-        self.fits = self.wanted(*(measure.name for measure in measures if measure.rate))
-        self.fits |= self.wanted("deformation_gradient", "stretch", "directions")
+        self.fitted = self.wanted(*(measure.name for measure in measures if measure.rate))
+        self.fitted |= self.wanted("deformation_gradient", "stretch", "directions")
         self.sizes = self.upload(np.sqrt(mesh.vertex_areas), self.scalar)
 
     def refer(self, X, rounding):
@@ -197,12 +196,12 @@ class Neighbourhoods(_Elements):
 
     def measure(self, x):
         """Measures the frame x (n, 3), all but rates."""
-        gradients = self.gradients if self.fits else None
+        gradients = self.gradients if self.fitted else None
         self._fit(x, [gradients, self.frames, self.rotations, "residual", "cross_covariance"])
         names = ("deformation_gradient", "stretch", "directions", "rotation_angle")
         if self.wanted(*names):
             inputs = [self.gradients, self.frames, self.rotations]
-            self.launch(fits.measure_neighbourhoods(self.scalar), inputs, names)
+            self.launch(neighbourhood_fit.measure_neighbourhoods(self.scalar), inputs, names)
 
     def touched(self, vertices):
         """Which neighbourhoods have one of some vertices (n,) bool."""
@@ -211,14 +210,14 @@ class Neighbourhoods(_Elements):
 
     def _find_normals(self, x, out):
         inputs = [self.triangle_offsets, self.incident, self.triangles, x]
-        self.launch(fits.vertex_normals(self.scalar), inputs, [out])
+        self.launch(neighbourhood_fit.vertex_normals(self.scalar), inputs, [out])
 
     def _fit(self, x, outputs):
         x = self.centred(x)
         if outputs[0] is not None:
             self._find_normals(x, self.normals)
         inputs = [self.offsets, self.members, self.reference_normals, self.X, self.normals, x, self.rounding]
-        self.launch(fits.neighbourhood_gradients(self.scalar), inputs, outputs)
+        self.launch(neighbourhood_fit.neighbourhood_gradients(self.scalar), inputs, outputs)
 
 
 def material_directions(mesh, chosen, corner_coordinates=None):

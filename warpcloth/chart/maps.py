@@ -129,7 +129,7 @@ def _colour(cell):
 
 
 def _hatch(axes, coordinates, rows):
-    """What is stable or inaccurate in the colours of both."""
+    """Hatches the cells that are stable and inaccurate, in the colours of both."""
     from matplotlib.patches import Rectangle
 
     across, up = map(_edges, coordinates)

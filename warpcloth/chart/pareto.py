@@ -34,8 +34,8 @@ def plot_time(path, found):
         ValueError: The path has another ending.
     """
     rows, reference = found["rows"], found["reference"]
-    fronts = {name: front(rows, reference[name], name) for name in _ERRORS}
-    best = sorted(set().union(*fronts.values()), key=lambda i: rows[i]["ms_per_second"])
+    curves = {name: front(rows, reference[name], name) for name in _ERRORS}
+    best = sorted(set().union(*curves.values()), key=lambda i: rows[i]["ms_per_second"])
     texts = [f"{number}  {rows[i]['label']}" for number, i in enumerate(best, 1)]
     texts += [
         "",
@@ -59,9 +59,9 @@ def plot_time(path, found):
             axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none")
             ends[axes].append((x[-1], y[-1], solver if integrator == "euler" else f"{solver} {integrator}", colour))
     for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
-        x, y = ([rows[i][of] for i in fronts[name]] for of in ("ms_per_second", name))
+        x, y = ([rows[i][of] for i in curves[name]] for of in ("ms_per_second", name))
         axes.plot(x, y, color="gold", linewidth=5.0, zorder=0, label="nothing is better in both")
-        for i in fronts[name]:
+        for i in curves[name]:
             point, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": _TEXT}
             axes.annotate(str(best.index(i) + 1), point, (-4, -4), textcoords="offset points", **below)
         axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="quartiles of the times")

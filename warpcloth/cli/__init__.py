@@ -68,7 +68,7 @@ def main(argv=None):
 
 
 def _sentence(error, debug):
-    """What an error says; ours are sentences, others need their kind, and a hint at how to see more."""
+    """Returns the sentence for an error: its message if it is ours, else with its kind and a hint at how to see more."""
     if isinstance(error, OSError):
         if error.strerror is None:
             return error

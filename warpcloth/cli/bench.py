@@ -89,7 +89,7 @@ def bench(arguments):
 
 
 def _benchmarks(arguments, device):
-    """What the arguments ask for.
+    """Returns the benchmarks that the arguments ask for.
 
     Raises:
         ValueError: They do not go together, or one of them is wrong.
@@ -130,7 +130,7 @@ def _refuse(arguments, names, why):
 
 
 def _interrupted(run):
-    """What is left."""
+    """Says which results an interrupted run has kept."""
     if not run.rows:
         return "interrupted before the first row; nothing was measured"
     return f"interrupted after {len(run.rows)} of {run.total} rows, which are printed"

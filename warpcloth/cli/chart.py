@@ -155,15 +155,15 @@ def work_precision(arguments):
 
 
 def _parts(diagram):
-    """What measures a diagram, what draws it and what says the most of it; another diagram is another row."""
-    from ..chart import pareto as fronts
+    """The functions that measure a diagram, draw it and sum it up, by its name; another diagram is another row."""
+    from ..chart import pareto
     from ..lab import work_precision as measured
 
     return {
-        "time": (measured.time_diagram, fronts.plot_time, _time_lines),
-        "solver": (measured.solver_diagram, fronts.plot_solver, _solver_lines),
+        "time": (measured.time_diagram, pareto.plot_time, _time_lines),
+        "solver": (measured.solver_diagram, pareto.plot_solver, _solver_lines),
         "physics": (measured.physics_diagram, _plot_physics, _physics_lines),
-        "spectrum": (measured.spectrum_diagram, fronts.plot_spectrum, _spectrum_lines),
+        "spectrum": (measured.spectrum_diagram, pareto.plot_spectrum, _spectrum_lines),
     }[diagram]
 
 

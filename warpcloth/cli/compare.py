@@ -106,7 +106,7 @@ def _write_csv(path, columns):
 
 
 def _facts(arguments, found, sequences):
-    """What the summary says: the worst of each number with the frame that has it, and the root mean square over all."""
+    """Facts of the summary: the worst of each number with the frame that has it, and the root mean square over all."""
     facts = {
         "a": arguments.a,
         "b": arguments.b,

@@ -34,7 +34,7 @@ class Extremes:
 
 @dataclass
 class Report:
-    """What :func:`write_report` found.
+    """The result of :func:`write_report`.
 
     Attributes:
         rows: Number of rows.
@@ -282,7 +282,7 @@ def _archive(analyzer, path):
 
 
 class _Shown:
-    """What is looked at: a stage and pictures, coloured by one scalar on one scale."""
+    """The outputs to look at: a stage and pictures, coloured by one scalar on one scale."""
 
     def __init__(self, analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack):
         view, self.both_sides, colormap = looks

@@ -1,4 +1,4 @@
-"""What the commands share: device, progress and results on a terminal, where results go, and what measurements run on."""
+"""Parts that all commands use: device, progress and results on a terminal, where results go, and what measurements run on."""
 
 import contextlib
 import json
@@ -89,7 +89,7 @@ def add_dask(parser):
 
 @contextlib.contextmanager
 def executing(arguments):
-    """What a sweep is to run on, as its arguments: a Dask cluster, or nothing, for processes of this machine.
+    """Yields the keyword arguments of a sweep that say where it runs: a Dask cluster, or none for processes of this machine.
 
     Raises:
         ValueError: A number of processes is given beside a cluster.
@@ -107,7 +107,7 @@ def executing(arguments):
 
 @contextlib.contextmanager
 def measuring(arguments, device):
-    """What a sweep is to run on and what it shows, as its arguments: see :func:`executing`; on a GPU one process.
+    """Yields the keyword arguments of a sweep that say where it runs and what it shows; on a GPU one process.
 
     Raises:
         Interrupted: The user did; it says what is kept.
@@ -152,7 +152,7 @@ class Settings:
             self.bar.close()
 
     def interrupted(self):
-        """What is kept."""
+        """Says how many settings are kept."""
         if self.total is None:
             return "interrupted before the first setting; nothing was measured"
         return f"interrupted after {self.done} of {self.total} settings, which are kept; the same command goes on from there"

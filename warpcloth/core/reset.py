@@ -116,5 +116,5 @@ def _host(values):
 
 
 def _kind(values):
-    """What a Warp array is, for the sentence of an error."""
+    """Describes a Warp array, for the sentence of an error."""
     return f"an array {values.shape} of {values.dtype.__name__}"

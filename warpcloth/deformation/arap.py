@@ -33,7 +33,7 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Deformed:
-    """What :meth:`Arap.solve` found.
+    """The result of :meth:`Arap.solve`.
 
     Attributes:
         points: (n, 3) [m]; the handles are at their targets.

@@ -20,7 +20,7 @@ PRIMVAR = "rotationAngle"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Deformation:
-    """What a deformation left: a frame for each keyframe.
+    """The result of a deformation: a frame for each keyframe.
 
     Attributes:
         points: (F, n, 3) [m]; in memory, or read from ``output`` when asked for (float32 then).

@@ -16,7 +16,7 @@ from .structs import chained, int32_array
 
 
 class Window(NamedTuple):
-    """What a step reads of consecutive vertices of a model, which are numbered from the first of them.
+    """The arrays of consecutive vertices of a model that a step reads, numbered from the first of them.
 
     Attributes:
         terms: Their :class:`warpcloth.model.model.DeviceElements`.

@@ -39,7 +39,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Advice:
-    """What :func:`advise` found.
+    """The result of :func:`advise`.
 
     Attributes:
         trials: List of :class:`Trial`.
@@ -63,7 +63,7 @@ class Advice:
 
     @property
     def sentences(self):
-        """What follows, in words."""
+        """Returns the advice in sentences."""
         found = []
         step = next(trial for trial in self.trials if trial.kind == "step")
         if step.matters is not False:

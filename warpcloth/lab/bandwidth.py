@@ -1,4 +1,4 @@
-"""What a device can copy: the measure of all that is bound by memory."""
+"""The bandwidth of a device by copying: the measure of all that is bound by memory."""
 
 import time
 

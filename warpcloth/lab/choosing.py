@@ -42,7 +42,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Choice:
-    """What :func:`pick` chose.
+    """The result of :func:`pick`.
 
     Attributes:
         chosen: The :class:`Measured`, or None where nothing will do.
@@ -196,7 +196,7 @@ def _measured(setup, result, machine):
 
 
 def as_json(choice, found, exact):
-    """What was chosen and why, as JSON values."""
+    """Returns the choice and its reasons as JSON values."""
     rows = [asdict(each) | {"label": str(each.setup)} for each in found]
     chosen = None if choice.chosen is None else asdict(choice.chosen)
     facts = {"chosen": chosen, "meets": choice.meets, "certainty": choice.certainty}

@@ -54,10 +54,10 @@ class OneStep:
         model = scene.build(device=device, dtype="float64")
         x, v = (array.numpy() for array in (model.positions, model.velocities))
         if frame:
-            past = simulate(scene, Newton(substeps=substeps), device=device, dtype="float64", frames=frame)
-            if not past.status.ok:
-                raise ValueError(f"{scene.name} has no frame {frame} to step from: {past.status.message}")
-            x, v = past.points[-1], past.velocities[-1]
+            earlier = simulate(scene, Newton(substeps=substeps), device=device, dtype="float64", frames=frame)
+            if not earlier.status.ok:
+                raise ValueError(f"{scene.name} has no frame {frame} to step from: {earlier.status.message}")
+            x, v = earlier.points[-1], earlier.velocities[-1]
         self._start = [np.float32(array).astype(np.float64) for array in (x, v)]
         self._count = frame * substeps
         stepper = Newton(substeps=substeps, tolerance=1e-14, iterations=500, linear="factorised").bind(model)

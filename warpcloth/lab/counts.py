@@ -1,4 +1,4 @@
-"""What a step has to do, by counting: elements, the bytes that it must move at least, and launches."""
+"""The work of a step by counting: elements, the fewest bytes that it must move, and launches."""
 
 from contextlib import contextmanager
 
@@ -28,7 +28,7 @@ def compulsory_bytes(model, iterations):
 
 
 def launches_of(run):
-    """What ``run()`` launches: kernels, fills and copies within a device, those of loops on the device each time.
+    """Counts the launches of ``run()``: kernels, fills and copies within a device, those of loops on the device each time.
 
     Segments launch what they recorded one by one meanwhile, so that loops are run, and counted, by the host.
 

@@ -1,4 +1,4 @@
-"""What a measurement ran on, for those who read it later."""
+"""The machine that a measurement ran on, for those who read it later."""
 
 import os
 import platform

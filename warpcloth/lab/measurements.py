@@ -116,7 +116,7 @@ def task(function, **arguments):
 
 
 def run(task, source):
-    """What an executor calls: the result of a task, and the name of the machine that measured it.
+    """Runs a task for an executor: returns its result and the name of the machine that measured it.
 
     Args:
         task: The :class:`Task`.

@@ -1,4 +1,4 @@
-"""What benchmarks say together: growth with size, ratios of two results, tables and files."""
+"""Results of benchmarks: growth with size, ratios of two results, tables and files."""
 
 import csv
 import json

@@ -16,7 +16,7 @@ from ..solvers import Newton
 from .axes import ACCURACY, AXES, FIXED, OPTIONS
 from .cells import record_at, refined, scene_at, steps_in, together, vary
 from .measurements import SceneRef, Setup, task
-from .stability_limits import KNOWN, rules
+from .stability_limits import KNOWN, limit_ratios
 
 VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
 # Steps of the reference per step of the map, and the most steps that it takes in all (or as many as frames). A run with half as
@@ -27,7 +27,7 @@ _FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
 
 @dataclass(frozen=True)
 class Trial:
-    """What a run of B copies left; a copy that diverged is NaN from there.
+    """The result of a run of B copies; a copy that diverged is NaN from there.
 
     Attributes:
         points: (frames+1, B, n, 3) [m].
@@ -119,7 +119,7 @@ def measure(
         "refused"), ``reason``, ``step`` (that of divergence, or None), ``steps`` (those of the run), ``growth`` (see
         :class:`Trial`), ``error`` (or None), ``floor``, the distance of the reference to a run of twice its step, which bounds
         its own error if each halving at least halves that (or None), and ``rules`` (see
-        :func:`warpcloth.lab.stability_limits.rules`), of which :data:`KNOWN` is ``floor`` over ``accuracy``.
+        :func:`warpcloth.lab.stability_limits.limit_ratios`), of which :data:`KNOWN` is ``floor`` over ``accuracy``.
     """
     ref, setups = SceneRef(**scene), [Setup(**setup) for setup in setups]
     groups = [values]
@@ -141,7 +141,7 @@ def measure(
                 if cell["status"] != "refused":
                     of_cell = scene_at(ref, {**fixed, axis: value}, *length)
                     run_for = of_cell.frames * record.per_frame(of_cell.fps)
-                    known = {name: _finite(ratio) for name, ratio in rules(of_cell, record, run_for).items()}
+                    known = {name: _finite(ratio) for name, ratio in limit_ratios(of_cell, record, run_for).items()}
                     cell = cell | {"steps": run_for, "rules": known}
                     if cell["floor"] is not None and accuracy > 0.0:
                         cell["rules"][KNOWN] = cell["floor"] / accuracy
@@ -164,7 +164,7 @@ def _attempt(ref, record, fixed, axis, group, length, device, dtype, limit):
 
 
 def _reference(ref, fixed, axis, group, length, device, limit):
-    """What a group is compared with: :class:`Trial` of the coarser run and of the reference, or why not; None without any."""
+    """Returns the :class:`Trial` of the coarser run and of the reference of a group, or why there is none; None without any."""
     dt = {**fixed, axis: group[0]}["dt"]
     steps, duration = length
     steps = steps if duration is None else steps_in(duration, dt)

@@ -33,7 +33,7 @@ _LEAST = {"euler": -1.0 / 3.0, "midpoint": 0.0, "bdf2": -9.0 / 55.0}
 _MOST = 1000
 
 
-def rules(scene, record, steps):
+def limit_ratios(scene, record, steps):
     """Returns, by name, the ratios of those of :data:`LIMITS` that the record of a solver names, each above 1 beyond its limit.
 
     Args:
@@ -321,7 +321,7 @@ def _roots(half, product):
 
 
 def _share(mobility, compliance, record):
-    """What a sweep takes of what is wrong with a constraint by itself, without ω."""
+    """The share of the violation of a single constraint that a sweep corrects, without ω."""
     if getattr(record, "correction", None) == "per-step":
         return 1.0 - (compliance / (mobility + compliance)) ** (1.0 / record.iterations)
     return mobility / (mobility + compliance)

@@ -92,7 +92,7 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
 
 
 def _warm(stepper, model, points, frames, elements):
-    """What the warm frames say."""
+    """Times the warm frames and counts their work."""
     for _ in range(_WARM_UP - 1):
         _run_frame(stepper, points)
     times, iterations = [], []

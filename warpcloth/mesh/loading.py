@@ -62,7 +62,7 @@ READERS.update(dict.fromkeys(ENDINGS, read_file))
 
 
 def read_arrays(path, name=None):
-    """What a mesh is made of, as `read_file` describes it.
+    """Reads the arrays of a mesh, as `read_file` describes them.
 
     Args:
         path: As for `read_file`.

@@ -96,7 +96,7 @@ class Sequence:
         return np.array(self.read(range(len(self))[operator.index(frame)]), dtype=np.float64)
 
     def rounding(self, points: np.ndarray) -> float:
-        """What points (n, 3) in the numbers of the input are rounded by [m]; of those that are not finite it tells nothing."""
+        """Rounding of points (n, 3) [m] in the precision of the input, by the largest that is finite."""
         return np.finfo(self.precision).eps * np.abs(points).max(initial=0.0, where=np.isfinite(points))
 
     @cached_property
@@ -165,7 +165,7 @@ def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = N
 
 
 def as_sequence(mesh: Mesh, frames: ArrayLike | HasPoints, dt: float | None = None, times: ArrayLike | None = None) -> Sequence:
-    """The same for frames that Python holds.
+    """Makes a `Sequence` of frames that Python holds.
 
     Args:
         mesh: The `Mesh`, its points the rest shape.

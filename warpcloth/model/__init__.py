@@ -1,1 +1,1 @@
-"""What is built from a scene on a device."""
+"""Models: scenes built on a device."""

@@ -1,4 +1,4 @@
-"""What is built from a scene on a device: arrays of one or more copies laid out one after another, and nothing undeclared."""
+"""A scene on a device: arrays of one or more copies laid out one after another, and nothing undeclared."""
 
 import inspect
 import os
@@ -161,7 +161,7 @@ class DeviceElements:
         return stencil if self.cells is None else np.split(stencil[:, 0], self.cells.offsets.numpy()[1:-1])
 
     def reordered(self, order):
-        """The same elements, or cells, with those of index ``order`` in that order."""
+        """Returns the elements, or cells, of index ``order`` in that order."""
 
         def put(array):
             if 0 in array.strides:
@@ -181,7 +181,7 @@ class DeviceElements:
         return replace(self, **changed, refresh=self.refresh and self.refresh.with_arrays(put), cells=cells)
 
     def by_lowest(self):
-        """The same elements in the order of their lowest vertices; themselves where that is theirs."""
+        """Returns the elements in the order of their lowest vertices; themselves if they are in that order."""
         lowest = self.stencil.numpy().min(axis=1)
         return self.reordered(np.argsort(lowest, kind="stable")) if (np.diff(lowest) < 0).any() else self
 
@@ -515,7 +515,7 @@ class Model:
         return array
 
     def report(self):
-        """What was built: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels.
+        """Describes the model: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels.
 
         Terms of one label are numbered from the second on: Spring, Spring 2. Kernels are factory(variant).Term.
         """

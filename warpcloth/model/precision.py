@@ -1,4 +1,4 @@
-"""What the precision of a model holds: values that it would turn into 0 or infinity, and places where it loses the cloth."""
+"""Limits of a model's precision: values that it would turn into 0 or infinity, and positions where it loses the cloth."""
 
 import numpy as np
 

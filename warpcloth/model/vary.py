@@ -1,4 +1,4 @@
-"""What differs between the copies of a model: any number that a scene or one of its terms holds."""
+"""Values that differ between the copies of a model: any number that a scene or one of its terms holds."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -6,7 +6,7 @@ from ..kernels.minimise import add_inertia
 
 
 class Inertia:
-    """What inertia, and gravity where that is a force, add to the objective and to its gradient.
+    """Adds inertia, and gravity where that is a force, to the objective and to its gradient.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.

@@ -83,7 +83,7 @@ def state_of(stepper):
 
 @in_turn
 def _copies(stepper, number):
-    """What takes so many frames from a stepper."""
+    """Returns buffers that take so many frames from a stepper."""
     model = stepper.model
     if not model.device.is_cuda:
         return [_HostCopy(stepper) for _ in range(number)]

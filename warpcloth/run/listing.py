@@ -1,4 +1,4 @@
-"""What the command line can name, read from source files without running them: scenes, solvers and the options of these.
+"""Lists what the command line can name, read from source files without running them: scenes, solvers and the options of these.
 
 Nothing here loads Warp, so that help and the completion of a shell answer at once.
 """
@@ -69,7 +69,7 @@ def list_solvers():
 
 
 def _assigned(node, name):
-    """What the body of a module or class assigns to a name."""
+    """Returns the value that the body of a module or class assigns to a name."""
     found = (each for each in node.body if isinstance(each, ast.Assign))
     return next(ast.literal_eval(each.value) for each in found if getattr(each.targets[0], "id", None) == name)
 

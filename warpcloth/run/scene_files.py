@@ -20,7 +20,7 @@ _number_of_modules = itertools.count()
 
 @dataclass(frozen=True)
 class SceneSource:
-    """What makes a scene: the ``scene`` function of a Python file, or a USD stage.
+    """The source of a scene: the ``scene`` function of a Python file, or a USD stage.
 
     Attributes:
         path: The file.

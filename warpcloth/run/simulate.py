@@ -32,7 +32,7 @@ AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Animation:
-    """What a run left: the start and every good frame after it.
+    """The result of a run: the start and every good frame after it.
 
     Attributes:
         points: (frames+1, n, 3) [m]; in memory, or read from ``output`` when asked for (float32 then). Of B > 1 copies

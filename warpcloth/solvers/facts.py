@@ -21,7 +21,7 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class Facts:
-    """What is measured of a solver, and how it is drawn.
+    """Settings by which a solver is measured, and its style in charts.
 
     Attributes:
         method: The method, in a few words for tables.

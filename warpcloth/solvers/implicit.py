@@ -1,4 +1,4 @@
-"""What the methods share that iterate towards the minimiser of implicit Euler."""
+"""The base of methods that iterate towards the minimiser of implicit Euler."""
 
 import numpy as np
 

@@ -114,7 +114,7 @@ class Stepper:
         raise NotImplementedError  # every solver has its own
 
     def prepare_frame(self):
-        """What `frame` records when it is first called, which is for the main thread alone."""
+        """Records the graphs of `frame`, which must happen in the main thread; `frame` does it when it is first called."""
 
     @in_turn
     def frame(self):

@@ -1,4 +1,4 @@
-"""What all records of options share: the step, what a solver needs of every term, and its facts; and the catalogue by name."""
+"""The base of all records of options: the step, what a solver needs of every term, and its facts; and the catalogue by name."""
 
 import math
 from dataclasses import dataclass

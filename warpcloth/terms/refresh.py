@@ -16,7 +16,7 @@ STEP, EVALUATION = "step", "evaluation"
 
 
 class Moment(NamedTuple):
-    """What is known where elements are refreshed.
+    """The state from which elements are refreshed.
 
     Attributes:
         x: Positions (N,) vectors [m].
@@ -35,7 +35,7 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Refresh:
-    """What a term's elements need set anew during a run.
+    """The part of a term's elements that is set anew during a run.
 
     A term of stencils that come and go has arrays for its capacity, and its launch fills the stencils and the rest states that
     are in use; the stiffness of all others it sets to 0, by a count that stays on the device.

@@ -184,7 +184,7 @@ class FrameSequence:
         return (self._values(frame) * self._scale).astype(np.float32, copy=False)
 
     def _values(self, frame):
-        """What the file has of a frame, a vertex once."""
+        """Reads the values of a frame from the file, each vertex once."""
         if identity(self._file) not in (None, self._identity):
             raise RuntimeError(
                 f"{self._file}: has been written again since these frames were opened; open it again, "

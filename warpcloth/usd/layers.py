@@ -1,4 +1,4 @@
-"""What all frames share: the layer that an animation is put on, a complete stage or one over an artist's."""
+"""The parts that all frames share: the layer that an animation is put on, a complete stage or one over an artist's."""
 
 import os
 

@@ -194,7 +194,7 @@ def _over(source, mesh, primvars, coloured):
 
 
 def _facts_of(stage, source):
-    """What the source's root layer says, rates and range with it, for the root layer over it."""
+    """Returns the metadata of the source's root layer, with rates and range, for the root layer over it."""
     root = stage.GetRootLayer()
     rates = {"timeCodesPerSecond": source.time_codes_per_second, "framesPerSecond": source.fps or source.time_codes_per_second}
     start = {"startTimeCode": root.startTimeCode} if root.HasStartTimeCode() else {}

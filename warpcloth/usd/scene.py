@@ -205,7 +205,7 @@ def _pinned(cloth, surroundings):
 
 
 def _motion(values, cloth, surroundings, vertices, frames, fps):
-    """What animated points say: where the cloth starts (n, 3), and keyframes (F, p, 3) of the pinned vertices; or None."""
+    """Reads animated points: the positions at the start (n, 3), and keyframes (F, p, 3) of the pinned vertices; or None."""
     animated = UsdGeom.PointBased(cloth).GetPointsAttr()
     own = next(values.authored("pins.keyframes"), None)
     positions = keyframes = None

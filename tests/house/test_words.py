@@ -1,0 +1,101 @@
+"""Words: docstrings say what a thing is or does, and no name is made of a word that the field has a better one for."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PATHS = sorted(
+    path.relative_to(ROOT).as_posix()
+    for room in ("warpcloth", "kernels")
+    for path in (ROOT / room).rglob("*.py")
+    if path.relative_to(ROOT).parts[1] not in ("kernels", "scenes")  # the links
+)
+OPENINGS = re.compile(r"(What|The same)\b")
+# Words that no name contains, with what it says instead.
+INSTEAD = {
+    "place": "position, index, path …",
+    "places": "positions, indices …",
+    "team": "thread_pool",
+    "fronts": "pareto",
+    "rules": "limits",
+    "fits": "neighbourhood_fit",
+    "splitting": "admm",
+    "taut": "at_limit",
+    "slack": "dead_zone",
+    "reach": "max_length",
+}
+# "In place" is the field's.
+ALLOWED = {"in_place", "correct_in_place", "launch_in_place", "refuse_in_place"}
+# To be renamed.
+PENDING: dict[str, set[str]] = {
+    "kernels/admm.py": {
+        "Splitting",
+        "gather_splitting",
+        "scatter_splitting",
+        "splitting",
+        "splitting_forces",
+        "start_splitting",
+    },
+    "kernels/clusters.py": {"place"},
+    "kernels/copy.py": {"places"},
+    "kernels/membrane.py": {"edge_reach"},
+    "kernels/minimise.py": {"place"},
+    "kernels/project.py": {"place"},
+    "kernels/step.py": {"place"},
+    "kernels/term.py": {"reach"},
+    "kernels/terms/corotated_membrane.py": {"edge_reach", "reach"},
+    "kernels/terms/spring.py": {"reach"},
+    "kernels/terms/spring_limit.py": {"reach"},
+    "kernels/terms/strain_limit.py": {"edge_reach", "reach"},
+    "warpcloth/analysis/analysis.py": {"places"},
+    "warpcloth/chart/percentiles.py": {"reach"},
+    "warpcloth/core/hessian.py": {"place"},
+    "warpcloth/core/reset.py": {"_places"},
+    "warpcloth/fast/quadratic_pairs.py": {"place", "places_of"},
+    "warpcloth/lab/stability_limits.py": {"_reach"},
+    "warpcloth/lab/strips.py": {"reach"},
+    "warpcloth/model/model.py": {"_place", "places"},
+    "warpcloth/model/precision.py": {"place"},
+    "warpcloth/numerics/cluster_rows.py": {"_places", "place"},
+    "warpcloth/numerics/constraints.py": {"place"},
+    "warpcloth/numerics/hierarchy.py": {"place", "reach"},
+    "warpcloth/numerics/sweeps.py": {"place"},
+    "warpcloth/run/frames.py": {"_places", "places"},
+    "warpcloth/run/sources.py": {"place", "places"},
+    "warpcloth/solvers/admm.py": {"gather_splitting", "scatter_splitting", "splitting", "start_splitting"},
+    "warpcloth/solvers/threaded.py": {"places"},
+}
+
+
+def names(tree):
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            yield node.id
+        elif isinstance(node, ast.Attribute):
+            yield node.attr
+        elif isinstance(node, ast.arg):
+            yield node.arg
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+
+
+def words(name):
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().strip("_").split("_")
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_docstrings_open_with_a_statement(path):
+    for node in ast.walk(ast.parse((ROOT / path).read_text())):
+        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
+            text = ast.get_docstring(node) or ""
+            assert not OPENINGS.match(text), f"{getattr(node, 'name', 'module')}: {text.splitlines()[0]}"
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_names_are_words_of_the_field(path):
+    found = {name for name in names(ast.parse((ROOT / path).read_text())) if name.lower().strip("_") not in ALLOWED}
+    wrong = {name for name in found if INSTEAD.keys() & set(words(name))}
+    assert wrong == PENDING.get(path, set()), {word: INSTEAD[word] for name in wrong for word in words(name) if word in INSTEAD}
