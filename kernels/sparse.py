@@ -51,7 +51,7 @@ def share(name):
 
 
 @cache
-def local_coordinate(term: Term, dtype, corrected: bool):
+def cell_coordinate(term: Term, dtype, corrected: bool):
     """The device function (first, last, stencil, weights, x, d) → y of a cell at x, or with ``corrected`` at x + d."""
     vec3, _ = types(dtype)
     M, weights_type, y_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -84,11 +84,11 @@ def evaluate(term: Term, dtype, corrected: bool):
     vec3, _ = types(dtype)
     M, weights_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype)
     rest_type, share_type = wp.types.vector(term.parameters, dtype), wp.types.vector(4, dtype)
-    y_of, u, gradient, area = local_coordinate(term, dtype, corrected), term.energy, term.gradient, term.measure
+    y_of, u, gradient, area = cell_coordinate(term, dtype, corrected), term.energy, term.gradient, term.measure
 
     @wp.kernel(module="unique", enable_backward=False)
     def evaluate_cells(
-        # cells
+        # elements
         offsets: wp.array(dtype=wp.int32),
         stencil: wp.array2d(dtype=wp.int32),
         weights: wp.array(dtype=weights_type),
@@ -123,11 +123,11 @@ def blocks(term: Term, dtype, corrected: bool):
         wp.types.vector(term.rows, dtype),
         wp.types.vector(term.parameters, dtype),
     )
-    y_of, hessian, area = local_coordinate(term, dtype, corrected), term.hessian, term.measure
+    y_of, hessian, area = cell_coordinate(term, dtype, corrected), term.hessian, term.measure
 
     @wp.kernel(module="unique", enable_backward=False)
     def blocks_of_cells(
-        # cells
+        # elements
         offsets: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         stencil: wp.array2d(dtype=wp.int32),

@@ -19,7 +19,7 @@ from support.sheets import SPRINGS, TERMS, declared
 from warpcloth.cli import main
 from warpcloth.core.capture import Segment
 from warpcloth.core.thread_pool import ThreadPool
-from warpcloth.model.model import threads_on
+from warpcloth.model.threads import threads_on
 from warpcloth.solvers import solver as solvers
 
 pytestmark = pytest.mark.filterwarnings("ignore:threads is . on . cores")

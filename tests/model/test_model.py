@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,9 @@ from support.energies import DECLARED
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import RowSums, Sums
-from warpcloth.model.model import DTYPES
+from warpcloth.model.host_values import host_values
+from warpcloth.model.incidences import incidences_of
+from warpcloth.model.precision import DTYPES
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS as KINDS
 
@@ -830,3 +833,32 @@ def test_nothing_undeclared_exists(tmp_path, solver, declared, homes, names, dev
     assert EDGES in found["rows"]
     assert (HINGES in found["rows"]) == ("QuadraticBending" in names)
     assert (ATTACHED in found["rows"]) == ("Attachment" in names)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_binding_reads_no_elements_back(name, device, monkeypatch):
+    """Stencils, stiffness and rest states stay on the host until they are final, in an order of the model's own too.
+
+    On the CPU, where all is on the host, what reads them asks for what is kept.
+    """
+    mesh = wc.Mesh.grid(5, 5)
+    terms = [wc.Spring(pairs=("structural", "shear"), stiffness=np.linspace(50.0, 100.0, 72), damping=0.01)]
+    scene = wc.Scene(mesh, density=0.1, terms=[*terms, wc.QuadraticBending(stiffness=1e-5)], pins=[0, 4])
+    model = scene.build(device=device, copies=2, order=np.random.default_rng(0).permutation(25))
+    own = {array.ptr for elements in model.terms for array in (*elements.arguments, elements.damping) if array is not None}
+    read, numpy = set(), wp.array.numpy
+
+    def copied_back(array):
+        if sys._getframe(1).f_code is not host_values.__code__ or not array.device.is_cpu:
+            read.add(array.ptr)
+        return numpy(array)
+
+    monkeypatch.setattr(wp.array, "numpy", copied_back)
+    SOLVERS[name](substeps=50).bind(model)
+    assert read and not own & read
+
+
+def test_incidences_name_each_corner_once():
+    stencil = np.array([[3, 0], [0, 1], [3, 1]])
+    offsets, codes = incidences_of(stencil.ravel(), 5)
+    assert [codes[first:last].tolist() for first, last in pairwise(offsets)] == [[1, 2], [3, 5], [], [0, 4], []]

@@ -10,7 +10,7 @@ from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import Sums
 from warpcloth.model.damping import dissipations
-from warpcloth.model.model import DTYPES
+from warpcloth.model.precision import DTYPES
 from warpcloth.terms.refresh import STEP, Moment
 
 # A few roundings in a row: no sum here has more than a dozen addends that matter.

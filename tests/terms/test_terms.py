@@ -43,7 +43,7 @@ from warpcloth.kernels.fast import scatter_corrections
 from warpcloth.kernels.fast.parts import chain_of
 from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.kernels.vectors import types
-from warpcloth.model.model import DTYPES
+from warpcloth.model.precision import DTYPES
 from warpcloth.terms import TERMS, needs
 
 RAW, CLAMP, ABSOLUTE = HessianPolicy

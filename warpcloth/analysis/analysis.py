@@ -13,7 +13,7 @@ from ..base.checks import choice, number
 from ..base.types import FilePath, Precision
 from ..mesh.mesh import Mesh, same_topology
 from ..mesh.sequences import HasPoints, Sequence, as_sequence, open_sequence
-from ..model.model import DTYPES
+from ..model.precision import DTYPES
 from ..terms.membrane import Membrane
 from .frame_pairs import pairs_of
 from .measures import chosen

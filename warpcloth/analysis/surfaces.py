@@ -7,7 +7,7 @@ from ..base.checks import array, numeric, shown
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..kernels import deformation, neighbourhood_fit, rates
-from ..model.model import DTYPES
+from ..model.precision import DTYPES
 from ..terms import TERMS
 from ..terms.membrane import Membrane
 from .neighbourhoods import neighbourhoods

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels import assemble
+from ..model.host_values import host_values
 
 
 def constant_blocks(model, elements):
@@ -25,7 +26,7 @@ def constant_matrices(model, s):
     vertices = np.arange(n)
     rows, columns, values = [vertices], [vertices], [diagonal]
     for elements in model.terms:
-        stencil = elements.stencil.numpy()[: elements.per_copy]
+        stencil = host_values(elements.stencil)[: elements.per_copy]
         K = stencil.shape[1]
         rows.append(np.repeat(stencil, K, axis=1).ravel())
         columns.append(np.tile(stencil, K).ravel())

@@ -5,6 +5,7 @@ import warp as wp
 
 from ..base.turns import in_turn
 from ..kernels import assemble, linear, sparse
+from ..model.host_values import host_values
 
 
 def _is_sparse(elements):
@@ -21,7 +22,7 @@ class _Blocks:
 
     def pairs(self):
         """The row and the column of each block."""
-        stencil = self.elements.stencil.numpy().astype(np.int64)
+        stencil = host_values(self.elements.stencil).astype(np.int64)
         K = stencil.shape[1]
         return np.repeat(stencil, K, axis=1).ravel(), np.tile(stencil, K).ravel()
 
@@ -32,7 +33,7 @@ class _Blocks:
     def add_norms(self, norms, rows):
         """Adds the norms of the blocks to their rows."""
         K = self.elements.term.vertices
-        np.add.at(rows, self.elements.stencil.numpy(), norms.reshape(-1, K, K).sum(axis=2))
+        np.add.at(rows, host_values(self.elements.stencil), norms.reshape(-1, K, K).sum(axis=2))
 
 
 class _SparseBlocks:
@@ -41,13 +42,15 @@ class _SparseBlocks:
     def __init__(self, model, elements, corrected):
         self.model, self.elements, cells = model, elements, elements.cells
         self._kernel = model.kernel(sparse.blocks, cells.term, model.dtype, corrected)
-        ends = np.cumsum(np.diff(cells.offsets.numpy()).astype(np.int64) ** 2)
+        ends = np.cumsum(np.diff(host_values(cells.offsets)).astype(np.int64) ** 2)
         self._starts = wp.array(np.append(0, ends[:-1]).astype(np.int32), dtype=wp.int32, device=model.device)
         self.blocks = wp.zeros(int(ends[-1]), dtype=model.mat33, device=model.device)
 
     def pairs(self):
         """The row and the column of each block."""
-        vertices = np.split(self.elements.stencil.numpy()[:, 0].astype(np.int64), self.elements.cells.offsets.numpy()[1:-1])
+        vertices = np.split(
+            host_values(self.elements.stencil)[:, 0].astype(np.int64), host_values(self.elements.cells.offsets)[1:-1]
+        )
         rows = [np.repeat(cell, len(cell)) for cell in vertices]
         return np.concatenate(rows), np.concatenate([np.tile(cell, len(cell)) for cell in vertices])
 

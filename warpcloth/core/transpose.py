@@ -6,7 +6,7 @@ class Transpose:
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        elements: Its :class:`warpcloth.model.model.DeviceElements`.
+        elements: Its :class:`warpcloth.model.elements.DeviceElements`.
         scatter, gather: The factories of the two kernels, see :mod:`warpcloth.kernels.transpose`.
         key: Arguments of both.
     """

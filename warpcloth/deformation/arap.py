@@ -21,7 +21,7 @@ from ..kernels.vectors import types
 from ..mesh.mesh import Mesh
 from ..mesh.ordering import worthwhile_order
 from ..mesh.selection import distinct_vertices
-from ..model.model import DTYPES
+from ..model.precision import DTYPES
 from ..numerics.linear import constant_factor
 from ..numerics.rotation import kabsch
 

@@ -5,6 +5,7 @@ See :mod:`warpcloth.kernels.fast.block_forces` for what is done with them.
 
 import numpy as np
 
+from ..model.host_values import host_values
 from .structs import int32_array
 
 NUMBERS = 6144  # of scratch, if no vertex needs more: 2048 springs, which fit into the first cache
@@ -17,7 +18,7 @@ def block_layout(terms, per_copy, copies):
     A block ends before the coordinates of one of the terms are more than :data:`NUMBERS`; it has one vertex at least.
 
     Args:
-        terms: :class:`warpcloth.model.model.DeviceElements` of each term; all copies have the same.
+        terms: :class:`warpcloth.model.elements.DeviceElements` of each term; all copies have the same.
         per_copy: Vertices of a copy.
         copies: How many there are.
 
@@ -39,7 +40,7 @@ def block_layout(terms, per_copy, copies):
 
 def _one(elements):
     """The stencil (E, K) of one copy."""
-    return elements.stencil.numpy()[: elements.per_copy]
+    return host_values(elements.stencil)[: elements.per_copy]
 
 
 def _numbers_before(elements, per_copy):

@@ -5,7 +5,8 @@ import warp as wp
 
 from ..kernels.fast.gather_corrections import slot_rows
 from ..kernels.fast.parts import Part
-from ..model.model import incidences_of
+from ..model.host_values import host_values
+from ..model.incidences import incidences_of
 from .quadratic_pairs import matrix_entries
 from .structs import int32_array
 
@@ -49,7 +50,7 @@ def gathered_in_rows(elements, count, pairs, **others):
     :func:`warpcloth.kernels.fast.gather_corrections.slot_rows`.
 
     Args:
-        elements: :class:`warpcloth.model.model.DeviceElements`.
+        elements: :class:`warpcloth.model.elements.DeviceElements`.
         count: Vertices, N.
         pairs: Whether incidences may name the other vertex in place of the element.
         others: Other numbers (B·E,) of the elements, by name.
@@ -71,13 +72,13 @@ def gathered_in_rows(elements, count, pairs, **others):
     found = {"codes": int32_array(in_rows(codes), elements.stencil.device)}
     for name, array in arrays.items():
         shared = 0 in array.strides
-        found[name] = array if shared else wp.array(in_rows(array.numpy()[source]), dtype=array.dtype, device=array.device)
+        found[name] = array if shared else wp.array(in_rows(host_values(array)[source]), dtype=array.dtype, device=array.device)
     return part._replace(pairs=slots), found
 
 
 def _by_element(elements, count, part, arrays):
     """The part and the arrays of incidences that name elements."""
-    stencil = elements.stencil.numpy().ravel()
+    stencil = host_values(elements.stencil).ravel()
     offsets, codes = incidences_of(stencil, count)
     codes, padded = _slots(codes, stencil[codes], offsets, count)
     arrays |= {"offsets": int32_array(offsets, elements.stencil.device), "codes": int32_array(codes, elements.stencil.device)}
@@ -90,7 +91,7 @@ def _pairs(elements, count):
     -1 and 0 of an empty slot. None where elements are no pairs, or their rest state is set in each step, or there would be too
     many slots.
     """
-    stencil = elements.stencil.numpy()
+    stencil = host_values(elements.stencil)
     if stencil.shape[1] != 2 or elements.refresh is not None:
         return None
     columns = [incidences_of(stencil[:, corner], count) for corner in range(2)]
@@ -140,7 +141,7 @@ def _of_incidences(array, source):
     """The values of elements ``source``, if elements do not share one."""
     if 0 in array.strides:
         return array
-    return wp.array(array.numpy()[source], dtype=array.dtype, device=array.device)
+    return wp.array(host_values(array)[source], dtype=array.dtype, device=array.device)
 
 
 def lanes_of(model):

@@ -7,6 +7,7 @@ import warp as wp
 
 from ..kernels.assemble import constant_blocks
 from ..kernels.fast.quadratic_pair import QUADRATIC_PAIR
+from ..model.host_values import host_values
 
 CHUNK = 1 << 18  # elements whose blocks are added up at once
 # Pairs an element, up to which they are faster: a hinge takes 5 to 6 ns, a pair of vertices 1.2 (one core).
@@ -24,7 +25,7 @@ def matrix_entries(model, elements):
     from scipy.sparse import coo_matrix
 
     K, n = elements.term.vertices, model.per_copy
-    stencil = elements.stencil.numpy()
+    stencil = host_values(elements.stencil)
 
     def places_of(some):
         """Rows and columns of the entries off the diagonal, and where they are in the blocks."""

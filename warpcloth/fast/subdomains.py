@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.copy import copy_chosen
+from ..model.host_values import host_values
 from .block_step import BlockStep, Window
 from .structs import int32_array
 
@@ -78,7 +79,7 @@ class _Subdomain:
     def __init__(self, model, state, h, symplectic, count, first, end):
         terms, touched = [], [np.arange(first, end)]
         for elements in model.terms:
-            stencil = elements.stencil.numpy()
+            stencil = host_values(elements.stencil)
             chosen = np.flatnonzero(((stencil >= first) & (stencil < end)).any(axis=1))
             if len(chosen):
                 terms.append((elements.reordered(chosen), stencil[chosen]))

@@ -8,6 +8,7 @@ import warp as wp
 
 from ..kernels import damping as kernels
 from ..terms.refresh import STEP, Moment, Refresh
+from .host_values import host_values
 
 
 def damped_terms(model, he):
@@ -17,7 +18,7 @@ def damped_terms(model, he):
         if elements.damping is None:
             terms.append(elements)
         elif elements.term.dissipation.merges:
-            terms.append(_dissipation(model, elements, he, elements.stiffness.numpy()))
+            terms.append(_dissipation(model, elements, he, host_values(elements.stiffness)))
         else:
             terms += [elements, _dissipation(model, elements, he, 0.0)]
     return terms
@@ -31,7 +32,7 @@ def dissipations(model, he):
 def _dissipation(model, elements, he, stiffness):
     """The elements of D, or with their ``stiffness`` those of both."""
     dissipation, count = elements.term.dissipation, elements.count
-    viscous = elements.damping.numpy().astype(np.float64) / he
+    viscous = host_values(elements.damping).astype(np.float64) / he
     both = stiffness + viscous
     share = np.divide(viscous, both, out=np.zeros(count), where=both > 0.0)
     term = dissipation.term or elements.term

@@ -1,6 +1,9 @@
 """Limits of a model's precision: values that it would turn into 0 or infinity, and positions where it loses the cloth."""
 
 import numpy as np
+import warp as wp
+
+DTYPES = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
 
 
 def cast(name, unit, values, dtype, place, infinite=False):
@@ -39,7 +42,7 @@ def cast(name, unit, values, dtype, place, infinite=False):
 
 
 def refuse_coarse(mesh, positions, dtype, place):
-    """Refuses places so far from the origin, or a mesh so large or small, that a precision loses the cloth.
+    """Refuses positions so far from the origin, or a mesh so large or small, that a precision loses the cloth.
 
     ε·|x| may be 1 % of the median edge of the rest shape, and the square of every edge must be a normal number.
 

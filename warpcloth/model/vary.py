@@ -35,6 +35,27 @@ class Vary:
         self.taken.add(name)
         return array(f"vary[{name!r}]", self.values[name], (self.copies, *np.shape(default))).copy()
 
+    def masses(self, scene):
+        """Masses of all copies (B, n) [kg]."""
+        if self.has("density") and self.has("masses"):
+            raise ValueError("vary has density and masses; at most one of the two may be given")
+        if self.has("density") and scene.density is None:
+            raise ValueError("vary['density'] needs a scene with a density, and this one has masses; vary['masses'] instead")
+        masses = self.take("masses", scene.vertex_masses)
+        if self.has("density"):
+            density = self.take("density", np.float64(scene.density))
+            for copy in np.flatnonzero(~(density > 0.0)):
+                raise ValueError(f"vary['density'] is {density[copy]} in copy {copy}; it must be above 0")
+            masses = masses * (density / scene.density)[:, None]
+        allowed = masses > 0.0
+        allowed[:, scene.pins.vertices] |= masses[:, scene.pins.vertices] == 0.0
+        for copy, vertex in np.argwhere(~allowed)[:1]:
+            raise ValueError(
+                f"vary['masses'] of vertex {vertex} is {masses[copy, vertex]} kg in copy {copy}; it must be above 0, "
+                "of a pinned vertex 0 or more"
+            )
+        return masses
+
     def elements(self, term, mesh, positions):
         """The elements of a term, and what differs between their copies.
 

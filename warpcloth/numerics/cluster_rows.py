@@ -8,6 +8,7 @@ import warp as wp
 from ..core.capture import Mirror
 from ..kernels import cluster_rows as kernels
 from ..kernels.transpose import stored
+from ..model.host_values import host_values
 
 
 class ClusterRows:
@@ -15,7 +16,7 @@ class ClusterRows:
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        elements: The :class:`warpcloth.model.model.DeviceElements`, of cells.
+        elements: The :class:`warpcloth.model.elements.DeviceElements`, of cells.
 
     Attributes:
         count: Rows of one copy.
@@ -26,9 +27,9 @@ class ClusterRows:
         self.count = 3 * elements.per_copy
         names = ("linearise_clusters", "apply_cluster_rows", "pull_clusters")
         self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
-        self._stencil, self._offsets = elements.stencil.numpy()[:, 0], self.cells.offsets.numpy()
+        self._stencil, self._offsets = host_values(elements.stencil)[:, 0], host_values(self.cells.offsets)
         self._mass = elements.rest.numpy()[:, 3].astype(np.float64)
-        self._places = self.cells.shape.numpy().astype(np.float64)
+        self._places = host_values(self.cells.shape).astype(np.float64)
         self._inverses = np.stack([np.linalg.pinv(each, 1e-12, True) for each in self._inertias()])
         self._inertia = model.array(self._inverses, model.mat33)
         self._rotations = wp.zeros(self.cells.count, dtype=model.mat33, device=model.device)

@@ -13,6 +13,7 @@ from ..core.transpose import Transpose
 from ..kernels import constraint_jacobian as jacobian
 from ..kernels import constraint_rows as kernels
 from ..kernels.constraint_step import scale_rows, weigh
+from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 from .cluster_rows import ClusterRows
 
@@ -22,7 +23,7 @@ class TermRows:
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        elements: The :class:`warpcloth.model.model.DeviceElements`.
+        elements: The :class:`warpcloth.model.elements.DeviceElements`.
         curved: Whether tension stiffens.
 
     Attributes:
@@ -67,7 +68,7 @@ class TermRows:
     def _in_full(self):
         """Scratch, kernel and pattern of :meth:`entries`: rows and columns of every entry in one matrix of all copies."""
         elements, Q = self.elements, self.rows
-        stencil = elements.stencil.numpy().astype(np.int64)
+        stencil = host_values(elements.stencil).astype(np.int64)
         E, K = stencil.shape
         blocks = Mirror(wp.zeros((E, Q * K), dtype=wp.vec3d, device=self.model.device))
         copy, e = np.divmod(np.arange(E), elements.per_copy)

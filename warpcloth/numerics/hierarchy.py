@@ -12,7 +12,8 @@ import numpy as np
 import warp as wp
 
 from ..kernels.terms import SPRING_LIMIT
-from ..model.model import DeviceElements
+from ..model.elements import DeviceElements
+from ..model.host_values import host_values
 
 _HUB = 8  # kept neighbours of a dropped vertex, above which they are linked to the nearest of them alone, not each to each
 
@@ -107,11 +108,11 @@ def _finest(model, free):
         if elements.term.reach is None:
             continue
         E = elements.per_copy
-        stiffness = elements.stiffness.numpy().reshape(model.copies, E).astype(np.float64).T
+        stiffness = host_values(elements.stiffness).reshape(model.copies, E).astype(np.float64).T
         if (stiffness == stiffness[:, :1]).all():
             stiffness = stiffness[:, :1]
         # What bounds all copies is the longest of their lengths; the last sweeps have each its own.
-        stencil, rest = elements.stencil.numpy()[:E], elements.rest.numpy().reshape(model.copies, E, -1)
+        stencil, rest = host_values(elements.stencil)[:E], host_values(elements.rest).reshape(model.copies, E, -1)
         found = [elements.term.reach(points, stencil, each) for each in (rest if (rest != rest[:1]).any() else rest[:1])]
         pairs, _, factors = found[0]
         lengths = np.max([lengths for _, lengths, _ in found], axis=0)

@@ -1,12 +1,11 @@
 """Weights of the local problems of ADMM, r = W²/(s k A) of each element."""
 
-from dataclasses import replace
-
 import numpy as np
 import warp as wp
 
 from ..core.constant_matrix import constant_blocks
 from ..kernels.admm import stiffness_scale
+from ..model.host_values import host_values
 
 
 def best_weights(model, elements, he, curvature=None):
@@ -18,8 +17,8 @@ def best_weights(model, elements, he, curvature=None):
         he: Effective step hₑ [s].
         curvature: s of each element (E,), see :func:`curvatures`, if that is known.
     """
-    blocks = constant_blocks(model, weighed(elements, curvatures(model, elements) if curvature is None else curvature))
-    root = np.sqrt(model.inverse_mass.numpy().astype(np.float64))[elements.stencil.numpy()]
+    blocks = constant_blocks(model, elements.weighed(curvatures(model, elements) if curvature is None else curvature))
+    root = np.sqrt(model.inverse_mass.numpy().astype(np.float64))[host_values(elements.stencil)]
     rates = np.linalg.eigvalsh(root[:, :, None] * blocks * root[:, None, :])[:, -1]
     return np.divide(0.5, he * np.sqrt(rates), out=np.ones_like(rates), where=rates > 0.0)
 
@@ -35,9 +34,3 @@ def curvatures(model, elements):
     found = scale.numpy()
     # A hinge without a normal at rest has no curvature there, and its weight would be 0.
     return np.where(found > 0.0, found, found.max() or 1.0)
-
-
-def weighed(elements, factor):
-    """Returns the elements with k multiplied by a factor (E,)."""
-    stiffness = elements.stiffness.numpy() * factor
-    return replace(elements, stiffness=wp.array(stiffness, dtype=elements.stiffness.dtype, device=elements.stiffness.device))

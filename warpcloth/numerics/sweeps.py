@@ -11,6 +11,7 @@ from ..core.thread_pool import ThreadPool
 from ..fast.plan import plan
 from ..kernels import project as kernels
 from ..kernels.clusters import correct_clusters
+from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 
 # By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
@@ -66,7 +67,7 @@ class Sweep:
     Attributes:
         correction: d (N,) [m].
         multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, in the order of ``elements``, or Nones.
-        elements: :class:`warpcloth.model.model.DeviceElements` of each term, in the order of the sweep.
+        elements: :class:`warpcloth.model.elements.DeviceElements` of each term, in the order of the sweep.
         ranges: Of each term what one launch takes, as (first, count).
     """
 
@@ -135,14 +136,14 @@ class Sweep:
             return even, model.constant(1.0, model.count)
         constraints = np.zeros(model.count)
         for elements in terms:
-            constraints += np.bincount(elements.stencil.numpy().ravel(), minlength=model.count)
+            constraints += np.bincount(host_values(elements.stencil).ravel(), minlength=model.count)
         if kind == "vertex-averaged":
             return even, model.array(1.0 / np.maximum(constraints + alpha, np.finfo(np.float32).tiny), model.dtype)
         constraints[model.inverse_mass.numpy() == 0.0] = 1.0  # what does not move cannot overshoot
-        largest = [constraints[elements.stencil.numpy()].max(axis=1) for elements in terms]
+        largest = [constraints[host_values(elements.stencil)].max(axis=1) for elements in terms]
         for i, elements in enumerate(terms):
             if elements.cells:  # one factor for all of a cell
-                firsts = elements.cells.offsets.numpy()[:-1]
+                firsts = host_values(elements.cells.offsets)[:-1]
                 largest[i] = np.repeat(np.maximum.reduceat(largest[i], firsts), elements.cells.sizes)
         return [model.array(self.relaxation / each, model.dtype) for each in largest], model.constant(1.0, model.count)
 

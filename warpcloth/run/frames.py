@@ -91,7 +91,7 @@ def _copies(stepper, number):
     shape = (number, 2, model.count)
     found = wp.empty(shape, dtype=model.vec3, device=model.device)
     host = wp.empty(shape, dtype=model.vec3, device="cpu", pinned=True)
-    places = None if model.places is None else wp.array(model.places, dtype=wp.int32, device=model.device)
+    places = None if model.indices is None else wp.array(model.indices, dtype=wp.int32, device=model.device)
     stream = wp.Stream(model.device)
     return [_DeviceCopy(stepper, stream, places, found[k], host[k]) for k in range(number)]
 

@@ -17,7 +17,7 @@ from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
 from ..base.types import FilePath, Precision, Progress
 from ..core.status import Status
 from ..mesh.ordering import order_of_run
-from ..model.model import DTYPES
+from ..model.precision import DTYPES
 from ..scene.scene import Scene
 from ..solvers.step import Step
 from ..usd import FrameSequence

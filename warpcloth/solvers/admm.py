@@ -18,7 +18,7 @@ from ..model.model import Model
 from ..numerics.inertia import Inertia
 from ..numerics.iterate import GravityScale
 from ..numerics.linear import CopyFactors
-from ..numerics.local_weights import best_weights, curvatures, weighed
+from ..numerics.local_weights import best_weights, curvatures
 from ..terms.needs import ELEMENTS, FINITE
 from ..terms.refresh import EVALUATION, Moment
 from .facts import Benchmark, Facts, grid
@@ -147,9 +147,8 @@ class ADMMStepper(ImplicitStepper):
         ratios = [self._ratios_of(*each) for each in zip(model.terms, scales, strict=True)]
         factors = [scale * ratio for scale, ratio in zip(scales, ratios, strict=True)]
         self._inertia, self._sums = Inertia(model, 1.0 / self.he**2), Sums(model)
-        self._factors = CopyFactors(
-            model, constant_matrices(model.with_terms(map(weighed, model.terms, factors)), self._inertia.s)
-        )
+        weighed = model.with_terms(elements.weighed(factor) for elements, factor in zip(model.terms, factors, strict=True))
+        self._factors = CopyFactors(model, constant_matrices(weighed, self._inertia.s))
         self.factorise_seconds = self._factors.seconds
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
         self._primal, self._dual = (Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device)) for _ in range(2))

@@ -11,6 +11,7 @@ from ..base.turns import in_turn
 from ..core.hessian import Hessian
 from ..fast.plan import plan
 from ..model.damping import dissipations
+from ..model.host_values import host_values
 from ..model.model import Model
 from ..terms.needs import FINITE
 from ..terms.refresh import STEP, Moment
@@ -152,7 +153,7 @@ def _unlike(model):
     B = model.copies
     arrays = [model.inverse_mass, *(array for each in model.terms for array in (each.stiffness, each.rest, each.damping))]
     arrays += [each.cells.rest for each in model.terms if each.cells and each.cells.weights is not None]
-    rows = [array.numpy().reshape(B, -1) for array in arrays if array is not None and 0 not in array.strides]
+    rows = [host_values(array).reshape(B, -1) for array in arrays if array is not None and 0 not in array.strides]
     first = {}
     for copy in range(B):
         first.setdefault(sha256(b"".join(row[copy].tobytes() for row in rows)).digest(), copy)

@@ -13,7 +13,7 @@ class Need:
     """A property that a solver needs of every term.
 
     Attributes:
-        met: (elements) → whether a term has it; ``elements`` is a :class:`warpcloth.model.model.DeviceElements`, or anything
+        met: (elements) → whether a term has it; ``elements`` is a :class:`warpcloth.model.elements.DeviceElements`, or anything
             else with ``term``, ``hard`` and ``damping`` (None of what is not damped).
         lack: What a solver cannot take of a term that has it not, with {label} in it.
         remedy: What a user can change in the term instead of the solver, if anything.

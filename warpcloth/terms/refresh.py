@@ -43,7 +43,7 @@ class Refresh:
     Attributes:
         when: :data:`STEP` or :data:`EVALUATION`.
         launch: Function of (model, elements, moment) that launches what writes ``elements``, the
-            :class:`warpcloth.model.model.DeviceElements`, at a :class:`Moment`. It is recorded once and replayed: it
+            :class:`warpcloth.model.elements.DeviceElements`, at a :class:`Moment`. It is recorded once and replayed: it
             may neither read on the host nor allocate.
         arrays: What it reads of each element, (B·E,); reordered with the elements.
     """

@@ -1,0 +1,175 @@
+"""The elements of a term on a device."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from ..kernels.sparse import share
+from ..kernels.term import Term
+from ..terms.refresh import Refresh
+from .csr_cells import Cells, SparseCells, rigid_cells, sparse_cells
+from .host_values import host_values, keep, part, release, reordered, repeat
+from .incidences import incidences_of
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceElements:
+    """The elements of one term in all copies, on the device.
+
+    Attributes:
+        label, kind, term: As in :class:`warpcloth.terms.declared.Elements`.
+        per_copy: Elements of one copy, E.
+        stencil: (B·E, K) int32.
+        stiffness: (B·E,); of stride 0 where all elements share one value.
+        rest: (B·E,) vectors of P.
+        hard: Whether any stiffness is infinite.
+        damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
+        refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
+        cells: :class:`Cells` or :class:`SparseCells` that the elements are the vertices of, or None.
+    """
+
+    label: str
+    kind: str
+    term: Term
+    per_copy: int
+    stencil: wp.array
+    stiffness: wp.array
+    rest: wp.array
+    hard: bool
+    damping: wp.array | None = None
+    refresh: Refresh | None = None
+    cells: Cells | SparseCells | None = None
+
+    @property
+    def arguments(self):
+        """The arguments that every kernel over elements starts with."""
+        return [self.stencil, self.stiffness, self.rest]
+
+    @property
+    def arrays(self):
+        """All arrays of the term."""
+        cells = self.cells.arrays if self.cells else []
+        return self.arguments + ([] if self.damping is None else [self.damping]) + cells
+
+    @property
+    def count(self):
+        """Elements of all copies, B·E."""
+        return len(self.stencil)
+
+    def stiffness_of_copies(self, model):
+        """Returns the stiffness (B,) that all elements of each copy share, or None if the elements of a copy differ."""
+        # Colours put elements of all copies in one order; all vertices of an element are in one copy.
+        by_copy = np.argsort(host_values(self.stencil)[:, 0] // model.per_copy, kind="stable")
+        values = host_values(self.stiffness)[by_copy].reshape(model.copies, -1)
+        return values[:, 0] if values.size and (values == values[:, :1]).all() else None
+
+    def with_unit_stiffness(self):
+        """Returns these elements with a stiffness of 1, or 0 where it is 0."""
+        stiffness = host_values(self.stiffness)
+        ones = keep((stiffness > 0.0).astype(stiffness.dtype), self.stiffness.dtype, self.stiffness.device)
+        return replace(self, stiffness=ones, hard=False)
+
+    def weighed(self, factor):
+        """Returns these elements with the stiffness multiplied by a factor (E,)."""
+        stiffness = host_values(self.stiffness)
+        product = (stiffness * factor).astype(stiffness.dtype)
+        return replace(self, stiffness=keep(product, self.stiffness.dtype, self.stiffness.device))
+
+    @property
+    def constraints(self):
+        """Vertices (B·C, K) of each constraint, or of cells a list of arrays: elements, and cells as a whole."""
+        stencil = host_values(self.stencil)
+        return stencil if self.cells is None else np.split(stencil[:, 0], host_values(self.cells.offsets)[1:-1])
+
+    def reordered(self, order):
+        """The elements, or cells, with those of index ``order`` in that order."""
+        cells = self.cells
+        if cells:
+            cells, order = cells.reordered(order)
+        return self._changed(lambda array: reordered(array, order), cells)
+
+    def by_lowest(self):
+        """The elements in the order of their lowest vertices; themselves where that is theirs."""
+        lowest = host_values(self.stencil).min(axis=1)
+        return self.reordered(np.argsort(lowest, kind="stable")) if (np.diff(lowest) < 0).any() else self
+
+    def part(self, first, count):
+        """Those of ``count`` of the copies from ``first`` on, as a model of these alone has them."""
+        E = self.per_copy
+        chosen = slice(first * E, (first + count) * E)
+        found = self._changed(lambda array: part(array, chosen), self.cells and self.cells.part(first, count, chosen))
+        return replace(found, stencil=part(self.stencil, slice(count * E)))  # whose first vertex is 0
+
+    def _changed(self, change, cells):
+        """The elements with every array of them as the function ``change`` makes it, and other cells."""
+        changed = {name: change(getattr(self, name)) for name in ("stencil", "stiffness", "rest")}
+        if self.damping is not None:
+            changed["damping"] = change(self.damping)
+        return replace(self, **changed, refresh=self.refresh and self.refresh.with_arrays(change), cells=cells)
+
+    def at_limit(self, points):
+        """Of a limit the elements with no range at all about the rest shape ``points`` of one copy; else these."""
+        if not self.term.dead_zone:
+            return self
+        rest = self.term.rest_state(points, host_values(self.stencil) % len(points), least=1.0, most=1.0)
+        return replace(self, rest=keep(rest.astype(host_values(self.stiffness).dtype), self.rest.dtype, self.rest.device))
+
+    @cached_property
+    def incidences(self):
+        """(offsets (N+1,), codes (B·E·K,)), see :func:`incidences_of`, on the device. Built when first asked for."""
+        stencil, device = host_values(self.stencil).ravel(), self.stencil.device
+        found = incidences_of(stencil, int(stencil.max()) + 1)
+        return tuple(wp.array(each.astype(np.int32), dtype=wp.int32, device=device) for each in found)
+
+
+def elements_on(model, term, positions, vary):
+    """The elements of a term on a model.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`, all but its terms.
+        term: A :class:`warpcloth.terms.declared.Declared`.
+        positions: Where the vertices of each copy start, (B, n, 3) [m].
+        vary: :class:`warpcloth.model.vary.Vary`.
+    """
+    one, rest, stiffness, damping = vary.elements(term, model.scene.mesh, positions)
+    E = len(one.stencil)
+    vertices = model.in_model(one.stencil)
+    if model.order is not None and vertices.shape[1] == 2:
+        vertices = np.sort(vertices, axis=1)  # a pair has no direction, and those of one are faster
+    stencil = vertices[None] + (np.arange(model.copies) * model.per_copy)[:, None, None]
+    cells, declared = None, one.term
+    if one.cells is not None:
+        if one.weights is None:
+            cells, rest = rigid_cells(model, one)
+        else:
+            cells, rest, declared = *sparse_cells(model, one, rest), share(one.term.name)
+        if stiffness.shape[1] > 1:
+            stiffness = np.repeat(stiffness, np.diff(one.cells), axis=1)
+    rest_type = wp.types.vector(declared.parameters, model.dtype)
+    rest = model.keep(f"{one.label}: rest state", "", rest, rest_type, infinite=True)  # a limit may be none
+    if one.refresh:
+        release(rest)
+    found = DeviceElements(
+        label=one.label,
+        kind=one.kind,
+        term=declared,
+        per_copy=E,
+        stencil=keep(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), wp.int32, model.device),
+        stiffness=_numbers(model, f"{one.label}.stiffness", stiffness, E),
+        rest=rest,
+        hard=bool(np.isinf(stiffness).any()),
+        damping=_numbers(model, f"{one.label}.damping", damping, E) if damping.any() else None,
+        cells=cells,
+        refresh=one.refresh,
+    )
+    return found if model.order is None or cells else found.by_lowest()
+
+
+def _numbers(model, name, values, E):
+    """(B, 1) or (B, E) values as an array (B·E,), of stride 0 where all are one value."""
+    each = "element" if values.shape[1] > 1 else None
+    if (values != values[0, 0]).any() or len(values) * values.shape[1] == model.copies * E:
+        return model.keep(name, "", np.broadcast_to(values, (model.copies, E)), model.dtype, each, infinite=True)
+    return repeat(model.keep(name, "", values[:1, :1], model.dtype, None, infinite=True), model.copies * E)

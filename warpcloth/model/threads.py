@@ -1,0 +1,24 @@
+"""How many threads of the CPU share the steps of a model."""
+
+import os
+import warnings
+
+import warp as wp
+
+from ..base.checks import whole
+
+
+def threads_on(device, threads):
+    """The number of threads, refused where one device or mode cannot have it."""
+    whole("threads", threads, 1)
+    if threads > 1 and not device.is_cpu:
+        raise ValueError(f"threads is {threads} on {device}, which has its own; more than 1 is for device='cpu'")
+    if threads > 1 and wp.config.mode == "debug" and wp.config.enable_tiles_in_stack_memory:
+        raise ValueError(
+            f"threads is {threads} in Warp's debug mode, where threads of one kernel share the pointer to its tiles; "
+            "wp.config.mode='release' or wp.config.enable_tiles_in_stack_memory=False take more than 1"
+        )
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if threads > cores:
+        warnings.warn(f"threads is {threads} on {cores} cores; more threads than cores are slower", stacklevel=5)
+    return int(threads)
