@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from warpcloth.cli import _parser
+from warpcloth.cli.options import _of_solver
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS
 from warpcloth.terms.needs import lacks
@@ -114,12 +115,31 @@ def options():
     return "".join(parts) + "\n"
 
 
+def solver_options():
+    """Lists the options of all solvers, with the solvers that have them and their defaults."""
+    found = {}
+    for name, record in SOLVERS.items():
+        for row in _of_solver(name)["rows"]:
+            found.setdefault((row["name"], row["allowed"]), []).append((record.__name__, row["default"]))
+    rows = []
+    for (name, allowed), having in found.items():
+        by_default = {}
+        for solver, default in having:
+            by_default.setdefault(default, []).append(f"`{solver}`")
+        everyone = len(having) == len(SOLVERS) and len(by_default) == 1
+        with_default = ["all"] if everyone else [", ".join(names) for names in by_default.values()]
+        told = [of + ("" if default is None else f" ({default})") for of, default in zip(with_default, by_default, strict=True)]
+        rows.append([f"`{name}`", allowed, "; ".join(told)])
+    return table(("Option", "Values", "Solvers (default)"), rows)
+
+
 TABLES = {
     "energies": energies,
     "solvers": solvers,
     "attributes": attributes,
     "term attributes": term_attributes,
     "options": options,
+    "solver options": solver_options,
 }
 
 
