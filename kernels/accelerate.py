@@ -18,10 +18,12 @@ def plain_step(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def step(
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
+        # state in
         d: wp.array(dtype=vec3),
         w: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
         # out
         out: wp.array(dtype=vec3),
     ):
@@ -41,9 +43,11 @@ def note_change(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def note(
-        slot: wp.array(dtype=wp.int32),
+        # state in
         gradient: wp.array(dtype=vec3),
         w: wp.array(dtype=vec3),
+        # parameters
+        slot: wp.array(dtype=wp.int32),
         # in and out
         last_gradient: wp.array(dtype=vec3),
         last_w: wp.array(dtype=vec3),
@@ -67,11 +71,13 @@ def partial_products(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def multiply(
-        slot: wp.array(dtype=wp.int32),
+        # state in
         gradient: wp.array(dtype=vec3),
         s: wp.array2d(dtype=vec3),
         y: wp.array2d(dtype=vec3),
         z: wp.array2d(dtype=vec3),
+        # parameters
+        slot: wp.array(dtype=wp.int32),
         per_copy: int,
         # out
         out: wp.array3d(dtype=wp.float64),
@@ -98,7 +104,12 @@ def finish_products():
     """Kernel over (copies, 4m): out = the sum over chunks."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def add_chunks(partial: wp.array3d(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
+    def add_chunks(
+        # state in
+        partial: wp.array3d(dtype=wp.float64),
+        # out
+        out: wp.array2d(dtype=wp.float64),
+    ):
         copy, row = wp.tid()
         total = wp.float64(0.0)
         for chunk in range(partial.shape[1]):
@@ -118,12 +129,14 @@ def combine(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def combine_histories(
-        coefficients: wp.array2d(dtype=wp.float64),
-        per_copy: int,
+        # state in
         d: wp.array(dtype=vec3),
         w: wp.array(dtype=vec3),
         s: wp.array2d(dtype=vec3),
         z: wp.array2d(dtype=vec3),
+        # parameters
+        coefficients: wp.array2d(dtype=wp.float64),
+        per_copy: int,
         # out
         out: wp.array(dtype=vec3),
     ):
@@ -144,7 +157,7 @@ def combine(dtype):
 
 
 @cache
-def choose(dtype):
+def accept(dtype):
     """Kernel over vertices: d becomes the accelerated candidate where its φ is no more than the plain one's, else that.
 
     A φ that is NaN is never chosen. The step is s of the slot.
@@ -152,13 +165,15 @@ def choose(dtype):
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def choose_candidate(
-        slot: wp.array(dtype=wp.int32),
-        per_copy: int,
+    def accept_candidate(
+        # state in
         plain: wp.array(dtype=vec3),
         accelerated: wp.array(dtype=vec3),
         plain_energy: wp.array(dtype=wp.float64),
         energy: wp.array(dtype=wp.float64),
+        # parameters
+        slot: wp.array(dtype=wp.int32),
+        per_copy: int,
         # in and out
         d: wp.array(dtype=vec3),
         # out
@@ -172,7 +187,7 @@ def choose(dtype):
         s[slot[0], i] = chosen - d[i]
         d[i] = chosen
 
-    return choose_candidate
+    return accept_candidate
 
 
 @cache
@@ -180,7 +195,12 @@ def next_slot():
     """Kernel of one thread: slot[0] = (slot[0] + 1) mod m."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def advance(slot: wp.array(dtype=wp.int32), m: int):
+    def advance(
+        # parameters
+        m: int,
+        # in and out
+        slot: wp.array(dtype=wp.int32),
+    ):
         slot[0] = (slot[0] + 1) % m
 
     return advance

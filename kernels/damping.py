@@ -24,11 +24,14 @@ def set_damped_rest(term: Term, dtype, bdf2: bool, midpoint: bool):
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_rest(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
         rest: wp.array(dtype=rest_type),
         share: wp.array(dtype=dtype),
+        # state in
         x: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
+        # parameters
         scale: dtype,
         # out
         out: wp.array(dtype=out_type),

@@ -18,9 +18,11 @@ def set_trial(dtype):
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def place(
+        # state in
         correction: wp.array(dtype=vec3),
         direction: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.float64),
+        # parameters
         per_copy: int,
         # out
         trial: wp.array(dtype=vec3),
@@ -40,13 +42,16 @@ def add_inertia(dtype):
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def add(
+        # elements
         mass: wp.array(dtype=dtype),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
+        # state in
+        correction: wp.array(dtype=vec3),
+        # parameters
         per_copy: int,
         s: dtype,
         load: dtype,
-        correction: wp.array(dtype=vec3),
         # in and out
         gradient: wp.array(dtype=vec3),
         # out
@@ -71,7 +76,12 @@ def negate(dtype):
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
-    def negate_vertices(a: wp.array(dtype=vec3), out: wp.array(dtype=vec3)):
+    def negate_vertices(
+        # state in
+        a: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=vec3),
+    ):
         i = wp.tid()
         out[i] = -a[i]
 
@@ -84,7 +94,9 @@ def begin_search():
 
     @wp.kernel(module="warpcloth.minimise", enable_backward=False)
     def begin(
+        # parameters
         active: wp.array(dtype=wp.int32),
+        # out
         step: wp.array(dtype=wp.float64),
         searching: wp.array(dtype=wp.int32),
         trials: wp.array(dtype=wp.int32),
@@ -109,10 +121,12 @@ def check_trial():
 
     @wp.kernel(module="warpcloth.minimise", enable_backward=False)
     def check(
+        # state in
         start: wp.array(dtype=wp.float64),
         trial: wp.array(dtype=wp.float64),
         slope: wp.array(dtype=wp.float64),
         trial_slope: wp.array(dtype=wp.float64),
+        # parameters
         noise: wp.float64,
         trials: wp.array(dtype=wp.int32),
         most: int,
@@ -143,7 +157,12 @@ def begin_trial():
     """Kernel of one thread, before :func:`check_trial`: counts the trial; proceed = 0."""
 
     @wp.kernel(module="warpcloth.minimise", enable_backward=False)
-    def begin(trials: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
+    def begin(
+        # in and out
+        trials: wp.array(dtype=wp.int32),
+        # out
+        proceed: wp.array(dtype=wp.int32),
+    ):
         trials[0] = trials[0] + 1
         proceed[0] = 0
 
@@ -155,7 +174,14 @@ def end_trial():
     """Kernel of one thread, after :func:`check_trial`: one more evaluation after the last halving, then the end."""
 
     @wp.kernel(module="warpcloth.minimise", enable_backward=False)
-    def end(trials: wp.array(dtype=wp.int32), most: int, proceed: wp.array(dtype=wp.int32)):
+    def end(
+        # state in
+        trials: wp.array(dtype=wp.int32),
+        # parameters
+        most: int,
+        # in and out
+        proceed: wp.array(dtype=wp.int32),
+    ):
         if trials[0] > most:
             proceed[0] = 0
 

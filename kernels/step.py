@@ -18,8 +18,10 @@ def predict(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def predict_vertices(
+        # elements
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
+        # parameters
         per_copy: int,
         he: dtype,
         # in and out
@@ -45,10 +47,13 @@ def start_bdf2(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def start(
+        # elements
         inverse_mass: wp.array(dtype=dtype),
-        h: dtype,
+        # state in
         v: wp.array(dtype=vec3),
         second: wp.array(dtype=vec3),
+        # parameters
+        h: dtype,
         # in and out
         move: wp.array(dtype=vec3),
         v_before: wp.array(dtype=vec3),
@@ -72,8 +77,10 @@ def predict_bdf2(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def predict_vertices(
+        # elements
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
+        # parameters
         per_copy: int,
         he: dtype,
         # in and out
@@ -106,9 +113,12 @@ def move_pins(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def move(
+        # elements
         pins: wp.array(dtype=wp.int32),
         keyframes: wp.array2d(dtype=vec3),
+        # state in
         step: wp.array(dtype=wp.int32),
+        # parameters
         steps_per_frame: int,
         per_copy: int,
         h: dtype,
@@ -137,7 +147,10 @@ def count_step():
     """Kernel over copies: step += 1."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def count(step: wp.array(dtype=wp.int32)):
+    def count(
+        # in and out
+        step: wp.array(dtype=wp.int32),
+    ):
         copy = wp.tid()
         step[copy] = step[copy] + 1
 
@@ -154,8 +167,11 @@ def finish(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def finish_vertices(
+        # elements
         inverse_mass: wp.array(dtype=dtype),
+        # state in
         correction: wp.array(dtype=vec3),
+        # parameters
         he: dtype,
         # in and out
         x: wp.array(dtype=vec3),
@@ -179,9 +195,12 @@ def finish_midpoint(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def finish_vertices(
+        # elements
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
+        # state in
         correction: wp.array(dtype=vec3),
+        # parameters
         per_copy: int,
         he: dtype,
         # in and out
@@ -204,9 +223,12 @@ def note_move(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def note(
+        # elements
         inverse_mass: wp.array(dtype=dtype),
+        # state in
         correction: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
+        # parameters
         h: dtype,
         # in and out
         move: wp.array(dtype=vec3),
@@ -232,15 +254,16 @@ def reset(dtype, led: bool):
 
     @wp.kernel(module="unique", enable_backward=False)
     def reset_vertices(
-        # parameters
-        mask: wp.array(dtype=wp.bool),
+        # elements
         inverse_mass: wp.array(dtype=dtype),
-        per_copy: int,
-        # starts
         positions: wp.array(dtype=vec3),
+        # state in
         x_start: wp.array(dtype=vec3),
         v_start: wp.array(dtype=vec3),
         starts: wp.array(dtype=wp.uint64),
+        # parameters
+        mask: wp.array(dtype=wp.bool),
+        per_copy: int,
         words: wp.array(dtype=wp.int32),
         # out
         carried: wp.array(dtype=wp.uint64),

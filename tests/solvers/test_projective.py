@@ -289,7 +289,7 @@ def test_products_of_past_corrections_are_sums_over_chunks(chunks, device):
     s, y, z = random.normal(size=(3, m, copies * n, 3))
     gradient = random.normal(size=(copies * n, 3))
     histories = (wp.array(each, dtype=wp.vec3d, device=device) for each in (s, y, z))
-    given = [wp.array([slot], dtype=wp.int32, device=device), wp.array(gradient, dtype=wp.vec3d, device=device), *histories, n]
+    given = [wp.array(gradient, dtype=wp.vec3d, device=device), *histories, wp.array([slot], dtype=wp.int32, device=device), n]
     partial = wp.zeros((copies, chunks, 4 * m), dtype=wp.float64, device=device)
     out = wp.zeros((copies, 4 * m), dtype=wp.float64, device=device)
     wp.launch(accelerate.partial_products(wp.float64), partial.shape, given, [partial], device=device)

@@ -49,7 +49,7 @@ class Reset:
         if self._kernel is None:
             self._prepare()
         starts, words, carried = self._given
-        given = [mask, model.inverse_mass, model.per_copy, model.positions, x, v, starts, words]
+        given = [model.inverse_mass, model.positions, x, v, starts, mask, model.per_copy, words]
         model.launch(self._kernel, model.count, given, [carried, *stepper.state])
         if stepper.residual.any() or any(result is not Result.COMPLETED for result in stepper.results):
             chosen = mask.numpy()

@@ -29,7 +29,7 @@ class AcceleratedStep:
         self.coefficients = Mirror(wp.zeros((B, 1 + 2 * m), dtype=wp.float64, device=device))
         self.plain_energy, self.energy = (Mirror(wp.zeros(B, dtype=wp.float64, device=device)) for _ in range(2))
         self.energy_of = Energy(model, stepper.sums, corrected=True)
-        names = ("note_change", "partial_products", "combine", "choose")
+        names = ("note_change", "partial_products", "combine", "accept")
         self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
         self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in ("finish_products", "next_slot")}
         self._note = Segment(device, self._launch_note)
@@ -54,9 +54,9 @@ class AcceleratedStep:
 
     def _launch_note(self):
         stepper, model = self.stepper, self.stepper.model
-        given = [self.slot, stepper.gradient, stepper.w]
+        given = [stepper.gradient, stepper.w, self.slot]
         self._launch("note_change", model.count, given, [self.last_gradient, self.last_w, self.y, self.z])
-        given = [self.slot, stepper.gradient, self.s, self.y, self.z, model.per_copy]
+        given = [stepper.gradient, self.s, self.y, self.z, self.slot, model.per_copy]
         self._launch("partial_products", self.partial.shape, given, [self.partial])
         self._launch("finish_products", self.products.array.shape, [self.partial], [self.products.array])
 
@@ -65,13 +65,13 @@ class AcceleratedStep:
         stepper, model = self.stepper, self.stepper.model
         N, n, d = model.count, model.per_copy, stepper.correction
         stepper.launch_plain_step(self.plain)
-        given = [self.coefficients.array, n, d, stepper.w, self.s, self.z]
+        given = [d, stepper.w, self.s, self.z, self.coefficients.array, n]
         self._launch("combine", N, given, [self.accelerated])
         self._launch_energy(self.plain, self.plain_energy.array)
         self._launch_energy(self.accelerated, self.energy.array)
-        self._launch("next_slot", 1, [self.slot, self.method.window], [])
-        given = [self.slot, n, self.plain, self.accelerated, self.plain_energy.array, self.energy.array]
-        self._launch("choose", N, given, [d, self.s])
+        self._launch("next_slot", 1, [self.method.window], [self.slot])
+        given = [self.plain, self.accelerated, self.plain_energy.array, self.energy.array, self.slot, n]
+        self._launch("accept", N, given, [d, self.s])
 
     def _launch_energy(self, d, out):
         """out (B,) = φ(d)."""

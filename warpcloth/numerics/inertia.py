@@ -25,5 +25,5 @@ class Inertia:
     def add(self, d, gradient):
         """gradient (N,) += s M d − load·M g, and 0 for pins; sets ``work``."""
         model = self.model
-        given = [model.mass, model.inverse_mass, model.gravity, model.per_copy, self.s, self.load, d]
+        given = [model.mass, model.inverse_mass, model.gravity, d, model.per_copy, self.s, self.load]
         model.launch(self._kernel, model.count, given, [gradient, self.work])

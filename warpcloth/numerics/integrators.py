@@ -112,7 +112,7 @@ class BDF2(Euler):
             if stepper.count is not None:
                 stepper.count.fill_(-1)  # pins are led to their first keyframe, which is where they are
             stepper.step()
-        self._launch(kernels.start_bdf2, [stepper.h, model.velocities, v], [self.move, self.v_before])
+        self._launch(kernels.start_bdf2, [model.velocities, v, stepper.h], [self.move, self.v_before])
         stepper.state.start_here("move before", "v before")
         wp.copy(x, model.positions)
         wp.copy(v, model.velocities)

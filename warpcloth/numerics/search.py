@@ -77,7 +77,7 @@ class Search:
 
     def _try_step(self):
         self._launch_trial()
-        self._launch("begin_trial", 1, [], [self.trials, HALVINGS, self.proceed])
+        self._launch("begin_trial", 1, [], [self.trials, self.proceed])
         given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
         self._launch("check_trial", self.model.copies, given, [self.step, self.searching, self.proceed])
         self._launch("end_trial", 1, [self.trials, HALVINGS], [self.proceed])

@@ -225,7 +225,7 @@ class ADMMStepper(ImplicitStepper):
 
     def _launch_move(self):
         model = self.model
-        given = [self._active.array, model.per_copy, self.correction, self._w]
+        given = [self.correction, self._w, self._active.array, model.per_copy]
         model.launch(self._plain_step, model.count, given, [self.correction])
 
     def _each(self):

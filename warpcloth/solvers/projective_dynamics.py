@@ -175,7 +175,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
     def launch_plain_step(self, out):
         """out = d − w."""
         model = self.model
-        given = [self._active.array, model.per_copy, self.correction, self.w]
+        given = [self.correction, self.w, self._active.array, model.per_copy]
         model.launch(self._plain_step, model.count, given, [out])
 
     def _launch_gradient(self):
