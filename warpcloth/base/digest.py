@@ -17,10 +17,19 @@ def scene_digest(scene):
     Raises:
         ValueError: Something in it is no data.
     """
-    digest = hashlib.sha256()
     mesh = scene.mesh
     facts = [mesh.points, mesh.triangles, mesh.edges, mesh.grid_shape, scene.vertex_masses, scene.positions, scene.velocities]
-    for fact in (*facts, scene.terms, scene.pins, scene.gravity, float(scene.fps)):
+    return digest_of((*facts, scene.terms, scene.pins, scene.gravity, float(scene.fps)))
+
+
+def digest_of(facts):
+    """A hash of numbers, texts, lists, arrays and records of these.
+
+    Raises:
+        ValueError: Something is none of these.
+    """
+    digest = hashlib.sha256()
+    for fact in facts:
         _add(digest, fact)
     return digest.hexdigest()[:24]
 

@@ -147,6 +147,11 @@ def _parser():
         text = "the .usd, .usda, .usdc or .usdz file to write"
         text += "" if sub is deforms else "; by default NAME.usdc, where NAME is the scene's, which must not exist yet"
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
+    runs.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with the run to that file that was interrupted, after its last chunk of frames",
+    )
     for sub in (runs, deforms, analyzes):
         sub.add_argument("--single-file", action="store_true", help="merge everything into one file, with no folder of frames")
     scenes = add("scenes", run.scenes, "List scenes and their parameters.")

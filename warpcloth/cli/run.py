@@ -32,7 +32,7 @@ def run(arguments):
 
     source, values, scene = named_scene(arguments)
     frames = scene.frames if arguments.frames is None else arguments.frames
-    arguments.output = _own_output(scene) if arguments.output is None else arguments.output
+    arguments.output = _own_output(scene, arguments.resume) if arguments.output is None else arguments.output
     check_writable(arguments.output)
     device = find_device(arguments.device)
     if arguments.tolerance is not None or arguments.budget is not None:
@@ -50,6 +50,7 @@ def run(arguments):
             dtype=arguments.dtype,
             frames=frames,
             single_file=arguments.single_file,
+            resume=arguments.resume,
             progress=progress,
             threads=arguments.threads,
         )
@@ -82,7 +83,7 @@ def run(arguments):
         return say(f"{status.message}; the last good frame is {status.frame}, in {arguments.output}", 1)
 
 
-def _own_output(scene):
+def _own_output(scene, resume):
     """Returns the default output of a run: a file with the scene's name in the current folder.
 
     Raises:
@@ -91,7 +92,7 @@ def _own_output(scene):
     if scene.name != os.path.basename(scene.name) or not scene.name.isprintable() or scene.name.strip(". ") == "":
         raise ValueError(f"the scene is called {scene.name!r}, which cannot be the name of a file; give one with -o")
     output = f"{scene.name}.usdc"
-    if os.path.lexists(output):
+    if os.path.lexists(output) and not resume:
         raise ValueError(f"{output} exists already, and without -o nothing is replaced; give -o {output} to replace it")
     return output
 

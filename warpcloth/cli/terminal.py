@@ -166,19 +166,21 @@ class Progress:
         self.bar = open_bar(frames, first, "{n_fmt} of {total_fmt} frames{postfix}, {remaining} left")
 
     def __call__(self, frame, frames):
+        begins = frame == 0 or frame > (self.frame or 0) + 1  # later than 0 begins a run that is resumed
         self.frame = frame
-        if frame == 0 and self.hint:  # now that nothing was refused, and while it can still be followed
+        if begins and self.hint:  # now that nothing was refused, and while it can still be followed
             if self.bar is not None:
                 self.bar.clear()
             print(self.hint, file=sys.stderr)
         if self.bar is None:
             return
-        if frame == 0:
+        if begins:
             self.bar.set_description("running", refresh=False)
             self.bar.reset(total=frames)
+            self.bar.initial = self.bar.n = frame
         else:
             elapsed = self.bar.format_dict["elapsed"]
-            self.bar.set_postfix_str(f"{elapsed / frame:.3g} s each", refresh=False)
+            self.bar.set_postfix_str(f"{elapsed / (frame - self.bar.initial):.3g} s each", refresh=False)
             self.bar.update()
 
     def close(self):

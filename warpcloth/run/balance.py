@@ -106,6 +106,8 @@ class Balance:
         has, given: Energy that each copy has, and that it can have been given, in the last frame that was checked, (B,) [J].
     """
 
+    carried = ("_lowest", "_fastest", "_rounding", "_rounded_height")  # from frame to frame
+
     def __init__(self, model, stepper):
         self.model = model
         self._h = stepper.h

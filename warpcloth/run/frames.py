@@ -23,6 +23,7 @@ class Frame(NamedTuple):
         results: The worst :class:`warpcloth.core.status.Result` of each copy until then, a list of B.
         residual: The largest residual of each copy until then, (B,).
         seconds: What computing it took; on CUDA as its clock says.
+        state: The state of the stepper then, as :meth:`warpcloth.core.state.State.to_host` gives it, or None.
     """
 
     points: np.ndarray
@@ -30,9 +31,10 @@ class Frame(NamedTuple):
     results: list
     residual: np.ndarray
     seconds: float
+    state: dict | None = None
 
 
-def frames_of(stepper, count, ahead):
+def frames_of(stepper, count, ahead, keeps=None):
     """The next frames of a stepper, as a generator that must be closed: it waits for what is still being computed.
 
     While one is in use a thread computes those after it. The first is computed alone, for it may record graphs, beside which
@@ -42,17 +44,20 @@ def frames_of(stepper, count, ahead):
         stepper: The :class:`warpcloth.solvers.solver.Stepper`; closed early it has gone on further than the last frame taken.
         count: How many.
         ahead: The most that are computed beyond the one in use; 0 computes each when it is asked for, without a thread.
+        keeps: Function of how many frames there were before, which says whether the next one has the state, or None.
     """
+    numbers = itertools.count()
     copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
 
     def compute():
         copy = next(copies)
         copy.frame()
-        return copy, list(stepper.results), np.array(stepper.residual)
+        state = _state_of(stepper) if keeps is not None and keeps(next(numbers)) else None
+        return copy, list(stepper.results), np.array(stepper.residual), state
 
-    def taken(copy, results, residual):
+    def taken(copy, results, residual, state):
         points, velocities, seconds = copy.take()
-        return Frame(points, velocities, results, residual, seconds)
+        return Frame(points, velocities, results, residual, seconds, state)
 
     first = taken(*compute())
     if ahead == 0:
@@ -79,6 +84,12 @@ def state_of(stepper):
     model = stepper.model
     on_host(model.device, "reading a frame")
     return tuple(np.array(model.in_scene_order(array.numpy())) for array in stepper.state)  # on the CPU numpy() is a view
+
+
+@in_turn
+def _state_of(stepper):
+    """All that it carries, on the host."""
+    return stepper.state.to_host()
 
 
 @in_turn

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..usd import AnimationWriter, FrameSequence
+from .checkpoint import NAME, Checkpoint
 from .lines import lines_of
 
 
@@ -12,13 +13,18 @@ class Memory:
     def __init__(self, frames, copies):
         self.frames, self._most, self._copies = 0, frames + 1, copies
 
-    def append(self, points, velocities):
+    keeps = None  # no state
+
+    def append(self, points, velocities, state=None, watch=None):
         if self.frames == 0:
             self.shape = (self._copies, len(points) // self._copies, 3) if self._copies > 1 else points.shape
             self.points, self.velocities = (np.empty((self._most, *self.shape), points.dtype) for _ in range(2))
         self.points[self.frames] = points.reshape(self.shape)
         self.velocities[self.frames] = velocities.reshape(self.shape)
         self.frames += 1
+
+    def finish(self):
+        """The run has ended by itself."""
 
     def close(self):
         pass
@@ -31,24 +37,83 @@ class Memory:
 
 
 class File:
-    """Writes frames as USD and reads them back when asked."""
+    """Writes frames as USD, with checkpoints beside them until the run has ended, and reads them back when asked.
 
-    def __init__(self, scene, output, single_file):
-        stage, self.single_file = scene.stage, single_file
+    Args:
+        scene: The :class:`warpcloth.Scene`.
+        output: Path of the file.
+        single_file: Whether it is one file in the end.
+        facts: Function that gives the :func:`warpcloth.run.checkpoint.facts_of` of the run.
+        resume: Whether to go on with the run that was interrupted.
+
+    Attributes:
+        checkpoint: The :class:`warpcloth.run.checkpoint.Checkpoint` to go on from, or None.
+
+    Raises:
+        ValueError: If there is nothing to resume, or it is another run.
+    """
+
+    def __init__(self, scene, output, single_file, facts, resume=False):
+        stage, self.single_file, self._output = scene.stage, single_file, output
+        self._facts, self._found, self.checkpoint = facts, None, None
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
             self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis, lines=lines)
         else:
             self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim)
-        self.append, self.saved = self.writer.append, self.writer.saved
+        self.saved = self.writer.saved
+        if resume:
+            try:
+                self._resume()
+            except BaseException:
+                self.writer.close()  # nothing is pending; others may write
+                raise
+
+    def _resume(self):
+        """Goes on with the run whose checkpoint is the newest."""
+        found = self.writer.runs_with(NAME)
+        if not found:
+            raise ValueError(
+                f"{self._output}: there is nothing to resume, for no run to it was interrupted after its first "
+                f"{self.writer.chunk} frames; run without resume to begin"
+            )
+        self.checkpoint = Checkpoint.read(found[0] / NAME)
+        self.checkpoint.refuse_other(self._output, self._facts())
+        self.writer.resume(found[0], self.checkpoint.chunks, self.checkpoint.span, self.checkpoint.frame + 1)
 
     @property
     def frames(self):
         return self.writer.frames
 
-    def close(self):
+    def keeps(self, number):
+        """Whether there is a checkpoint after the frame of this number."""
+        return (number + 1) % self.writer.chunk == 0 and self._known() is not None
+
+    def _known(self):
+        """The facts, or None of a scene that is not made of data alone, whose run cannot be resumed."""
+        if self._found is None:
+            try:
+                self._found = (self._facts(),)
+            except ValueError:
+                self._found = (None,)
+        return self._found[0]
+
+    def append(self, points, velocities, state=None, watch=None):
+        """Adds a frame; with a checkpoint where it comes with the state and the watch and ends a chunk."""
+        self.writer.append(points, velocities)
+        if state is not None and self.writer.kept == self.writer.frames:
+            chunks, span = self.writer.written()
+            frame = self.writer.frames - 1
+            Checkpoint(frame, self._known(), chunks, span, state, watch.to_host()).write(self.writer.run)
+
+    def finish(self):
+        """The run has ended by itself, so that nothing is left to resume."""
         self.writer.close(single_file=self.single_file)
+        (self.writer.run / NAME).unlink(missing_ok=True)
+
+    def close(self):
+        self.writer.close(single_file=self.single_file, keep=(self.writer.run / NAME).exists())
 
     def read(self):
         path = self.writer.path

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import choice, whole
 from ..base.interrupts import recording
 from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
+from ..base.turns import in_turn
 from ..base.types import FilePath, Precision, Progress
 from ..core.status import Status
 from ..mesh.ordering import order_of_run
@@ -21,6 +22,7 @@ from ..model.precision import DTYPES
 from ..scene.scene import Scene
 from ..solvers.step import Step
 from ..usd import FrameSequence
+from .checkpoint import facts_of
 from .frames import state_of
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
@@ -74,6 +76,7 @@ def simulate(
     single_file: bool = False,
     progress: Progress | None = None,
     threads: int = 1,
+    resume: bool = False,
 ) -> Animation:
     """Runs a scene with a solver.
 
@@ -94,6 +97,8 @@ def simulate(
         single_file: Whether ``output`` is to be one file in the end, with nothing beside it.
         progress: Function called with (frame, frames) once each frame is kept, from 0, the start, on; or None.
         threads: See :class:`warpcloth.model.model.Model`.
+        resume: Whether to go on with the run to ``output`` that was interrupted, from the last chunk of frames it finished, to
+            the bit of a run that was not interrupted. Everything but ``frames`` and ``single_file`` must be as it was.
 
     Returns:
         :class:`Animation`. A run that diverges ends with its last good frame and says so in ``status``. Of several copies the
@@ -103,7 +108,8 @@ def simulate(
         BlockingIOError: If another process, or thread, is writing ``output``.
         Interrupted: A KeyboardInterrupt, if the user interrupts; the message says which frames are in ``output``.
         OSError: If a file cannot be written; the message also says which frames are in ``output``.
-        ValueError: If an argument breaks a rule, or the scene's stage has changed and no longer fits the frames.
+        ValueError: If an argument breaks a rule, the scene's stage has changed and no longer fits the frames, or there is
+            nothing to resume, or another run.
 
     Examples:
         >>> import warpcloth as wc
@@ -120,8 +126,14 @@ def simulate(
     choice("dtype", dtype, tuple(DTYPES))
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
+    if resume and output is None:
+        raise ValueError("resume is given without output, the file of the run to go on with")
+
+    def facts():
+        return facts_of(scene, solver, device, dtype, vary, threads)
+
     # First, for it refuses a wrong output before anything compiles.
-    recorder = Memory(frames, copies) if output is None else File(scene, output, single_file)
+    recorder = Memory(frames, copies) if output is None else File(scene, output, single_file, facts, resume)
     with recording(recorder, frames):
         _refuse_size(frames, scene, dtype, copies, output)
         start = time.perf_counter()
@@ -130,20 +142,34 @@ def simulate(
         )
         stepper = solver.bind(model)
         timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds}
-        watch = Watch(model, stepper)
+        watch, first = Watch(model, stepper), 0
+        if resume:
+            first = _resume(recorder.checkpoint, frames, stepper, watch)
+        else:
+            recorder.append(*state_of(stepper))
         timings["frames"] = watch.seconds
-        recorder.append(*state_of(stepper))
         if progress is not None:
-            progress(0, frames)
-        with closing(watched_frames(stepper, watch, frames, _ahead(model, output))) as found:
+            progress(first, frames)
+        with closing(watched_frames(stepper, watch, frames, _ahead(model, output), first, recorder.keeps)) as found:
             for number, frame in found:
-                recorder.append(frame.points, frame.velocities)
+                recorder.append(frame.points, frame.velocities, frame.state, watch)
                 if progress is not None:
                     progress(number, frames)
+        recorder.finish()
     status = watch.status(solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), output)
+
+
+@in_turn
+def _resume(checkpoint, frames, stepper, watch):
+    """Puts a stepper and a watch back to a checkpoint, and returns the number of its frame."""
+    if frames < checkpoint.frame:
+        raise ValueError(f"frames is {frames}; the run to be resumed has {checkpoint.frame} already, and this must be no less")
+    stepper.state.from_host(checkpoint.state)
+    watch.from_host(checkpoint.watch, stepper.state)
+    return checkpoint.frame
 
 
 def _refuse_size(frames, scene, dtype, copies, output):

@@ -7,10 +7,10 @@ import numpy as np
 from ..base.turns import in_turn
 from ..core.status import Result, Status, sentence
 from .balance import GAIN, STRETCHED, Balance
-from .frames import frames_of
+from .frames import Frame, frames_of
 
 
-def watched_frames(stepper, watch, frames, ahead=0, first=0):
+def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
     """The frames of a stepper in which some copy is good, as a generator: the loop of every run.
 
     Args:
@@ -19,11 +19,15 @@ def watched_frames(stepper, watch, frames, ahead=0, first=0):
         frames: Number of the last frame.
         ahead: See :func:`warpcloth.run.frames.frames_of`.
         first: Number of the frame that the stepper is at.
+        keeps: Function of the number of a frame which says whether that has the state of the stepper, or None.
 
     Yields:
         The number of each frame and the :class:`warpcloth.run.frames.Frame`, in which copies that diverged are NaN.
     """
-    with closing(frames_of(stepper, frames - first, ahead)) as found:
+    if first == frames:
+        return
+    of_number = None if keeps is None else lambda before: keeps(first + 1 + before)
+    with closing(frames_of(stepper, frames - first, ahead, of_number)) as found:
         for number, frame in enumerate(found, start=first + 1):
             if not watch.passes(number, frame):
                 return
@@ -105,6 +109,26 @@ class Watch:
         for array in (points, velocities):
             array.reshape(B, n, 3)[~self.alive] = np.nan
         return bool(self.alive.any())
+
+    def _carried(self):
+        """What goes on from frame to frame, as pairs of an object and the names of its attributes."""
+        yield self, ("worst_strain", "good", "alive", "growth", "seconds")
+        yield self.balance, self.balance.carried
+        for source in self.balance.sources:
+            yield source, source.carried
+
+    def to_host(self):
+        """All that it knows of the frames until now, as arrays by name."""
+        parts = enumerate(self._carried())
+        return {f"{k} {name}": np.array(getattr(part, name)) for k, (part, names) in parts for name in names}
+
+    def from_host(self, values, state):
+        """Takes over what :meth:`to_host` gave in a run that goes on here, from the :class:`warpcloth.core.state.State`."""
+        for k, (part, names) in enumerate(self._carried()):
+            for name in names:
+                found = values[f"{k} {name}"]
+                setattr(part, name, found.tolist() if name == "seconds" else found[()])
+        self.last = Frame(None, None, state.results, state.residual, 0.0)
 
     def _strain(self, points):
         """Largest |l/L − 1| of an edge of each copy, for points (B, n, 3); NaN for copies that are no longer good."""

@@ -49,6 +49,8 @@ class ChunkWriter:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
         frames: Number of frames appended.
         kept: Number of appended frames that are in the file.
+        chunk: Frames of a chunk.
+        run: The folder of the chunks.
     """
 
     # Of all sampled prims: name of their set of value clips; a set in a source below with the same name is not seen.
@@ -69,19 +71,21 @@ class ChunkWriter:
             raise ValueError(f"output = {output}: is a link to {self._output}, must end as that does")
         if int(chunk) != chunk or chunk < 1:
             raise ValueError(f"chunk = {chunk}: must be a whole number, at least 1")
-        self._chunk = int(chunk)
+        self.chunk = int(chunk)
         self._counts = {"vertex": len(mesh.points), "uniform": len(mesh.triangles)}
         self._folder, self._packed = frames_folder(self._output), self._output.suffix == ".usdz"
         if self._folder.exists() and not self._folder.is_dir():
             raise ValueError(f"{self._folder}: is a file, must be free for the folder of frames")
         # A name never used before: pxr may still hold layers of an earlier run in this process, and would show those.
-        self._run = self._folder / f"{self._output.suffix[1:]}-{secrets.token_hex(4)}"
-        self.path = str(self._run / "animation.usdc" if self._packed else self._output)
+        self.run = self._folder / f"{self._output.suffix[1:]}-{secrets.token_hex(4)}"
+        self.path = str(self.run / "animation.usdc" if self._packed else self._output)
         self.frames = self.kept = 0
         self._given, self._packing, self._lock = os.fspath(output), False, None
         self._span = None  # first and last time code appended
         self._pending = []
         self._chunks = []  # (first time code, file) of each chunk that stands
+        self._number = 0  # of the next chunk
+        self._stale = set()  # files of an interrupted run that the first root of this one no longer names
         self._closed = False
 
     def _put_on(self, rest, targets, root_metadata, metadata, source=None, files=(), refit=None):
@@ -134,13 +138,14 @@ class ChunkWriter:
         packing = f", and {self._given} was not made" if path != self._given else f", with {self._folder.name} beside it"
         return f"frames 0 to {self.kept - 1} are in {path}" + (packing if self._packing else "")
 
-    def close(self, single_file: bool = False) -> None:
+    def close(self, single_file: bool = False, keep: bool = False) -> None:
         """Writes what is pending. Without a single frame nothing is written.
 
         Args:
             single_file: Make one self-contained file, with all of the source in it, and remove the folder. Frames are
                 copied chunk by chunk, so that memory stays flat; .usda alone is written from a binary file. A .usdz
                 always is one.
+            keep: Whether the chunks stay beside one file too, for the run to be resumed.
 
         Raises:
             OSError: A file could not be written; the finished chunks stay.
@@ -155,11 +160,14 @@ class ChunkWriter:
             with deferred(0 if isinstance(sys.exc_info()[1], KeyboardInterrupt) else 1):
                 self._packing = single_file or self._packed
                 self._write_chunk(last=True)
+                if self._stale and not keep:
+                    self._write_root(self._chunks)
+                    self._remove_stale()
                 self._closed = True
                 if self._chunks:
                     self._check_source()
-                    if self._packing:
-                        self._write_single_file()
+                    if self._packing and not (keep and self._stale):  # else it has more frames than this
+                        self._write_single_file(keep)
                         self._packing = False
         except OSError as error:
             self._keep_chunks()
@@ -167,13 +175,49 @@ class ChunkWriter:
         finally:
             self._lock.release()
 
+    def runs_with(self, name):
+        """Folders of runs to this output that left a file of this name, the newest first."""
+        found = self._folder.glob(f"{self._output.suffix[1:]}-*/{name}") if self._folder.is_dir() else ()
+        return [path.parent for path in sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)]
+
+    def written(self):
+        """(chunks, span) for :meth:`resume`: the time code and the file name of each chunk, and the ends of all."""
+        return [(time, path.name) for time, path in self._chunks], self._span
+
+    def resume(self, run, chunks, span, frames):
+        """Goes on with a run to this output that was interrupted, before the first frame is appended.
+
+        What it wrote later than these chunks is removed once another chunk stands in its place.
+
+        Args:
+            run: Its folder.
+            chunks: As :meth:`written` gave them.
+            span: As :meth:`written` gave it.
+            frames: Number of frames in the chunks.
+
+        Raises:
+            FileNotFoundError: One of the chunks is gone.
+        """
+        self.run, self._chunks = Path(run), [(time, Path(run) / name) for time, name in chunks]
+        for path in (self.run / "rest.usdc", self.run / "manifest.usda", *(path for _, path in self._chunks)):
+            if not path.is_file():
+                self._chunks = []
+                raise FileNotFoundError(f"{path}: is missing, so that the run cannot be resumed; run without resume")
+        found = sorted(self.run.glob("frames_*.usdc"))
+        self._stale = set(found) - {path for _, path in self._chunks}
+        self._number = int(found[-1].stem.removeprefix("frames_")) + 1  # pxr may hold files of the names that are there
+        self._span, self.frames, self.kept = tuple(span), frames, frames
+        if self._packed:
+            self.path = str(self.run / "animation.usdc")
+        (self.run / _COMPLETE).unlink(missing_ok=True)
+
     def _keep_chunks(self):
         """Writes a root layer into the folder of the chunks if the output cannot be written."""
-        if self._closed or not (self._run / "rest.usdc").exists():
+        if self._closed or not (self.run / "rest.usdc").exists():
             return
-        before, self.path = self.path, str(self._run / "animation.usdc")
+        before, self.path = self.path, str(self.run / "animation.usdc")
         try:
-            (self._run / _COMPLETE).touch()
+            (self.run / _COMPLETE).touch()
             self._write_chunk()
         except OSError:  # a full disk: the folder cannot be written either
             self.path = before
@@ -198,7 +242,7 @@ class ChunkWriter:
         self._pending.append((time, samples))
         self._span = (time if self._span is None else self._span[0], time)
         self.frames += 1
-        if len(self._pending) >= self._chunk:
+        if len(self._pending) >= self.chunk:
             self._write_chunk()
 
     def _check_open(self):
@@ -241,14 +285,14 @@ class ChunkWriter:
             if self._pending:
                 self._write_pending()
             if last and self._packed and self._chunks:
-                (self._run / _COMPLETE).touch()
+                (self.run / _COMPLETE).touch()
 
     def _write_pending(self):
         if not self._chunks:
             self._start_run()
         elif not self._chunks[-1][1].exists():  # USD would make the folder again, and the file would lack the earlier frames
             self.kept, last = 0, self.frames - len(self._pending) - 1
-            raise FileNotFoundError(f"{self._run}: has been removed during the run, with frames 0 to {last}")
+            raise FileNotFoundError(f"{self.run}: has been removed during the run, with frames 0 to {last}")
         layer = self._declared(Sdf.Layer.CreateAnonymous(".usdc"))
         for time, values in self._pending:
             for attribute, value in values.items():
@@ -256,19 +300,20 @@ class ChunkWriter:
         for name in ("timeCodesPerSecond", "framesPerSecond"):
             layer.pseudoRoot.SetInfo(name, self._root_metadata[name])
         layer.startTimeCode, layer.endTimeCode = self._pending[0][0], self._pending[-1][0]
-        path = self._run / f"frames_{len(self._chunks):06d}.usdc"
+        path = self.run / f"frames_{self._number:06d}.usdc"
         export(layer, path)
         chunks = [*self._chunks, (self._pending[0][0], path)]
         self._write_root(chunks)
         # Only now, so that a chunk whose writing was interrupted is written again by close.
-        self._chunks, self._pending, self.kept = chunks, [], self.frames
+        self._chunks, self._pending, self.kept, self._number = chunks, [], self.frames, self._number + 1
+        self._remove_stale()
         if len(chunks) == 1 and not self._packed:
             self._remove_other_runs()
 
     def _start_run(self):
-        self._run.mkdir(parents=True, exist_ok=True)
-        export(self._rest, self._run / "rest.usdc")
-        export(self._declared(Sdf.Layer.CreateAnonymous(".usda")), self._run / "manifest.usda")
+        self.run.mkdir(parents=True, exist_ok=True)
+        export(self._rest, self.run / "rest.usdc")
+        export(self._declared(Sdf.Layer.CreateAnonymous(".usda")), self.run / "manifest.usda")
 
     def _declared(self, layer):
         """The layer, with all sampled attributes in it."""
@@ -285,7 +330,7 @@ class ChunkWriter:
         for target in self._targets:
             clips = Usd.ClipsAPI(stage.OverridePrim(target.prim))
             clips.SetClipAssetPaths(asset_paths, self._clip_set)
-            clips.SetClipManifestAssetPath(Sdf.AssetPath(relative_path(self._run / "manifest.usda", folder)), self._clip_set)
+            clips.SetClipManifestAssetPath(Sdf.AssetPath(relative_path(self.run / "manifest.usda", folder)), self._clip_set)
             clips.SetClipPrimPath(target.prim, self._clip_set)
             clips.SetClipActive([(time, index) for index, (time, _) in enumerate(chunks)], self._clip_set)
             # Clip time is stage time. One frame has one time: listed twice, USD 25.5 reports the frame twice.
@@ -294,7 +339,7 @@ class ChunkWriter:
         self._describe(layer)
         # Last, for an anonymous layer cannot tell what they are relative to.
         layer.subLayerPaths = [relative_path(path, folder) for path in self._base_paths()]
-        export(layer, self.path, self._run)
+        export(layer, self.path, self.run)
 
     def _describe(self, layer):
         """Writes on a root layer what is read from root layers only."""
@@ -303,7 +348,12 @@ class ChunkWriter:
             layer.pseudoRoot.SetInfo(name, value)
 
     def _base_paths(self):
-        return [self._run / "rest.usdc"] + ([self._source] if self._source else [])
+        return [self.run / "rest.usdc"] + ([self._source] if self._source else [])
+
+    def _remove_stale(self):
+        for path in self._stale:
+            path.unlink(missing_ok=True)
+        self._stale = set()
 
     def _remove_other_runs(self):
         """Removes what earlier runs to the same output left, now that the output no longer refers to it."""
@@ -311,7 +361,7 @@ class ChunkWriter:
         for folder in self._folder.iterdir():
             inside = os.path.join(os.path.realpath(folder), "")
             read = any(file.startswith(inside) for file in self._files)
-            if read or folder == self._run or not own_kind.fullmatch(folder.name):
+            if read or folder == self.run or not own_kind.fullmatch(folder.name):
                 continue
             if (folder / _COMPLETE).exists():
                 warnings.warn(
@@ -322,16 +372,16 @@ class ChunkWriter:
             else:
                 shutil.rmtree(folder, ignore_errors=True)  # a file that another process has open is no reason to fail
 
-    def _write_single_file(self):
-        contents = Contents(self._run)
+    def _write_single_file(self, keep):
+        contents = Contents(self.run)
         named = contents.named if self._packed else named_from(self._output.parent)
         flat = self._declared(flatten(self._base_paths(), self._describe, named))
         for attribute in self._attributes():
             flat.GetAttributeAtPath(attribute).ClearInfo("timeSamples")
-        single = self._run / f"{self._output.stem}.usdc"
+        single = self.run / f"{self._output.stem}.usdc"
         _export(flat, single)
         self._copy_frames(single)
-        finished = self._run / f"finished{self._output.suffix}"
+        finished = self.run / f"finished{self._output.suffix}"
         if self._packed:
             with _writing(self._output):
                 contents.write(single, finished, self._output)
@@ -341,8 +391,10 @@ class ChunkWriter:
             os.replace(single, finished)
         _rename(finished, self._output)
         self.path = str(self._output)
-        (self._run / _COMPLETE).unlink(missing_ok=True)
-        shutil.rmtree(self._run)
+        (self.run / _COMPLETE).unlink(missing_ok=True)
+        if keep:
+            return
+        shutil.rmtree(self.run)
         with suppress(OSError):  # it may be gone, or in use by a run to an output with another ending
             if self._packed:
                 self._remove_other_runs()

@@ -84,7 +84,7 @@ class MeasureWriter(ChunkWriter):
         """
         super().__init__(output, mesh, chunk)
         # Its own, or earlier measures and the motion of a result that was measured would not be seen.
-        self._clip_set = f"measures_{self._run.name[-8:]}"
+        self._clip_set = f"measures_{self.run.name[-8:]}"
         up_axis = up_axis or mesh.up_axis or "Y"
         check_scene(fps, up_axis)
         primvars, directions = dict(primvars), dict(directions or {})

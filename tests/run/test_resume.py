@@ -1,0 +1,229 @@
+"""Runs that were interrupted go on to the bit of those that were not; all others are refused in one sentence."""
+
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from support.command_line import refused, run
+from support.setups import SOLVERS
+from warpcloth.cli import main
+from warpcloth.run import recorders
+from warpcloth.scenes import hanging
+from warpcloth.usd import FrameSequence, chunks
+
+LAST, STOP = 24, 13  # frames; the last checkpoint before STOP is after frame 9
+PINS = [0, 4]
+
+
+def moved(offset=0.0):
+    """A damped cloth out of balance, two corners led; far from the origin explicit steps keep the position residual."""
+    grid = wc.Mesh.grid(5, 5, pattern="alternating")
+    mesh = wc.Mesh(grid.points + offset, grid.triangles, grid_shape=grid.grid_shape)
+    start = mesh.points + np.random.default_rng(0).normal(scale=0.02, size=mesh.points.shape)
+    start[PINS] = mesh.points[PINS]
+    keyframes = mesh.points[PINS][None] + np.linspace(0.0, 0.2, LAST - 4)[:, None, None] * [0.0, 0.3, 1.0]
+    terms = [wc.Spring(pairs=("structural", "shear"), stiffness=100.0, damping=0.0 if offset else 0.02)]
+    given = {"positions": start, "pins": wc.Pins(PINS, keyframes), "fps": 480.0, "duration": LAST / 480.0}
+    return wc.Scene(mesh, density=0.1, terms=terms, **given)
+
+
+def stop_at(*frames):
+    def progress(frame, _frames):
+        if frame in frames:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def interrupted(scene, solver, output, *frames, **given):
+    with pytest.raises(KeyboardInterrupt):
+        wc.simulate(scene, solver, output=str(output), progress=stop_at(*frames), **given)
+
+
+def same(one, other):
+    """Whether two animations have the same frames and end in the same words."""
+    for name in ("points", "velocities"):
+        a, b = (np.asarray(getattr(animation, name)) for animation in (one, other))
+        assert a.shape == b.shape and a.tobytes() == b.tobytes()
+    assert one.status == other.status and one.worst_strain == other.worst_strain
+    assert len(one.timings["frames"]) == len(other.timings["frames"])
+    return True
+
+
+CASES = [(name, 0.0, dtype) for name in SOLVERS for dtype in ("float32", "float64")]
+
+
+@pytest.mark.parametrize(("name", "offset", "dtype"), [*CASES, ("explicit", 300.0, "float32")])
+def test_a_resumed_run_is_the_same_to_the_bit(name, offset, dtype, tmp_path, device, monkeypatch):
+    """In the file, and in the precision of the run, which the file has not."""
+    scene, solver, kept = moved(offset), SOLVERS[name], []
+    append = recorders.File.append
+
+    def keep(self, points, velocities, *carried):
+        kept[-1].append((points.copy(), velocities.copy()))
+        append(self, points, velocities, *carried)
+
+    monkeypatch.setattr(recorders.File, "append", keep)
+    given, outputs = {"device": device, "dtype": dtype}, [tmp_path / f"{k}.usdc" for k in range(2)]
+    kept.append([])
+    whole = wc.simulate(scene, solver, output=str(outputs[0]), **given)
+    kept.append([])
+    interrupted(scene, solver, outputs[1], STOP, **given)
+    kept.append([])
+    resumed = wc.simulate(scene, solver, output=str(outputs[1]), resume=True, **given)
+    assert same(whole, resumed) and len(whole.points) == LAST + 1
+    assert len(kept[2]) == LAST - 9
+    for expected, found in zip(kept[0][10:], kept[2], strict=True):
+        assert all(a.tobytes() == b.tobytes() for a, b in zip(expected, found, strict=True))
+    assert not list(tmp_path.rglob("checkpoint*"))
+
+
+@pytest.mark.parametrize("stops", [(STOP,), (20, 21), (10, 10, 23)])
+@pytest.mark.parametrize(("ending", "single"), [("usdc", False), ("usda", True), ("usdz", False)])
+def test_frames_go_on_in_the_same_file(ending, single, stops, tmp_path, device):
+    """However often it is interrupted; and where it is one file, that is all that is left."""
+    scene, solver, given = moved(), SOLVERS["newton bdf2"], {"device": device, "single_file": single}
+    whole = wc.simulate(scene, solver, output=str(tmp_path / f"whole.{ending}"), **given)
+    output = tmp_path / f"out.{ending}"
+    for k, stop in enumerate(stops):
+        interrupted(scene, solver, output, stop, resume=k > 0, **given)
+        assert len(FrameSequence(output)) == stop + 1
+    assert same(whole, wc.simulate(scene, solver, output=str(output), resume=True, **given))
+    folders = [path for path in tmp_path.iterdir() if path.is_dir()]
+    files = sorted(path.name for path in tmp_path.rglob("*") if path.is_file() and path.name.startswith("frames_"))
+    assert len(folders) == (0 if single or ending == "usdz" else 2) and len(files) == 3 * len(folders)
+
+
+KILLED = """
+import os, sys
+from warpcloth.cli import main
+from warpcloth.run import recorders
+
+append = recorders.File.append
+
+def killed(self, *given):
+    append(self, *given)
+    if self.frames == 26:
+        os.kill(os.getpid(), int(sys.argv[1]))
+
+recorders.File.append = killed
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_the_command_line_resumes_what_a_signal_ended(number, tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = ["run", "hanging", "-p", "n=6", "--solver", "xpbd", "-s", "substeps=2", "iterations=2"]
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(int(number)), *command], capture_output=True, timeout=120)
+    assert ended.returncode == (-number if number == signal.SIGKILL else 128 + number), ended.stderr.decode()
+    assert len(FrameSequence("hanging.usdc")) == (20 if number == signal.SIGKILL else 26)
+    code, out, err = run(capfd, *command, "--resume")
+    assert code == 0 and "60 of 60" in out and err == ""
+    assert main([*command, "-o", "whole.usdc"]) == 0
+    for name in ("points", "velocities"):
+        one, other = (np.asarray(FrameSequence(path, attribute=name)) for path in ("hanging.usdc", "whole.usdc"))
+        assert one.shape == (61, 36, 3) and one.tobytes() == other.tobytes()
+    refused(capfd, [*command, "--resume", "-o", "hanging.usdc"], "hanging.usdc: there is nothing to resume")
+
+
+def test_a_full_disk_is_an_interruption_too(tmp_path, device, monkeypatch):
+    scene, solver, output = moved(), SOLVERS["xpbd"], tmp_path / "out.usdc"
+    export = chunks._export
+
+    def full(layer, file, meant=None):
+        if meant is not None and meant.name == "frames_000001.usdc":
+            raise OSError(f"{meant}: could not be written: no space left on device")
+        export(layer, file, meant)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(chunks, "_export", full)
+        with pytest.raises(OSError, match="could not be written"):
+            wc.simulate(scene, solver, output=str(output), device=device)
+    whole = wc.simulate(scene, solver, output=str(tmp_path / "whole.usdc"), device=device)
+    assert same(whole, wc.simulate(scene, solver, output=str(output), device=device, resume=True))
+
+
+def test_more_frames_may_be_asked_for_and_not_fewer(tmp_path, device):
+    scene, solver, output = moved(), SOLVERS["xpbd"], str(tmp_path / "out.usdc")
+    interrupted(scene, solver, output, 21, device=device)
+    with pytest.raises(ValueError, match="frames is 18; the run to be resumed has 19 already, and this must be no less"):
+        wc.simulate(scene, solver, output=output, device=device, resume=True, frames=18)
+    whole = wc.simulate(scene, solver, output=str(tmp_path / "whole.usdc"), device=device, frames=30)
+    assert same(whole, wc.simulate(scene, solver, output=output, device=device, resume=True, frames=30))
+    interrupted(scene, solver, output, 21, device=device)
+    assert len(wc.simulate(scene, solver, output=output, device=device, resume=True, frames=19).points) == 20
+
+
+OTHERS = {
+    "another scene": ({"scene": replace(moved(), gravity=(0.0, -1.0, 0.0))}, "had another scene; run as then"),
+    "another option": ({"solver": wc.XPBD(substeps=1, iterations=3)}, r"had the solver XPBD\(.*iterations=4.*iterations=3"),
+    "another solver": ({"solver": wc.Newton(substeps=1)}, r"had the solver XPBD\(.*, and this one has the solver Newton\("),
+    "another precision": ({"dtype": "float64"}, "had dtype float32, and this one has dtype float64"),
+    "other values": ({"vary": {"gravity": [[0.0, -1.0, 0.0]]}}, "had other values of vary"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_another_run_is_refused(name, tmp_path, device):
+    """And leaves what is there as it is, to be resumed or replaced."""
+    given, said = {"scene": moved(), "solver": SOLVERS["xpbd"], "device": device}, OTHERS[name][1]
+    output = str(tmp_path / "out.usdc")
+    with pytest.raises(KeyboardInterrupt):
+        wc.simulate(**given, output=output, progress=stop_at(STOP))
+    with pytest.raises(ValueError, match=f"out.usdc: cannot be resumed, because the run that was interrupted {said}"):
+        wc.simulate(**given | OTHERS[name][0], output=output, resume=True)
+    assert len(FrameSequence(output)) == STOP + 1
+    assert len(wc.simulate(**given, output=output, resume=True).points) == LAST + 1
+
+
+def test_where_there_is_nothing_to_resume_that_is_said(tmp_path, device):
+    scene, solver, output = moved(), SOLVERS["xpbd"], str(tmp_path / "out.usdc")
+    nothing = "out.usdc: there is nothing to resume, for no run to it was interrupted after its first 10 frames; run without"
+    with pytest.raises(ValueError, match="resume is given without output"):
+        wc.simulate(scene, solver, device=device, resume=True)
+    with pytest.raises(ValueError, match=nothing):
+        wc.simulate(scene, solver, output=output, device=device, resume=True)
+    interrupted(scene, solver, output, 5, device=device)
+    with pytest.raises(ValueError, match=nothing):
+        wc.simulate(scene, solver, output=output, device=device, resume=True)
+    wc.simulate(scene, solver, output=output, device=device)
+    with pytest.raises(ValueError, match=nothing):
+        wc.simulate(scene, solver, output=output, device=device, resume=True)
+    interrupted(scene, solver, output, STOP, device=device)
+    (checkpoint,) = tmp_path.rglob("checkpoint.npz")
+    checkpoint.write_bytes(checkpoint.read_bytes()[:100])
+    with pytest.raises(ValueError, match=r"checkpoint\.npz: is no checkpoint that can be read"):
+        wc.simulate(scene, solver, output=output, device=device, resume=True)
+
+
+def test_a_run_diverges_where_it_would_have_and_is_over_then(tmp_path, device):
+    scene, solver = hanging.scene(n=8), wc.XPBD(substeps=4, iterations=4, relaxation=1.85)
+    whole = wc.simulate(scene, solver, output=str(tmp_path / "whole.usdc"), device=device)
+    assert not whole.status.ok and whole.status.frame > STOP
+    output = str(tmp_path / "out.usdc")
+    interrupted(scene, solver, output, STOP, device=device)
+    assert same(whole, wc.simulate(scene, solver, output=output, device=device, resume=True))
+    with pytest.raises(ValueError, match="there is nothing to resume"):
+        wc.simulate(scene, solver, output=output, device=device, resume=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opaque(wc.Spring):
+    """A term with something that no digest is of."""
+
+    what: object = object()
+
+
+def test_a_scene_without_a_digest_runs_and_cannot_be_resumed(tmp_path, device):
+    scene, solver, output = moved(), SOLVERS["xpbd"], str(tmp_path / "out.usdc")
+    scene = replace(scene, terms=[Opaque(pairs="structural", stiffness=100.0)])
+    interrupted(scene, solver, output, STOP, device=device)
+    with pytest.raises(ValueError, match="there is nothing to resume"):
+        wc.simulate(scene, solver, output=output, device=device, resume=True)
