@@ -33,7 +33,7 @@ def threads():
 def look_ahead(monkeypatch, frames):
     """Lets runs compute so many frames ahead, on the CPU too."""
     module = sys.modules["warpcloth.run.watch"]
-    monkeypatch.setattr(module, "frames_of", lambda stepper, count, _ahead: frames_of(stepper, count, frames))
+    monkeypatch.setattr(module, "frames_of", lambda stepper, count, _ahead, keeps: frames_of(stepper, count, frames, keeps))
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_
     monkeypatch.setattr(
         sys.modules["warpcloth.run.watch"],
         "frames_of",
-        lambda stepper, count, ahead: asked.append(ahead) or frames_of(stepper, count, ahead),
+        lambda stepper, count, ahead, keeps: asked.append(ahead) or frames_of(stepper, count, ahead, keeps),
     )
     path = None if output is None else str(tmp_path / output)
     wc.simulate(hanging.scene(n=8), SOLVERS["explicit"], output=path, device=device, frames=2)

@@ -55,7 +55,7 @@ class File:
 
     def __init__(self, scene, output, single_file, facts, resume=False):
         stage, self.single_file, self._output = scene.stage, single_file, output
-        self._facts, self._found, self.checkpoint = facts, None, None
+        self._facts, self._found, self.checkpoint, self._ended = facts, None, None, False
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
@@ -108,12 +108,17 @@ class File:
             Checkpoint(frame, self._known(), chunks, span, state, watch.to_host()).write(self.writer.run)
 
     def finish(self):
-        """The run has ended by itself, so that nothing is left to resume."""
-        self.writer.close(single_file=self.single_file)
-        (self.writer.run / NAME).unlink(missing_ok=True)
+        """The run has ended by itself, so that nothing is left to resume once the file is complete."""
+        self._ended = True
+        self.close()
 
     def close(self):
-        self.writer.close(single_file=self.single_file, keep=(self.writer.run / NAME).exists())
+        checkpoint = self.writer.run / NAME
+        try:
+            self.writer.close(single_file=self.single_file, keep=not self._ended and checkpoint.exists())
+        finally:
+            if self._ended and self.writer.complete:
+                checkpoint.unlink(missing_ok=True)
 
     def read(self):
         path = self.writer.path

@@ -175,6 +175,11 @@ class ChunkWriter:
         finally:
             self._lock.release()
 
+    @property
+    def complete(self):
+        """Whether it is closed, with everything in one file if that was asked for."""
+        return self._closed and not self._packing
+
     def runs_with(self, name):
         """Folders of runs to this output that left a file of this name, the newest first."""
         found = self._folder.glob(f"{self._output.suffix[1:]}-*/{name}") if self._folder.is_dir() else ()
