@@ -1,1 +1,1 @@
-"""Kernels that exist for speed alone; what they compute, the others do too."""
+"""Kernels that exist for speed alone; the others compute the same."""

@@ -1,4 +1,4 @@
-"""Factories of what adds the forces of a block of elements in stages, each a loop that the compiler can vectorise.
+"""Factories of functions that add the forces of a block of elements in stages, loops that the compiler can vectorise.
 
 Local coordinates are gathered into scratch, forces computed there, and scattered. The elements of a block come in pieces: runs,
 where each element has all vertices one higher than the last, so that memory is read and written in order, and others, whose
@@ -79,7 +79,7 @@ def gather_piece(part: Part, dtype, corrected: bool = False):
 
 @cache
 def compute_forces(part: Part, dtype, corrected: bool = False):
-    """The device function (elements, first, last, h, y, dy): kA ∂u/∂y, and what damping adds to it, in place of y.
+    """The device function (elements, first, last, h, y, dy): kA ∂u/∂y and the force of damping, in place of y.
 
     Of the elements of a block, from ``first`` up to ``last``; with ``corrected`` at y + dy.
     """

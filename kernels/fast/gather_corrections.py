@@ -96,7 +96,7 @@ class Projected(NamedTuple):
 
 @cache
 def constraints_of(of: Projected, dtype):
-    """The struct of what a sweep reads of one term: elements, the factors of their Δλ, and λ before and after."""
+    """The struct of one term for a sweep: elements, the factors of their Δλ, and λ before and after."""
     lambda_type = multiplier_type(of.term, dtype, of.scalar)
 
     @wp.struct

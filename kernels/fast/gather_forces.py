@@ -1,4 +1,4 @@
-"""Factories of what sums over the elements of a vertex in a fixed order, of all terms in one pass: deterministic on a GPU."""
+"""Factories of sums over the elements of a vertex, of all terms in one launch, in a fixed order: deterministic on a GPU."""
 
 from functools import cache
 
@@ -29,7 +29,7 @@ def sum_of_lanes(dtype, lanes: int):
 
 @cache
 def move_of(dtype, ahead):
-    """The device function (v, i, h) → what xᵢ is moved by: h vᵢ, or of int32 what is packed in vᵢ in units of h."""
+    """The device function (v, i, h) → the move of xᵢ: h vᵢ, or of int32 the residual packed in vᵢ in units of h."""
     vec3, _ = types(dtype)
     if ahead is wp.int32:
         whole = load(wp.int32)

@@ -40,7 +40,7 @@ def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int =
         v_after: wp.array(dtype=vec3),
         residual_after: wp.array(dtype=stored),
     ):
-        # Of pins too: what follows need not wait for w.
+        # Of pins too, so that the sum need not wait for w.
         total = vec3()
         if wp.static(compensated):
             total = total_of(thread, chain, inverse_mass.shape[0], x, residual, unit)

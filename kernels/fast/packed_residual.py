@@ -32,5 +32,5 @@ def pack_one(value: float, unit: float):
 
 @wp.func
 def pack_residual(value: wp.vec3, unit: float):
-    """The numbers nearest to value [m]; what is more than 511 units away is lost, and NaN is 0 or so, for x is NaN as well."""
+    """The numbers nearest to value [m], at most 511 units; NaN becomes some number, and x is NaN then as well."""
     return pack_one(value[0], unit) | (pack_one(value[1], unit) << 10) | (pack_one(value[2], unit) << 20)

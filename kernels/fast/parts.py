@@ -36,7 +36,7 @@ class Part(NamedTuple):
 
 @cache
 def local_gradient(part: Part, dtype, corrected: bool = False):
-    """The device function (k, β, rest, y, dy, h) → kA ∂u/∂y (M, 3), and what damping adds to it at y + dy.
+    """The device function (k, β, rest, y, dy, h) → kA ∂u/∂y (M, 3) and the force of damping at y + dy.
 
     With ``corrected`` all of it is taken at y + dy.
     """
@@ -72,7 +72,7 @@ def local_gradient(part: Part, dtype, corrected: bool = False):
 
 @cache
 def elements_struct(part: Part, dtype):
-    """The struct of what a kernel reads of one term.
+    """The struct of the arrays of one term.
 
     Swept: block b has the pieces from offsets[b] to offsets[b+1], and ``codes`` are the first element of each and how many,
     see :mod:`.blocks`. Gathered: so many incidences has vertex i, and ``codes`` are K·element + corner, from offsets[i] on or,
@@ -99,7 +99,7 @@ class Nothing:
 
 
 def chain_of(parts: tuple[Part, ...], dtype, struct_of=elements_struct):
-    """The struct of what a kernel reads of all terms: that of the first, and the chain of the others.
+    """The struct of the arrays of all terms: that of the first, and the chain of the others.
 
     Args:
         parts: The facts of each term.

@@ -45,7 +45,7 @@ class ExplicitStep:
         compensated: Whether x is moved on by compensated summation.
 
     Attributes:
-        residual: What x is rounded by (N,) [m], or None.
+        residual: Position residual of compensated summation (N,) [m], or None.
         record: :class:`StepRecord`.
     """
 

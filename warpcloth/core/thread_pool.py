@@ -82,7 +82,7 @@ class ThreadPool:
         Calls from several threads, as of several steppers of one model, run one after another.
 
         Raises:
-            Exception: What a function raises, of several the first one. What waits for it is let go.
+            Exception: The first that a function raises. Threads that wait for it are let go.
         """
         if self.threads == 1:
             for function in functions:

@@ -1,6 +1,6 @@
-"""Blocks of consecutive vertices and, of each term, the pieces of the elements whose lowest vertices these are.
+"""Blocks of consecutive vertices and the elements of each term in the block of their lowest vertex, in pieces.
 
-See :mod:`warpcloth.kernels.fast.block_forces` for what is done with them.
+See :mod:`warpcloth.kernels.fast.block_forces` for the forces of a block.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ RUN = 8  # elements, from which on a run is faster than looking stencils up
 
 
 def block_layout(terms, per_copy, copies):
-    """The first vertex of each block, the terms in the order of the blocks, and what kernels read of each.
+    """The first vertex of each block, the terms in the order of the blocks, and the arrays of each for a kernel.
 
     A block ends before the coordinates of one of the terms are more than :data:`NUMBERS`; it has one vertex at least.
 
@@ -50,7 +50,7 @@ def _numbers_before(elements, per_copy):
 
 
 def _in_pieces(elements, blocks, copies):
-    """The elements block by block, runs first, and what kernels read of them."""
+    """The elements block by block, runs first, and their arrays for a kernel."""
     stencil = _one(elements)
     lowest = stencil.min(axis=1)
     block = np.searchsorted(blocks, lowest, side="right") - 1

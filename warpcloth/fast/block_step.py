@@ -46,7 +46,7 @@ class BlockStep:
         window: The :class:`Window` of the vertices of ``state``, if these are not all of the model.
 
     Attributes:
-        residual: What x is rounded by (N,) [m], or None.
+        residual: Position residual of compensated summation (N,) [m], or None.
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 

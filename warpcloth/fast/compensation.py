@@ -5,8 +5,8 @@ import warp as wp
 
 # Largest rounding of positions, relative to the mean edge, without compensated summation.
 ROUNDING = 4e-5
-# A packed residual has units of this times the rounding of x, so that it holds what positions so many times as far from the
-# origin as those known beforehand are rounded by.
+# A packed residual has units of this times the rounding of x, so that it holds the residual of positions so many times as
+# far from the origin as those known beforehand.
 FINER, FARTHER = 2.0**-6, 16.0
 
 

@@ -47,7 +47,7 @@ class GatherSweeps:
                 array.zero_()
 
     def launch(self, sweeps=1):
-        """Launches so many sweeps; what an odd number leaves in the other arrays is copied back."""
+        """Launches so many sweeps; after an odd number the other arrays are copied back."""
         model = self.model
         for sweep in range(sweeps):
             (before, *_), (after, *_) = self._states[sweep % 2], self._states[1 - sweep % 2]

@@ -17,11 +17,11 @@ LANES, LANED = 4, 50_000
 
 
 def gathered(model, elements, damped=False, rows=True):
-    """The :class:`warpcloth.kernels.fast.parts.Part` of elements and what their struct has, by name, to gather over vertices.
+    """The :class:`warpcloth.kernels.fast.parts.Part` of elements and the arrays of their struct, by name, for gathering.
 
     Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
-    than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and what the element has
-    beside it at hand, unless elements are refreshed. A stiffness that all pairs of a copy share is stored once per vertex, so
+    than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and the data of the
+    element at hand, unless elements are refreshed. A stiffness that all pairs of a copy share is stored once per vertex, so
     that a copy gets the same bits as a model of its own. For a quadratic energy without damping the incidences are the rows of
     its matrix, if ``rows`` allows it. Rows take a third of the time, but their rounding errors do not cancel between vertices:
     in float32 this noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as with elements.

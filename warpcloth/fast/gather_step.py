@@ -32,7 +32,7 @@ class GatherStep:
         compensated: Whether x is moved on by compensated summation.
 
     Attributes:
-        residual: What x is rounded by (N,), vectors [m] or packed; or None.
+        residual: Position residual of compensated summation (N,), vectors [m] or packed; or None.
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
@@ -88,8 +88,9 @@ class GatherStep:
 def block_of(model, parts):
     """Threads of the block that takes a small copy through all steps of a launch; 0 where each step has to be a launch.
 
-    What a copy reads can then stay in the cache of its multiprocessor: springs of 132 copies of 32² vertices take 0.53 of the
-    time of launches, of 4096 copies 0.47. Few copies are as fast by several threads a vertex, and leave multiprocessors idle.
+    The arrays of a copy can then stay in the cache of its multiprocessor: springs of 132 copies of 32² vertices take 0.53 of
+    the time of launches, of 4096 copies 0.47. Few copies are as fast by several threads a vertex, and leave multiprocessors
+    idle.
     """
     between = model.pins is not None or any(elements.refresh for elements in model.terms)
     if between or lanes_of(model) > 1 or model.per_copy > VERTICES or not all(part.pairs for part in parts):

@@ -1,4 +1,4 @@
-"""The one door to what is there for speed alone: each backend does what the core does, with the same results but for rounding.
+"""The one door to code for speed alone: each backend does the work of the core, with the same results but for rounding.
 
 - ``core``, the readable one: gradients and corrections term by term, then an update of the vertices.
 - ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices, and of several threads each has a subdomain;
@@ -38,7 +38,7 @@ class Plan:
         self.model, self.backend = model, backend
 
     def gradient(self, corrected=False, terms=None):
-        """Returns a :class:`warpcloth.core.gradient.Gradient`, or what does the same."""
+        """Returns a :class:`warpcloth.core.gradient.Gradient`, or a faster one of the same methods."""
         return (GatherGradient if self.backend == "gather" else Gradient)(self.model, corrected, terms)
 
     def explicit_step(self, state, h, symplectic, count, pool):

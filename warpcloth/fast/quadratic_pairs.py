@@ -27,39 +27,39 @@ def matrix_entries(model, elements):
     K, n = elements.term.vertices, model.per_copy
     stencil = host_values(elements.stencil)
 
-    def places_of(some):
-        """Rows and columns of the entries off the diagonal, and where they are in the blocks."""
+    def off_diagonal(some):
+        """Rows and columns of the entries off the diagonal, and whether each entry of the blocks is one."""
         rows, columns = np.repeat(some, K, axis=1), np.tile(some, K)
         apart = rows != columns
         return rows[apart], columns[apart], apart
 
     # Colours put elements of all copies in one order; all vertices of an element are in one copy.
-    rows, columns, _apart = places_of(stencil[stencil[:, 0] < n])
+    rows, columns, _apart = off_diagonal(stencil[stencil[:, 0] < n])
     pattern = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n)).tocsr()
     rows, columns = np.repeat(np.arange(n, dtype=np.int64), np.diff(pattern.indptr)), pattern.indices.astype(np.int64)
-    place = rows * n + columns
-    size, shape = min(CHUNK, elements.count), (model.copies, len(place))
+    keys = rows * n + columns
+    size, shape = min(CHUNK, elements.count), (model.copies, len(keys))
     numbers, sizes = np.zeros(shape), np.zeros(shape)
     blocks = wp.zeros((size, K * K), dtype=wp.float64, device=model.device)
     kernel = model.kernel(constant_blocks, elements.term, model.dtype)
     for first in range(0, elements.count, size):
         some = slice(first, min(first + size, elements.count))
         model.launch(kernel, some.stop - first, [array[some] for array in elements.arguments], [blocks])
-        own_rows, own_columns, apart = places_of(stencil[some].astype(np.int64))
-        found = own_rows // n, np.searchsorted(place, own_rows % n * n + own_columns % n)
+        own_rows, own_columns, apart = off_diagonal(stencil[some].astype(np.int64))
+        found = own_rows // n, np.searchsorted(keys, own_rows % n * n + own_columns % n)
         own = _without_zeros(blocks.numpy()[: len(apart)], K)[apart]
         np.add.at(numbers, found, own)
         np.add.at(sizes, found, np.abs(own))
     if elements.stiffness_of_copies(model) is None:
-        return rows, columns, numbers  # what cancels in a copy need not in others, and copies may not depend on these
-    # What cancels, as elements at right angles do, leaves rounding of itself. It may not be held against what else is at its
-    # vertices: a few large elements may be all that joins two parts of small ones.
+        return rows, columns, numbers  # an entry that cancels in a copy need not in others, on which no copy may depend
+    # Elements at right angles cancel but for their own rounding. An entry may not be compared with others at its vertices: a
+    # few large elements may be all that joins two parts of small ones.
     some = (np.abs(numbers) > 4.0 * np.finfo(model.numpy_dtype).eps * sizes).any(axis=0)
     return rows[some], columns[some], numbers[:, some]
 
 
 def _without_zeros(blocks, K):
-    """Blocks (E, K·K) without what weights that are 0 but for rounding, as of vertices in one line, have in them."""
+    """Blocks (E, K·K), 0 where a weight is 0 but for rounding, as of vertices in one line."""
     squares = blocks[:, :: K + 1]
     small = squares <= ZERO**2 * squares.max(axis=1, keepdims=True)
     return np.where((small[:, :, None] | small[:, None]).reshape(blocks.shape), 0.0, blocks)

@@ -10,7 +10,7 @@ def chained(parts, arrays, dtype, struct_of=elements_struct):
     """The struct of all terms: that of the first, and the chain of the others.
 
     Args:
-        parts: What ``struct_of`` takes, of each term.
+        parts: The facts of each term, which ``struct_of`` takes.
         arrays: The values of each struct, by name.
         dtype: A Warp scalar type.
         struct_of: As :func:`warpcloth.kernels.fast.parts.chain_of` takes it.

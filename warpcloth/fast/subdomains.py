@@ -29,7 +29,7 @@ class SubdomainSteps:
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool`.
 
     Attributes:
-        residual: What x is rounded by (N,) [m], or None.
+        residual: Position residual of compensated summation (N,) [m], or None.
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
@@ -141,7 +141,7 @@ class _Subdomain:
             wp.copy(self._whole_count, self._count)
 
     def give(self, exchanged):
-        """Writes what are ghosts of others."""
+        """Writes its vertices that are ghosts of others."""
         for array, out in zip(self._arrays, exchanged, strict=True):
             self.model.launch(self._copy, len(self._given[0]), [*self._given, array], [out])
 

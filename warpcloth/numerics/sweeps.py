@@ -1,7 +1,7 @@
 """Sweeps over the constraints of a model: Jacobi with three ways to keep it from overshooting, Gauss–Seidel by colour or not.
 
-Gauss–Seidel lets each constraint see what those before it did. Constraints of one colour share no vertex that moves, so that
-their order is no matter and they run at once; between colours, and between terms, the order is fixed and changes the result.
+Gauss–Seidel lets each constraint see the moves of those before it. Constraints of one colour share no vertex that moves, so
+their order does not matter and they run at once; between colours, and between terms, the order is fixed and changes the result.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..terms.refresh import EVALUATION, Moment
 # By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
 # the largest n of its vertices. Jacobi: the plain sum.
 SWEEPS = ("vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential")
-# Gauss–Seidel: what an element sees depends on those before it.
+# Gauss–Seidel: an element sees the moves of those before it.
 IN_PLACE = ("coloured", "sequential")
 
 
@@ -39,8 +39,8 @@ def colours(constraints, free):
     # Each element at a vertex is a neighbour of those before it there.
     first = np.searchsorted(vertices, vertices)
     before = np.arange(len(vertices)) - first
-    place = np.arange(before.sum()) - np.repeat(np.cumsum(before) - before - first, before)
-    pairs = np.stack([np.repeat(elements, before), elements[place]], axis=1)
+    others = np.arange(before.sum()) - np.repeat(np.cumsum(before) - before - first, before)
+    pairs = np.stack([np.repeat(elements, before), elements[others]], axis=1)
     found = wp.zeros(len(sizes), dtype=wp.int32, device="cpu")
     if len(pairs):
         wp.utils.graph_coloring_assign(wp.array(pairs, dtype=wp.int32, device="cpu"), found)
@@ -68,7 +68,7 @@ class Sweep:
         correction: d (N,) [m].
         multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, in the order of ``elements``, or Nones.
         elements: :class:`warpcloth.model.elements.DeviceElements` of each term, in the order of the sweep.
-        ranges: Of each term what one launch takes, as (first, count).
+        ranges: The (first, count) of the elements that each launch takes, of each term.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Sweep:
             constraints += np.bincount(host_values(elements.stencil).ravel(), minlength=model.count)
         if kind == "vertex-averaged":
             return even, model.array(1.0 / np.maximum(constraints + alpha, np.finfo(np.float32).tiny), model.dtype)
-        constraints[model.inverse_mass.numpy() == 0.0] = 1.0  # what does not move cannot overshoot
+        constraints[model.inverse_mass.numpy() == 0.0] = 1.0  # a vertex that does not move cannot overshoot
         largest = [constraints[host_values(elements.stencil)].max(axis=1) for elements in terms]
         for i, elements in enumerate(terms):
             if elements.cells:  # one factor for all of a cell
@@ -148,7 +148,7 @@ class Sweep:
         return [model.array(self.relaxation / each, model.dtype) for each in largest], model.constant(1.0, model.count)
 
     def launch_start(self):
-        """d = 0, λ = 0, after x̃ is there."""
+        """Launches d = 0, λ = 0, once x̃ is there."""
         if not self.in_place:
             self._jacobi.launch_start()
             return
@@ -157,14 +157,14 @@ class Sweep:
                 array.zero_()
 
     def launch(self, backward=False):
-        """One sweep; of Gauss–Seidel also backward, from the last term, colour and element to the first."""
+        """Launches one sweep; of Gauss–Seidel also backward, from the last term, colour and element to the first."""
         if self.in_place:
             self._launch_in_place(backward)
         else:
             self._jacobi.launch()
 
     def parts(self, sweeps):
-        """Pairs of a function that launches and of how many times it runs, for so many sweeps."""
+        """Returns pairs of a function that launches and of how many times it runs, for so many sweeps."""
         return [(self.launch, sweeps)] if self.in_place else self._jacobi.parts(sweeps)
 
     def _launch_in_place(self, backward):
@@ -179,7 +179,7 @@ class Sweep:
             each = (cells or elements).per_copy if self.ordered else 1
             for first, count in self.ranges[i][::way]:
                 before, part = pool.part(count // each)
-                # A thread of the CPU goes through what it has in a loop, in half of the time that as many threads take.
+                # A thread of the CPU takes all its elements in one loop, in half of the time that as many threads take.
                 threads, each_thread = (1, part * each) if model.device.is_cpu else (part, each)
                 given = [
                     *of_cells,

@@ -1,4 +1,4 @@
-"""Several copies shared out among threads."""
+"""Batches whose copies are shared out among threads."""
 
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ from .solver import Stepper
 
 
 class ThreadedStepper(Stepper):
-    """Several copies for several threads: a stepper of its own, on neighbouring copies, in each.
+    """A batch for several threads: each has a stepper of its own, on neighbouring copies.
 
     Args:
         options: Of the solver.
@@ -66,5 +66,5 @@ class ThreadedStepper(Stepper):
         mask, positions, velocities = self._reset.on_device(mask, positions, velocities)
         n = self.model.per_copy
         for part, (first, end) in zip(self.parts, self._copies, strict=True):
-            places = [None if given is None else given[first * n : end * n] for given in (positions, velocities)]
-            part.reset(mask[first:end], *places)
+            of_part = [None if given is None else given[first * n : end * n] for given in (positions, velocities)]
+            part.reset(mask[first:end], *of_part)
