@@ -95,12 +95,12 @@ def take_choice(arguments, device):
 def command_line(arguments, values, setup):
     """The command that runs a scene with a setup."""
     words = ["warpcloth", "run", arguments.scene]
+    words += [word for module in arguments.imports for word in ("--import", module)]
     given = [f"{name}={value}" for name, value in values.items() if name in assignments(arguments.p)]
     words += ["-p", *given] if given else []
     words += ["--solver", setup.solver, "-s", *(f"{name}={value}" for name, value in setup.options.items())]
     words += [] if arguments.frames is None else ["--frames", str(arguments.frames)]
     words += [] if arguments.device == "cpu" else ["--device", arguments.device]
-    words += [word for module in arguments.imports for word in ("--import", module)]
     return shlex.join([*words, "--dtype", arguments.dtype, "-o", "out.usdc"])
 
 
