@@ -40,8 +40,8 @@ def material_state(points, stencil, poisson_ratio):
     return np.column_stack([inverse_edges(points, stencil), 0.5 / (1.0 + nu), nu / (1.0 - nu**2)])
 
 
-def edge_reach(points, stencil, stretch):
-    """``reach`` of triangles (E, 3) of stretches up to ``stretch`` (E,): their edges, each with a third of Σ kL² = 2A."""
+def edge_max_lengths(points, stencil, stretch):
+    """``max_lengths`` of triangles (E, 3) of stretches up to ``stretch`` (E,): their edges, each with a third of Σ kL² = 2A."""
     pairs = stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     sides = points[pairs[:, 1]] - points[pairs[:, 0]]
     squares = np.einsum("ij,ij->i", sides, sides)

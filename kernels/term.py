@@ -63,9 +63,9 @@ class Term:
         hessian: (y, rest, policy) → ∂²u/∂y² (3M, 3M), y row by row, see :class:`HessianPolicy`.
         dead_zone: Whether there is a range about the rest shape without energy; ``rest_state`` then takes the ratios
             ``least`` and ``most`` of its ends.
-        reach: NumPy function (points (n, 3) [m], stencil (E, K), rest (E, P)) → (pairs (E·m, 2), lengths (E·m,) [m], factors
-            (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it does
-            not), and how stiff a spring between them would be, kₑ = 1; or None.
+        max_lengths: NumPy function (points (n, 3) [m], stencil (E, K), rest (E, P)) → (pairs (E·m, 2), lengths (E·m,) [m],
+            factors (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it
+            does not), and how stiff a spring between them would be, kₑ = 1; or None.
         cells: Whether elements of K = 1 are the vertices of cells of any size, see :class:`warpcloth.model.model.Cells`.
         project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or None.
         prox: (v, rest, compliance) → argmin u(y) + ‖y − v‖²/(2·compliance) (M, 3), compliance 0 or more, in closed form, the
@@ -91,7 +91,7 @@ class Term:
     gradient: Any
     hessian: Any
     dead_zone: bool = False
-    reach: Callable | None = None
+    max_lengths: Callable | None = None
     cells: bool = False
     project: Any = None
     prox: Any = None

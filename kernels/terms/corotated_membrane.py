@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..membrane import edge_reach, inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
+from ..membrane import edge_max_lengths, inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
 from ..term import Term
 from .membrane_damping import DISSIPATION
 
@@ -22,9 +22,9 @@ def rest_state(points, stencil):
     return inverse_edges(points, stencil)
 
 
-def reach(points, stencil, rest):
+def max_lengths(points, stencil, rest):
     """The edges, no longer than at rest."""
-    return edge_reach(points, stencil, np.ones(len(stencil)))
+    return edge_max_lengths(points, stencil, np.ones(len(stencil)))
 
 
 @wp.func
@@ -58,7 +58,7 @@ COROTATED_MEMBRANE = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
-    reach=reach,
+    max_lengths=max_lengths,
     project=project,
     dissipation=DISSIPATION,
 )

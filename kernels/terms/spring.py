@@ -22,7 +22,7 @@ def rest_state(points, stencil):
     return np.linalg.norm(points[stencil[:, 1]] - points[stencil[:, 0]], axis=1)[:, None]
 
 
-def reach(points, stencil, rest):
+def max_lengths(points, stencil, rest):
     """The pairs themselves, no longer than L."""
     return stencil, rest[:, -1], np.ones(len(stencil))
 
@@ -159,7 +159,7 @@ SPRING = Term(
     energy=energy,
     gradient=gradient,
     hessian=hessian,
-    reach=reach,
+    max_lengths=max_lengths,
     project=project,
     constraint=constraint,
     constraint_gradient=constraint_gradient,

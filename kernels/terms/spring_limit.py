@@ -69,6 +69,6 @@ SPRING_LIMIT = Term(
     gradient=gradient,
     hessian=hessian,
     dead_zone=True,
-    reach=spring.reach,
+    max_lengths=spring.max_lengths,
     project=project,
 )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..membrane import edge_reach, inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
+from ..membrane import edge_max_lengths, inverse_edges, measure, range_energy, range_gradient, range_hessian, weight
 from ..term import Term
 
 
@@ -21,9 +21,9 @@ def rest_state(points, stencil, least=-np.inf, most=np.inf):
     return np.column_stack([inverse_edges(points, stencil), np.broadcast_to(least, E), np.broadcast_to(most, E)])
 
 
-def reach(points, stencil, rest):
+def max_lengths(points, stencil, rest):
     """The edges, no longer than σ_max times their length at rest."""
-    return edge_reach(points, stencil, rest[:, 4])
+    return edge_max_lengths(points, stencil, rest[:, 4])
 
 
 @wp.func
@@ -58,6 +58,6 @@ STRAIN_LIMIT = Term(
     gradient=gradient,
     hessian=hessian,
     dead_zone=True,
-    reach=reach,
+    max_lengths=max_lengths,
     project=project,
 )

@@ -75,7 +75,8 @@ def test_levels_of_any_mesh(name):
     if not found:
         return
     given = [
-        elements.term.reach(scene.mesh.points, elements.stencil.numpy(), elements.rest.numpy()) for elements in model.terms
+        elements.term.max_lengths(scene.mesh.points, elements.stencil.numpy(), elements.rest.numpy())
+        for elements in model.terms
     ]
     pairs, lengths = (np.concatenate(each) for each in zip(*[each[:2] for each in given], strict=True))
     first = np.lexsort((lengths, pairs.max(axis=1), pairs.min(axis=1)))
@@ -121,7 +122,7 @@ def test_reach_of_triangles(name, most):
     """Their edges, σ_max times as long as at rest; springs that resist a uniform stretch ε by Aε², as ½kA‖F − I‖² does."""
     scene = SCENES[name]
     elements = scene.terms[0].elements(scene.mesh, scene.positions)
-    pairs, lengths, factors = elements.term.reach(scene.mesh.points, elements.stencil, elements.rest)
+    pairs, lengths, factors = elements.term.max_lengths(scene.mesh.points, elements.stencil, elements.rest)
     rest = lengths_of(scene.mesh.points, pairs)
     assert np.allclose(lengths, most * rest, rtol=8 * EPS)
     energy = 0.5 * (factors * rest**2).reshape(-1, 3).sum(axis=1)

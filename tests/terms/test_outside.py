@@ -1,6 +1,5 @@
 """The energy of docs/extending.md, one file outside the package, through all that takes one; identities in test_terms.py."""
 
-import json
 import sys
 from dataclasses import dataclass, replace
 
@@ -127,17 +126,6 @@ def test_the_command_line_imports_it_for_a_stage(stage, tmp_path, capfd):
     refused(capfd, ["info", stage[0]], "must be one of")
     assert "Plane" in run(capfd, "info", *stage)[1]
     assert run(capfd, "run", *stage, "--frames", 2, "-o", tmp_path / "moved.usdc")[0] == 0
-
-
-@pytest.mark.slow
-def test_benchmarks_and_charts_take_it(stage, tmp_path, capfd):
-    """In processes of their own, which import it too."""
-    code, out, err = run(capfd, "bench", *stage, "--solver", "xpbd", "-s", "substeps=2", "--frames", 3, "--json")
-    assert code == 0 and json.loads(out), err
-    chart = tmp_path / "chart.csv"
-    options = ["--diagram", "solver", "--solvers", "xpbd", "newton", "--frames", 1, "--csv", chart]
-    code, out, err = run(capfd, "chart", "work-precision", *stage, *options)
-    assert code == 0 and {"newton", "xpbd"} <= {row.split(",")[0] for row in chart.read_text().splitlines()}, err
 
 
 def test_a_membrane_is_a_material_by_its_name(tmp_path, capfd):

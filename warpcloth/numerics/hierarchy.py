@@ -1,7 +1,7 @@
 """Coarser and coarser levels of a cloth, for solvers that carry information over many vertices at once (Müller 2008).
 
-What the levels are made of are bounds: pairs of vertices that the terms of a model keep no farther apart than a length, see
-``reach`` of :class:`warpcloth.kernels.term.Term`. A level keeps some vertices of the finer one, no two of which are linked
+The levels are made of bounds: pairs of vertices that the terms of a model keep no farther apart than a length, see
+``max_lengths`` of :class:`warpcloth.kernels.term.Term`. A level keeps some vertices of the finer one, no two of them linked
 there, so that every dropped vertex is linked to at least one kept one; pins are all kept. A bound between kept vertices is the
 shortest way over up to two dropped ones, with its length: what meets all finer bounds meets it, on any mesh, however folded.
 """
@@ -105,7 +105,7 @@ def _finest(model, free):
     n, soft, hard = model.per_copy, [], []
     points = model.rest_points
     for elements in model.terms:
-        if elements.term.reach is None:
+        if elements.term.max_lengths is None:
             continue
         E = elements.per_copy
         stiffness = host_values(elements.stiffness).reshape(model.copies, E).astype(np.float64).T
@@ -113,7 +113,7 @@ def _finest(model, free):
             stiffness = stiffness[:, :1]
         # What bounds all copies is the longest of their lengths; the last sweeps have each its own.
         stencil, rest = host_values(elements.stencil)[:E], host_values(elements.rest).reshape(model.copies, E, -1)
-        found = [elements.term.reach(points, stencil, each) for each in (rest if (rest != rest[:1]).any() else rest[:1])]
+        found = [elements.term.max_lengths(points, stencil, each) for each in (rest if (rest != rest[:1]).any() else rest[:1])]
         pairs, _, factors = found[0]
         lengths = np.max([lengths for _, lengths, _ in found], axis=0)
         each = len(pairs) // E
