@@ -126,9 +126,11 @@ def stiffness_scale(term: Term, dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def scale(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # state in
         x: wp.array(dtype=vec3),
         # out
         out: wp.array(dtype=dtype),

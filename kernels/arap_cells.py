@@ -24,9 +24,11 @@ def set_moments(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_from_centroid(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         members: wp.array(dtype=wp.int32),
         weights: wp.array(dtype=dtype),
+        # state in
         X: wp.array(dtype=vec3),
         # out
         moments: wp.array(dtype=vec3),
@@ -65,9 +67,11 @@ def fit_rotations(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def fit(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         members: wp.array(dtype=wp.int32),
         moments: wp.array(dtype=vec3),
+        # state in
         x: wp.array(dtype=vec3),
         # out
         rotations: wp.array(dtype=mat33),
@@ -87,7 +91,7 @@ def fit_rotations(dtype):
 
 
 @cache
-def gather(dtype):
+def gather_moments(dtype):
     """Kernel over vertices, the transpose of the sums in :func:`fit_rotations`: b_i = start_i + Σ_{c∋i} R_c g_ic.
 
     Entries offsets[i] to offsets[i+1] of ``cells`` and ``moments`` are the cells of vertex i and its moments in them.
@@ -95,10 +99,12 @@ def gather(dtype):
     vec3, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def gather_moments(
+    def gather_at_vertices(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         cells: wp.array(dtype=wp.int32),
         moments: wp.array(dtype=vec3),
+        # state in
         rotations: wp.array(dtype=mat33),
         start: wp.array(dtype=vec3),
         # out
@@ -110,7 +116,7 @@ def gather(dtype):
             total += rotations[cells[k]] * moments[k]
         b[i] = total
 
-    return gather_moments
+    return gather_at_vertices
 
 
 @cache
@@ -123,9 +129,11 @@ def edge_energy(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def energy_of_edges(
+        # elements
         edges: wp.array(dtype=wp.vec2i),
         weights: wp.array(dtype=dtype),
         rest: wp.array(dtype=vec3),
+        # state in
         rotations: wp.array(dtype=mat33),
         x: wp.array(dtype=vec3),
         # out
@@ -154,9 +162,11 @@ def triangle_energy(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def energy_of_triangles(
+        # elements
         triangles: wp.array(dtype=wp.vec3i),
         weights: wp.array(dtype=vec3),
         rest: wp.array(dtype=vec3),
+        # state in
         rotations: wp.array(dtype=mat33),
         x: wp.array(dtype=vec3),
         # out

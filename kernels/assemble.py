@@ -10,7 +10,7 @@ import warp as wp
 from .local import local_coordinate
 from .memory import load, load_shared
 from .term import Term
-from .transpose import Source, gather, scatter
+from .transpose import LocalSource, gather, scatter
 from .vectors import types
 
 
@@ -58,7 +58,7 @@ def elastic(term: Term, dtype):
 
 @cache
 def forces(term: Term, dtype, corrected: bool = False):
-    """The :class:`.transpose.Source` of kₑ Aₑ ∂u/∂y."""
+    """The :class:`.transpose.LocalSource` of kₑ Aₑ ∂u/∂y."""
     data, rest_type = elastic(term, dtype), wp.types.vector(term.parameters, dtype)
     y_of, gradient, measure = local_coordinate(term, dtype, corrected), term.gradient, term.measure
     number = load_shared(dtype)
@@ -67,7 +67,7 @@ def forces(term: Term, dtype, corrected: bool = False):
     def force(data: data, e: int, r: rest_type):
         return (number(data.stiffness, e) * measure(r)) * gradient(y_of(data.stencil, e, r, data.x, data.d), r)
 
-    return Source(data, force)
+    return LocalSource(data, force)
 
 
 def scatter_gradient(term: Term, dtype, corrected: bool = False):

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from .project import place, spread_compliance
+from .project import nth_of_thread, spread_compliance, sweep_turn
 from .rotation import nearest_rotation
 from .vectors import types
 
@@ -66,9 +66,11 @@ def fit_targets(dtype, corrected: bool):
 
     @wp.kernel(module="unique", enable_backward=False)
     def fit_all(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         stencil: wp.array2d(dtype=wp.int32),
         shape: wp.array(dtype=vec3),
+        # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         # in and out
@@ -93,35 +95,34 @@ def correct_clusters(dtype, multipliers: bool, per_step: bool):
 
     @wp.kernel(module="unique", enable_backward=False)
     def correct(
+        # elements
         offsets: wp.array(dtype=wp.int32),
         shape: wp.array(dtype=vec3),
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # state in
         inverse_mass: wp.array(dtype=dtype),
         x: wp.array(dtype=vec3),
-        first: int,
-        each: int,
-        h: dtype,
-        sweeps: int,
-        relaxation: dtype,
+        # parameters
+        turn: sweep_turn(dtype),
         # in and out
         lambdas: wp.array(dtype=lambda_type),
         d: wp.array(dtype=vec3),
     ):
-        for k in range(wp.abs(each)):
-            c = place(first, each, wp.tid(), k)
+        for k in range(wp.abs(turn.each)):
+            c = nth_of_thread(turn.first, turn.each, wp.tid(), k)
             _R = fit_cluster(offsets[c], offsets[c + 1], stencil, rest, shape, x, d)
             for e in range(offsets[c], offsets[c + 1]):
                 v = stencil[e, 0]
-                compliance = dtype(1.0) / (stiffness[e] * h * h)
+                compliance = dtype(1.0) / (stiffness[e] * turn.h * turn.h)
                 if wp.static(per_step):
-                    compliance = spread(dtype(1.0), compliance, sweeps)
+                    compliance = spread(dtype(1.0), compliance, turn.sweeps)
                 if inverse_mass[v] > dtype(0.0) and wp.isfinite(compliance):
                     t = vec3(rest[e][0], rest[e][1], rest[e][2])
                     if wp.static(multipliers):
                         t = t - (compliance * inverse_mass[v]) * lambdas[e][0]
-                    move = (relaxation / (dtype(1.0) + compliance)) * t
+                    move = (turn.relaxation / (dtype(1.0) + compliance)) * t
                     d[v] = d[v] + move
                     if wp.static(multipliers):
                         after = lambdas[e]

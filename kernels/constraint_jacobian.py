@@ -7,19 +7,19 @@ from functools import cache
 
 import warp as wp
 
-from .constraint_rows import RowLayout, first_row, rows_of, slope_type
+from .constraint_rows import RowLayout, first_row, row_count, slope_type
 from .local import local_coordinate
-from .reduce import left_out
+from .reduce import stands_aside
 from .term import Term
-from .transpose import Source, gather, scatter
+from .transpose import LocalSource, gather, scatter
 from .vectors import types
 
 
 @cache
 def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: rows += J v, of the copies that are active, see :func:`.reduce.left_out`."""
+    """Kernel over elements: rows += J v, of the copies that are active, see :func:`.reduce.stands_aside`."""
     vec3, _ = types(dtype)
-    M, Q = wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
+    M, Q = wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
     y_of = local_coordinate(term, dtype, False)
 
@@ -38,7 +38,7 @@ def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
         rows: wp.array(dtype=dtype),
     ):
         e = wp.tid()
-        if left_out(active, e // layout.per_copy):
+        if stands_aside(active, e // layout.per_copy):
             return
         s = first_row(e, layout, Q)
         y = y_of(stencil, e, rest[e], v, v)
@@ -74,8 +74,8 @@ def held_rows(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def pulls(term: Term, dtype, scalar: bool, curved: bool):
-    """The :class:`.transpose.Source` of the force of the rows of an element over y (M, 3)."""
-    M, Q = wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
+    """The :class:`.transpose.LocalSource` of the force of the rows of an element over y (M, 3)."""
+    M, Q = wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     data = held_rows(term, dtype, scalar, curved)
 
@@ -99,10 +99,10 @@ def pulls(term: Term, dtype, scalar: bool, curved: bool):
         return z
 
     @wp.func
-    def stands_aside(rows: data, e: int):
-        return left_out(rows.active, e // rows.layout.per_copy)
+    def of_inactive_copy(rows: data, e: int):
+        return stands_aside(rows.active, e // rows.layout.per_copy)
 
-    return Source(data, of_constraint if scalar else of_projection, stands_aside)
+    return LocalSource(data, of_constraint if scalar else of_projection, of_inactive_copy)
 
 
 def scatter_rows(term: Term, dtype, scalar: bool, curved: bool):
@@ -118,7 +118,7 @@ def gather_rows(term: Term, dtype, scalar: bool, curved: bool):
 @cache
 def rows_in_full(term: Term, dtype, scalar: bool, curved: bool):
     """Kernel over elements: out[e, rows·i + j] = row j of ∂/∂xᵢ, in double precision, to be assembled on the host."""
-    K, M, Q = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(rows_of(term, scalar, curved))
+    K, M, Q = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
     weight = term.weight
 

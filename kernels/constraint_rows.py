@@ -61,7 +61,7 @@ def row_values(dtype):
     return RowValues
 
 
-def rows_of(term: Term, scalar: bool, curved: bool):
+def row_count(term: Term, scalar: bool, curved: bool):
     """Rows of one element."""
     if not scalar:
         return 3 * term.rows
@@ -70,7 +70,7 @@ def rows_of(term: Term, scalar: bool, curved: bool):
 
 def slope_type(term: Term, dtype, scalar: bool, curved: bool):
     """The type of an element's Jacobian: covectors (rows, 3M), or of constant ones whether they are active, 0 or 1."""
-    return wp.types.matrix((rows_of(term, scalar, curved), 3 * term.rows), dtype) if scalar else dtype
+    return wp.types.matrix((row_count(term, scalar, curved), 3 * term.rows), dtype) if scalar else dtype
 
 
 @cache
@@ -100,7 +100,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
     """
     vec3, _ = types(dtype)
     K, M, N = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(term.stiffening_rows)
-    Q = wp.constant(rows_of(term, scalar, curved))
+    Q = wp.constant(row_count(term, scalar, curved))
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     slope = slope_type(term, dtype, scalar, curved)
     y_of, weight, measure, dead_zone = local_coordinate(term, dtype, True), term.weight, term.measure, term.dead_zone

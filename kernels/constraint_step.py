@@ -14,6 +14,7 @@ def weigh(dtype):
 
     @wp.kernel(module=f"warpcloth.constraint_step.{dtype.__name__}", enable_backward=False)
     def weigh_vertices(
+        # state in
         inverse_mass: wp.array(dtype=dtype),
         # in and out
         v: wp.array(dtype=vec3),
@@ -30,7 +31,13 @@ def mismatch(dtype):
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"warpcloth.constraint_step.{dtype.__name__}", enable_backward=False)
-    def subtract(d: wp.array(dtype=vec3), v: wp.array(dtype=vec3), out: wp.array(dtype=vec3)):
+    def subtract(
+        # state in
+        d: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=vec3),
+    ):
         i = wp.tid()
         out[i] = d[i] - v[i]
 
@@ -44,8 +51,10 @@ def add_step(dtype, vectors: bool):
 
     @wp.kernel(module="unique", enable_backward=False)
     def add_steps(
+        # state in
         step: wp.array(dtype=wp.float64),
         change: wp.array(dtype=value),
+        # parameters
         per_copy: int,
         # in and out
         a: wp.array(dtype=value),
@@ -61,7 +70,12 @@ def begin_step():
     """Kernel over copies: step 1 for those that still iterate, 0 for the rest."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def begin(active: wp.array(dtype=wp.int32), step: wp.array(dtype=wp.float64)):
+    def begin(
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        # out
+        step: wp.array(dtype=wp.float64),
+    ):
         copy = wp.tid()
         step[copy] = wp.float64(active[copy])
 
@@ -73,7 +87,13 @@ def scale_rows(dtype):
     """Kernel over rows: out = factors·a."""
 
     @wp.kernel(module=f"warpcloth.constraint_step.{dtype.__name__}", enable_backward=False)
-    def scale(factors: wp.array(dtype=dtype), a: wp.array(dtype=dtype), out: wp.array(dtype=dtype)):
+    def scale(
+        # state in
+        factors: wp.array(dtype=dtype),
+        a: wp.array(dtype=dtype),
+        # out
+        out: wp.array(dtype=dtype),
+    ):
         i = wp.tid()
         out[i] = factors[i] * a[i]
 
@@ -85,7 +105,12 @@ def negate_rows(dtype):
     """Kernel over rows: out = −a."""
 
     @wp.kernel(module=f"warpcloth.constraint_step.{dtype.__name__}", enable_backward=False)
-    def negate(a: wp.array(dtype=dtype), out: wp.array(dtype=dtype)):
+    def negate(
+        # state in
+        a: wp.array(dtype=dtype),
+        # out
+        out: wp.array(dtype=dtype),
+    ):
         i = wp.tid()
         out[i] = -a[i]
 

@@ -179,8 +179,23 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool):
     return change
 
 
+@cache
+def sweep_turn(dtype):
+    """The struct of one launch of a Gauss–Seidel sweep: elements from ``first`` on, ``each`` of a thread; h, sweeps and ω."""
+
+    @wp.struct
+    class SweepTurn:
+        first: int
+        each: int
+        h: dtype
+        sweeps: int
+        relaxation: dtype
+
+    return SweepTurn
+
+
 @wp.func
-def place(first: int, each: int, thread: int, k: int):
+def nth_of_thread(first: int, each: int, thread: int, k: int):
     """The k-th of what a thread takes in a sweep, see :func:`correct_in_place`."""
     e = first + thread * wp.abs(each) + k
     if each < 0:
@@ -205,34 +220,33 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
 
     @wp.kernel(module="unique", enable_backward=False)
     def correct(
+        # elements
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        # state in
         inverse_mass: wp.array(dtype=dtype),
         x: wp.array(dtype=vec3),
-        first: int,
-        each: int,
-        h: dtype,
-        sweeps: int,
-        relaxation: dtype,
+        # parameters
+        turn: sweep_turn(dtype),
         # in and out
         lambdas: wp.array(dtype=lambda_type),
         d: wp.array(dtype=vec3),
     ):
-        for k in range(wp.abs(each)):
-            e = place(first, each, wp.tid(), k)
+        for k in range(wp.abs(turn.each)):
+            e = nth_of_thread(turn.first, turn.each, wp.tid(), k)
             r = rest_of(rest, e)
             before = lambda_type(dtype(0.0))
             if wp.static(multipliers):
                 before = lambdas[e]
-            more, rows = change(stencil, e, shared(stiffness, e), r, inverse_mass, x, d, h, before, sweeps)
+            more, rows = change(stencil, e, shared(stiffness, e), r, inverse_mass, x, d, turn.h, before, turn.sweeps)
             if wp.static(multipliers):
-                lambdas[e] = before + relaxation * more
+                lambdas[e] = before + turn.relaxation * more
             for i in range(K):
                 v = vertex(stencil, K * e + i)
                 mobility = number(inverse_mass, v)
                 if mobility > dtype(0.0):
-                    put(d, v, vector(d, v) + (mobility * relaxation) * share_of(r, i, rows))
+                    put(d, v, vector(d, v) + (mobility * turn.relaxation) * share_of(r, i, rows))
 
     return correct
 
@@ -244,8 +258,10 @@ def add_momentum(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def add(
+        # state in
         mass: wp.array(dtype=dtype),
         d: wp.array(dtype=vec3),
+        # parameters
         s: dtype,
         # in and out
         out: wp.array(dtype=vec3),

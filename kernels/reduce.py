@@ -11,7 +11,7 @@ from .vectors import types
 
 
 @wp.func
-def left_out(active: wp.array(dtype=wp.int32), copy: int):
+def stands_aside(active: wp.array(dtype=wp.int32), copy: int):
     """Whether a copy is not among the active ones, (B,); none is left out where that is None."""
     if active:
         return active[copy] == 0
@@ -57,7 +57,7 @@ def partial_dot(dtype):
         out: wp.array2d(dtype=wp.float64),
     ):
         copy, chunk = wp.tid()
-        if left_out(active, copy):
+        if stands_aside(active, copy):
             return
         total = wp.float64(0.0)
         for i in range(chunk, per_copy, out.shape[1]):
@@ -83,7 +83,7 @@ def partial_product(dtype):
         out: wp.array2d(dtype=wp.float64),
     ):
         copy, chunk = wp.tid()
-        if left_out(active, copy):
+        if stands_aside(active, copy):
             return
         total = wp.float64(0.0)
         for i in range(chunk, per_copy, out.shape[1]):

@@ -1,7 +1,7 @@
 """The transpose of local coordinates, out += Dᵀz: vertex i of an element gets Σₘ wᵢ[m] z[m].
 
-z is what its user says: forces kA∂u/∂y, multipliers of constraints. A :class:`Source` computes it from arrays of its own, and
-two kernels add it up: over elements in order, for the CPU, and over vertices, for a GPU, each with its elements in order.
+A :class:`LocalSource` computes z from arrays of its own, such as forces kA∂u/∂y or multipliers of constraints. Two kernels add
+it up: over elements in order, for the CPU, and over vertices, for a GPU, each with its elements in order.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def to_corner(term: Term, dtype):
     return share_of
 
 
-class Source(NamedTuple):
+class LocalSource(NamedTuple):
     """Where z comes from.
 
     Attributes:
@@ -59,11 +59,11 @@ def stored(term: Term, dtype):
     def stored_z(data: Stored, e: int, rest: rest_type):
         return data.z[e]
 
-    return Source(Stored, stored_z)
+    return LocalSource(Stored, stored_z)
 
 
 @cache
-def scatter(term: Term, dtype, source: Source):
+def scatter(term: Term, dtype, source: LocalSource):
     """Kernel over elements: out += Dᵀz. For the CPU, which takes elements in order: nothing is atomic."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
@@ -94,7 +94,7 @@ def scatter(term: Term, dtype, source: Source):
 
 
 @cache
-def gather(term: Term, dtype, source: Source):
+def gather(term: Term, dtype, source: LocalSource):
     """Kernel over vertices: out += Dᵀz in a fixed order, through :class:`warpcloth.model.incidence.Incidence`."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)

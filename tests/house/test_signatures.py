@@ -10,14 +10,6 @@ KERNELS = Path(__file__).parents[2] / "kernels"
 # Elements are what a model fixes when it is built; parameters are numbers, and which copies or vertices take part.
 GROUPS = ("elements", "state in", "parameters", "in and out", "out")
 MOST = 12
-# Files whose kernels are to be brought into this form; the list only shrinks.
-UNORDERED = {
-    "admm.py",
-    "arap_cells.py",
-    "clusters.py",
-    "constraint_step.py",
-    "project.py",
-}
 
 
 def faults(path):
@@ -47,7 +39,4 @@ def name_of(path):
 
 @pytest.mark.parametrize("path", sorted(KERNELS.rglob("*.py")), ids=name_of)
 def test_parameters_are_grouped(path):
-    found = faults(path)
-    if found and name_of(path) in UNORDERED:
-        pytest.xfail("\n".join(found))
-    assert not found
+    assert not faults(path)

@@ -1210,7 +1210,7 @@ ROWS = [
 @every_dtype
 def test_rows_of_constraints_gather_what_they_scatter(term, scalar, curved, dtype, device):
     """out += Jᵀλ of the copies that are active."""
-    found, rows = [], constrain.rows_of(term, scalar, curved)
+    found, rows = [], constrain.row_count(term, scalar, curved)
     for factory, each in ((jacobian.scatter_rows, "cpu"), (jacobian.gather_rows, device)):
         model = model_of(rest_mesh(), None, [term.name], dtype, each, pins=[0, 7], copies=3)
         elements = model.terms[0]

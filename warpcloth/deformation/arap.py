@@ -328,7 +328,7 @@ class Arap:
             launch(reduce.partial_sum(), partial.shape, [energies, len(elements)], partial)
             launch(reduce.finish_sum(), 1, [partial, 0], total)
             if len(b):
-                launch(cells.gather(scalar), len(b), [*columns, rotations, start], b)
+                launch(cells.gather_moments(scalar), len(b), [*columns, rotations, start], b)
 
         return Segment(self.device, fit_cells)
 

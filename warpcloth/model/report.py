@@ -1,4 +1,4 @@
-"""What a model was built of."""
+"""The report of what a model was built of."""
 
 import numpy as np
 import warp as wp

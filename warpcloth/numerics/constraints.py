@@ -35,7 +35,7 @@ class TermRows:
         scalar = term.constraint is not None
         key = (term, model.dtype, scalar, curved and scalar)
         self.model, self.elements, self._key = model, elements, key
-        self.rows = kernels.rows_of(term, *key[2:])
+        self.rows = kernels.row_count(term, *key[2:])
         self.count = self.rows * elements.per_copy
         self._slopes = wp.zeros(elements.count, dtype=kernels.slope_type(*key), device=model.device)
         self._linearise, self._apply = model.kernel(kernels.linearise, *key), model.kernel(jacobian.apply_rows, *key)

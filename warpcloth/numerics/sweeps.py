@@ -181,17 +181,10 @@ class Sweep:
                 before, part = pool.part(count // each)
                 # A thread of the CPU takes all its elements in one loop, in half of the time that as many threads take.
                 threads, each_thread = (1, part * each) if model.device.is_cpu else (part, each)
-                given = [
-                    *of_cells,
-                    *elements.arguments,
-                    model.inverse_mass,
-                    self.x,
-                    first + before * each,
-                    way * each_thread,
-                    self.h,
-                    self.spread,
-                    self.relaxation,
-                ]
+                turn = kernels.sweep_turn(model.dtype)()
+                turn.first, turn.each = first + before * each, way * each_thread
+                turn.h, turn.sweeps, turn.relaxation = self.h, self.spread, self.relaxation
+                given = [*of_cells, *elements.arguments, model.inverse_mass, self.x, turn]
                 if part:
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
                 pool.launch_barrier(model)
