@@ -5,7 +5,7 @@ import warp as wp
 
 
 def report(model):
-    """What was built: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels.
+    """Reports what was built: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels.
 
     Terms of one label are numbered from the second on: Spring, Spring 2. Kernels are factory(variant).Term.
     """
