@@ -1,6 +1,6 @@
 """Factories of the kernels that move vertices through time: predict, finish, pins.
 
-A pinned vertex has inverse mass 0. Fixed pins stay; moved ones take the place that their keyframes give. hₑ is the effective
+A pinned vertex has inverse mass 0. Fixed pins stay; moved ones take the position that their keyframes give. hₑ is the effective
 step of an implicit integrator, see :mod:`warpcloth.numerics.integrators`.
 """
 
@@ -13,7 +13,7 @@ from .vectors import types
 
 @cache
 def predict(dtype):
-    """Kernel over vertices: v += hₑ g, x += hₑ v, the place x̃ that inertia and gravity alone lead to."""
+    """Kernel over vertices: v += hₑ g, x += hₑ v, the position x̃ that inertia and gravity alone lead to."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -71,7 +71,7 @@ def start_bdf2(dtype):
 def predict_bdf2(dtype):
     """Kernel over vertices: v ← (4v₀ − v₋₁)/3 + hₑ g, move ← (x₀ − x₋₁)/3 + hₑ v, x += move, v₋₁ ← v₀.
 
-    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v; moves are kept in place of x₋₁, for they have the digits that large coordinates lose.
+    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v; moves are kept instead of x₋₁, for they have the digits that large coordinates lose.
     """
     vec3, _ = types(dtype)
 
@@ -104,7 +104,7 @@ def predict_bdf2(dtype):
 
 @cache
 def move_pins(dtype):
-    """Kernel over (copies, pins): places the pinned vertices where the keyframes say they are h later.
+    """Kernel over (copies, pins): puts the pinned vertices where the keyframes say they are h later.
 
     Counted in whole steps of this h, in each copy by itself, ``steps_per_frame`` of them to a keyframe; between keyframes
     linear, after the last at rest. x is set, v = (x − x before)/h.
@@ -133,11 +133,11 @@ def move_pins(dtype):
         last = keyframes.shape[0] - 1
         frame = wp.min(after // steps_per_frame, last)
         part = dtype(after - frame * steps_per_frame) / dtype(steps_per_frame)
-        place = keyframes[frame, p]
+        position = keyframes[frame, p]
         if frame < last:
-            place = (dtype(1.0) - part) * place + part * keyframes[frame + 1, p]
-        v[i] = (place - x[i]) / h
-        x[i] = place
+            position = (dtype(1.0) - part) * position + part * keyframes[frame + 1, p]
+        v[i] = (position - x[i]) / h
+        x[i] = position
 
     return move
 

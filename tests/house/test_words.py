@@ -42,11 +42,9 @@ PENDING: dict[str, set[str]] = {
     "kernels/clusters.py": {"place"},
     "kernels/copy.py": {"places"},
     "kernels/minimise.py": {"place"},
-    "kernels/step.py": {"place"},
     "warpcloth/analysis/analysis.py": {"places"},
     "warpcloth/chart/percentiles.py": {"reach"},
     "warpcloth/core/hessian.py": {"place"},
-    "warpcloth/core/reset.py": {"_places"},
     "warpcloth/fast/quadratic_pairs.py": {"place", "places_of"},
     "warpcloth/lab/stability_limits.py": {"_reach"},
     "warpcloth/lab/strips.py": {"reach"},
@@ -55,11 +53,7 @@ PENDING: dict[str, set[str]] = {
     "warpcloth/numerics/cluster_rows.py": {"_places", "place"},
     "warpcloth/numerics/constraints.py": {"place"},
     "warpcloth/numerics/hierarchy.py": {"place"},
-    "warpcloth/numerics/sweeps.py": {"place"},
-    "warpcloth/run/frames.py": {"_places", "places"},
-    "warpcloth/run/sources.py": {"place", "places"},
     "warpcloth/solvers/admm.py": {"gather_splitting", "scatter_splitting", "splitting", "start_splitting"},
-    "warpcloth/solvers/threaded.py": {"places"},
 }
 
 

@@ -65,8 +65,8 @@ class Reset:
             ValueError: If one of them breaks a rule.
         """
         mask = self._mask(mask)
-        x = None if positions is None else self._places("positions", "m", positions)
-        v = None if velocities is None else self._places("velocities", "m/s", velocities)
+        x = None if positions is None else self._vectors("positions", "m", positions)
+        v = None if velocities is None else self._vectors("velocities", "m/s", velocities)
         return mask, x, v
 
     def _mask(self, mask):
@@ -84,7 +84,7 @@ class Reset:
             raise ValueError(f"mask is {shown(mask)}; it must be an array ({B},) of truth values, one for each copy")
         return self._buffered("mask", wp.bool, B, values)
 
-    def _places(self, name, unit, values):
+    def _vectors(self, name, unit, values):
         """Positions or velocities on the device, (B·n,) vectors."""
         model = self.model
         shape = (model.copies, model.per_copy, 3)

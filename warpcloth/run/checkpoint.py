@@ -1,6 +1,7 @@
 """Checkpoints: all that an interrupted run needs to go on, to the bit of one that was not interrupted.
 
-A run that writes a file leaves one beside each finished chunk of its frames, in place of the last, and none when it has ended.
+A run that writes a file leaves one beside its frames with each finished chunk, instead of the one before, and none when it has
+ended.
 """
 
 import json
@@ -29,7 +30,7 @@ _CALLED = {
 
 
 def facts_of(scene, solver, device, dtype, vary, threads):
-    """What a run depends on to the bit, by name.
+    """All that the bits of a run depend on, by name.
 
     Raises:
         ValueError: If something in the scene is no data.
@@ -66,7 +67,7 @@ class Checkpoint:
     watch: dict
 
     def write(self, folder):
-        """Writes it into a folder, in place of one that is there.
+        """Writes it into a folder, over one that is there.
 
         Raises:
             OSError: If it cannot be written; the one that is there stays.

@@ -102,9 +102,9 @@ def _copies(stepper, number):
     shape = (number, 2, model.count)
     found = wp.empty(shape, dtype=model.vec3, device=model.device)
     host = wp.empty(shape, dtype=model.vec3, device="cpu", pinned=True)
-    places = None if model.indices is None else wp.array(model.indices, dtype=wp.int32, device=model.device)
+    indices = None if model.indices is None else wp.array(model.indices, dtype=wp.int32, device=model.device)
     stream = wp.Stream(model.device)
-    return [_DeviceCopy(stepper, stream, places, found[k], host[k]) for k in range(number)]
+    return [_DeviceCopy(stepper, stream, indices, found[k], host[k]) for k in range(number)]
 
 
 class _HostCopy:
@@ -130,11 +130,11 @@ class _DeviceCopy:
     So the next frame begins while this one is copied, and who takes it waits for its event alone.
     """
 
-    def __init__(self, stepper, stream, places, found, host):
-        self.stepper, self._stream, self._places, self._found, self._host = stepper, stream, places, found, host
+    def __init__(self, stepper, stream, indices, found, host):
+        self.stepper, self._stream, self._indices, self._found, self._host = stepper, stream, indices, found, host
         self._began, self._ended = (wp.Event(stream.device, enable_timing=True) for _ in range(2))
         self._copied = wp.Event(stream.device)
-        if places is not None:
+        if indices is not None:
             self._take = stepper.model.kernel(take_vertices, stepper.model.dtype)
 
     @in_turn
@@ -144,10 +144,10 @@ class _DeviceCopy:
         self.stepper.frame()
         for k, array in enumerate(self.stepper.state):
             found = self._found[k]
-            if self._places is None:
+            if self._indices is None:
                 wp.copy(found, array)
             else:
-                model.launch(self._take, model.count, [array, self._places], [found])
+                model.launch(self._take, model.count, [array, self._indices], [found])
         stream.record_event(self._ended)
         self._stream.wait_event(self._ended)
         wp.copy(self._host, self._found, stream=self._stream)

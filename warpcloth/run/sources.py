@@ -102,11 +102,11 @@ class MovingPins(Source):
         self._patches = self._found()
         share = np.where(np.isin(np.arange(len(self._points)), pins.vertices), 0.0, scene.vertex_masses)
         share = share / share.sum() if share.any() else share
-        places = np.column_stack([self._points, np.ones(len(self._points))])
-        spread, middle = (share[:, None] * places).T @ places, share @ places
+        points = np.column_stack([self._points, np.ones(len(self._points))])
+        spread, middle = (share[:, None] * points).T @ points, share @ points
         speeds, kicks, rises = [], [], []
         for patch, maps in zip(self._patches, self._maps, strict=True):
-            beside = self._frames[:, patch] - np.einsum("fij,pj->fpi", maps, places[pins.vertices[patch]])
+            beside = self._frames[:, patch] - np.einsum("fij,pj->fpi", maps, points[pins.vertices[patch]])
             moves, own = (np.diff(each, axis=0, prepend=each[:1], append=each[-1:]) for each in (maps, beside))
             turns, own_turns = (np.diff(each, axis=0, prepend=0.0 * each[:1]) for each in (moves, own))
             for found, of_maps, of_pins in ((speeds, moves, own), (kicks, turns, own_turns)):
@@ -125,9 +125,9 @@ class MovingPins(Source):
 
         scene = self._balance.model.scene
         vertices, n = scene.pins.vertices, len(scene.mesh.points)
-        place = np.full(n, -1)
-        place[vertices] = np.arange(len(vertices))
-        a, b = place[scene.mesh.edges.T]
+        pin = np.full(n, -1)
+        pin[vertices] = np.arange(len(vertices))
+        a, b = pin[scene.mesh.edges.T]
         joined = (a >= 0) & (b >= 0)
         graph = coo_array((np.ones(joined.sum()), (a[joined], b[joined])), shape=(len(vertices), len(vertices)))
         count, labels = connected_components(graph, directed=False)

@@ -111,7 +111,7 @@ class Watch:
         return bool(self.alive.any())
 
     def _carried(self):
-        """What goes on from frame to frame, as pairs of an object and the names of its attributes."""
+        """Pairs of an object and the names of its attributes that go on from frame to frame."""
         yield self, ("worst_strain", "good", "alive", "growth", "seconds")
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
