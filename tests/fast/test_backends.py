@@ -18,7 +18,7 @@ from warpcloth.fast.block_layout import block_layout as layout_of
 from warpcloth.fast.gather_layout import gathered
 from warpcloth.fast.plan import plan
 from warpcloth.model.damping import damped_terms
-from warpcloth.numerics.sweeps import Sweep
+from warpcloth.numerics.sweeps import JacobiSweep
 from warpcloth.solvers import solver
 from warpcloth.solvers.explicit import ExplicitStepper, step_limits
 from warpcloth.terms.refresh import STEP, Moment
@@ -282,7 +282,7 @@ def test_jacobi_sweeps_are_those_of_the_core(name, options, dtype, device):
         model = model.with_terms(damped_terms(model, h))
         model.refresh(STEP, Moment(model.positions))  # sets the rest state of what is damped, by element
         d = model.array(moves, model.vec3)
-        made = Sweep(model, model.positions, h, relaxation=0.1, backend=backend, **options)
+        made = JacobiSweep(model, model.positions, h, relaxation=0.1, backend=backend, **options)
         made.correction.assign(d)
         made.launch_start()
         assert not made.correction.numpy().any()

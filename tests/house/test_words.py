@@ -45,7 +45,6 @@ PENDING: dict[str, set[str]] = {
     "warpcloth/analysis/analysis.py": {"places"},
     "warpcloth/chart/percentiles.py": {"reach"},
     "warpcloth/core/hessian.py": {"place"},
-    "warpcloth/fast/quadratic_pairs.py": {"place", "places_of"},
     "warpcloth/lab/stability_limits.py": {"_reach"},
     "warpcloth/lab/strips.py": {"reach"},
     "warpcloth/model/model.py": {"_place"},

@@ -29,7 +29,7 @@ from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.terms import SPRING
-from warpcloth.numerics.sweeps import SWEEPS, Sweep
+from warpcloth.numerics.sweeps import SWEEPS, GaussSeidelSweep
 from warpcloth.solvers.explicit import step_limits
 
 EPS = np.finfo(np.float64).eps
@@ -408,7 +408,7 @@ def test_05_order_within_a_colour_does_not_matter(kind, multipliers, device):
     model = replace(declared, positions=start).build(device=device, dtype="float64")
     found = []
     for turned in (False, True):
-        sweep = Sweep(model, model.positions, 0.1, kind, 1.0, multipliers=multipliers)
+        sweep = GaussSeidelSweep(model, model.positions, 0.1, kind, 1.0, multipliers=multipliers)
         if turned:
             sweep.elements = [
                 elements.reordered(np.concatenate([np.arange(first, first + count)[::-1] for first, count in ranges]))
@@ -647,16 +647,16 @@ def test_08_multipliers_start_afresh_in_each_step(reset, device, monkeypatch):
     h = 1 / 60
     s = 1.0 / (1.0 + m / (k * h**2))
     expected = {"each step": m * 9.81 / k, "each sweep": 9.81 * h**2 * (1 - s) ** n / (1 - (1 - s) ** n)}
-    launch = Sweep.launch
+    launch = GaussSeidelSweep.launch
 
     def forgetful(sweep):
         sweep.multipliers[0].zero_()
         launch(sweep)
 
     if reset == "each sweep":
-        monkeypatch.setattr(Sweep, "launch", forgetful)
+        monkeypatch.setattr(GaussSeidelSweep, "launch", forgetful)
     elif reset == "never":
-        monkeypatch.setattr(Sweep, "launch_start", lambda sweep: sweep.correction.zero_())
+        monkeypatch.setattr(GaussSeidelSweep, "launch_start", lambda sweep: sweep.correction.zero_())
     stepper = wc.XPBD(substeps=1, iterations=n).bind(hanging_mass(k, m, 0.0).build(device=device, dtype="float64"))
     lengths = []
     for _ in range(800):

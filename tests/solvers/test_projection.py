@@ -12,7 +12,7 @@ from support.steps import after_one_step, hanging_mass, swinging
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
 from warpcloth.kernels.terms import SPRING
-from warpcloth.numerics.sweeps import Sweep, colours
+from warpcloth.numerics.sweeps import GaussSeidelSweep, colours
 
 EPS = np.finfo(np.float64).eps
 
@@ -48,7 +48,7 @@ def test_colours_share_no_vertex_that_moves(name, pinned, device):
         terms += [wc.QuadraticBending(stiffness=1.0), wc.DihedralBending(stiffness=1.0)]
     declared = wc.Scene(mesh, masses=np.ones(len(mesh.points)), terms=terms, pins=pins)
     model = declared.build(device=device, copies=2, dtype="float64")
-    sweep = Sweep(model, model.positions, 1.0, "coloured", 1.0)
+    sweep = GaussSeidelSweep(model, model.positions, 1.0, "coloured", 1.0)
     free = model.inverse_mass.numpy() > 0.0
     for given, elements, ranges in zip(model.terms, sweep.elements, sweep.ranges, strict=True):
         stencil = elements.stencil.numpy()

@@ -47,86 +47,56 @@ def colours(constraints, free):
     return found.numpy()
 
 
-class Sweep:
-    """One sweep over all constraints of a model, term by term as declared: ``launch`` moves the correction d from x̃ on.
+class _Sweep:
+    """Sweeps over all constraints of a model, term by term as declared, which move the correction d from x̃ on.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         x: x̃, (N,) vectors [m]; read only.
         h: Step [s].
-        kind: One of :data:`SWEEPS`.
         relaxation: ω, a factor of every Δλ.
-        alpha: α of the average by vertex.
         scalar: Whether terms that have both are taken by their scalar constraint.
         multipliers: Whether λ adds up over the sweeps of a step (XPBD).
-        spread: The number of sweeps that finite stiffness is spread over, or None.
         correction: The d to move on, if not one of its own.
-        pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares Gauss–Seidel sweeps by colour; None for one thread.
-        backend: Of Jacobi sweeps, see :func:`warpcloth.fast.plan.plan`.
 
     Attributes:
         correction: d (N,) [m].
         multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, in the order of ``elements``, or Nones.
         elements: :class:`warpcloth.model.elements.DeviceElements` of each term, in the order of the sweep.
-        ranges: The (first, count) of the elements that each launch takes, of each term.
     """
 
-    def __init__(
-        self,
-        model,
-        x,
-        h,
-        kind,
-        relaxation,
-        alpha=0.0,
-        scalar=False,
-        multipliers=False,
-        spread=None,
-        correction=None,
-        pool=None,
-        backend="auto",
-    ):
-        self.model, self.x, self.h, self.relaxation, self.pool = model, x, h, relaxation, pool or ThreadPool(1)
-        self.spread = spread or 1
-        self.in_place, self.ordered = kind in IN_PLACE, kind == "sequential"
-        self.correction = model.vectors() if correction is None else correction
-        self.elements, self.ranges = list(model.terms), [[(0, (elements.cells or elements).count)] for elements in model.terms]
-        if kind == "coloured":
-            self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True) if model.terms else ((), ())
-        keys = []
+    def __init__(self, model, x, h, relaxation, scalar, multipliers, correction):
+        self.model, self.x, self.h, self.relaxation = model, x, h, relaxation
+        self.correction, self.elements = model.vectors() if correction is None else correction, list(model.terms)
+        self._keys = []
         for elements in model.terms:
             term = elements.term
             only = term.project is None and term.prox is None
-            of_constraint = only or (scalar and term.constraint is not None)
-            keys.append((elements.term, model.dtype, of_constraint))
+            self._keys.append((term, model.dtype, only or (scalar and term.constraint is not None)))
         self.multipliers = [
             wp.zeros(elements.count, dtype=kernels.multiplier_type(*key), device=model.device) if multipliers else None
-            for elements, key in zip(model.terms, keys, strict=True)
-        ]
-        if not self.in_place:
-            self._jacobi = plan(model, backend).jacobi_sweeps(
-                x, h, self.correction, self.multipliers, keys, *self._weights(kind, alpha), spread
-            )
-            return
-        # Cells fit themselves as they are swept.
-        self._fresh = [elements for elements in self.elements if elements.refresh and not elements.cells]
-        more = multipliers, spread is not None
-        self._kernels = [
-            model.kernel(correct_clusters, model.dtype, *more)
-            if elements.cells
-            else model.kernel(kernels.correct_in_place, *key, *more)
-            for elements, key in zip(model.terms, keys, strict=True)
+            for elements, key in zip(model.terms, self._keys, strict=True)
         ]
 
-    def _by_colour(self, elements):
-        """The elements of all copies by colour, and the range of each colour."""
-        model = self.model
-        free = model.inverse_mass.numpy()[: model.per_copy] > 0.0
-        one = elements.constraints[: elements.cells.per_copy if elements.cells else elements.per_copy]
-        colour = np.tile(colours(one, free), model.copies)
-        counts = np.bincount(colour)
-        firsts = np.cumsum(counts) - counts
-        return elements.reordered(np.argsort(colour, kind="stable")), list(zip(firsts.tolist(), counts.tolist(), strict=True))
+
+class JacobiSweep(_Sweep):
+    """Jacobi sweeps, in which each constraint sees where its vertices were before.
+
+    ``launch_start``, ``launch`` and ``parts`` are those of :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`.
+
+    Args:
+        model, x, h, relaxation, scalar, multipliers: See :class:`_Sweep`.
+        kind: One of :data:`SWEEPS` that is not in :data:`IN_PLACE`.
+        alpha: α of the average by vertex.
+        spread: The number of sweeps that finite stiffness is spread over, or None.
+        backend: See :func:`warpcloth.fast.plan.plan`.
+    """
+
+    def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None, backend="auto"):
+        super().__init__(model, x, h, relaxation, scalar, multipliers, None)
+        given = x, h, self.correction, self.multipliers, self._keys, *self._weights(kind, alpha), spread
+        sweeps = plan(model, backend).jacobi_sweeps(*given)
+        self.launch_start, self.launch, self.parts = sweeps.launch_start, sweeps.launch, sweeps.parts
 
     def _weights(self, kind, alpha):
         """Factors of elements and of vertices."""
@@ -147,30 +117,73 @@ class Sweep:
                 largest[i] = np.repeat(np.maximum.reduceat(largest[i], firsts), elements.cells.sizes)
         return [model.array(self.relaxation / each, model.dtype) for each in largest], model.constant(1.0, model.count)
 
+
+class GaussSeidelSweep(_Sweep):
+    """Gauss–Seidel sweeps, in which each constraint sees the moves of those before it.
+
+    Args:
+        model, x, h, relaxation, scalar, multipliers, correction: See :class:`_Sweep`.
+        kind: One of :data:`IN_PLACE`.
+        spread: The number of sweeps that finite stiffness is spread over, or None.
+        pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares sweeps by colour; None for one thread.
+
+    Attributes:
+        ranges: The (first, count) of the elements that each launch takes, of each term.
+    """
+
+    def __init__(
+        self,
+        model,
+        x,
+        h,
+        kind,
+        relaxation,
+        scalar=False,
+        multipliers=False,
+        spread=None,
+        correction=None,
+        pool=None,
+    ):
+        super().__init__(model, x, h, relaxation, scalar, multipliers, correction)
+        self.pool, self.spread, self.ordered = pool or ThreadPool(1), spread or 1, kind == "sequential"
+        self.ranges = [[(0, (elements.cells or elements).count)] for elements in model.terms]
+        if kind == "coloured" and model.terms:
+            self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True)
+        # Cells fit themselves as they are swept.
+        self._refreshed = [elements for elements in self.elements if elements.refresh and not elements.cells]
+        more = multipliers, spread is not None
+        self._kernels = [
+            model.kernel(correct_clusters, model.dtype, *more)
+            if elements.cells
+            else model.kernel(kernels.correct_in_place, *key, *more)
+            for elements, key in zip(model.terms, self._keys, strict=True)
+        ]
+
+    def _by_colour(self, elements):
+        """The elements of all copies by colour, and the range of each colour."""
+        model = self.model
+        free = model.inverse_mass.numpy()[: model.per_copy] > 0.0
+        one = elements.constraints[: elements.cells.per_copy if elements.cells else elements.per_copy]
+        colour = np.tile(colours(one, free), model.copies)
+        counts = np.bincount(colour)
+        firsts = np.cumsum(counts) - counts
+        return elements.reordered(np.argsort(colour, kind="stable")), list(zip(firsts.tolist(), counts.tolist(), strict=True))
+
     def launch_start(self):
         """Launches d = 0, λ = 0, once x̃ is there."""
-        if not self.in_place:
-            self._jacobi.launch_start()
-            return
         for array in (self.correction, *self.multipliers):
             if array is not None:
                 array.zero_()
 
-    def launch(self, backward=False):
-        """Launches one sweep; of Gauss–Seidel also backward, from the last term, colour and element to the first."""
-        if self.in_place:
-            self._launch_in_place(backward)
-        else:
-            self._jacobi.launch()
-
     def parts(self, sweeps):
         """Returns pairs of a function that launches and of how many times it runs, for so many sweeps."""
-        return [(self.launch, sweeps)] if self.in_place else self._jacobi.parts(sweeps)
+        return [(self.launch, sweeps)]
 
-    def _launch_in_place(self, backward):
+    def launch(self, backward=False):
+        """Launches one sweep, or one backward, from the last term, colour and element to the first."""
         model, pool = self.model, self.pool
-        if self._fresh:
-            pool.launch_alone(model, lambda: model.refresh(EVALUATION, Moment(self.x, self.correction), self._fresh))
+        if self._refreshed:
+            pool.launch_alone(model, lambda: model.refresh(EVALUATION, Moment(self.x, self.correction), self._refreshed))
         way = -1 if backward else 1
         for i in range(len(self.elements))[::way]:
             elements = self.elements[i]

@@ -9,7 +9,7 @@ from ..base.checks import number, whole
 from ..kernels.hierarchy import follow
 from ..model.model import Model
 from ..numerics.hierarchy import levels, on_device
-from ..numerics.sweeps import Sweep
+from ..numerics.sweeps import GaussSeidelSweep
 from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
@@ -90,14 +90,14 @@ class HierarchicalPBDStepper(LaunchedStepper):
 
     Attributes:
         levels: The :class:`warpcloth.numerics.hierarchy.Level` of each level above the finest, finer ones first.
-        sweep: The :class:`warpcloth.numerics.sweeps.Sweep` over all terms, with x − x̃ of the last step.
+        sweep: The :class:`warpcloth.numerics.sweeps.GaussSeidelSweep` over all terms, with x − x̃ of the last step.
     """
 
     def __init__(self, options, model):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations
         self.levels = levels(model, options.levels)
-        self.sweep = Sweep(self.model, self.state.x, self.h, "coloured", options.relaxation, pool=self.pool)
+        self.sweep = GaussSeidelSweep(self.model, self.state.x, self.h, "coloured", options.relaxation, pool=self.pool)
         self.model = self.model.with_terms(self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
         self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
@@ -105,7 +105,7 @@ class HierarchicalPBDStepper(LaunchedStepper):
     def _on_level(self, level):
         """The sweep over a level, and the launch by which the vertices that it drops follow it."""
         model, d = self.model, self.sweep.correction
-        sweep = Sweep(
+        sweep = GaussSeidelSweep(
             on_device(model, level), self.state.x, self.h, "coloured", self.options.relaxation, correction=d, pool=self.pool
         )
         dropped, offsets, parents = (

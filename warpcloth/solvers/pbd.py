@@ -6,7 +6,7 @@ from typing import Literal
 from ..base.checks import number, whole
 from ..base.renamed import renamed
 from ..model.model import Model
-from ..numerics.sweeps import IN_PLACE, Sweep
+from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
 from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
@@ -108,7 +108,7 @@ class PBDStepper(LaunchedStepper):
     """:class:`PBD` on a model.
 
     Attributes:
-        sweep: The :class:`warpcloth.numerics.sweeps.Sweep`, with x − x̃ of the last step.
+        sweep: The sweep of :mod:`warpcloth.numerics.sweeps`, with x − x̃ of the last step.
     """
 
     def __init__(self, options, model):
@@ -117,9 +117,11 @@ class PBDStepper(LaunchedStepper):
         model = self.model
         # Spread over one sweep it is what it is.
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
-        self.sweep = Sweep(
-            model, self.state.x, self.h, options.sweep, options.relaxation, options.alpha, spread=spread, pool=self.pool
-        )
+        given = model, self.state.x, self.h, options.sweep, options.relaxation
+        if options.ordered:
+            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool)
+        else:
+            self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread)
         self.model = model.with_terms(self.sweep.elements)
         self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
 

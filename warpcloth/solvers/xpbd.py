@@ -15,7 +15,7 @@ from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..model.model import Model
 from ..numerics.iterate import GravityScale
-from ..numerics.sweeps import IN_PLACE, Sweep
+from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
 from ..terms.needs import FINITE, LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
@@ -128,23 +128,16 @@ class XPBDStepper(LaunchedStepper):
     """:class:`XPBD` on a model.
 
     Attributes:
-        sweep: The :class:`warpcloth.numerics.sweeps.Sweep`, with x − x̃ and λ of the last step.
+        sweep: The sweep of :mod:`warpcloth.numerics.sweeps`, with x − x̃ and λ of the last step.
     """
 
     def __init__(self, options, model):
         super().__init__(options, model, options.integrator)
         self.iterations = options.iterations
         model = self.model
-        self.sweep = Sweep(
-            model,
-            self.state.x,
-            self.he,
-            options.sweep,
-            options.relaxation,
-            scalar=options.form == "scalar",
-            multipliers=True,
-            pool=self.pool,
-        )
+        given = model, self.state.x, self.he, options.sweep, options.relaxation
+        more = {"scalar": options.form == "scalar", "multipliers": True}
+        self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool) if options.ordered else JacobiSweep(*given, **more)
         self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
@@ -156,7 +149,7 @@ class XPBDStepper(LaunchedStepper):
         self._keep_largest = model.kernel(keep_largest)
         self._scale = GravityScale(model).or_else(1.0)
         sweeps = self.sweep.parts(options.iterations - (not soft))
-        if options.integrator == "midpoint" and self.sweep.in_place:
+        if options.integrator == "midpoint" and options.ordered:
             sweeps = [(self._launch_to_and_fro, options.iterations // 2)]
         self.record((self._launch_start, 1), *sweeps, (self._launch_last, 1))
         self.integrator.start()
