@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import warpcloth.cli.run
+import warpcloth.cli.scenes
 import warpcloth.usd
 from support.command_line import refused, run
 from warpcloth.base.outputs import Lock
@@ -644,7 +645,7 @@ def test_an_interrupt_that_python_makes_another_error_of_is_one(capfd, monkeypat
         def __set_name__(self, *_):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(warpcloth.cli.run, "folders", lambda: type("New", (), {"field": Field()}))
+    monkeypatch.setattr(warpcloth.cli.scenes, "folders", lambda: type("New", (), {"field": Field()}))
     assert run(capfd, "scenes") == (130, "", "warpcloth: interrupted\n")
 
 

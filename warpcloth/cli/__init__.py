@@ -19,7 +19,7 @@ import warnings
 import numpy as np
 
 from ..base.interrupts import Interrupts
-from . import analyze, bench, chart, choose, compare, deform, options, run
+from . import analyze, bench, chart, choose, compare, deform, info, options, run, scenes
 from .terminal import DTYPES, Printable, say, show_warning
 
 
@@ -107,7 +107,7 @@ def _parser():
         return sub
 
     runs = add("run", run.run, "Run a scene and write its animation as USD.", epilog=run.EPILOG)
-    info = add("info", run.info, "Say what is in a scene, and what is built from it.", epilog=run.EPILOG)
+    infos = add("info", info.info, "Say what is in a scene, and what is built from it.", epilog=info.EPILOG)
     deforms = add("deform", deform.deform, "Deform a mesh as rigidly as its handles allow.", epilog=deform.EPILOG)
     deform.add_arguments(deforms)
     analyzes = add("analyze", analyze.analyze, "Measure how an animated cloth deforms.", epilog=analyze.EPILOG)
@@ -120,7 +120,7 @@ def _parser():
     choose.add_arguments(chooses)
     benches = add("bench", bench.bench, "Measure what frames cost, and compare two results.", epilog=bench.EPILOG)
     bench.add_arguments(benches)
-    for sub in (runs, info):
+    for sub in (runs, infos):
         sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
         sub.add_argument("--solver", choices=options.solvers(), help="the solver; newton if not given")
         for option, of, text in (("-s", "option", "options of the solver"), ("-p", "parameter", "parameters of the scene")):
@@ -128,20 +128,20 @@ def _parser():
             sub.add_argument(option, nargs="+", action="extend", default=[], metavar=f"{of}=value", help=text)
         sub.add_argument("--prim", help="path or name of the cloth's prim, for a stage with several meshes")
         sub.add_argument("--pins", metavar="SELECTION", help="vertices that stand still; replaces the scene's pins")
-    info.add_argument("--advise", action="store_true", help="try which terms, precision and resolution matter")
-    info.add_argument("--tolerance", metavar="SHARE", help="of --advise: the largest change that does not matter (1%%)")
-    info.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try (30)")
+    infos.add_argument("--advise", action="store_true", help="try which terms, precision and resolution matter")
+    infos.add_argument("--tolerance", metavar="SHARE", help="of --advise: the largest change that does not matter (1%%)")
+    infos.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try (30)")
     runs.add_argument("--tolerance", metavar="SHARE", help="choose solver and settings of this error, such as 1%%; see choose")
     runs.add_argument("--budget", metavar="TIME", help="choose the most accurate within this time per frame, such as 16ms")
     runs.add_argument("--frames", type=int, metavar="N", help="frames after the first; those of the scene if not given")
-    for sub in (runs, info, deforms, analyzes, compares, chooses, benches):
+    for sub in (runs, infos, deforms, analyzes, compares, chooses, benches):
         sub.add_argument("--device", default="cpu", help="device: cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print one JSON object")
     for sub in (runs, benches):
         sub.add_argument(
             "--threads", type=int, default=1, metavar="N", help="threads that share the steps on the CPU (default: 1)"
         )
-    for sub in (runs, info, deforms, analyzes, chooses, benches):
+    for sub in (runs, infos, deforms, analyzes, chooses, benches):
         sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
     for sub in (runs, deforms):
         text = "the .usd, .usda, .usdc or .usdz file to write"
@@ -154,8 +154,8 @@ def _parser():
     )
     for sub in (runs, deforms, analyzes):
         sub.add_argument("--single-file", action="store_true", help="merge everything into one file, with no folder of frames")
-    scenes = add("scenes", run.scenes, "List scenes and their parameters.")
-    scenes.add_argument("folder", nargs="?", help="a folder of .py files; those of scenes known by name if not given")
+    lists = add("scenes", scenes.scenes, "List scenes and their parameters.")
+    lists.add_argument("folder", nargs="?", help="a folder of .py files; those of scenes known by name if not given")
     return parser
 
 

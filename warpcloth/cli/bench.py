@@ -7,7 +7,7 @@ from ..base.outputs import Output, check_apart
 from ..base.quiet import find_device
 from ..base.texts import assignments, options
 from .options import DEFAULT, solvers
-from .run import named_scene, solver_setup
+from .setup import named_scene, solver_setup
 from .terminal import Interrupted, as_json, check_writable, open_bar, say
 
 EPILOG = """\

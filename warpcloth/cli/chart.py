@@ -8,14 +8,13 @@ from ..base.checks import number, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments
 from ..picture.figures import PICTURES
+from ..run.listing import list_failures
 from . import stability
 from .options import add_import, solvers
-from .run import named_scene
+from .setup import named_scene
 from .terminal import DTYPES, add_dask, as_json, check_outputs, measuring
 
 TEXT = "Chart speed against accuracy, stability and failures."
-# Those of :data:`warpcloth.lab.failures.FAILURES`, which loads Warp.
-FAILURES = ("locking", "isometry", "slivers", "cotangents", "rank")
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
 
 EPILOG = """\
@@ -87,8 +86,9 @@ def _add_work_precision(charts):
 
 
 def _add_failure(charts):
+    names = list_failures()
     sub = add(charts, "failure", failure, "Chart where terms, weights and fits fail, beside theory.", FAILURE_EPILOG)
-    sub.add_argument("failure", metavar="FAILURE", choices=FAILURES, help=f"one of {', '.join(FAILURES)}")
+    sub.add_argument("failure", metavar="FAILURE", choices=names, help=f"one of {', '.join(names)}")
 
 
 def failure(arguments):

@@ -5,7 +5,7 @@ import sys
 
 from ..base.quiet import find_device
 from ..base.texts import assignments, fraction, milliseconds
-from .run import named_scene
+from .setup import named_scene
 from .terminal import Interrupted, Settings, add_dask, as_json, executing
 
 EPILOG = """\

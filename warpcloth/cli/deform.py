@@ -14,7 +14,7 @@ from ..base.limits import refuse_memory
 from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
 from ..base.texts import convert
-from .run import named_scene
+from .setup import named_scene
 from .terminal import Progress, as_json, check_writable, frames_folder_of, location
 
 _FRAMES, _FPS = 24, 24.0

@@ -68,10 +68,19 @@ def list_solvers():
     return {_assigned(record, "name"): _options(record, classes) for record in records}
 
 
+def list_failures():
+    """Returns the names of the charts of failures, in their order."""
+    return tuple(map(ast.literal_eval, _value(ast.parse((_PACKAGE / "lab" / "failures.py").read_bytes()), "FAILURES").keys))
+
+
 def _assigned(node, name):
     """Returns the value that the body of a module or class assigns to a name."""
+    return ast.literal_eval(_value(node, name))
+
+
+def _value(node, name):
     found = (each for each in node.body if isinstance(each, ast.Assign))
-    return next(ast.literal_eval(each.value) for each in found if getattr(each.targets[0], "id", None) == name)
+    return next(each.value for each in found if getattr(each.targets[0], "id", None) == name)
 
 
 def _options(record, classes):
