@@ -44,14 +44,12 @@ PENDING: dict[str, set[str]] = {
     "kernels/minimise.py": {"place"},
     "warpcloth/analysis/analysis.py": {"places"},
     "warpcloth/chart/percentiles.py": {"reach"},
-    "warpcloth/core/hessian.py": {"place"},
     "warpcloth/lab/stability_limits.py": {"_reach"},
     "warpcloth/lab/strips.py": {"reach"},
     "warpcloth/model/model.py": {"_place"},
     "warpcloth/model/precision.py": {"place"},
     "warpcloth/numerics/cluster_rows.py": {"_places", "place"},
     "warpcloth/numerics/constraints.py": {"place"},
-    "warpcloth/numerics/hierarchy.py": {"place"},
     "warpcloth/solvers/admm.py": {"gather_splitting", "scatter_splitting", "splitting", "start_splitting"},
 }
 

@@ -70,7 +70,7 @@ class Hessian:
 
     Attributes:
         offsets, columns: Block rows (N+1,) and the column of each block.
-        diagonal: Place of each diagonal block (N,).
+        diagonal: Index of each diagonal block (N,).
         values: The blocks [N/m].
         policy: (B,) int32, a :class:`HessianPolicy` for each copy.
         count, per_copy, vector, block: Unknowns, those of a copy, the types of one and of a diagonal block.
@@ -99,18 +99,18 @@ class Hessian:
             source = np.flatnonzero(~(fixed[rows] | fixed[columns]))
             keys.append(rows[source] * n + columns[source])
             sources.append(source)
-        unique, place = np.unique(np.concatenate(keys), return_inverse=True)
+        unique, index = np.unique(np.concatenate(keys), return_inverse=True)
 
         def put(values):
             return wp.array(values.astype(np.int32), dtype=wp.int32, device=model.device)
 
         self.offsets = put(np.searchsorted(unique, np.arange(n + 1) * n))
         self.columns = put(unique % n)
-        self.diagonal = put(place[:n])
+        self.diagonal = put(index[:n])
         self.values = wp.zeros(len(unique), dtype=model.mat33, device=model.device)
         self.gathers, start = [], n
         for source in sources:
-            target = place[start : start + len(source)]
+            target = index[start : start + len(source)]
             order = np.argsort(target, kind="stable")
             offsets = np.searchsorted(target[order], np.arange(len(unique) + 1))
             self.gathers.append((put(offsets), put(source[order])))

@@ -143,10 +143,10 @@ def _parallel(bounds, n, copies):
     bounds = _joined(bounds, copies)
     stiffness = 1.0 / bounds.compliance
     keys = bounds.pairs.min(axis=1).astype(np.int64) * n + bounds.pairs.max(axis=1)
-    unique, place = np.unique(keys, return_inverse=True)
-    total = np.stack([np.bincount(place, each, len(unique)) for each in stiffness.T], axis=1)
+    unique, index = np.unique(keys, return_inverse=True)
+    total = np.stack([np.bincount(index, each, len(unique)) for each in stiffness.T], axis=1)
     mean = stiffness.mean(axis=1)
-    lengths = np.bincount(place, mean * bounds.lengths, len(unique)) / np.bincount(place, mean, len(unique))
+    lengths = np.bincount(index, mean * bounds.lengths, len(unique)) / np.bincount(index, mean, len(unique))
     with np.errstate(divide="ignore"):
         return Bounds(np.stack(np.divmod(unique, n), axis=1), lengths, 1.0 / total)
 
