@@ -143,12 +143,12 @@ def stiffness_scale(term: Term, dtype):
 
 
 @cache
-def splitting(term: Term, dtype):
+def admm_elements(term: Term, dtype):
     """The struct of the elements of a term as ADMM has them: W² = r s k A, and z, u, gap = W²(y − z), change of W²z [N]."""
     y_type = wp.types.matrix((term.rows, 3), dtype)
 
     @wp.struct
-    class Splitting:
+    class AdmmElements:
         stiffness: wp.array(dtype=dtype)
         ratio: wp.array(dtype=dtype)
         scale: wp.array(dtype=dtype)
@@ -157,11 +157,11 @@ def splitting(term: Term, dtype):
         gap: wp.array(dtype=y_type)
         change: wp.array(dtype=y_type)
 
-    return Splitting
+    return AdmmElements
 
 
 @cache
-def start_splitting(term: Term, dtype):
+def start_admm(term: Term, dtype):
     """Kernel over elements: z = y at x̃, u = 0."""
     vec3, _ = types(dtype)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -175,7 +175,7 @@ def start_splitting(term: Term, dtype):
         # state in
         x: wp.array(dtype=vec3),
         # out
-        of: splitting(term, dtype),
+        of: admm_elements(term, dtype),
     ):
         e = wp.tid()
         of.z[e] = y_of(stencil, e, rest[e], x, x)
@@ -203,7 +203,7 @@ def split(term: Term, dtype):
         # parameters
         steps: int,
         # in and out
-        of: splitting(term, dtype),
+        of: admm_elements(term, dtype),
     ):
         e = wp.tid()
         r = rest_of(rest, e)
@@ -222,18 +222,18 @@ def split(term: Term, dtype):
 
 
 @cache
-def splitting_forces(term: Term, dtype):
-    """The device functions (elements, e) → max(1, 1/r) and (elements, e, rest) → gap + W²u, see :func:`scatter_splitting`."""
+def admm_forces(term: Term, dtype):
+    """The device functions (elements, e) → max(1, 1/r) and (elements, e, rest) → gap + W²u, see :func:`scatter_admm`."""
     rest_type = wp.types.vector(term.parameters, dtype)
     measure, shared, take = term.measure, load_shared(dtype), load(wp.types.matrix((term.rows, 3), dtype))
 
     @wp.func
-    def weight_of(of: splitting(term, dtype), e: int):
+    def weight_of(of: admm_elements(term, dtype), e: int):
         part = shared(of.ratio, e)
         return wp.max(part, dtype(1.0)) / part
 
     @wp.func
-    def pull_of(of: splitting(term, dtype), e: int, r: rest_type):
+    def pull_of(of: admm_elements(term, dtype), e: int, r: rest_type):
         w2 = shared(of.ratio, e) * shared(of.scale, e) * shared(of.stiffness, e) * measure(r)
         return take(of.gap, e) + w2 * take(of.u, e)
 
@@ -241,7 +241,7 @@ def splitting_forces(term: Term, dtype):
 
 
 @cache
-def scatter_splitting(term: Term, dtype):
+def scatter_admm(term: Term, dtype):
     """Kernel over elements: adds max(1, 1/r) Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N].
 
     For the CPU, in order: nothing is atomic.
@@ -249,7 +249,7 @@ def scatter_splitting(term: Term, dtype):
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    (weight_of, pull_of), share_of = splitting_forces(term, dtype), to_corner(term, dtype)
+    (weight_of, pull_of), share_of = admm_forces(term, dtype), to_corner(term, dtype)
     rest_of, take, vector, vertex, put = load(rest_type), load(y_type), load(vec3), load(wp.int32, 2), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -258,7 +258,7 @@ def scatter_splitting(term: Term, dtype):
         stencil: wp.array2d(dtype=wp.int32),
         rest: wp.array(dtype=rest_type),
         # state in
-        of: splitting(term, dtype),
+        of: admm_elements(term, dtype),
         # in and out
         primal: wp.array(dtype=vec3),
         dual: wp.array(dtype=vec3),
@@ -280,11 +280,11 @@ def scatter_splitting(term: Term, dtype):
 
 
 @cache
-def gather_splitting(term: Term, dtype):
-    """Kernel over vertices: the sums of :func:`scatter_splitting` in a fixed order, as :func:`.transpose.gather` makes one."""
+def gather_admm(term: Term, dtype):
+    """Kernel over vertices: the sums of :func:`scatter_admm` in a fixed order, as :func:`.transpose.gather` makes one."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
-    (weight_of, pull_of), share_of = splitting_forces(term, dtype), to_corner(term, dtype)
+    (weight_of, pull_of), share_of = admm_forces(term, dtype), to_corner(term, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather(
@@ -293,7 +293,7 @@ def gather_splitting(term: Term, dtype):
         codes: wp.array(dtype=wp.int32),
         rest: wp.array(dtype=rest_type),
         # state in
-        of: splitting(term, dtype),
+        of: admm_elements(term, dtype),
         # in and out
         primal: wp.array(dtype=vec3),
         dual: wp.array(dtype=vec3),

@@ -1,6 +1,6 @@
 """Factories of kernels over rigid clusters: where their vertices are to go, and Gauss–Seidel sweeps over whole clusters.
 
-A cluster c has the elements offsets[c] to offsets[c+1], one for each vertex, with rest places ``shape`` about its centre of
+A cluster c has the elements offsets[c] to offsets[c+1], one for each vertex, with rest positions ``shape`` about its centre of
 mass and rest states (t, m), see :mod:`.terms.rigid_cluster`.
 """
 
@@ -24,10 +24,10 @@ def fit(dtype, corrected: bool):
 
     @wp.func
     def from_first(stencil: wp.array2d(dtype=wp.int32), first: int, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        place = x[stencil[e, 0]] - x[stencil[first, 0]]
+        relative = x[stencil[e, 0]] - x[stencil[first, 0]]
         if wp.static(corrected):
-            place += d[stencil[e, 0]] - d[stencil[first, 0]]
-        return place
+            relative += d[stencil[e, 0]] - d[stencil[first, 0]]
+        return relative
 
     @wp.func
     def fit_cluster(

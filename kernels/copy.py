@@ -26,7 +26,7 @@ def copy_rows():
 
 @cache
 def take_vertices(dtype):
-    """Kernel over the vertices of all copies: out = the values of each copy at places (n,)."""
+    """Kernel over the vertices of all copies: out = the values of each copy at indices (n,)."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -34,13 +34,13 @@ def take_vertices(dtype):
         # state in
         values: wp.array(dtype=vec3),
         # parameters
-        places: wp.array(dtype=wp.int32),
+        indices: wp.array(dtype=wp.int32),
         # out
         out: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        n = places.shape[0]
-        out[i] = values[i // n * n + places[i % n]]
+        n = indices.shape[0]
+        out[i] = values[i // n * n + indices[i % n]]
 
     return take_each_vertex
 

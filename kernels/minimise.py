@@ -17,7 +17,7 @@ def set_trial(dtype):
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
-    def place(
+    def set_each_trial(
         # state in
         correction: wp.array(dtype=vec3),
         direction: wp.array(dtype=vec3),
@@ -32,7 +32,7 @@ def set_trial(dtype):
         trial[i] = correction[i] + dtype(step[i // per_copy]) * direction[i]
         gradient[i] = vec3()
 
-    return place
+    return set_each_trial
 
 
 @cache

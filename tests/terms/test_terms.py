@@ -34,8 +34,7 @@ from warpcloth.core.sums import Sums
 from warpcloth.fast import quadratic_pairs as quadratic
 from warpcloth.fast.gather_layout import gathered
 from warpcloth.fast.structs import chained
-from warpcloth.kernels import admm as splitting
-from warpcloth.kernels import assemble
+from warpcloth.kernels import admm, assemble
 from warpcloth.kernels import constraint_jacobian as jacobian
 from warpcloth.kernels import constraint_rows as constrain
 from warpcloth.kernels.fast import gather_forces as gather
@@ -1177,19 +1176,19 @@ def test_sums_of_splitting_gather_what_they_scatter(term, dtype, device):
     """Gᵀ of the gaps, the changes and the multipliers of ADMM, added to what is there."""
     found = []
     # Scattering is for one thread, of the CPU.
-    for factory, each in ((splitting.scatter_splitting, "cpu"), (splitting.gather_splitting, device)):
+    for factory, each in ((admm.scatter_admm, "cpu"), (admm.gather_admm, device)):
         model = model_of(rest_mesh(), None, [term.name], dtype, each, pins=[0, 7], copies=2)
         elements = model.terms[0]
         random, matrix = np.random.default_rng(10), wp.types.matrix((term.rows, 3), model.dtype)
         ratio, scale = (model.array(random.uniform(0.5, 2.0, elements.count), model.dtype) for _ in range(2))
         values = [model.array(random.normal(size=(elements.count, term.rows, 3)), matrix) for _ in range(3)]
-        of = splitting.splitting(term, model.dtype)()
+        of = admm.admm_elements(term, model.dtype)()
         of.stiffness, of.ratio, of.scale = elements.stiffness, ratio, scale
         of.u, of.gap, of.change = values
         out = [model.vectors() for _ in range(3)]
         for array in out:
             array.fill_(model.vec3(1.0, 2.0, 3.0))
-        gathers = factory is splitting.gather_splitting
+        gathers = factory is admm.gather_admm
         given = [*(elements.incidences if gathers else [elements.stencil]), elements.rest, of]
         model.launch(factory(term, model.dtype), model.count if gathers else elements.count, given, out)
         found.append([array.numpy() - [1.0, 2.0, 3.0] for array in out])

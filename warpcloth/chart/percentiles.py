@@ -99,8 +99,8 @@ def _frame(axes, percentiles, neutral):
     shown = np.append(finite, bands)
     low, high = shown.min(), shown.max()
     if len(bands) and np.ptp(bands) > 0.0:
-        reach = np.ptp(bands)
-        low, high = max(low, bands.min() - reach), min(high, bands.max() + reach)
+        margin = np.ptp(bands)
+        low, high = max(low, bands.min() - margin), min(high, bands.max() + margin)
         axes.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
     if known.max() > high:
         axes.text(0.99, 0.98, f"to {known.max():.3g}", va="top", transform=axes.transAxes, **_NOTE)

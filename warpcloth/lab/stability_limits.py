@@ -108,7 +108,7 @@ def _ordered_relaxation(cell):
         return None if limit is None else cell.record.relaxation / limit
 
 
-def _reach(cell):
+def _rings(cell):
     """Divides how many edges lie between pins and the furthest vertex by the sweeps."""
     if len(cell.scene.pins.vertices):
         return rings(cell.scene) / cell.record.iterations
@@ -146,7 +146,7 @@ LIMITS = {
     "Gauss–Seidel, |z| = 1": _ordered_relaxation,
     "1 + Σk h²/m iterations": _iterations_across,
     "r = 1/(2hω)": _weight,
-    "a ring an iteration": _reach,
+    "a ring an iteration": _rings,
 }
 
 

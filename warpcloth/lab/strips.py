@@ -69,8 +69,8 @@ def strip(pattern, angle, spacing, length=1.0, width=1.0):
     mesh = Mesh(np.stack([x, np.zeros_like(x), z], axis=1), triangles.reshape(-1, 3))
     pinned = x <= near
     energy = roll(mesh)
-    reach = np.ptp(x[mesh.hinges], axis=1)
-    clamp = (x[pinned].max() + x[~pinned].min()) / 2.0 - (energy * reach).sum() / energy.sum() / 2.0
+    extent = np.ptp(x[mesh.hinges], axis=1)
+    clamp = (x[pinned].max() + x[~pinned].min()) / 2.0 - (energy * extent).sum() / energy.sum() / 2.0
     return Strip(mesh, np.flatnonzero(pinned), clamp, _end(mesh))
 
 

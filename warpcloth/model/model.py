@@ -86,7 +86,7 @@ class Model:
         if vary.has("positions"):
             for copy, start in enumerate(positions):
                 scene.pins.refuse_far(start, f" in copy {copy}")
-        refuse_coarse(scene.mesh, positions, self.numpy_dtype, lambda copy, i: self._place("vertex", copy, i))
+        refuse_coarse(scene.mesh, positions, self.numpy_dtype, lambda copy, i: self._label("vertex", copy, i))
         self.positions = self._put("position", "m", positions, self.vec3)
         self.velocities = self._put("velocity", "m/s", velocities, self.vec3)
         self.mass = self._put("mass", "kg", masses, self.dtype)
@@ -171,9 +171,9 @@ class Model:
         return keep(held.reshape(-1, *held.shape[2:]), dtype, self.device)
 
     def _cast(self, name, unit, values, each, infinite=False):
-        return cast(name, unit, values, self.numpy_dtype, lambda copy, i: self._place(each, copy, i), infinite)
+        return cast(name, unit, values, self.numpy_dtype, lambda copy, i: self._label(each, copy, i), infinite)
 
-    def _place(self, each, copy, i):
+    def _label(self, each, copy, i):
         """The words for one of what ``each`` names, or for a whole copy."""
         words = [] if each is None else [f"{each} {i}"]
         return " of ".join(words + ([f"copy {copy}"] if self.copies > 1 else []))

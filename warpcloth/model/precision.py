@@ -6,7 +6,7 @@ import warp as wp
 DTYPES = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
 
 
-def cast(name, unit, values, dtype, place, infinite=False):
+def cast(name, unit, values, dtype, label, infinite=False):
     """``values`` in the precision of a model, each finite there, and single numbers 0 only where they were.
 
     Args:
@@ -14,14 +14,14 @@ def cast(name, unit, values, dtype, place, infinite=False):
         unit: Their unit, likewise.
         values: (B, count) numbers, or (B, count, …) components of vectors, in double precision.
         dtype: ``np.float32`` or ``np.float64``.
-        place: Function (copy, index) → words for the place of a value, which may be none.
+        label: Function (copy, index) → the words that name a value, which may be none.
         infinite: Whether a value may be infinite if it was so.
 
     Returns:
         np.ndarray: Of the same shape.
 
     Raises:
-        ValueError: Naming the first value that is lost and its place.
+        ValueError: Naming the first value that is lost and its index.
     """
     limits = np.finfo(dtype)
     with np.errstate(over="ignore", under="ignore"):
@@ -32,7 +32,7 @@ def cast(name, unit, values, dtype, place, infinite=False):
     if np.ndim(values) == 2:  # of a vector, a component that is next to nothing may be lost
         lost |= (np.abs(held) < limits.tiny) & (values != 0.0)
     for index in np.argwhere(lost)[:1]:
-        words = [name, place(*index[:2])] if place(*index[:2]) else [name]
+        words = [name, label(*index[:2])] if label(*index[:2]) else [name]
         value = f"{values[tuple(index)]:.3g} {unit}".strip()
         raise ValueError(
             f"{' of '.join(words)} is {value}; {limits.dtype} ends at {limits.max:.2g}, and towards 0 at {limits.tiny:.2g}; "
@@ -41,7 +41,7 @@ def cast(name, unit, values, dtype, place, infinite=False):
     return held
 
 
-def refuse_coarse(mesh, positions, dtype, place):
+def refuse_coarse(mesh, positions, dtype, label):
     """Refuses positions so far from the origin, or a mesh so large or small, that a precision loses the cloth.
 
     ε·|x| may be 1 % of the median edge of the rest shape, and the square of every edge must be a normal number.
@@ -50,7 +50,7 @@ def refuse_coarse(mesh, positions, dtype, place):
         mesh: The :class:`warpcloth.Mesh`.
         positions: (B, n, 3) [m].
         dtype: ``np.float32`` or ``np.float64``.
-        place: Function (b, i) → words for the place of a position.
+        label: Function (b, i) → the words that name a position.
 
     Raises:
         ValueError: Naming the edge, or the largest coordinate.
@@ -71,7 +71,7 @@ def refuse_coarse(mesh, positions, dtype, place):
     resolved = limits.eps * abs(x)
     if resolved > 0.01 * edge:
         raise ValueError(
-            f"{place(b, i)} is at {'xyz'[axis]} = {x:.6g} m, where {limits.dtype} resolves {resolved:.2g} m, "
+            f"{label(b, i)} is at {'xyz'[axis]} = {x:.6g} m, where {limits.dtype} resolves {resolved:.2g} m, "
             f"and the median edge is {edge:.3g} m, which must be 100 times that; {_instead('move it to the origin', dtype)}"
         )
 

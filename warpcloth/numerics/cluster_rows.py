@@ -29,7 +29,7 @@ class ClusterRows:
         self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
         self._stencil, self._offsets = host_values(elements.stencil)[:, 0], host_values(self.cells.offsets)
         self._mass = elements.rest.numpy()[:, 3].astype(np.float64)
-        self._places = host_values(self.cells.shape).astype(np.float64)
+        self._rest = host_values(self.cells.shape).astype(np.float64)
         self._inverses = np.stack([np.linalg.pinv(each, 1e-12, True) for each in self._inertias()])
         self._inertia = model.array(self._inverses, model.mat33)
         self._rotations = wp.zeros(self.cells.count, dtype=model.mat33, device=model.device)
@@ -41,12 +41,12 @@ class ClusterRows:
 
     def _inertias(self):
         """Σ m(q²I − qqᵀ) of each cell at rest, (C, 3, 3) [kg m²]."""
-        mass, q = self._mass, self._places
+        mass, q = self._mass, self._rest
         each = mass[:, None, None] * ((q**2).sum(axis=1)[:, None, None] * np.eye(3) - q[:, :, None] * q[:, None, :])
         return np.add.reduceat(each, self._offsets[:-1], axis=0)
 
-    def place(self, layout):
-        """Where its rows are, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
+    def set_layout(self, layout):
+        """Sets the layout of its rows, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
         self.layout = layout
 
     def launch_linearise(self, x, d, h, least, values):
@@ -69,7 +69,7 @@ class ClusterRows:
 
     def entries(self):
         """J on the host: values, rows and columns."""
-        mass, q, R, found = self._mass, self._places, self._turned.read().astype(np.float64), []
+        mass, q, R, found = self._mass, self._rest, self._turned.read().astype(np.float64), []
         for cell, (start, stop) in enumerate(pairwise(self._offsets)):
             if not R[cell].any():
                 continue

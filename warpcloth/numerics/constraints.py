@@ -41,8 +41,8 @@ class TermRows:
         self._linearise, self._apply = model.kernel(kernels.linearise, *key), model.kernel(jacobian.apply_rows, *key)
         self._transpose = Transpose(model, elements, jacobian.scatter_rows, jacobian.gather_rows, *key)
 
-    def place(self, layout):
-        """Where its rows are, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
+    def set_layout(self, layout):
+        """Sets the layout of its rows, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
         self.layout = layout
 
     def launch_linearise(self, x, d, h, least, values):
@@ -112,7 +112,7 @@ class Constraints:
         for part in self.parts:
             layout = kernels.RowLayout()
             layout.per_copy, layout.first, layout.rows_per_copy = part.elements.per_copy, first, self.per_copy
-            part.place(layout)
+            part.set_layout(layout)
             first += part.count
 
         def rows(dtype=model.dtype):

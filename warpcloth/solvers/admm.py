@@ -154,11 +154,11 @@ class ADMMStepper(ImplicitStepper):
         self._primal, self._dual = (Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device)) for _ in range(2))
         self._active = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
         self._split = [self._split_of(*each) for each in zip(model.terms, ratios, scales, strict=True)]
-        factories = kernels.start_splitting, kernels.split
+        factories = kernels.start_admm, kernels.split
         self._kernels = [
             [model.kernel(factory, elements.term, model.dtype) for factory in factories] for elements in model.terms
         ]
-        sums = kernels.scatter_splitting, kernels.gather_splitting
+        sums = kernels.scatter_admm, kernels.gather_admm
         self._sums_of = [Transpose(model, elements, *sums, elements.term, model.dtype) for elements in model.terms]
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._scale = GravityScale(model).or_else(1.0)
@@ -195,7 +195,7 @@ class ADMMStepper(ImplicitStepper):
     def _split_of(self, elements, ratio, scale):
         """The struct of z, u, gap and change of a term, all 0."""
         model, kind = self.model, wp.types.matrix((elements.term.rows, 3), self.model.dtype)
-        of = kernels.splitting(elements.term, model.dtype)()
+        of = kernels.admm_elements(elements.term, model.dtype)()
         of.stiffness, of.ratio, of.scale = elements.stiffness, model.per_element(ratio), model.per_element(scale)
         of.z, of.u, of.gap, of.change = (wp.zeros(elements.count, dtype=kind, device=model.device) for _ in range(4))
         return of
