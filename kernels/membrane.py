@@ -94,7 +94,7 @@ def dyad(u: Any, v: Any):
 
 
 @wp.func
-def kept(value: Any, policy: int):
+def mended(value: Any, policy: int):
     """An eigenvalue under a policy."""
     if policy != RAW and value < type(value)(0.0):
         if policy == ABSOLUTE:
@@ -142,10 +142,10 @@ def isotropic_hessian(U: Any, V: Any, stretch: Any, twist: Any, flip: Any, out1:
     c = dyad(u2, v1)
     d = dyad(u1, v2)
     H = wp.outer(a, B[0, 0] * a + B[0, 1] * b) + wp.outer(b, B[0, 1] * a + B[1, 1] * b)
-    H += wp.outer((half * kept(twist, policy)) * (c - d), c - d) + wp.outer((half * kept(flip, policy)) * (c + d), c + d)
+    H += wp.outer((half * mended(twist, policy)) * (c - d), c - d) + wp.outer((half * mended(flip, policy)) * (c + d), c + d)
     a = dyad(u3, v1)
     b = dyad(u3, v2)
-    return H + wp.outer(kept(out1, policy) * a, a) + wp.outer(kept(out2, policy) * b, b)
+    return H + wp.outer(mended(out1, policy) * a, a) + wp.outer(mended(out2, policy) * b, b)
 
 
 # --- the distance to the F whose singular values lie in a range, u = ½‖F − p‖² = ½Σ(σᵢ − cᵢ)², cᵢ = σᵢ clamped to it

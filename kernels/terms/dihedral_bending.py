@@ -65,7 +65,7 @@ def has_no_normal(e: Any, a: Any):
 
 
 @wp.func
-def undefined(y: Any):
+def has_no_angle(y: Any):
     return has_no_normal(y[0], y[1]) or has_no_normal(y[0], y[2])
 
 
@@ -84,7 +84,7 @@ def wrap(angle: Any):
 @wp.func
 def constraint(y: Any, rest: Any):
     c = wp.ddot(y, y * y.dtype(0.0))  # 0, and NaN where y is
-    if not undefined(y):
+    if not has_no_angle(y):
         # Not wp.normalize, which makes 0 of NaN.
         n1 = wp.cross(y[0], y[1])
         n2 = wp.cross(y[2], y[0])
@@ -114,7 +114,7 @@ def edge_covector(direction: Any):
 @wp.func
 def constraint_gradient(y: Any, rest: Any):
     g = y * y.dtype(0.0)
-    if not undefined(y):
+    if not has_no_angle(y):
         e = y[0]
         for corner in range(1, 3):
             normal = wp.cross(e, y[corner])
@@ -186,7 +186,7 @@ def factors(y: Any, corner: int):
 def curvature(y: Any, scale: Any, policy: int):
     """scale·∂²θ, or of each of its four products the part that ``policy`` asks for."""
     h = wp.matrix(shape=(9, 9), dtype=y.dtype)
-    if undefined(y):
+    if has_no_angle(y):
         return h
     for corner in range(1, 3):
         g, around, turn, sigma, ratio = factors(y, corner)
@@ -198,7 +198,7 @@ def curvature(y: Any, scale: Any, policy: int):
 @wp.func
 def stiffening(y: Any, rest: Any, tension: Any):
     rows = wp.matrix(shape=(4, 9), dtype=y.dtype)
-    if not undefined(y):
+    if not has_no_angle(y):
         for corner in range(1, 3):
             g, around, turn, sigma, ratio = factors(y, corner)
             rows[2 * corner - 2] = positive_half(g, around, y.dtype(1.0), tension)

@@ -26,6 +26,7 @@ NAMES = {
     "measure tasks": "each file of the laboratory has its measurement and the list of them; a term has its rest measure",
     "write_csv": "each table has one",
     "run": "runs what it is given",
+    "register": "adds a record to the catalogue of its room",
     "constant_blocks": "the launch of the kernel",
     "open_sequence": "reads any sequence, and one of a stage",
     "vertex_normals": "on the host and as a kernel",
@@ -34,12 +35,6 @@ NAMES = {
 }
 # Where the functions of terms are, whose names are given.
 TERMS = ("kernels/terms/", "kernels/membrane.py", "kernels/fast/quadratic_pair.py")
-# To be renamed.
-PENDING = {
-    "frames", "step", "Benchmark", "Trial", "as_json", "choose",
-    "chosen", "files_of", "flatten", "kept",
-    "product", "register", "spread", "undefined", "weight",
-}  # fmt: skip
 
 
 def defined():
@@ -64,13 +59,13 @@ def shared(places):
 def test_modules_of_one_name_are_of_one_matter():
     for name, where in shared(defined()[0]).items():
         host = [path for path in where if not path.startswith("kernels/")]
-        if (len(host) < 2 and len(where) == 2) or name in MODULES or name in PENDING:
+        if (len(host) < 2 and len(where) == 2) or name in MODULES:
             continue
         pytest.fail(f"{where} are of one name; rename one, or say in this file why they mean one thing")
 
 
 def test_classes_and_functions_of_one_name_mean_one_thing():
-    allowed = {name for names in NAMES for name in names.split()} | PENDING
+    allowed = {name for names in NAMES for name in names.split()}
     for name, where in shared(defined()[1]).items():
         terms = [path for path in where if path.startswith(TERMS)]
         if len(where) - len(terms) + bool(terms) > 1 and name not in allowed:

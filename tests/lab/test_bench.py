@@ -15,7 +15,7 @@ from warpcloth.cli import main
 from warpcloth.core.capture import Segment
 from warpcloth.lab import benchmarks
 from warpcloth.lab.bandwidth import measure as bandwidth
-from warpcloth.lab.benchmarks import Benchmark, Run, standard
+from warpcloth.lab.benchmarks import Run, SolverBenchmark, standard
 from warpcloth.lab.counts import compulsory_bytes, elements_of, launches_of
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.results import exponent, growth, ratios, write_csv
@@ -82,7 +82,7 @@ def test_counting_takes_the_same_steps(solver, device):
 @pytest.mark.parametrize("one", standard(), ids=lambda each: each.setup.solver)
 def test_a_row_of_every_solver(one, device):
     scene = SceneRef(one.scene.name, {"n": 5})
-    setup = Benchmark(scene, one.setup, device=device).setup_of(scene)
+    setup = SolverBenchmark(scene, one.setup, device=device).setup_of(scene)
     row = measure(asdict(scene), asdict(setup), frames=2, device=device, dtype="float32", started=time.time())
     assert row["status"] == "ok" and row["frames"] == 2 and row["vertices"] == 25
     scene = scene.load()
@@ -307,7 +307,7 @@ def test_each_benchmark_begins_with_an_empty_kernel_cache(monkeypatch):
 
     monkeypatch.setattr(benchmarks, "_alone", alone)
     monkeypatch.setenv("WARP_CACHE_PATH", "before")
-    Run([Benchmark(SceneRef("hanging"), Setup("pbd", {"substeps": 1}), (4, 6), frames=5)] * 2).measure()
+    Run([SolverBenchmark(SceneRef("hanging"), Setup("pbd", {"substeps": 1}), (4, 6), frames=5)] * 2).measure()
     assert os.environ["WARP_CACHE_PATH"] == "before" and not any(os.path.exists(folder) for folder, _, _ in seen)
     assert [(len(files), frames) for _, files, frames in seen] == [(0, 0), (1, 5), (2, 5)] * 2
     assert len({folder for folder, _, _ in seen[:3]}) == 1 and seen[0][0] != seen[3][0]
@@ -316,7 +316,7 @@ def test_each_benchmark_begins_with_an_empty_kernel_cache(monkeypatch):
 def test_scenes_without_sizes_are_taken_as_they_are(monkeypatch, tmp_path):
     made = rows_until(-1, None)
     monkeypatch.setattr(benchmarks, "_alone", made)
-    run = Run([Benchmark(SceneRef("hanging", {"n": 7}), Setup("pbd", {"substeps": 1}))])
+    run = Run([SolverBenchmark(SceneRef("hanging", {"n": 7}), Setup("pbd", {"substeps": 1}))])
     run.measure()
     assert run.total == len(run.rows) == 1 and run.rows[0]["parameters"] == {"n": 7}
     write_csv(tmp_path / "t.csv", run.rows)

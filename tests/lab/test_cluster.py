@@ -18,7 +18,7 @@ from warpcloth.base import extensions
 from warpcloth.base.digest import scene_digest, source_digest
 from warpcloth.cli import main
 from warpcloth.lab import cluster as clusters
-from warpcloth.lab.campaign import Store, kept, sweep
+from warpcloth.lab.campaign import Store, kept_store, sweep
 from warpcloth.lab.cluster import Cluster, connect
 from warpcloth.lab.measurements import SceneRef, task
 from warpcloth.lab.work_precision import time_diagram
@@ -196,7 +196,7 @@ def test_charts_are_those_of_processes(address, tmp_path, monkeypatch):
     here = time_diagram(scene, **given, workers=1)
     with connect(address) as cluster:
         there = time_diagram(scene, **given, executor=cluster)
-        assert len(kept("work-precision", cluster)) == len(kept("work-precision")) == len(here["rows"])
+        assert len(kept_store("work-precision", cluster)) == len(kept_store("work-precision")) == len(here["rows"])
     assert [row["ms"] for row in here["rows"]] != [row["ms"] for row in there["rows"]]
     for one, other in zip(here["rows"], there["rows"], strict=True):
         assert one["status"] == "ok" and one["error"] is not None

@@ -599,7 +599,7 @@ def test_no_verdict_that_the_reference_does_not_bear(floor, error, verdict):
 
     def trial(off):
         # RMS over two frames and two vertices: all are off.
-        return stability.Trial(x + np.array([0.0, off, 0.0]), np.array([1]), np.ones(1), [""], [None])
+        return stability.BatchRun(x + np.array([0.0, off, 0.0]), np.array([1]), np.ones(1), [""], [None])
 
     cell = stability._judge(trial(error), 0, [trial(floor), trial(0.0)], 0.01)
     assert cell["verdict"] == verdict and cell["status"] == "ok"

@@ -22,11 +22,11 @@ from warpcloth.lab.setups import label, setups_of_runs, setups_of_steps
 from warpcloth.lab.work_precision import (
     cheapest,
     front,
-    left_out,
+    quartiles,
     solver_diagram,
     spectrum_diagram,
-    spread,
     time_diagram,
+    without_point,
     write_csv,
 )
 from warpcloth.solvers import SOLVERS
@@ -186,7 +186,7 @@ def test_a_step_without_a_spectrum_costs_no_other(tmp_path):
     with ThreadPoolExecutor(1) as executor:
         found = spectrum_diagram(SceneRef("hanging", still), frames=1, limit=0.2, executor=executor, store=Store())
         assert [row["status"] for row in found["rows"]].count("ok") in range(1, 5)
-        assert "has nothing to minimise" in found["rows"][-1]["reason"] and left_out(found)
+        assert "has nothing to minimise" in found["rows"][-1]["reason"] and without_point(found)
         pareto.plot_spectrum(tmp_path / "spectrum.png", found)
         hard = SceneRef("net", {"n": 4, "stiffness": "inf"})
         with pytest.raises(ValueError, match="Newton cannot take Spring with infinite stiffness"):
@@ -256,7 +256,7 @@ def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
     rows.append({"solver": "xpbd", "label": "xpbd", "status": "ok", "reason": "", "points": points, "floor": 1e-9})
     found = {"scene": "a$^$.py", "frame": 1, "rate": 60.0, "dtype": "float64", "machine": machine.machine(), "rows": rows}
     said = [("newton, 2 settings", "refused: hard"), ("newton 8", "refused: soft"), ("admm 1", "refused: hard")]
-    assert left_out(found) == said
+    assert without_point(found) == said
     pareto.plot_solver(tmp_path / "solver.png", found)
     (legend,) = (axes.get_legend() for axes in drawn[0].axes if axes.get_legend())
     assert [text.get_text() for text in legend.get_texts()] == ["xpbd", "rounding of the objective"]
@@ -282,7 +282,7 @@ def test_a_lead_within_the_spread_is_none():
         {"status": "ok", "ms_per_second": 60.0 * ms, "ms": ms, "spread": [ms - off, ms + off], "error": a, "strain_error": b}
         for ms, off, a, b in ((1.0, 0.3, 4.0, 1.0), (1.2, 0.3, 2.0, 3.0), (2.0, 0.1, 1.0, 2.0), (2.3, 0.1, 0.5, 0.1))
     ]
-    assert spread(rows[0]) == pytest.approx((42.0, 78.0)) and spread({"ms_per_second": 3.0}) == (3.0, 3.0)
+    assert quartiles(rows[0]) == pytest.approx((42.0, 78.0)) and quartiles({"ms_per_second": 3.0}) == (3.0, 3.0)
     assert front(rows) == [1, 2, 3] and front(rows, name="strain_error") == [0, 3]
     rows[3]["spread"] = [2.0, 2.6]
     assert front(rows) == [1, 3]
@@ -358,7 +358,7 @@ def test_time_diagram(device, tmp_path, drawn):
     found["rows"][-1] |= {"status": "diverged", "reason": "diverged in frame 3", "error": None}
     found["rows"][-1].pop("front", None)
     name = found["rows"][-1]["label"]
-    assert (name, "diverged: diverged in frame 3") in left_out(found)
+    assert (name, "diverged: diverged in frame 3") in without_point(found)
     for ending in ("png", "svg"):
         pareto.plot_time(tmp_path / f"chart.{ending}", found)
     write_csv(tmp_path / "chart.csv", found)
@@ -390,7 +390,7 @@ def test_time_diagram(device, tmp_path, drawn):
         boxes = [each.get_window_extent() for each in ends.values()]
         assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
         bars = np.concatenate([np.array(each.get_segments()) for each in panel.collections])[:, :, 0]
-        assert np.allclose(sorted(bars.tolist()), sorted(map(list, map(spread, good))))
+        assert np.allclose(sorted(bars.tolist()), sorted(map(list, map(quartiles, good))))
         (joined,) = (line for line in panel.lines if line.get_label() == "nothing is better in both")
         assert joined.get_xydata().tolist() == [
             [found["rows"][i]["ms_per_second"], found["rows"][i][name]] for i in front_of[name]

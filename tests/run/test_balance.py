@@ -19,7 +19,7 @@ from warpcloth.kernels.terms import ATTACHMENT
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.stability import measure
 from warpcloth.run import balance
-from warpcloth.run.frames import Frame
+from warpcloth.run.frames_ahead import Frame
 from warpcloth.run.sources import Source, source_of
 from warpcloth.run.watch import Watch
 from warpcloth.scenes import flag, hanging, net

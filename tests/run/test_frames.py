@@ -11,7 +11,7 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.mesh.ordering import near_order
-from warpcloth.run.frames import frames_of, state_of
+from warpcloth.run.frames_ahead import frames_of, state_of
 from warpcloth.scenes import hanging
 from warpcloth.usd import FrameSequence, chunks
 

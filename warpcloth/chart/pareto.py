@@ -3,7 +3,7 @@
 import textwrap
 
 from ..lab.machine import in_words
-from ..lab.work_precision import WITHIN, cheapest, front, left_out, spread
+from ..lab.work_precision import WITHIN, cheapest, front, quartiles, without_point
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
 from ..solvers import SOLVERS
 
@@ -55,7 +55,7 @@ def plot_time(path, found):
         for axes, name in zip(panels, _ERRORS, strict=True):
             x, y = ([row[of] for row in line] for of in ("ms_per_second", name))
             axes.plot(x, y, color=colour, linewidth=0.7, alpha=0.6)
-            axes.hlines(y, *zip(*map(spread, line), strict=True), color=colour, linewidth=2.5, alpha=0.45)
+            axes.hlines(y, *zip(*map(quartiles, line), strict=True), color=colour, linewidth=2.5, alpha=0.45)
             axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none")
             ends[axes].append((x[-1], y[-1], solver if integrator == "euler" else f"{solver} {integrator}", colour))
     for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
@@ -150,7 +150,7 @@ def _floor(axes, value, label, colour=GREY):
 
 def _missing(head, found):
     """Lines that say what is left out, and why."""
-    lines = [line for each in left_out(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]
+    lines = [line for each in without_point(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]
     return ["", head, *lines] if lines else []
 
 

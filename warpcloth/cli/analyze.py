@@ -7,7 +7,7 @@ from ..base.checks import choice
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import convert
-from .terminal import Progress, as_json, check_writable, frames_folder_of, location
+from .terminal import Progress, check_writable, frames_folder_of, json_text, location
 
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays, .npz or .npy.
@@ -138,7 +138,7 @@ def analyze(arguments):
         **{name: path for name, path in files.items() if name != "output"},
         "still": ", ".join(map(str, stills.values())) if stills else None,
     }
-    print(as_json(facts) if arguments.json else _summary(facts))
+    print(json_text(facts) if arguments.json else _summary(facts))
     return 0
 
 

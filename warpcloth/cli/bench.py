@@ -8,7 +8,7 @@ from ..base.quiet import find_device
 from ..base.texts import assignments, options
 from .options import DEFAULT, solvers
 from .setup import named_scene, solver_setup
-from .terminal import Interrupted, as_json, check_writable, open_bar, say
+from .terminal import Interrupted, check_writable, json_text, open_bar, say
 
 EPILOG = """\
 Without SCENE, every solver runs hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of net; this takes
@@ -94,7 +94,7 @@ def _benchmarks(arguments, device):
     Raises:
         ValueError: They do not go together, or one of them is wrong.
     """
-    from ..lab.benchmarks import Benchmark, standard
+    from ..lab.benchmarks import SolverBenchmark, standard
     from ..lab.measurements import SceneRef, Setup
     from ..solvers import SOLVERS
 
@@ -117,7 +117,7 @@ def _benchmarks(arguments, device):
         solver = solver_setup(arguments, scene, device).solver
         chosen |= {} if step_given else {"substeps": solver.substeps}
     sizes = tuple(sorted(set(arguments.sizes)))
-    benchmark = Benchmark(SceneRef(arguments.scene, parameters), Setup(arguments.solver, chosen), sizes, **given)
+    benchmark = SolverBenchmark(SceneRef(arguments.scene, parameters), Setup(arguments.solver, chosen), sizes, **given)
     benchmark.scenes()[0].load()  # what it refuses is said before anything is measured
     return [benchmark]
 
@@ -169,7 +169,7 @@ def _write(arguments, run, device):
         "rows": run.rows,
         "growth": growth(run.rows),
     }
-    print(as_json(facts) if arguments.json else _text(facts))
+    print(json_text(facts) if arguments.json else _text(facts))
 
 
 _HEAD = ("ms a frame", "quartiles", "cloths/s", "ns", "GB/s", "share", "launches", "start s", "compile s", "factor s", "MB", "")
@@ -245,7 +245,7 @@ def _compare(arguments):
         raise ValueError(f"{arguments.compare[0]} and {arguments.compare[1]} have no row in common that was measured in both")
     differ = [name for name in ("processor", "device") if old["machine"][name] != new["machine"][name]]
     if arguments.json:
-        print(as_json({"old": old["machine"], "new": new["machine"], "rows": found}))
+        print(json_text({"old": old["machine"], "new": new["machine"], "rows": found}))
         return 0
     for name in differ:
         print(f"{name}: {old['machine'][name]} and {new['machine'][name]}, so that times say little of the code")

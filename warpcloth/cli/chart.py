@@ -12,7 +12,7 @@ from ..run.listing import list_failures
 from . import stability
 from .options import add_import, solvers
 from .setup import named_scene
-from .terminal import DTYPES, add_dask, as_json, check_outputs, measuring
+from .terminal import DTYPES, add_dask, check_outputs, json_text, measuring
 
 TEXT = "Chart speed against accuracy, stability and failures."
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
@@ -103,7 +103,7 @@ def failure(arguments):
         plot_failure(arguments.output, found)
     if arguments.csv:
         write_csv(arguments.csv, found)
-    print(as_json(found) if arguments.json else _failure_summary(found))
+    print(json_text(found) if arguments.json else _failure_summary(found))
     return 0
 
 
@@ -150,7 +150,7 @@ def work_precision(arguments):
         plot(arguments.output, found)
     if arguments.csv:
         write_csv(arguments.csv, found)
-    print(as_json(found) if arguments.json else _summary(found, lines))
+    print(json_text(found) if arguments.json else _summary(found, lines))
     return 0
 
 
@@ -180,7 +180,7 @@ def _physics_lines(found):
 
 
 def _summary(found, lines_of):
-    from ..lab.work_precision import left_out
+    from ..lab.work_precision import without_point
 
     rows, device = found["rows"], found["machine"]["device"]
     counts = {status: sum(row["status"] == status for row in rows) for status in ("ok", "diverged", "slow", "refused")}
@@ -188,7 +188,7 @@ def _summary(found, lines_of):
     lines = [f"{found['scene']}: {len(rows)} settings, {said}", f"  device        {device}, {found['dtype']}"]
     lines += [f"  measured on   {count} {name}" for name, count in Counter(row["machine"] for row in rows).items()]
     lines += lines_of(found)
-    for label, why in left_out(found):
+    for label, why in without_point(found):
         status, _, reason = why.partition(": ")
         lines.append(f"  {status:<12}  {label}: {reason}")
     return "\n".join(lines)

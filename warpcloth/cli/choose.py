@@ -6,7 +6,7 @@ import sys
 from ..base.quiet import find_device
 from ..base.texts import assignments, fraction, milliseconds
 from .setup import named_scene
-from .terminal import Interrupted, Settings, add_dask, as_json, executing
+from .terminal import Interrupted, Settings, add_dask, executing, json_text
 
 EPILOG = """\
 Each solver goes from coarse settings to fine ones, until it meets the tolerance or costs more than one that does. Errors are
@@ -33,16 +33,16 @@ def add_arguments(parser):
 
 def choose(arguments):
     device = find_device(arguments.device)
-    choice, found, exact, values = chosen(arguments, device)
-    from ..lab.choosing import as_json as facts_of
+    choice, found, exact, values = choice_for(arguments, device)
+    from ..lab.choosing import as_json
 
     command = None if choice.chosen is None else command_line(arguments, values, choice.chosen.setup)
-    facts = {"scene": arguments.scene, "parameters": values, **facts_of(choice, found, exact), "command": command}
-    print(as_json(facts) if arguments.json else _text(facts, choice, found, exact))
+    facts = {"scene": arguments.scene, "parameters": values, **as_json(choice, found, exact), "command": command}
+    print(json_text(facts) if arguments.json else _text(facts, choice, found, exact))
     return 0
 
 
-def chosen(arguments, device):
+def choice_for(arguments, device):
     """The choice for the scene, tolerance and budget of the arguments, all that was measured, reference, and parameters."""
     from ..lab.choosing import choose
     from ..lab.measurements import SceneRef
@@ -84,7 +84,7 @@ def take_choice(arguments, device):
         if given:
             raise ValueError(f"{name} is given, and --tolerance or --budget chooses it; leave one out")
     arguments.solvers, arguments.limit, arguments.dask = None, 60.0, None
-    choice, _found, _exact, _values = chosen(arguments, device)
+    choice, _found, _exact, _values = choice_for(arguments, device)
     if not choice.meets:
         raise ValueError(f"nothing meets --tolerance and --budget: {choice.certainty}")
     setup = choice.chosen.setup

@@ -8,7 +8,7 @@ from ..base.checks import whole
 from ..base.outputs import TEXT, Output, check_apart
 from ..base.quiet import find_device
 from ..picture.figures import PICTURES, check_path
-from .terminal import Progress, as_json, check_writable
+from .terminal import Progress, check_writable, json_text
 
 _SHOWN = 8  # frames or exclusions of each that the summary names
 
@@ -63,7 +63,7 @@ def compare(arguments):
     facts = _facts(arguments, found, (a, b))
     if arguments.json:
         per_frame = {name: np.asarray(column).tolist() for name, column in columns.items()}
-        print(as_json(facts | {"device": str(device), "frames": per_frame}))
+        print(json_text(facts | {"device": str(device), "frames": per_frame}))
     else:
         print(_summary(facts, found))
     return 0

@@ -15,7 +15,7 @@ from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
 from ..base.texts import convert
 from .setup import named_scene
-from .terminal import Progress, as_json, check_writable, frames_folder_of, location
+from .terminal import Progress, check_writable, frames_folder_of, json_text, location
 
 _FRAMES, _FPS = 24, 24.0
 
@@ -148,7 +148,7 @@ def deform(arguments):
             "file": arguments.output,
             "frames_folder": frames_folder_of(arguments),
         }
-        print(as_json(facts) if arguments.json else _summary(facts))
+        print(json_text(facts) if arguments.json else _summary(facts))
         return 0
 
 

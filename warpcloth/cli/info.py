@@ -9,7 +9,7 @@ from ..base.quiet import find_device
 from ..base.texts import fraction
 from .setup import EPILOG as EPILOG
 from .setup import Chosen, fewest_below, hint_of, named_scene, solver_facts, solver_line, solver_setup
-from .terminal import Progress, as_json
+from .terminal import Progress, json_text
 
 
 def info(arguments):
@@ -54,7 +54,7 @@ def info(arguments):
             "hold only the edges of triangles, which leaves 3 + boundary edges degrees of freedom",
             stacklevel=2,
         )
-    print(as_json(facts) if arguments.json else f"{scene}\n{_info_text(facts)}")
+    print(json_text(facts) if arguments.json else f"{scene}\n{_info_text(facts)}")
     hint = setup.solver and hint_of(arguments, setup, scene)
     if hint:
         print(hint, file=sys.stderr)
@@ -123,7 +123,7 @@ def advise_on(arguments, source, values, scene, device):
             else ["resolution is not tried: no whole number among the parameters of the scene sets its vertices"]
         ),
     }
-    print(as_json(facts) if arguments.json else _advice(facts))
+    print(json_text(facts) if arguments.json else _advice(facts))
     return 0
 
 

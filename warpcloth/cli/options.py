@@ -15,7 +15,7 @@ from ..base.extensions import load_extension, load_installed
 from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import WORDS, kinds_of_parameter, parameters_of, words_of
 from ..run.listing import folders, list_scenes, list_solvers
-from .terminal import as_json
+from .terminal import json_text
 
 _HELP = "help"
 DEFAULT = "newton"  # solver
@@ -33,7 +33,7 @@ def show_help(arguments):
         found["options"] = _of_solver(getattr(arguments, "solver", None))
     if _HELP in getattr(arguments, "p", ()):
         found["parameters"] = _of_scene(_scene_name(arguments))
-    print(as_json(found) if getattr(arguments, "json", False) else "\n\n".join(map(_text, found.values())))
+    print(json_text(found) if getattr(arguments, "json", False) else "\n\n".join(map(_text, found.values())))
     return 0
 
 

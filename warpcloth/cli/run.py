@@ -6,7 +6,7 @@ import statistics
 from ..base.quiet import find_device
 from .setup import EPILOG as EPILOG
 from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
-from .terminal import Progress, as_json, check_writable, frames_folder_of, location, say
+from .terminal import Progress, check_writable, frames_folder_of, json_text, location, say
 
 
 def run(arguments):
@@ -59,7 +59,7 @@ def run(arguments):
             "file": arguments.output,
             "frames_folder": frames_folder_of(arguments),
         }
-        print(as_json(facts) if arguments.json else _summary(facts))
+        print(json_text(facts) if arguments.json else _summary(facts))
         if status.ok:
             return 0
         return say(f"{status.message}; the last good frame is {status.frame}, in {arguments.output}", 1)

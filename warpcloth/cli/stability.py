@@ -6,7 +6,7 @@ from ..base.checks import number, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, options
 from ..lab.axes import ACCURACY, AXES, FIXED, SEED
-from .terminal import DTYPES, as_json, check_outputs, measuring
+from .terminal import DTYPES, check_outputs, json_text, measuring
 
 _COUNT = 9
 
@@ -49,7 +49,7 @@ def add_arguments(parser):
 
 
 def chart(arguments):
-    from ..lab.campaign import kept, sweep
+    from ..lab.campaign import kept_store, sweep
     from ..lab.machine import machine
     from ..lab.stability import VERDICTS
 
@@ -61,7 +61,7 @@ def chart(arguments):
     given = {"device": str(device), "dtype": arguments.dtype, "limit": arguments.limit, "accuracy": arguments.accuracy}
     tasks = survey.tasks(reference=arguments.accuracy > 0.0, **given)
     with measuring(arguments, device) as run:
-        store = kept("stability", run.get("executor"))
+        store = kept_store("stability", run.get("executor"))
         cells = survey.table(sweep(tasks, store=store, **run), store)
     if arguments.output or arguments.csv:
         from ..chart.maps import plot_maps, write_table
@@ -77,7 +77,7 @@ def chart(arguments):
         facts = {"scene": str(survey.scene), "x": survey.x, "y": survey.y, "axes": axes, "fixed": fixed, "steps": survey.steps}
         facts["duration"] = survey.duration
         facts |= {**given, "seed": SEED, "machine": machine(device), "maps": dict(zip(methods, cells, strict=True))}
-        print(as_json(facts))
+        print(json_text(facts))
         return 0
     for method, rows in zip(methods, cells, strict=True):
         counts = Counter(cell["verdict"] for row in rows for cell in row)

@@ -211,7 +211,7 @@ class Progress:
             self.close()
 
 
-def as_json(facts):
+def json_text(facts):
     return json.dumps(_plain(facts), allow_nan=False)
 
 

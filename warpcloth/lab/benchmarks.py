@@ -17,7 +17,7 @@ from .timing import measure
 
 
 @dataclass(frozen=True)
-class Benchmark:
+class SolverBenchmark:
     """A solver on a scene of several sizes.
 
     Attributes:
@@ -61,19 +61,19 @@ def standard(**given):
     """Returns every solver on ``hanging`` of growing size, and what else their records measure.
 
     Args:
-        given: Further fields of each :class:`Benchmark`.
+        given: Further fields of each :class:`SolverBenchmark`.
     """
     kind = "cuda" if given.get("device", "cpu").startswith("cuda") else "cpu"
     listed = [(name, each) for name, record in SOLVERS.items() for each in record.facts.benchmarks]
     listed.sort(key=lambda one: one[1].scene != "hanging")
-    return [Benchmark(SceneRef(one.scene), Setup(name, one.options), getattr(one, kind), **given) for name, one in listed]
+    return [SolverBenchmark(SceneRef(one.scene), Setup(name, one.options), getattr(one, kind), **given) for name, one in listed]
 
 
 class Run:
     """The rows of benchmarks, which it has as far as it has come: whoever interrupts it keeps them.
 
     Args:
-        benchmarks: :class:`Benchmark`\\s, of one device.
+        benchmarks: :class:`SolverBenchmark`\\s, of one device.
 
     Attributes:
         total: How many rows there will be.

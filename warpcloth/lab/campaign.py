@@ -180,7 +180,7 @@ def _end_with(parent):
     os._exit(1)
 
 
-def kept(name, executor=None):
+def kept_store(name, executor=None):
     """The :class:`Store` of a chart in the folder for caches; of a cluster another one, for its times are of other machines."""
     return Store(cache_folder() / getattr(executor, "folder", "") / f"{name}.jsonl")
 

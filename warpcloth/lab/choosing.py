@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from ..base.checks import number
 from ..solvers import SOLVERS
 from . import trajectory
-from .campaign import kept, sweep
+from .campaign import kept_store, sweep
 from .measurements import Setup, task
 from .reference import reference
 from .setups import setups_of_runs
@@ -152,7 +152,7 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
     pick([], tolerance, budget)  # refuses wrong ones before anything is measured
     # One at a time: side by side they would slow one another.
     run = {"workers": 1} | run
-    run = run if "store" in run else {"store": kept("trajectories", run.get("executor")), **run}
+    run = run if "store" in run else {"store": kept_store("trajectories", run.get("executor")), **run}
     rungs = ladders(setups_of_runs(scene, solvers, device, dtype))
     exact = reference(scene, frames, **({} if tolerance is None else {"tolerance": tolerance / _FINER}))
 

@@ -30,7 +30,7 @@ _HUB = 60.0
 _BEND = np.pi / 2
 
 
-def weight(degrees):
+def edge_weight(degrees):
     """½(cot α + cot β) of α = β, half of that sum each."""
     return 1.0 / np.tan(np.radians(0.5 * degrees))
 
@@ -45,10 +45,10 @@ _EQUAL, _CLAMPED, _LOST, _EXACT = "cot((α + β)/2)", "the same, negative ones 0
 PANELS = (
     Panel(
         "weight",
-        f"Weight of an edge of two equal triangles; of 100° each {weight(200.0):.3f}".replace("-", "−"),
+        f"Weight of an edge of two equal triangles; of 100° each {edge_weight(200.0):.3f}".replace("-", "−"),
         "sum of the opposite angles α + β [°]",
         "weight",
-        laws={_EQUAL: weight, _CLAMPED: lambda d: max(0.0, weight(d))},
+        laws={_EQUAL: edge_weight, _CLAMPED: lambda d: max(0.0, edge_weight(d))},
         follows={"cotangent": _EQUAL, "clamped": _CLAMPED, "intrinsic Delaunay": _CLAMPED},
         marks={180.0: "Delaunay"},
     ),

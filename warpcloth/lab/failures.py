@@ -9,7 +9,7 @@ import csv
 from ..base.checks import choice
 from ..base.outputs import TEXT, Output
 from . import cotangents, isometry, locking, rank, slivers
-from .campaign import kept, sweep
+from .campaign import kept_store, sweep
 from .machine import machine
 
 FAILURES = {"locking": locking, "isometry": isometry, "slivers": slivers, "cotangents": cotangents, "rank": rank}
@@ -32,7 +32,7 @@ def failure_chart(name, device="cpu", **run):
     """
     choice("failure", name, tuple(FAILURES))
     tasks = FAILURES[name].tasks(str(device))
-    run = run if "store" in run else {"store": kept("failures", run.get("executor")), **run}
+    run = run if "store" in run else {"store": kept_store("failures", run.get("executor")), **run}
     results = {task.key: points for task, points in sweep(tasks, **run)}
     panels = {panel.key: panel for panel in FAILURES[name].PANELS}
     rows = []

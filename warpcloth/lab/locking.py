@@ -186,7 +186,7 @@ def relaxed(pattern, elements, moduli, device):
         settled = replace(scene, positions=rest.points)
         strained = energies(settled, device=device, dtype="float64")[0].sum()
         found.append(point("cost", series, x, strained / (0.5 * D * CURVATURE**2 * area)))
-        found.append(point("kept", series, x, kept(flat, scene.mesh.points, rest.points)))
+        found.append(point("kept", series, x, kept_angles(flat, scene.mesh.points, rest.points)))
     return found
 
 
@@ -232,12 +232,12 @@ def nearly_rigid(holding, degrees, device):
     pairs = held(holding, flat)
     scene, rest = _at_rest(flat, pairs, _ALL_BUT_RIGID, device)
     settled = rest.status.result in SETTLED
-    value = kept(flat, scene.mesh.points, rest.points) if settled else None
+    value = kept_angles(flat, scene.mesh.points, rest.points) if settled else None
     free = (_left(flat, pairs) - 6) / len(flat.points)
     return [point("left", holding, free, value, "" if settled else rest.status.message)]
 
 
-def kept(mesh, imposed, points):
+def kept_angles(mesh, imposed, points):
     """Part of the angles of its hinges on an imposed shape that a mesh has, weighted by what they cost."""
     before, weights = rest_state(imposed, mesh.hinges).T
     after = rest_state(points, mesh.hinges)[:, 0]
@@ -254,7 +254,7 @@ def let_go(pattern, degrees, device):
     run = simulate(scene, solver, device=device, dtype="float64")
     series = pattern if pattern == "equilateral" else f"{pattern}, turned by {degrees:g}°"
     frames = np.unique(np.geomspace(1, len(run.points) - 1, 25).astype(int))
-    return [point("time", series, run.times[frame], kept(flat, start, run.points[frame])) for frame in frames]
+    return [point("time", series, run.times[frame], kept_angles(flat, start, run.points[frame])) for frame in frames]
 
 
 def cantilever(pattern, elements, device):

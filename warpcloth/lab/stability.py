@@ -26,7 +26,7 @@ _FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
 
 
 @dataclass(frozen=True)
-class Trial:
+class BatchRun:
     """The result of a run of B copies; a copy that diverged is NaN from there.
 
     Attributes:
@@ -75,7 +75,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
                     raise Slow(f"stopped after {limit:g} s, in frame {number} of {frames}")
     said = [watch.messages.get(copy, each.value if each in _FAILED else "") for copy, each in enumerate(stepper.results)]
     said = [text.replace(f", copy {copy}:", ":") for copy, text in enumerate(said)]  # which is of the row, not of the map
-    return Trial(points, watch.good, watch.growth, said, list(stepper.results), stepper.steps_per_frame)
+    return BatchRun(points, watch.good, watch.growth, said, list(stepper.results), stepper.steps_per_frame)
 
 
 def measure(
@@ -117,8 +117,8 @@ def measure(
         list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS` ("stalled": a step ended in
         no minimum; "unsure": inaccurate or not, the reference does not tell), ``status`` ("ok", "diverged", "slow" or
         "refused"), ``reason``, ``step`` (that of divergence, or None), ``steps`` (those of the run), ``growth`` (see
-        :class:`Trial`), ``error`` (or None), ``floor``, the distance of the reference to a run of twice its step, which bounds
-        its own error if each halving at least halves that (or None), and ``rules`` (see
+        :class:`BatchRun`), ``error`` (or None), ``floor``, the distance of the reference to a run of twice its step, which
+        bounds its own error if each halving at least halves that (or None), and ``rules`` (see
         :func:`warpcloth.lab.stability_limits.limit_ratios`), of which :data:`KNOWN` is ``floor`` over ``accuracy``.
     """
     ref, setups = SceneRef(**scene), [Setup(**setup) for setup in setups]
@@ -150,7 +150,7 @@ def measure(
 
 
 def _attempt(ref, record, fixed, axis, group, length, device, dtype, limit):
-    """The :class:`Trial` of a group, or the cell of all its copies."""
+    """The :class:`BatchRun` of a group, or the cell of all its copies."""
     try:
         if len(group) == 1:
             scene = scene_at(ref, {**fixed, axis: group[0]}, *length)
@@ -164,7 +164,7 @@ def _attempt(ref, record, fixed, axis, group, length, device, dtype, limit):
 
 
 def _reference(ref, fixed, axis, group, length, device, limit):
-    """Returns the :class:`Trial` of the coarser run and of the reference of a group, or why there is none; None without any."""
+    """Returns a :class:`BatchRun` of the coarser run and of the reference of a group, or why there is none; or None."""
     dt = {**fixed, axis: group[0]}["dt"]
     steps, duration = length
     steps = steps if duration is None else steps_in(duration, dt)

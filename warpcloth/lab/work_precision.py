@@ -11,7 +11,7 @@ import math
 from ..base.digest import scene_digest
 from ..base.outputs import TEXT, Output
 from . import convergence, physics, spectrum, trajectory
-from .campaign import kept, sweep
+from .campaign import kept_store, sweep
 from .machine import machine
 from .measurements import task
 from .reference import reference
@@ -227,7 +227,7 @@ def front(rows, floor=0.0, name="error"):
         name: The error, "error" or "strain_error".
     """
     eligible = [i for i, row in enumerate(rows) if row["status"] == "ok" and row[name] is not None]
-    levels, spreads = {i: max(rows[i][name], floor) for i in eligible}, {i: spread(rows[i]) for i in eligible}
+    levels, spreads = {i: max(rows[i][name], floor) for i in eligible}, {i: quartiles(rows[i]) for i in eligible}
     order = {i: (rows[i]["ms_per_second"], rows[i][name], i) for i in eligible}
 
     def beats(i, j):
@@ -238,14 +238,14 @@ def front(rows, floor=0.0, name="error"):
     return sorted((j for j in eligible if not any(beats(i, j) for i in eligible)), key=order.get)
 
 
-def spread(row):
+def quartiles(row):
     """Returns the quartiles of the time for a second of motion, (low, high) [ms]; both are the median if they are unknown."""
     if not row.get("spread"):
         return row["ms_per_second"], row["ms_per_second"]
     return tuple(each * row["ms_per_second"] / row["ms"] for each in row["spread"])
 
 
-def left_out(found):
+def without_point(found):
     """(label, status and reason) of the rows of a diagram that have no point in the picture, one for all alike of a solver."""
     groups = {}
     for row in found["rows"]:
@@ -298,6 +298,6 @@ def _measured(function, scene, setups, given, run):
 
 def _results(tasks, run):
     """The result of each task and the machine that measured it, in their order."""
-    run = run if "store" in run else {"store": kept("work-precision", run.get("executor")), **run}
+    run = run if "store" in run else {"store": kept_store("work-precision", run.get("executor")), **run}
     results = {each.key: result for each, result in sweep(tasks, **run)}
     return [{**results[each.key], "machine": run["store"].machine(each)} for each in tasks]

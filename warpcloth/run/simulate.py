@@ -23,7 +23,7 @@ from ..scene.scene import Scene
 from ..solvers.step import Step
 from ..usd import FrameSequence
 from .checkpoint import facts_of
-from .frames import state_of
+from .frames_ahead import state_of
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
 

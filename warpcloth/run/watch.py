@@ -7,7 +7,7 @@ import numpy as np
 from ..base.turns import in_turn
 from ..core.status import Result, Status, sentence
 from .balance import GAIN, STRETCHED, Balance
-from .frames import Frame, frames_of
+from .frames_ahead import Frame, frames_of
 
 
 def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
@@ -17,12 +17,12 @@ def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
         watch: The :class:`Watch`; it also notes how the last frame ended, good or not.
         frames: Number of the last frame.
-        ahead: See :func:`warpcloth.run.frames.frames_of`.
+        ahead: See :func:`warpcloth.run.frames_ahead.frames_of`.
         first: Number of the frame that the stepper is at.
         keeps: Function of the number of a frame which says whether that has the state of the stepper, or None.
 
     Yields:
-        The number of each frame and the :class:`warpcloth.run.frames.Frame`, in which copies that diverged are NaN.
+        The number of each frame and the :class:`warpcloth.run.frames_ahead.Frame`, in which copies that diverged are NaN.
     """
     if first == frames:
         return
@@ -76,7 +76,7 @@ class Watch:
 
         Args:
             number: Number of the frame; they come in order from 1.
-            frame: The :class:`warpcloth.run.frames.Frame`.
+            frame: The :class:`warpcloth.run.frames_ahead.Frame`.
         """
         self.last, points, velocities = frame, frame.points, frame.velocities
         self.seconds.append(frame.seconds)

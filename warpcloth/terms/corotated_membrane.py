@@ -5,7 +5,7 @@ from typing import Any, ClassVar, TypeVar
 
 from ..kernels.term import Term
 from ..kernels.terms import COROTATED_MEMBRANE
-from .membrane import Membrane, product
+from .membrane import Membrane, membrane_stiffness
 
 Own = TypeVar("Own", bound="CorotatedMembrane")
 
@@ -29,4 +29,4 @@ class CorotatedMembrane(Membrane):
     @classmethod
     def from_material(cls: type[Own], youngs_modulus: float, thickness: float, **fields: Any) -> Own:
         """Of a material with E [Pa] and ν = 0, ``thickness`` t [m] thick."""
-        return cls(stiffness=product(cls, youngs_modulus, thickness), **fields)
+        return cls(stiffness=membrane_stiffness(cls, youngs_modulus, thickness), **fields)

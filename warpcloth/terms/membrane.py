@@ -50,7 +50,7 @@ class IsotropicMembrane(Membrane):
     @classmethod
     def from_material(cls: type[Own], youngs_modulus: float, poisson_ratio: float, thickness: float, **fields: Any) -> Own:
         """Of a material with E [Pa] and ν, ``thickness`` t [m] thick: μ = Et/(2(1 + ν)), λ = Eνt/(1 − ν²) [N/m]."""
-        return cls(stiffness=product(cls, youngs_modulus, thickness), poisson_ratio=poisson_ratio, **fields)
+        return cls(stiffness=membrane_stiffness(cls, youngs_modulus, thickness), poisson_ratio=poisson_ratio, **fields)
 
     @classmethod
     def from_moduli(cls: type[Own], mu: float, lam: float, **fields: Any) -> Own:
@@ -64,7 +64,7 @@ class IsotropicMembrane(Membrane):
         return self.term.rest_state(mesh.points, stencil, poisson_ratio=self.of_elements("poisson_ratio", len(stencil)))
 
 
-def product(cls, youngs_modulus, thickness):
+def membrane_stiffness(cls, youngs_modulus, thickness):
     """Et [N/m]."""
     given = {"youngs_modulus": youngs_modulus, "thickness": thickness}
     modulus, t = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in given.items())

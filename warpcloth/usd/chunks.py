@@ -14,7 +14,7 @@ import numpy as np
 
 from ..base.interrupts import deferred
 from ..base.outputs import Lock
-from .layers import flatten, named_from, relative_path
+from .layers import flattened_layer, named_from, relative_path
 from .modules import Sdf, Usd
 from .packages import Contents
 from .stage import METADATA_KEY, followed, identity
@@ -380,7 +380,7 @@ class ChunkWriter:
     def _write_single_file(self, keep):
         contents = Contents(self.run)
         named = contents.named if self._packed else named_from(self._output.parent)
-        flat = self._declared(flatten(self._base_paths(), self._describe, named))
+        flat = self._declared(flattened_layer(self._base_paths(), self._describe, named))
         for attribute in self._attributes():
             flat.GetAttributeAtPath(attribute).ClearInfo("timeSamples")
         single = self.run / f"{self._output.stem}.usdc"

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.types import FilePath
 from ..mesh.mesh import Surface
 from ..mesh.sequences import Sequence
-from .layers import files_of
+from .layers import files_of_stage
 from .modules import Sdf, UsdGeom
 from .stage import (
     curve_vertices,
@@ -128,7 +128,7 @@ class FrameSequence:
     @property
     def files(self) -> tuple[str, ...]:
         """Real paths of the files that the stage is made of."""
-        return tuple(sorted(files_of(self._stage)))
+        return tuple(sorted(files_of_stage(self._stage)))
 
     @property
     def ndim(self) -> int:

@@ -229,7 +229,7 @@ def over_layer(source, prim, mesh, primvars):
     for name in _BLOCKED:
         _block(artist, over, name)
     declare_primvars(layer, artist, target, surroundings.path)
-    return layer, target, root_metadata(stage), surroundings, files_of(stage)
+    return layer, target, root_metadata(stage), surroundings, files_of_stage(stage)
 
 
 def artist_prim(surroundings, mesh):
@@ -317,7 +317,7 @@ def _block(artist, over, name):
     return True
 
 
-def files_of(stage):
+def files_of_stage(stage):
     """Real paths of all files that a stage is made of."""
     return {os.path.realpath(used.realPath) for used in stage.GetUsedLayers() if used.realPath}
 
@@ -334,7 +334,7 @@ def root_metadata(stage):
     return facts
 
 
-def flatten(base_paths, describe, named):
+def flattened_layer(base_paths, describe, named):
     """One layer with everything that the given layers compose to, without their clips.
 
     Args:
@@ -357,7 +357,7 @@ def flatten(base_paths, describe, named):
 
 
 def named_from(folder):
-    """Returns a function for `flatten` that makes paths of files relative to a folder; paths to missing files stay."""
+    """Returns a function for `flattened_layer` that makes paths of files relative to a folder; paths to missing files stay."""
     return lambda path, _: relative_path(path, folder) if os.path.isabs(path) and os.path.exists(path) else path
 
 

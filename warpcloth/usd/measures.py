@@ -19,7 +19,7 @@ from .layers import (
     bind_material,
     declare_primvars,
     define_material,
-    files_of,
+    files_of_stage,
     root_metadata,
     scene_layer,
 )
@@ -101,7 +101,7 @@ class MeasureWriter(ChunkWriter):
             material = UsdShade.Material.Get(stage, "/World/Looks/Cloth")
         else:
             rest, target, stage = _over(source, mesh, primvars, coloured)
-            facts, path, files = _facts_of(stage, source), source.path, files_of(stage)
+            facts, path, files = _facts_of(stage, source), source.path, files_of_stage(stage)
             material = _show_colours(stage, source, with_mesh=bool(coloured)) if coloured or directions else None
             self._stage = stage
 

@@ -13,10 +13,10 @@ from .values import (
     array_of,
     check_composed,
     check_stage,
+    checked_rows,
     reason_of,
     refuse_outside,
     refuse_path,
-    rows_of,
     sentences,
     time_codes_of,
     token_of,
@@ -275,7 +275,7 @@ def curve_vertices(prim, count):
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(VERTEX_PRIMVAR)
     if not (primvar and primvar.HasValue()):
         return np.arange(count, dtype=np.int32)
-    vertices = rows_of(primvar.GetName(), primvar.Get(), whole=True)
+    vertices = checked_rows(primvar.GetName(), primvar.Get(), whole=True)
     named = np.unique(vertices)
     if len(vertices) != count or not np.array_equal(named, np.arange(len(named))):
         raise ValueError(f"primvars:{VERTEX_PRIMVAR} must name each vertex from 0 on, once for each of {count} points")

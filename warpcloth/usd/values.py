@@ -155,10 +155,10 @@ def array_of(attribute, components=(), whole=False, time=None):
         ValueError: The rows have another type or shape, or cannot be read.
     """
     value = value_of(attribute, time)
-    return None if value is None else rows_of(attribute.GetName(), value, components, whole)
+    return None if value is None else checked_rows(attribute.GetName(), value, components, whole)
 
 
-def rows_of(name, value, components=(), whole=False):
+def checked_rows(name, value, components=(), whole=False):
     """Returns the rows of a value, with the checks of :func:`array_of`."""
     rows = np.array(value)
     if rows.dtype.kind not in ("iu" if whole else "iuf") or rows.shape[1:] != components or rows.ndim != 1 + len(components):
