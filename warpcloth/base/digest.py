@@ -19,6 +19,8 @@ def scene_digest(scene):
     """
     mesh = scene.mesh
     facts = [mesh.points, mesh.triangles, mesh.edges, mesh.grid_shape, scene.vertex_masses, scene.positions, scene.velocities]
+    if mesh.parts:
+        facts += [(name, *part) for name, part in mesh.parts.items()]
     return digest_of((*facts, scene.terms, scene.pins, scene.gravity, float(scene.fps)))
 
 

@@ -1,7 +1,7 @@
 """The mesh of a cloth: NumPy arrays, validated once, and the topology that energies and solvers read."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from ..base.checks import choice, shown
 from ..base.limits import refuse_memory
 from ..base.types import Converted, FilePath, UpAxis, default
 from ..kernels.deformation import FLATTEST
+from .parts import Part, checked_parts, joined
 from .selection import select
 
 # By the ending of a file, what reads a mesh from it: (path, name of the geometry, class) → mesh. Modules that read files enter
@@ -42,6 +43,7 @@ class Mesh:
         texture_coordinates: One st pair for each vertex (n, 2), float64, or None.
         grid_shape: (nx, ny) if vertex i + nx·j is column i, row j of a grid of four-sided cells, or None.
         up_axis: "Y" or "Z", which gravity and files follow; None if unknown, which they take as "Y".
+        parts: Of a mesh that :meth:`join` made (first vertex, number of vertices, grid_shape) of each part by name, or None.
 
     Raises:
         ValueError: An array has the wrong shape or type, is empty, or has an element (named by its index) that is not
@@ -65,6 +67,7 @@ class Mesh:
     texture_coordinates: Converted[ArrayLike | None, np.ndarray | None] = default(None)
     grid_shape: tuple[int, int] | None = None
     up_axis: UpAxis | None = None
+    parts: Mapping[str, Part] | None = None
 
     def __post_init__(self) -> None:
         if self.up_axis is not None:
@@ -99,6 +102,8 @@ class Mesh:
             if nx * ny != n:
                 raise ValueError(f"grid_shape = {self.grid_shape}: {nx}·{ny} must be the number of points, {n}")
             keep(self, "grid_shape", (nx, ny))
+        if self.parts is not None:
+            keep(self, "parts", checked_parts(self.parts, n, self.triangles if len(self.triangles) else self.edges))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self.points)} points, {len(self.triangles)} triangles, {len(self.edges)} edges)"
@@ -153,6 +158,51 @@ class Mesh:
         triangles = np.where(mirrored[:-1, :-1, None], np.stack([a, c, b, b, c, d], axis=-1), straight).reshape(-1, 3)
         st = st / st.max(axis=0)
         return cls(points.reshape(-1, 3), triangles, texture_coordinates=st, grid_shape=None if equilateral else (nx, ny))
+
+    @classmethod
+    def join(cls: type[Own], meshes: Mapping[str, "Mesh"]) -> Own:
+        """One mesh of several, such as pieces of a garment: the vertices of the first part, then those of the next.
+
+        ``part(name)`` selects the vertices of a part, a term with ``part=name`` acts on that part alone, and own pairs of a
+        :class:`warpcloth.Spring` join two. Texture coordinates are kept if all parts have them.
+
+        Args:
+            meshes: The mesh of each part by its name, which must be an identifier.
+
+        Raises:
+            ValueError: There is none, triangles are mixed with edges alone, the up axes differ, or a name is no identifier.
+        """
+        return cls(**joined(meshes))
+
+    def part(self, name: str) -> "Mesh":
+        """A part by itself, as it was joined.
+
+        Raises:
+            ValueError: The mesh has no part of that name.
+        """
+        found = (self.parts or {}).get(name)
+        if found is None:
+            known = f"its parts are {', '.join(self.parts)}" if self.parts else "Mesh.join makes one of parts"
+            raise ValueError(f"the mesh has no part {name!r}; {known}")
+        first, count, grid_shape = found
+        chosen = slice(first, first + count)
+
+        def own(elements):
+            return elements[(elements[:, 0] >= first) & (elements[:, 0] < first + count)] - first
+
+        st = self.texture_coordinates
+        return Mesh(
+            self.points[chosen],
+            triangles=own(self.triangles) if len(self.triangles) else None,
+            edges=None if len(self.triangles) else own(self.edges),
+            texture_coordinates=None if st is None else st[chosen],
+            grid_shape=grid_shape,
+            up_axis=self.up_axis,
+        )
+
+    def _of_parts(self, indices: Callable[["Mesh"], np.ndarray]) -> np.ndarray:
+        """What a function finds of each part, as vertices of the whole."""
+        return np.concatenate([indices(self.part(name)) + part.first for name, part in (self.parts or {}).items()])
 
     @classmethod
     def chain(cls: type[Own], n: int, length: float = 1.0, direction: ArrayLike = (0, -1, 0)) -> Own:
@@ -221,6 +271,8 @@ class Mesh:
         Raises:
             ValueError: The triangles are closed, without a boundary.
         """
+        if self.parts:
+            return self._of_parts(Mesh.corners)
         if self.grid_shape:
             nx, ny = self.grid_shape
             return np.array([0, nx - 1, nx * (ny - 1), nx * ny - 1], dtype=np.int32)
@@ -257,6 +309,8 @@ class Mesh:
         """  # noqa: E501 (a table's row is one line)
         if kind not in ("structural", "shear", "bending", "edges"):
             raise ValueError(f'kind = {kind!r}: must be "structural", "shear", "bending" or "edges"')
+        if self.parts and kind != "edges":
+            return self._of_parts(lambda mesh: mesh.springs(kind))
         if self.grid_shape and kind != "edges":
             nx, ny = self.grid_shape
             vertex = np.arange(nx * ny).reshape(ny, nx)

@@ -27,11 +27,13 @@ def select(mesh, text):
                   | "all" | "boundary" | "corners"
                   | "nearest" "(" x "," y "," z ["," count] ")"
                   | "index" "(" range {"," range} ")"
+                  | "part" "(" name ")"
         range     = index | [start] ":" [stop] [":" step]
 
     Comparisons are of rest points, with 1e-6 of the bounding box's diagonal as tolerance: within it a coordinate is
     equal, and so neither less nor greater. `nearest` gives the vertex nearest to a point, or that many (of equally near
-    ones the lower indices). A range is Python's, without negative numbers: `10:20` is 10 to 19.
+    ones the lower indices). A range is Python's, without negative numbers: `10:20` is 10 to 19. `part` is one of a mesh that
+    was joined.
 
     Args:
         mesh: A Mesh.
@@ -157,15 +159,17 @@ class _Reader:
 
     def vertices(self):
         column = self.tokens[self.position][2]
-        word = self.accept("x", "y", "z", "all", "boundary", "corners", "nearest", "index")
+        word = self.accept("x", "y", "z", "all", "boundary", "corners", "nearest", "index", "part")
         if word is None:
-            self.expected("x, y, z, all, boundary, corners, nearest(…), index(…), not or (")
+            self.expected("x, y, z, all, boundary, corners, nearest(…), index(…), part(…), not or (")
         if word in ("x", "y", "z"):
             return self.comparison("xyz".index(word))
         if word == "nearest":
             return self.nearest()
         if word == "index":
             return self.index()
+        if word == "part":
+            return self.part()
         if word == "all":
             return self.mask(slice(None))
         try:
@@ -184,6 +188,12 @@ class _Reader:
         tolerance = _EQUAL * np.linalg.norm(np.ptp(self.mesh.points, axis=0))
         less, greater = above < -tolerance, above > tolerance
         return {"<": less, "<=": ~greater, "==": ~(less | greater), "!=": less | greater, ">=": ~less, ">": greater}[sign]
+
+    def part(self):
+        self.require("(")
+        first, count, _ = (self.mesh.parts or {})[self.require(*(self.mesh.parts or ["a mesh of parts"]))]
+        self.require(")")
+        return self.mask(slice(first, first + count))
 
     def nearest(self):
         self.require("(")

@@ -85,7 +85,7 @@ class Vary:
         for copy in range(self.copies):
             try:
                 declared = replace(term, **{name: values[copy] for name, values in given.items()})
-                rest.append(declared.rest(mesh, positions[copy], one.stencil))
+                rest.append(declared.elements(mesh, positions[copy]).rest)
             except ValueError as error:
                 raise ValueError(f"{error}, in copy {copy}") from error
         return one, np.stack(rest), stiffness, damping

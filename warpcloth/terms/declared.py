@@ -1,7 +1,7 @@
 """The base of the records of energies: fields that say what they take, checks, and the elements on a mesh."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
 import numpy as np
@@ -96,6 +96,8 @@ class Declared:
         term: The energy, of ``kernels/terms``.
         stiffness: One or (E,) [unit of the term].
         name: To tell two terms of one kind apart.
+        part: The part of the mesh that it acts on, see :meth:`warpcloth.Mesh.join`; all where it is None. Selections, indices
+            and arrays are then those of the part.
 
     Raises:
         ValueError: If a value breaks a rule; lengths are compared with the number of elements when a scene is built.
@@ -105,8 +107,11 @@ class Declared:
 
     stiffness: float | Sequence[float] | np.ndarray = field(metadata=FROM_0)
     name: str | None = None
+    part: str | None = None
 
     def __post_init__(self):
+        if not (self.part is None or isinstance(self.part, str)):
+            raise ValueError(f"{self.label}.part is {shown(self.part)}; it must be the name of a part of the mesh or None")
         if not (self.name is None or isinstance(self.name, str)):
             raise ValueError(f"{type(self).__name__}.name is {shown(self.name)}; it must be a text or None")
         for name, of_field in self.quantities().items():
@@ -159,8 +164,17 @@ class Declared:
             :class:`Elements`.
 
         Raises:
-            ValueError: If the mesh has none, or an array has another length than the elements.
+            ValueError: If the mesh has none, has no such part, or an array has another length than the elements.
         """
+        if self.part is None:
+            return self.elements_on(mesh, positions)
+        part = mesh.part(self.part)
+        first = mesh.parts[self.part].first
+        found = self.elements_on(part, None if positions is None else positions[first : first + len(part.points)])
+        return replace(found, stencil=found.stencil + np.int32(first))
+
+    def elements_on(self, mesh: Mesh, positions: np.ndarray) -> Elements:
+        """The elements on a whole mesh, see :meth:`elements`, which leads here with the part alone if there is one."""
         stencil = self.stencil(mesh)
         if len(stencil) == 0:
             raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")

@@ -97,8 +97,8 @@ class RigidCluster(Declared):
         bodies = (len(self._selections) or 1) if self.sizes is None else len(self.sizes)
         return self.of_elements("stiffness", bodies)
 
-    def elements(self, mesh: Mesh, positions: np.ndarray) -> Elements:
-        found = super().elements(mesh, positions)
+    def elements_on(self, mesh: Mesh, positions: np.ndarray) -> Elements:
+        found = super().elements_on(mesh, positions)
         cells = np.cumsum([0, *(len(body) for body in self._bodies(mesh))])
         return replace(found, cells=cells, refresh=Refresh(EVALUATION, _fit))
 

@@ -25,7 +25,7 @@ class Sparse(Declared):
         """Rest state (C, P) of the cells, from the rest shape of the mesh."""
         raise NotImplementedError
 
-    def elements(self, mesh, positions):
+    def elements_on(self, mesh, positions):
         from scipy.sparse import coo_array
 
         D, M, n = coo_array(self.operator(mesh)), self.term.rows, len(mesh.points)

@@ -79,6 +79,10 @@ ATTRIBUTES = (
     Attribute("mesh.points", "warpcloth:points", "cloth", ("double3[]",)),  # in the prim's own space
     Attribute("mesh.edges", "warpcloth:edges", "cloth", ("int2[]",)),  # of curves, in order
     Attribute("mesh.grid_shape", "warpcloth:gridShape", "cloth", ("int2",)),
+    # Parts that were joined, in order: names, numbers of vertices, and shapes of those that are grids, else (0, 0).
+    Attribute("mesh.parts", "warpcloth:parts", "cloth", ("token[]",)),
+    Attribute("mesh.part_sizes", "warpcloth:partSizes", "cloth", ("int[]",)),
+    Attribute("mesh.part_grid_shapes", "warpcloth:partGridShapes", "cloth", ("int2[]",)),
     # Standard: UsdPhysics, and the AOUSD proposal for deformable bodies.
     Attribute("(total mass)", "physics:mass", "body", ("float",), kilograms=1),  # spread evenly
     Attribute("(mass per volume)", "physics:density", "body", ("float",), kilograms=1, metres=-3),
@@ -103,6 +107,7 @@ def attributes():
     """All rows of the table: one for each field of the energies that are registered, and those above."""
     rows = {
         "type": ("token",),
+        "part": ("token",),
         "name": ("string",),  # only where <name> is not the name of the term; empty where it has none
     }
     for energy in TERMS.values():

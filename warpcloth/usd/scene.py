@@ -9,6 +9,7 @@ import numpy as np
 from ..base.limits import MOST_FRAMES
 from ..base.types import FilePath
 from ..mesh.mesh import Mesh
+from ..mesh.parts import Part
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
 from .attributes import TERMS_NAMESPACE, Values, attributes, author, has_api
@@ -120,7 +121,8 @@ def _exact_mesh(values, cloth, surroundings):
         points = points @ transform[:3, :3] + transform[3, :3] if same else None
     if edges is not None and not np.array_equal(np.unique(np.sort(edges, axis=1), axis=0), np.sort(mesh.edges, axis=1)):
         edges = None
-    if points is None and edges is None and grid_shape is None:
+    parts = _parts(values)
+    if points is None and edges is None and grid_shape is None and parts is None:
         return mesh
     return Mesh(
         mesh.points if points is None else points,
@@ -129,7 +131,21 @@ def _exact_mesh(values, cloth, surroundings):
         texture_coordinates=mesh.texture_coordinates,
         grid_shape=None if grid_shape is None else tuple(grid_shape.tolist()),
         up_axis=mesh.up_axis,
+        parts=parts,
     )
+
+
+def _parts(values):
+    """The parts of a mesh by name, or None."""
+    names, sizes, shapes = (values.get(f"mesh.{name}") for name in ("parts", "part_sizes", "part_grid_shapes"))
+    if names is None and sizes is None and shapes is None:
+        return None
+    counts = [None if each is None else len(each) for each in (names, sizes, shapes)]
+    if len(set(counts)) > 1:
+        raise ValueError(f"warpcloth:parts, partSizes, partGridShapes have {counts} values, must have one each for every part")
+    firsts = np.cumsum(sizes) - sizes
+    grids = [tuple(shape) if any(shape) else None for shape in shapes.tolist()]
+    return {name: Part(*part) for name, *part in zip(names, firsts.tolist(), sizes.tolist(), grids, strict=True)}
 
 
 def _duration(stage, values, fps):
@@ -338,6 +354,10 @@ def _scene_values(scene):
         given["mesh.edges"] = mesh.edges
     if mesh.grid_shape:
         given["mesh.grid_shape"] = mesh.grid_shape
+    if mesh.parts:
+        given["mesh.parts"] = tuple(mesh.parts)
+        given["mesh.part_sizes"] = [part.count for part in mesh.parts.values()]
+        given["mesh.part_grid_shapes"] = [part.grid_shape or (0, 0) for part in mesh.parts.values()]
     return given
 
 

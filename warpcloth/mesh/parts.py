@@ -1,0 +1,88 @@
+"""Parts: several meshes joined into one, such as the pieces of a garment or layers of cloth.
+
+The vertices of a part follow one another, and no triangle or edge joins two parts. Springs between parts, such as seams, are
+pairs of vertices of the whole.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ..base.checks import shown
+
+
+class Part(NamedTuple):
+    """A part of a mesh: vertices ``first`` to ``first + count``.
+
+    Attributes:
+        first: Its first vertex.
+        count: How many vertices it has.
+        grid_shape: (nx, ny) if it is a grid, or None.
+    """
+
+    first: int
+    count: int
+    grid_shape: tuple[int, int] | None = None
+
+
+def joined(meshes):
+    """The fields of a mesh that meshes are the parts of.
+
+    Args:
+        meshes: A :class:`warpcloth.Mesh` for each name.
+
+    Raises:
+        ValueError: If there are none, some have triangles and others edges alone, or the up axes differ.
+    """
+    if not (isinstance(meshes, Mapping) and meshes and all(hasattr(mesh, "triangles") for mesh in meshes.values())):
+        raise ValueError(f"parts is {shown(meshes)}; it must be a mapping of names to meshes, with one part or more")
+    each = list(meshes.values())
+    of_triangles = [len(mesh.triangles) > 0 for mesh in each]
+    if any(of_triangles) != all(of_triangles):
+        raise ValueError("parts has meshes of triangles and meshes of edges alone; all must be of one kind")
+    axes = {mesh.up_axis for mesh in each} - {None}
+    if len(axes) > 1:
+        raise ValueError("parts has meshes whose up axis is Y and others whose up axis is Z; it must be the same for all")
+    firsts = np.cumsum([0, *(len(mesh.points) for mesh in each)])
+
+    def shifted(field):
+        return np.concatenate([getattr(mesh, field) + first for mesh, first in zip(each, firsts[:-1], strict=True)])
+
+    textured = all(mesh.texture_coordinates is not None for mesh in each)
+    return {
+        "points": np.concatenate([mesh.points for mesh in each]),
+        "triangles": shifted("triangles") if all(of_triangles) else None,
+        "edges": None if all(of_triangles) else shifted("edges"),
+        "texture_coordinates": np.concatenate([mesh.texture_coordinates for mesh in each]) if textured else None,
+        "up_axis": next(iter(axes), None),
+        "parts": {
+            name: Part(int(first), len(mesh.points), mesh.grid_shape)
+            for (name, mesh), first in zip(meshes.items(), firsts[:-1], strict=True)
+        },
+    }
+
+
+def checked_parts(parts, count, elements):
+    """Parts as a dict of :class:`Part` by name.
+
+    Args:
+        parts: (first, count, grid_shape) by name.
+        count: Number of vertices of the mesh.
+        elements: Its triangles or edges, (m, K).
+
+    Raises:
+        ValueError: If a name is no identifier, the parts are not all vertices, one part after another, or an element joins two.
+    """
+    found = {name: Part(*part) for name, part in parts.items()}
+    for name in found:
+        if not (isinstance(name, str) and name.isidentifier()):
+            raise ValueError(f"parts: the name {name!r} must be letters, digits and underscores, and begin with no digit")
+    ends = np.cumsum([0, *(part.count for part in found.values())])
+    if not found or ends[-1] != count or any(part.first != first for part, first in zip(found.values(), ends, strict=False)):
+        raise ValueError(f"parts is {shown(found)}; it must have all {count} vertices, one part after another")
+    of_part = np.searchsorted(ends, elements, side="right")
+    apart = np.flatnonzero((of_part != of_part[:, :1]).any(axis=1))
+    if len(apart):
+        raise ValueError(f"parts: vertices {elements[apart[0]].tolist()} of an element must lie in one part")
+    return found
