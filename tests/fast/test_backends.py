@@ -78,7 +78,7 @@ def test_explicit_steps_are_those_of_the_core(name, backend, scheme, dtype, devi
     model = scene.build(device=device, dtype=dtype, copies=2, vary=vary)
     options = wc.Explicit(substeps=4, scheme=scheme, above_limit="allow")
     stepper, core = (ExplicitStepper(options, model, each) for each in (backend, "core"))
-    assert stepper.h <= step_limits(model)[1] and stepper.steps.record.backend == backend
+    assert stepper.h <= step_limits(model)[1] and stepper.plan.record.backend == backend
     for each in (stepper, core):
         for _ in range(steps):
             each.step()
@@ -94,7 +94,7 @@ def test_explicit_steps_are_those_of_the_core(name, backend, scheme, dtype, devi
 def record(scene, device, backend="auto", threads=1):
     """How explicit steps of a scene are taken."""
     model = scene.build(device=device, threads=threads)
-    return ExplicitStepper(wc.Explicit(substeps=500, above_limit="allow"), model, backend).steps.record
+    return ExplicitStepper(wc.Explicit(substeps=500, above_limit="allow"), model, backend).plan.record
 
 
 BENDING = wc.QuadraticBending(stiffness=1e-3)
@@ -386,7 +386,7 @@ def test_motion_does_not_depend_on_where_the_origin_is(away, substeps, backend, 
         return ExplicitStepper(wc.Explicit(substeps=substeps), scene.build(device=device, dtype=dtype), backend)
 
     exact, stepper, other = (stepper_of(*key) for key in ((0.0, "float64"), (away, "float32"), (away, "float32")))
-    assert stepper.steps.record.compensated == ("position residual" in stepper.state.arrays) == (away > 0.0)
+    assert stepper.plan.record.compensated == ("position residual" in stepper.state.arrays) == (away > 0.0)
     for _ in range(20):
         exact.frame()
         stepper.frame()
@@ -427,5 +427,5 @@ def test_the_residual_of_positions_is_packed_where_that_holds_it(scene, varied, 
     first = {"positions": mesh.points, "velocities": 0.0 * mesh.points, "gravity": np.array(scene.gravity)}
     vary = {name: np.stack([first[name], first[name] + more]) for name, more in varied.items()}
     model = scene.build(device=device, copies=2, vary=vary)
-    found = ExplicitStepper(wc.Explicit(substeps=64), model, "gather").steps.record
+    found = ExplicitStepper(wc.Explicit(substeps=64), model, "gather").plan.record
     assert found.compensated and found.packed == packed

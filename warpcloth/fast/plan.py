@@ -18,6 +18,7 @@ from .gather_corrections import GatherSweeps
 from .gather_gradient import GatherGradient
 from .gather_step import GatherStep
 from .scatter_corrections import ScatterSweeps
+from .step_record import StepRecord
 from .subdomains import SubdomainSteps
 
 BACKENDS = ("auto", "core", "blocks", "gather")
@@ -32,10 +33,11 @@ class Plan:
 
     Attributes:
         model, backend: As given.
+        record: :class:`warpcloth.fast.step_record.StepRecord` of the explicit steps, once they are made; else None.
     """
 
     def __init__(self, model, backend):
-        self.model, self.backend = model, backend
+        self.model, self.backend, self.record = model, backend, None
 
     def gradient(self, corrected=False, terms=None):
         """Returns a :class:`warpcloth.core.gradient.Gradient`, or a faster one of the same methods."""
@@ -57,8 +59,14 @@ class Plan:
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
         if pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
-            return SubdomainSteps(*given, pool)
-        return {"core": ExplicitStep, "blocks": BlockStep, "gather": GatherStep}[self.backend](*given)
+            steps = SubdomainSteps(*given, pool)
+        elif self.backend == "core":
+            self.record = StepRecord("core", compensated=given[-1])
+            return ExplicitStep(*given)
+        else:
+            steps = {"blocks": BlockStep, "gather": GatherStep}[self.backend](*given)
+        self.record = steps.record
+        return steps
 
     def jacobi_sweeps(self, *given):
         """Returns Jacobi sweeps, see :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`, whose arguments they have."""

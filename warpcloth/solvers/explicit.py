@@ -238,15 +238,16 @@ class ExplicitStepper(LaunchedStepper):
         backend: See :func:`warpcloth.fast.plan.plan`.
 
     Attributes:
-        steps: The steps that the plan makes; its ``record`` is a :class:`warpcloth.core.explicit_step.StepRecord`.
+        plan: The :class:`warpcloth.fast.plan.Plan`, whose ``record`` says how steps are taken.
     """
 
     def __init__(self, options, model, backend="auto"):
         super().__init__(options, model)
         symplectic = options.scheme == "symplectic"
-        self.steps = plan(model, backend).explicit_step(tuple(self.state), self.h, symplectic, self.count, self.pool)
-        self.state.add("position residual", self.steps.residual)
+        self.plan = plan(model, backend)
+        self._steps = self.plan.explicit_step(tuple(self.state), self.h, symplectic, self.count, self.pool)
+        self.state.add("position residual", self._steps.residual)
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):
-        self.steps.launch(steps, self.launch_pins_of)
+        self._steps.launch(steps, self.launch_pins_of)
