@@ -26,12 +26,12 @@ def scene(angle: float = 150.0, cells: int = 5, stiffness: float = 100.0, bendin
     held = mesh.select("x == 0 or x == 1")
     x, y, z = mesh.points[held].T
     turn = np.radians(angle) * np.linspace(0.0, 1.0, round(duration * fps) + 1)[:, None] * (x > 0.5)
-    places = [x + 0 * turn, y * np.cos(turn) - z * np.sin(turn), y * np.sin(turn) + z * np.cos(turn)]
+    keyframes = [x + 0 * turn, y * np.cos(turn) - z * np.sin(turn), y * np.sin(turn) + z * np.cos(turn)]
     return wc.Scene(
         mesh,
         density=1.0,
         terms=[wc.Spring(pairs="edges", stiffness=stiffness), wc.DihedralBending(stiffness=bending)],
-        pins=wc.Pins(held, np.stack(places, axis=-1)),
+        pins=wc.Pins(held, np.stack(keyframes, axis=-1)),
         gravity=(0.0, 0.0, 0.0),
         duration=duration,
         fps=fps,

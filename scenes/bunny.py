@@ -24,12 +24,12 @@ def scene(angle: float = 45.0, lift: float = 0.1, stiffness: float = 1e3, bendin
     x, y, z = (mesh.points[held] - neck).T
     ease = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, round(duration * fps) + 1))[:, None] * np.ones_like(y)
     turn, rise = np.radians(angle) * ease * (y > 0.5), lift * ease * (y > 0.5)
-    places = [x * np.cos(turn) + z * np.sin(turn), y + rise, z * np.cos(turn) - x * np.sin(turn)]
+    keyframes = [x * np.cos(turn) + z * np.sin(turn), y + rise, z * np.cos(turn) - x * np.sin(turn)]
     return wc.Scene(
         mesh,
         density=1.0,
         terms=[wc.Spring(pairs="edges", stiffness=stiffness), wc.DihedralBending(stiffness=bending)],
-        pins=wc.Pins(held, np.stack(places, axis=-1) + neck),
+        pins=wc.Pins(held, np.stack(keyframes, axis=-1) + neck),
         gravity=(0.0, 0.0, 0.0),
         duration=duration,
         fps=fps,

@@ -17,7 +17,7 @@ def scene(n: int = 9, stiffness: float = 500.0, bending: float = 1e-5, push: flo
     left = right * (2.0 * load + 4.0 * bar) / (load + bar)
     upper = np.array([[0.0, -string, 0.0], [-left, -string - 0.03, 0.0], [right, -string - 0.03, 0.0]])
     lower = upper[2] - [0.0, string, 0.0] + [[0.0, 0.0, 0.0], [-0.2, -0.03, 0.0], [0.2, -0.03, 0.0]]
-    cloths = [place - [0.0, string, 0.0] + upright for place in (upper[1], lower[1], lower[2] - [0.0, 2.0 * string, 0.0])]
+    cloths = [position - [0.0, string, 0.0] + upright for position in (upper[1], lower[1], lower[2] - [0.0, 2.0 * string, 0.0])]
     points = np.concatenate([[[0.0, 0.0, 0.0]], upper, lower, *cloths])
     first = 7 + n * n * np.arange(3)[:, None]
     mesh = wc.Mesh(points, np.concatenate([grid.triangles + offset for offset in first[:, 0]]))

@@ -442,7 +442,7 @@ def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
             assert np.array_equal(line.get_xydata(), np.transpose([[point[name] for point in row["points"]], gaps]))
     assert "admm: diverged: a gap of 1e+07" in text_of(drawn[0]).replace("\n  ", " ")
     assert [list(line.get_ydata()) for line in drawn[1].axes[0].lines] == [row["eigenvalues"] for row in other["rows"]]
-    floors = [line for line in drawn[1].axes[1].lines if line.get_label() == "rounding of the places"]
+    floors = [line for line in drawn[1].axes[1].lines if line.get_label() == "rounding of the positions"]
     assert [line.get_ydata()[0] for line in floors] == [row["floor"] for row in other["rows"]]
     assert [line.get_color() for line in floors] == [line.get_color() for line in drawn[1].axes[0].lines]
     for axes in (iterations, ms):

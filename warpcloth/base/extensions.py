@@ -36,7 +36,7 @@ def load_extension(name):
     """Imports a module that registers energies and solvers.
 
     Args:
-        name: Name of the module, or path of a .py file; a file takes the place of another of its name that was loaded before.
+        name: Name of the module, or path of a .py file; a file replaces another of its name that was loaded before.
 
     Raises:
         ValueError: It cannot be imported.

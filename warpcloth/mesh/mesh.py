@@ -201,7 +201,7 @@ class Mesh:
         )
 
     def _of_parts(self, indices: Callable[["Mesh"], np.ndarray]) -> np.ndarray:
-        """What a function finds of each part, as vertices of the whole."""
+        """Joins the vertices that a function finds of each part, as vertices of the whole."""
         return np.concatenate([indices(self.part(name)) + part.first for name, part in (self.parts or {}).items()])
 
     @classmethod

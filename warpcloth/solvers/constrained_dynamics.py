@@ -102,7 +102,7 @@ class ConstrainedDynamics(ImplicitStep):
         """The solver on ``model``, all scratch allocated.
 
         Raises:
-            ValueError: If a term has no constraint, or infinite stiffness where that has no place.
+            ValueError: If a term has no constraint, or infinite stiffness where that is not allowed.
         """
         self.refuse(model)
         if self.integrator != "euler":

@@ -39,7 +39,7 @@ class ProjectiveDynamics(ImplicitStep):
 
     Motion across stiff elements is slow: of one spring with a fixed end, of length l and rest length L, what is wrong across
     shrinks by k(L/l)/(m/h² + k) an iteration, what is wrong along is gone after one. Hence the accelerations; a proposal whose
-    φ is above that of the plain iteration from the same place is dropped for that. Chebyshev needs a bound of that factor and
+    φ is above that of the plain iteration from the same point is dropped for that. Chebyshev needs a bound of that factor and
     takes 1 − min m/(h²D), D the row sums of |A|.
 
     Attributes:

@@ -36,7 +36,7 @@ class XPBD(ImplicitStep):
     One hanging mass stretches by mg/k at rest for any iterations and step. Few iterations leave a cloth too soft, the more so
     the finer it is; more substeps cure that better than more iterations (Macklin et al. 2019, *Small steps*): ``hanging`` with
     32² vertices stretches by 26 % with 4 × 20 a frame and by 5 % with 80 × 1. Infinite stiffness is α̃ = 0: constraints are met,
-    but not in the place that is nearest to x̃, for λ keeps parts of earlier directions.
+    but not at the positions that are nearest to x̃, for λ keeps parts of earlier directions.
 
     By midpoint Gauss–Seidel sweeps go forward and backward in turn. Always in one order, they give to the motion what they
     leave unbalanced on one side: a ``hanging`` of 32² vertices then diverges in most settings. Two ways converge more slowly

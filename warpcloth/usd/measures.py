@@ -176,7 +176,7 @@ def _scene(mesh, up_axis, primvars, coloured):
     target = replace(target, vectors=("points", "normals", "extent"), primvars=primvars, coloured=coloured)
     target.declare(rest, target.attributes)
     if coloured:
-        # One colour for all has no place where each element has its own.
+        # A single colour would override those of the elements.
         rest.GetAttributeAtPath(f"{target.prim}.{DISPLAY_COLOUR}").ClearDefaultValue()
     return rest, target, facts
 
