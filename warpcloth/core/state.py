@@ -17,7 +17,7 @@ class State:
         x: Positions (N,) vectors [m].
         v: Velocities (N,) vectors [m/s].
         batch_size: Copies of the scene, B.
-        parts: States of parts of the batch, whose x and v are views of these.
+        shares: States of shares of the batch, whose x and v are views of these.
 
     Attributes:
         arrays: All arrays on the device, by name, ``"x"`` and ``"v"`` among them; of N or of B entries.
@@ -26,8 +26,8 @@ class State:
         residual: The largest residual of each copy so far, (B,).
     """
 
-    def __init__(self, x, v, batch_size, parts=()):
-        self.arrays, self.starts, self.parts = {"x": x, "v": v}, {}, tuple(parts)
+    def __init__(self, x, v, batch_size, shares=()):
+        self.arrays, self.starts, self.shares = {"x": x, "v": v}, {}, tuple(shares)
         self.results, self.residual = [Result.COMPLETED] * batch_size, np.zeros(batch_size)
 
     @property
@@ -56,7 +56,7 @@ class State:
 
     def copy(self):
         """A state of its own, equal to this one."""
-        other = State(wp.clone(self.x), wp.clone(self.v), len(self.results), [part.copy() for part in self.parts])
+        other = State(wp.clone(self.x), wp.clone(self.v), len(self.results), [share.copy() for share in self.shares])
         other.arrays |= {name: wp.clone(array) for name, array in self.arrays.items() if name not in other.arrays}
         other.starts, other.results, other.residual = self.starts, list(self.results), self.residual.copy()
         return other
@@ -65,8 +65,8 @@ class State:
         """Makes this state equal to another of the same solver and model; the arrays stay where they are."""
         for name, array in self.arrays.items():
             wp.copy(array, other.arrays[name])
-        for part, of_other in zip(self.parts, other.parts, strict=True):
-            part.assign(of_other)
+        for share, of_other in zip(self.shares, other.shares, strict=True):
+            share.assign(of_other)
         self.results, self.residual = list(other.results), other.residual.copy()
 
     def __eq__(self, other):
@@ -85,8 +85,8 @@ class State:
         """Everything as NumPy arrays of their own, by name."""
         found = {name: np.array(array.numpy()) for name, array in self.arrays.items()}
         found |= {"results": np.array([result.name for result in self.results]), "residual": np.array(self.residual)}
-        for k, part in enumerate(self.parts):
-            found |= {f"part {k} {name}": values for name, values in part.to_host().items() if name not in ("x", "v")}
+        for k, share in enumerate(self.shares):
+            found |= {f"share {k} {name}": values for name, values in share.to_host().items() if name not in ("x", "v")}
         return found
 
     def from_host(self, values):
@@ -101,6 +101,6 @@ class State:
         for name, array in self.arrays.items():
             array.assign(values[name])
         self.results, self.residual = [Result[name] for name in values["results"]], np.array(values["residual"])
-        for k, part in enumerate(self.parts):
-            own = {name: values.get(f"part {k} {name}", array) for name, array in part.to_host().items()}
-            part.from_host(own)
+        for k, share in enumerate(self.shares):
+            own = {name: values.get(f"share {k} {name}", array) for name, array in share.to_host().items()}
+            share.from_host(own)

@@ -126,7 +126,7 @@ class Balance:
         self._lowest = self.elastic.energy(model.positions, most=0.0)
         # Rounding of positions gives a velocity of at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
         self._note_farthest(points)
-        found = (source_of(part, self, stepper) for part in (stepper, *model.scene.parts))
+        found = (source_of(part, self, stepper) for part in (stepper, *model.scene.declared))
         self.sources = [source for source in found if source is not None]
 
     def kinetic(self, velocities):

@@ -103,7 +103,7 @@ class Scene:
     stage: StageMesh | None = None
 
     @property
-    def parts(self) -> tuple[object, ...]:
+    def declared(self) -> tuple[object, ...]:
         """All that it declares beside the cloth itself, any of which may put energy in."""
         return (self.pins, *self.terms)
 
