@@ -57,6 +57,7 @@ wc.PBD(substeps=2, stiffness="per-step")
 wc.Pins([0], keyframes=0.5).vertices.nothing
 wc.equilibrium(scene, linear="cholesky")
 scene.stage.prim
+wc.Sceen
 """
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 # Installed packages name their modules in this group, see docs/extending.md.
 GROUP = "warpcloth.extensions"
-_names = set()  # of modules that registered something, or were loaded to do so
-_files = set()  # names of modules that were loaded by the path of a file
+_names: set[str] = set()  # of modules that registered something, or were loaded to do so
+_files: set[str] = set()  # names of modules that were loaded by the path of a file
 
 
 @cache

@@ -22,7 +22,7 @@ class Part(NamedTuple):
     """
 
     first: int
-    count: int
+    count: int  # type: ignore[assignment]  # instead of the method of tuples
     grid_shape: tuple[int, int] | None = None
 
 

@@ -13,7 +13,7 @@ class Memory:
     def __init__(self, frames, copies):
         self.frames, self._most, self._copies = 0, frames + 1, copies
 
-    keeps = None  # no state
+    keeps = checkpoint = None  # no state
 
     def append(self, points, velocities, state=None, watch=None):
         if self.frames == 0:

@@ -169,7 +169,7 @@ class Declared:
         if self.part is None:
             return self.elements_on(mesh, positions)
         part = mesh.part(self.part)
-        first = mesh.parts[self.part].first
+        first = (mesh.parts or {})[self.part].first
         found = self.elements_on(part, None if positions is None else positions[first : first + len(part.points)])
         return replace(found, stencil=found.stencil + np.int32(first))
 
