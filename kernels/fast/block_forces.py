@@ -13,11 +13,11 @@ from ..local import from_corner
 from ..memory import load, load_shared, store
 from ..transpose import to_corner
 from ..vectors import types
-from .parts import Part, chain_of, elements_struct, local_gradient
+from .term_facts import TermFacts, chain_of, elements_struct, local_gradient
 
 
 @cache
-def gather_piece(part: Part, dtype, corrected: bool = False):
+def gather_piece(part: TermFacts, dtype, corrected: bool = False):
     """The device function (elements, first, count, base, x, v, h, y, dy): y of a piece; dy = h Σ wᵢ ⊗ vᵢ too
     if it is damped or ``corrected``.
 
@@ -78,7 +78,7 @@ def gather_piece(part: Part, dtype, corrected: bool = False):
 
 
 @cache
-def compute_forces(part: Part, dtype, corrected: bool = False):
+def compute_forces(part: TermFacts, dtype, corrected: bool = False):
     """The device function (elements, first, last, h, y, dy): kA ∂u/∂y and the force of damping, in place of y.
 
     Of the elements of a block, from ``first`` up to ``last``; with ``corrected`` at y + dy.
@@ -118,7 +118,7 @@ def compute_forces(part: Part, dtype, corrected: bool = False):
 
 
 @cache
-def scatter_piece(part: Part, dtype):
+def scatter_piece(part: TermFacts, dtype):
     """The device function (elements, first, count, base, forces, out): out += wᵢ·force, of a piece of such."""
     vec3, _ = types(dtype)
     term = part.term
@@ -158,7 +158,7 @@ def scatter_piece(part: Part, dtype):
 
 
 @cache
-def add_block(part: Part, dtype, corrected: bool = False):
+def add_block(part: TermFacts, dtype, corrected: bool = False):
     """The device function (elements, block, x, v, h, y, dy, out): out += ∂U/∂x + ∂D/∂x [N] of the elements of a block.
 
     With ``corrected`` the first at x + h v.
@@ -201,7 +201,7 @@ def add_block(part: Part, dtype, corrected: bool = False):
 
 
 @cache
-def add_block_forces(parts: tuple[Part, ...], dtype, corrected: bool = False):
+def add_block_forces(parts: tuple[TermFacts, ...], dtype, corrected: bool = False):
     """As :func:`add_block`, of all terms."""
     vec3, _ = types(dtype)
     chain_type = chain_of(parts, dtype)

@@ -12,11 +12,11 @@ from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..vectors import types
 from .block_forces import add_block_forces
-from .parts import Part, chain_of
+from .term_facts import TermFacts, chain_of
 
 
 @cache
-def block_step(parts: tuple[Part, ...], dtype, symplectic: bool, flags: str, compensated: bool = False):
+def block_step(parts: tuple[TermFacts, ...], dtype, symplectic: bool, flags: str, compensated: bool = False):
     """Kernel over copies, each block by block: v, x after a step, a = g − ∇U/m.
 
     ``gradient`` is that of other terms, and 0 afterwards. ``flags`` are those of the compiler, on the CPU. ``compensated`` is

@@ -14,7 +14,7 @@ from ..memory import load, load_shared, store
 from ..project import multiplier, multiplier_type
 from ..transpose import to_corner
 from ..vectors import types
-from .parts import Part, chain_of, elements_struct
+from .term_facts import TermFacts, chain_of, elements_struct
 
 
 def slot_rows(slots):
@@ -49,7 +49,7 @@ def load_row(dtype, scalar, width):
 
 
 @cache
-def row_functions(part: Part, dtype):
+def row_functions(part: TermFacts, dtype):
     """The device functions of pairs: (codes, q) → codes of row q; (a, q) → numbers of row q; (rest, row, i, N) → rest states
     (P, width) of a row of vertex i; (those, k) → that of the k-th slot."""
     P, (_rows, width) = wp.constant(part.term.parameters), slot_rows(sum(part.pairs))
@@ -78,12 +78,12 @@ class Projected(NamedTuple):
     """Facts about the elements of one term by which the kernel of a sweep is compiled.
 
     Attributes:
-        part: Their :class:`.elements.Part`; all that is not shared is in rows of :func:`slot_rows` for pairs.
+        part: Their :class:`.term_facts.TermFacts`; all that is not shared is in rows of :func:`slot_rows` for pairs.
         scalar, multipliers, per_step: As in :mod:`.project`.
         even: Whether all elements share one factor.
     """
 
-    part: Part
+    part: TermFacts
     scalar: bool
     even: bool = False
     multipliers: bool = False

@@ -9,7 +9,7 @@ from ..memory import load, load_shared, store
 from ..transpose import to_corner
 from ..vectors import types
 from .packed_residual import unpack_residual
-from .parts import Part, chain_of, elements_struct, local_gradient
+from .term_facts import TermFacts, chain_of, elements_struct, local_gradient
 
 
 @cache
@@ -49,7 +49,7 @@ def move_of(dtype, ahead):
 
 
 @cache
-def gather_term(part: Part, dtype, ahead=None, lanes: int = 1):
+def gather_term(part: TermFacts, dtype, ahead=None, lanes: int = 1):
     """The device function (elements, i, lane, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term.
 
     The first is taken at x, or where :func:`move_of` has moved it if the type of v is given as ``ahead``. Of ``lanes`` threads
@@ -118,7 +118,7 @@ def gather_term(part: Part, dtype, ahead=None, lanes: int = 1):
 
 
 @cache
-def gather_pairs(part: Part, dtype, ahead, lanes: int):
+def gather_pairs(part: TermFacts, dtype, ahead, lanes: int):
     """As :func:`gather_term`, of pairs, without a branch: an empty slot pairs the vertex with itself, where forces are 0.
 
     So all slots are read at once; one after another they take 1.2 times as long (H200, 64² vertices).
@@ -180,7 +180,7 @@ def gather_pairs(part: Part, dtype, ahead, lanes: int):
 
 
 @cache
-def gather_matrix_rows(part: Part, dtype, ahead, lanes: int):
+def gather_matrix_rows(part: TermFacts, dtype, ahead, lanes: int):
     """As :func:`gather_term`, by the rows of the matrix Q of a quadratic energy, which add up to 0: Σⱼ Qᵢⱼ (xⱼ − xᵢ)."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
@@ -232,7 +232,7 @@ def gather_matrix_rows(part: Part, dtype, ahead, lanes: int):
 
 
 @cache
-def gather_terms(parts: tuple[Part, ...], dtype, ahead=None, lanes: int = 1):
+def gather_terms(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1):
     """As :func:`gather_term`, of all terms."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
@@ -259,7 +259,7 @@ def gather_terms(parts: tuple[Part, ...], dtype, ahead=None, lanes: int = 1):
 
 
 @cache
-def sum_at_vertices(parts: tuple[Part, ...], dtype, ahead=None, lanes: int = 1):
+def sum_at_vertices(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1):
     """The device function (thread, chain, N, x, v, h) → that sum of vertex ``thread // lanes``, in all its threads."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
@@ -283,7 +283,7 @@ def sum_at_vertices(parts: tuple[Part, ...], dtype, ahead=None, lanes: int = 1):
 
 
 @cache
-def gather_forces(parts: tuple[Part, ...], dtype, corrected: bool = False, lanes: int = 1):
+def gather_forces(parts: tuple[TermFacts, ...], dtype, corrected: bool = False, lanes: int = 1):
     """Kernel over vertices, ``lanes`` threads each: adds ∂U/∂x [N] of all terms, at x or if ``corrected`` at x + d, to out."""
     vec3, _ = types(dtype)
     total_of = sum_at_vertices(parts, dtype, vec3 if corrected else None, lanes)

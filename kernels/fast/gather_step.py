@@ -9,11 +9,11 @@ from ..memory import load, store
 from ..vectors import types
 from .gather_forces import move_of, sum_at_vertices
 from .packed_residual import pack_residual
-from .parts import Part, chain_of
+from .term_facts import TermFacts, chain_of
 
 
 @cache
-def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int = 1, residual_type=None):
+def gather_vertex(parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: int = 1, residual_type=None):
     """The device function by which ``lanes`` threads set x, v of a vertex after a step, a = g − ∇U/m, in other arrays.
 
     ``residual_type`` is that of :func:`gather_step`.
@@ -67,7 +67,9 @@ def gather_vertex(parts: tuple[Part, ...], dtype, symplectic: bool, lanes: int =
 
 
 @cache
-def gather_step(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, alone: bool, lanes: int = 1, residual_type=None):
+def gather_step(
+    parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, alone: bool, lanes: int = 1, residual_type=None
+):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
     Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN
@@ -118,7 +120,7 @@ def wait_for_block(): ...
 
 
 @cache
-def gather_steps_of_copies(parts: tuple[Part, ...], dtype, symplectic: bool, fast: bool, threads: int):
+def gather_steps_of_copies(parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, threads: int):
     """Kernel over (copies, threads): x, v after several steps. A copy is a block of ``threads``, which wait for one another.
 
     x_other and v_other are where every other step ends; where nothing is damped v may be v_other.

@@ -39,7 +39,7 @@ from warpcloth.kernels import constraint_jacobian as jacobian
 from warpcloth.kernels import constraint_rows as constrain
 from warpcloth.kernels.fast import gather_forces as gather
 from warpcloth.kernels.fast import scatter_corrections
-from warpcloth.kernels.fast.parts import chain_of
+from warpcloth.kernels.fast.term_facts import chain_of
 from warpcloth.kernels.term import HessianPolicy, Term
 from warpcloth.kernels.vectors import types
 from warpcloth.model.precision import DTYPES

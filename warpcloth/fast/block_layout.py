@@ -24,7 +24,7 @@ def block_layout(terms, per_copy, copies):
 
     Returns:
         (vertices (blocks + 1,), terms, the arrays of each term by the names of
-        :func:`warpcloth.kernels.fast.parts.elements_struct`, the most numbers that a term has in a block)
+        :func:`warpcloth.kernels.fast.term_facts.elements_struct`, the most numbers that a term has in a block)
     """
     totals = [_numbers_before(elements, per_copy) for elements in terms]
     vertices = [0]

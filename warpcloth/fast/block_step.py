@@ -7,7 +7,7 @@ import warp as wp
 
 from ..core.gradient import Gradient
 from ..kernels.fast import block_step as kernels
-from ..kernels.fast.parts import Part
+from ..kernels.fast.term_facts import TermFacts
 from ..terms.refresh import STEP, Moment
 from .block_layout import block_layout
 from .quadratic_pairs import as_pairs
@@ -61,7 +61,7 @@ class BlockStep:
         self.record = StepRecord("blocks", pairs=pairs, compensated=compensated)
         vertices, swept, arrays, numbers = block_layout(swept, len(state[0]) // model.copies, model.copies)
         damped = [elements.damping is not None for elements in swept]
-        parts = [Part(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
+        parts = [TermFacts(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
         # Contracted as on CUDA, where a product is added without being rounded: springs then take 0.8 of the time.
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
         self._kernel = model.kernel(kernels.block_step, tuple(parts), model.dtype, symplectic, flags, compensated)

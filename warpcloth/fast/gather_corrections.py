@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..kernels.fast import gather_corrections as kernels
-from ..kernels.fast.parts import elements_struct
+from ..kernels.fast.term_facts import elements_struct
 from ..terms.refresh import EVALUATION, Moment
 from .gather_layout import gathered_in_rows
 from .structs import chained, filled

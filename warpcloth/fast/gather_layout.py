@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.fast.gather_corrections import slot_rows
-from ..kernels.fast.parts import Part
+from ..kernels.fast.term_facts import TermFacts
 from ..model.host_values import host_values
 from ..model.incidences import incidences_of
 from .quadratic_pairs import matrix_entries
@@ -17,7 +17,7 @@ LANES, LANED = 4, 50_000
 
 
 def gathered(model, elements, damped=False, rows=True):
-    """The :class:`warpcloth.kernels.fast.parts.Part` of elements and the arrays of their struct, by name, for gathering.
+    """The :class:`warpcloth.kernels.fast.term_facts.TermFacts` of elements and the arrays of their struct, by name.
 
     Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
     than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and the data of the
@@ -26,7 +26,7 @@ def gathered(model, elements, damped=False, rows=True):
     its matrix, if ``rows`` allows it. Rows take a third of the time, but their rounding errors do not cancel between vertices:
     in float32 this noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as with elements.
     """
-    part = Part(elements.term, damped, shared=0 in elements.stiffness.strides)
+    part = TermFacts(elements.term, damped, shared=0 in elements.stiffness.strides)
     arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
     if damped:
         arrays["damping"] = elements.damping
@@ -55,7 +55,7 @@ def gathered_in_rows(elements, count, pairs, **others):
         pairs: Whether incidences may name the other vertex in place of the element.
         others: Other numbers (B·E,) of the elements, by name.
     """
-    part = Part(elements.term, shared=0 in elements.stiffness.strides)
+    part = TermFacts(elements.term, shared=0 in elements.stiffness.strides)
     arrays = {"stiffness": elements.stiffness, "rest": elements.rest, **others}
     if not pairs or not (found := _pairs(elements, count)):
         return _by_element(elements, count, part, {"stencil": elements.stencil, **arrays})

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..kernels.fast.parts import chain_of, elements_struct
+from ..kernels.fast.term_facts import chain_of, elements_struct
 
 
 def chained(parts, arrays, dtype, struct_of=elements_struct):
@@ -13,7 +13,7 @@ def chained(parts, arrays, dtype, struct_of=elements_struct):
         parts: The facts of each term, which ``struct_of`` takes.
         arrays: The values of each struct, by name.
         dtype: A Warp scalar type.
-        struct_of: As :func:`warpcloth.kernels.fast.parts.chain_of` takes it.
+        struct_of: As :func:`warpcloth.kernels.fast.term_facts.chain_of` takes it.
     """
     made = chain_of(tuple(parts), dtype, struct_of)()
     if parts:

@@ -11,7 +11,7 @@ import warp as wp
 from ..term import Term
 
 
-class Part(NamedTuple):
+class TermFacts(NamedTuple):
     """Facts about the elements of one term by which a kernel is compiled.
 
     Attributes:
@@ -35,7 +35,7 @@ class Part(NamedTuple):
 
 
 @cache
-def local_gradient(part: Part, dtype, corrected: bool = False):
+def local_gradient(part: TermFacts, dtype, corrected: bool = False):
     """The device function (k, β, rest, y, dy, h) → kA ∂u/∂y (M, 3) and the force of damping at y + dy.
 
     With ``corrected`` all of it is taken at y + dy.
@@ -71,7 +71,7 @@ def local_gradient(part: Part, dtype, corrected: bool = False):
 
 
 @cache
-def elements_struct(part: Part, dtype):
+def elements_struct(part: TermFacts, dtype):
     """The struct of the arrays of one term.
 
     Swept: block b has the pieces from offsets[b] to offsets[b+1], and ``codes`` are the first element of each and how many,
@@ -98,7 +98,7 @@ class Nothing:
     unused: int
 
 
-def chain_of(parts: tuple[Part, ...], dtype, struct_of=elements_struct):
+def chain_of(parts: tuple[TermFacts, ...], dtype, struct_of=elements_struct):
     """The struct of the arrays of all terms: that of the first, and the chain of the others.
 
     Args:
