@@ -16,6 +16,7 @@ from warpcloth.kernels import accelerate
 from warpcloth.numerics import linear
 from warpcloth.numerics.acceleration import LBFGS, Anderson, Chebyshev
 from warpcloth.numerics.linear import CopyFactors
+from warpcloth.numerics.local_weights import best_weights
 from warpcloth.solvers.projective_dynamics import ACCELERATIONS
 
 EPS = np.finfo(np.float64).eps
@@ -297,6 +298,14 @@ def test_products_of_past_corrections_are_sums_over_chunks(chunks, device):
     pairs = [(a, b) for b in (gradient, y[slot]) for a in (s, z)]
     exact = [(a * b).reshape(m, copies, -1).sum(axis=2) for a, b in pairs]
     np.testing.assert_allclose(out.numpy(), np.vstack(exact).T, atol=3 * n * 8 * np.finfo(float).eps)
+
+
+def test_the_best_weight_of_a_spring(device):
+    """1/(2hω) of a spring of two free masses, ω² = 2k/m; each spring has its own."""
+    k, m, h = np.array([50.0, 200.0]), 0.2, 0.01
+    mesh = wc.Mesh([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0], [1.0, 1, 0]], edges=[[0, 1], [2, 3]])
+    model = wc.Scene(mesh, masses=np.full(4, m), terms=[wc.Spring(stiffness=k)]).build(device=device, dtype="float64")
+    np.testing.assert_allclose(best_weights(model, model.terms[0], h), 0.5 / (h * np.sqrt(2.0 * k / m)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -203,6 +203,16 @@ def test_a_sheet_at_rest_stays_there(name, dtype, device):
     assert np.linalg.norm(np.linalg.solve(inertia, L)) * 600 * stepper.h * 0.5 < np.sqrt(3.0) * 2.0 * np.sqrt(600) * eps
 
 
+@pytest.mark.parametrize("damping", [None, 3.0])
+def test_the_limit_of_a_mass_on_a_spring(damping, device):
+    """The h of ω²h² + 2hβ/m = 4, which without damping is 2/ω."""
+    k, m = 50.0, 0.2
+    hold = wc.Attachment(vertices=[1], targets=[[0.0, 0.0, 0.0]], stiffness=k, damping=damping)
+    model = wc.Scene(PAIR, masses=[m, m], terms=[hold], pins=[0]).build(device=device, dtype="float64")
+    square, c = k / m, (damping or 0.0) / m
+    assert step_limits(model) == pytest.approx(2 * [(np.sqrt(c * c + 4.0 * square) - c) / square], rel=1e-9)
+
+
 VARIED = {
     "nothing": (2, {}),
     "where they are": (
