@@ -312,7 +312,7 @@ OPTIONS = [
     ({"measures": "energy_density"}, "'energy_density' needs material="),
     ({"measures": "length_rate"}, "'length_rate' needs directions="),
     ({"measures": "all", "material": wc.Spring(stiffness=1.0)}, "must be a membrane"),
-    ({"measures": 3}, "measures = 3: must be one or more of"),
+    ({"measures": 3}, "measures is 3; it must be one or more of"),
     ({"directions": "uv"}, 'must be "st" or a vector'),
     ({"directions": "abc".split()}, 'it must be "st" or a vector'),
     ({"directions": "st"}, "the mesh has no texture coordinates"),

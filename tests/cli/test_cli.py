@@ -129,32 +129,32 @@ WRONG_USES = [
     ("info hanging -p density=__import__('os')", "it must be a number"),
     ("info hanging -p n", "'n' is not of the form name=value"),
     ("info hanging -p n=3 n=4", "n is given twice, as '3' and '4'"),
-    ("info hanging -p n=1", "hanging.py, line 14: ValueError: nx = 1: must be"),
+    ("info hanging -p n=1", "hanging.py, line 14: ValueError: nx is 1; it must be"),
     ("info hanging -p duration=0.01", "ValueError: duration is 0.01 s; at fps 60.0 it must be a whole number of frames"),
     # parameters that make no sense, of each scene that comes with the package
     ("info cantilever -p width=-1", "ValueError: width is -1.0; it must be a number of 0 or more"),
     ("info cantilever -p width=inf", "ValueError: width is inf; it must be a number of 0 or more"),
-    ("info cantilever -p elements=0", "ValueError: nx = 1: must be a whole number of vertices, at least 2"),
-    ("info cantilever -p elements=0 width=0.2", "ValueError: ny = 1: must be a whole number of vertices, at least 2"),
+    ("info cantilever -p elements=0", "ValueError: nx is 1; it must be a whole number of vertices, at least 2"),
+    ("info cantilever -p elements=0 width=0.2", "ValueError: ny is 1; it must be a whole number of vertices, at least 2"),
     ("info cantilever -p length=-1 width=0.2", "must be a finite positive length"),
     ("info cantilever -p bending=foo", "ValueError: bending is 'foo'; it must be one of 'quadratic', 'dihedral'"),
     ("info cantilever -p gamma=0", "ValueError: density is 0.0; it must be a number above 0"),
-    ("info cantilever -p length=0", "ValueError: size = 0.0: must be a finite positive length"),
+    ("info cantilever -p length=0", "ValueError: size is 0.0; it must be a finite positive length"),
     ("info cantilever -p stretching=-1", "Spring.stiffness is -0.001; it must be 0 or more"),
-    ("info catenary -p links=0", "ValueError: n = 1: must be a whole number of vertices, at least 2"),
+    ("info catenary -p links=0", "ValueError: n is 1; it must be a whole number of vertices, at least 2"),
     ("info catenary -p span=0", "ValueError: span is 0.0; it must be above 0, and no more than the length, 1.2"),
     ("info catenary -p span=1.3", "ValueError: span is 1.3; it must be above 0, and no more than the length, 1.2"),
-    ("info catenary -p length=-1", "ValueError: length = -1.0: must be a finite positive length"),
+    ("info catenary -p length=-1", "ValueError: length is -1.0; it must be a finite positive length"),
     ("info catenary -p weight=-1", "it must be a number above 0"),
     ("info catenary -p stretching=-1", "Spring.stiffness is -83.3"),
-    ("info chain -p links=0", "ValueError: n = 1: must be a whole number of vertices, at least 2"),
-    ("info chain -p length=inf", "ValueError: length = inf: must be a finite positive length"),
+    ("info chain -p links=0", "ValueError: n is 1; it must be a whole number of vertices, at least 2"),
+    ("info chain -p length=inf", "ValueError: length is inf; it must be a finite positive length"),
     (
         "info chain -p mass=0",
         "ValueError: vertex 1 has mass 0.0 kg; a vertex that is not pinned must have a finite one above 0",
     ),
     ("info chain -p stiffness=-1", "Spring.stiffness is -1.0; it must be 0 or more"),
-    ("info flag -p nx=1", "ValueError: nx = 1: must be a whole number of vertices, at least 2"),
+    ("info flag -p nx=1", "ValueError: nx is 1; it must be a whole number of vertices, at least 2"),
     ("info flag -p swing=inf", "ValueError: swing is inf; it must be a number of 0 or more"),
     ("info flag -p period=0", "ValueError: period is 0.0; it must be a number above 0"),
     ("info flag -p duration=inf", "ValueError: duration is inf; it must be a number above 0"),
@@ -228,7 +228,7 @@ def test_a_stage_with_cloth_attributes_runs_as_a_layer_over_it(folder, tmp_path,
     source, output = tmp_path / "cloth.usda", tmp_path / "out.usda"
     warpcloth.usd.write_scene(scene_files.find_source(folder / "good.py").function(), source)
     before = source.read_bytes()
-    refused(capfd, ["run", source, "-o", source], "is a file of the source's stage, which must not be changed")
+    refused(capfd, ["run", source, "-o", source], "a file of the source's stage; it must be another file")
     refused(capfd, ["run", source, "-p", "n=3", "-o", output], "has no parameter 'n'; allowed are prim")
     refused(capfd, ["run", source, "-p", "prim=/World/Silk", "-o", output], "/World/Silk")
     code, out, err = run(capfd, "run", source, "-p", "prim=/World/Cloth", "--json", "-o", output)

@@ -417,7 +417,7 @@ def with_isolated():
         (lambda: wc.Arap(two_squares(), [0]), "handles leave 1 of the 2 parts .* with 9 vertices, such as vertex 9"),
         (
             lambda: wc.Mesh([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]], [[0, 1, 2]]),
-            r"triangles\[0\] = \[0, 1, 2\]: must be higher",
+            r"triangles\[0\] is \[0, 1, 2\]; it must be higher",
         ),
     ],
 )

@@ -552,13 +552,13 @@ def test_surface_has_what_a_mesh_refuses(tmp_path, kind):
     assert surface.degenerate.tolist() == [1, 3, 4, 5] and surface.degenerate.dtype == np.int32
     assert surface.triangles.tolist() == [list(triangle) for triangle in triangles]
     np.testing.assert_array_equal(surface.triangle_areas[[0, 2, 3, 5]], [0.5, 0.5, 0.0, 0.0])
-    with pytest.raises(ValueError, match=r"triangles\[3\] = \[2, 2, 3\]: must be 3 different vertices"):
+    with pytest.raises(ValueError, match=r"triangles\[3\] is \[2, 2, 3\]; it must be 3 different vertices"):
         mesh()
     assert len(Surface(MESH.points, MESH.triangles).degenerate) == 0
 
 
 def test_surface_still_refuses_what_is_no_mesh():
-    with pytest.raises(ValueError, match=r"triangles\[0\] = \[0, 1, 9\]: must be indices of the 9 points"):
+    with pytest.raises(ValueError, match=r"triangles\[0\] is \[0, 1, 9\]; it must be indices of the 9 points"):
         Surface(MESH.points, [(0, 1, 9)])
     with pytest.raises(ValueError, match=r"points: has shape \(9, 2\)"):
         Surface(MESH.points[:, :2], [(0, 1, 2)])

@@ -496,7 +496,7 @@ def own(name, type_name, value):
             {**OWN, "warpcloth:terms:threads:pairs": ("IntArray", [0, 1])},
             r"has type int\[\], must be token or token\[\] or",
         ),
-        (own("terms:threads:pairs", "Token", "knots"), "kind = 'knots': must be"),
+        (own("terms:threads:pairs", "Token", "knots"), "kind is 'knots'; it must be"),
         (own("density", "Double", -1.0), "density is -1.0; it must be a number above 0"),
         (own("masses", "DoubleArray", [1.0] * 9), "exactly one of density and masses"),
         (own("duration", "Double", 0.0), "warpcloth:duration is 0.0 s, must be finite and above 0"),
@@ -547,7 +547,7 @@ def test_bad_writes_are_refused(tmp_path, name, terms, error, message):
 
 def test_the_stage_of_a_scene_is_not_overwritten(tmp_path):
     scene = read_scene(write_scene(chain(), tmp_path / "scene.usda"))
-    with pytest.raises(ValueError, match="is the stage that the scene was read from"):
+    with pytest.raises(ValueError, match="the stage that the scene was read from"):
         write_scene(scene, tmp_path / "scene.usda")
 
 

@@ -64,7 +64,7 @@ def pairs_of(labels, reference=None, pairs=None, lag=None, every=1):
         start = None if reference == "rest" else 0
     else:
         start = _index(
-            labels, reference, f"reference = {shown(reference)}", '"rest", "first", "previous" or a number of a frame'
+            labels, reference, f"reference is {shown(reference)}", '"rest", "first", "previous" or a number of a frame'
         )
     return [Pair(start, int(frame), last) for frame, last in zip(kept, before, strict=True)], []
 
@@ -77,9 +77,9 @@ def _listed(pairs):
         try:
             found = [() if isinstance(pair, (str, bytes)) else tuple(pair) for pair in pairs]
         except TypeError:
-            raise ValueError(f"pairs = {shown(pairs)}: {rule}") from None
+            raise ValueError(f"pairs is {shown(pairs)}; it {rule}") from None
     if not found or any(len(pair) != 2 for pair in found):
-        raise ValueError(f"pairs = {shown(pairs)}: {rule}")
+        raise ValueError(f"pairs is {shown(pairs)}; it {rule}")
     return found
 
 
@@ -95,11 +95,11 @@ def _index(labels, value, where, rule):
     try:
         number = float(None if isinstance(value, (bool, np.bool_)) else value)
     except (TypeError, ValueError):
-        raise ValueError(f"{where}: must be {rule}") from None
+        raise ValueError(f"{where}; it must be {rule}") from None
     apart = np.abs(labels - number)
     if not apart.min() <= 1e-6:
         raise ValueError(
-            f"{where}: there is no frame {number:g}, only {len(labels)} from {labels[0]:g} to {labels[-1]:g}; must be {rule}"
+            f"{where}; there is no frame {number:g}, only {len(labels)} from {labels[0]:g} to {labels[-1]:g}; it must be {rule}"
         )
     return int(apart.argmin())
 

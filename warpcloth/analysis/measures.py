@@ -105,7 +105,7 @@ def chosen(names, on, given=("directions", "material", "rate")):
     try:
         names = tuple(names)
     except TypeError:
-        raise ValueError(f"measures = {shown(names)}: must be one or more of {', '.join(known)}, or all") from None
+        raise ValueError(f"measures is {shown(names)}; it must be one or more of {', '.join(known)}, or all") from None
     if names == ("all",):
         return [m for m in known.values() if (not m.needs or m.needs in given) and (not m.rate or "rate" in given)]
     for name in names:

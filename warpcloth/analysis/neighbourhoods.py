@@ -85,7 +85,7 @@ def _nearest(mesh, used, chosen):
         k = int(value) if kind == "k" else int(np.ceil(value / 100.0 * len(points)))
         if (kind == "k" and k < 3) or max(k, 3) > len(points):
             raise ValueError(
-                f"neighbourhood = {shown(chosen)}: is {k} of the {len(points)} vertices, must be 3 or more and at most all"
+                f"neighbourhood is {shown(chosen)}, {k} of the {len(points)} vertices; it must be 3 or more, at most all"
             )
         sizes, members = _sets(tree, k, widen=kind == "share")
         if wide := np.count_nonzero(sizes > k):
@@ -95,7 +95,7 @@ def _nearest(mesh, used, chosen):
                 stacklevel=2,
             )
     if sizes.sum() > np.iinfo(np.int32).max:
-        raise ValueError(f"neighbourhood = {shown(chosen)}: has {sizes.sum()} members in all, must be less than 2³¹")
+        raise ValueError(f"neighbourhood is {shown(chosen)}, with {sizes.sum()} members in all; it must have less than 2³¹")
     counts = np.zeros(len(used), dtype=np.int64)
     counts[vertices] = sizes
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), vertices[members].astype(np.int32)

@@ -242,7 +242,7 @@ def material_directions(mesh, chosen, corner_coordinates=None):
     with np.errstate(all="ignore"):
         if isinstance(chosen, str):
             if chosen != "st":
-                raise ValueError(f"directions = {shown(chosen)}: must {rule}")
+                raise ValueError(f"directions is {shown(chosen)}; it must {rule}")
             st = corner_coordinates
             if mesh.texture_coordinates is not None:
                 st = mesh.texture_coordinates[mesh.triangles]

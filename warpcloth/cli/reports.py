@@ -196,7 +196,7 @@ def _check(analyzer, listed, usd, stills, colour, curves):
     if (usd or stills) and not listed:
         raise ValueError(f"colour: {analyzer.measures[0].name} has no number to be coloured; measure something else too")
     if colour is not None and colour not in listed and (colour != "none" or stills):
-        raise ValueError(f"colour = {colour!r}: must be one of {', '.join(listed)}" + ("" if stills else ", or none"))
+        raise ValueError(f"colour is {colour!r}; it must be one of {', '.join(listed)}" + ("" if stills else ", or none"))
     names = {measure.name for measure in analyzer.measures}
     if curves and not {"stretch", "directions"} <= names:
         raise ValueError("curves: need the measures stretch and directions")

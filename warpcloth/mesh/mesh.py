@@ -97,7 +97,7 @@ class Mesh:
             keep(self, "texture_coordinates", _read_only(st))
         if self.grid_shape is not None:
             if np.shape(self.grid_shape) != (2,):
-                raise ValueError(f"grid_shape = {self.grid_shape}: must be two counts (nx, ny)")
+                raise ValueError(f"grid_shape is {self.grid_shape}; it must be two counts (nx, ny)")
             nx, ny = (_count("grid_shape", value) for value in self.grid_shape)
             if nx * ny != n:
                 raise ValueError(f"grid_shape = {self.grid_shape}: {nx}·{ny} must be the number of points, {n}")
@@ -134,11 +134,11 @@ class Mesh:
         """
         nx, ny = _count("nx", nx), _count("ny", ny)
         if pattern not in ("diagonal", "alternating", "equilateral"):
-            raise ValueError(f'pattern = {pattern!r}: must be "diagonal", "alternating" or "equilateral"')
+            raise ValueError(f'pattern is {pattern!r}; it must be "diagonal", "alternating" or "equilateral"')
         refuse_memory(f"nx = {nx}, ny = {ny}", _BYTES_OF_A_VERTEX * nx * ny)
         equilateral = pattern == "equilateral"
         if np.shape(size) != () and (equilateral or np.shape(size) != (2,)):
-            raise ValueError(f"size = {size}: must be one length{'' if equilateral else ' or two'} for pattern = {pattern!r}")
+            raise ValueError(f"size is {size}; it must be one length{'' if equilateral else ' or two'} for pattern={pattern!r}")
         width, depth = (_length("size", length) for length in np.broadcast_to(size, 2).tolist())
 
         column, row = np.meshgrid(np.arange(nx), np.arange(ny))
@@ -223,7 +223,7 @@ class Mesh:
         refuse_memory(f"n = {n}", _BYTES_OF_A_VERTEX * n)
         along = _coordinates("direction", [direction], 3)[0]
         if not along.any():
-            raise ValueError(f"direction = {shown(direction)}: must not be zero")
+            raise ValueError(f"direction is {shown(direction)}; it must not be zero")
         points = np.linspace(0, length, n)[:, None] * (along / np.linalg.norm(along))
         return cls(points, edges=np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
 
@@ -308,7 +308,7 @@ class Mesh:
             ValueError: The kind is unknown, or is "shear" where there are no cells, or "bending" where hinges are refused.
         """  # noqa: E501 (a table's row is one line)
         if kind not in ("structural", "shear", "bending", "edges"):
-            raise ValueError(f'kind = {kind!r}: must be "structural", "shear", "bending" or "edges"')
+            raise ValueError(f'kind is {kind!r}; it must be "structural", "shear", "bending" or "edges"')
         if self.parts and kind != "edges":
             return self._of_parts(lambda mesh: mesh.springs(kind))
         if self.grid_shape and kind != "edges":
@@ -322,7 +322,7 @@ class Mesh:
             pairs = np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in sides])
         elif kind == "shear":
             raise ValueError(
-                'kind = "shear": needs the four-sided cells of a diagonal or alternating grid; '
+                'kind is "shear", which needs the four-sided cells of a diagonal or alternating grid; '
                 "the edges of any other triangle mesh resist shear already"
             )
         elif kind != "bending":
@@ -480,7 +480,7 @@ def _refuse(name, rows, bad, rule):
     """Raises ValueError for the first row that is bad."""
     if bad.any():
         row = np.argmax(bad)
-        raise ValueError(f"{name}[{row}] = {rows[row].tolist()}: {rule}")
+        raise ValueError(f"{name}[{row}] is {rows[row].tolist()}; it {rule}")
 
 
 def _rows(name, value, width, kinds):
@@ -521,11 +521,11 @@ def _repeated(rows):
 def _count(name, value):
     if not isinstance(value, int | np.integer) or not 2 <= value <= _MOST_VERTICES:
         allowed = f"a whole number of vertices, at least 2 and at most {_MOST_VERTICES:,}"
-        raise ValueError(f"{name} = {shown(value)}: must be {allowed}")
+        raise ValueError(f"{name} is {shown(value)}; it must be {allowed}")
     return int(value)
 
 
 def _length(name, value):
     if not isinstance(value, int | float | np.number) or not 0 < value <= sys.float_info.max:
-        raise ValueError(f"{name} = {shown(value)}: must be a finite positive length")
+        raise ValueError(f"{name} is {shown(value)}; it must be a finite positive length")
     return float(value)

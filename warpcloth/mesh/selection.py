@@ -47,7 +47,7 @@ def select(mesh, text):
             the text, the column and what is allowed there.
     """
     if not isinstance(text, str):
-        raise ValueError(f"selection = {text!r}: must be a text")
+        raise ValueError(f"selection is {text!r}; it must be a text")
     return _Reader(mesh, text).read()
 
 

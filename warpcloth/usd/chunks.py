@@ -68,9 +68,9 @@ class ChunkWriter:
         self._output = Path(os.path.abspath(followed(output)))
         _check_output(self._output)
         if self._output.suffix != Path(output).suffix:
-            raise ValueError(f"output = {output}: is a link to {self._output}, must end as that does")
+            raise ValueError(f"output is {output}, a link to {self._output}; it must end as that does")
         if int(chunk) != chunk or chunk < 1:
-            raise ValueError(f"chunk = {chunk}: must be a whole number, at least 1")
+            raise ValueError(f"chunk is {chunk}; it must be a whole number, at least 1")
         self.chunk = int(chunk)
         self._counts = {"vertex": len(mesh.points), "uniform": len(mesh.triangles)}
         self._folder, self._packed = frames_folder(self._output), self._output.suffix == ".usdz"
@@ -105,7 +105,7 @@ class ChunkWriter:
             ValueError: The output is a file of the source's stage.
         """
         if os.path.realpath(self._output) in files:
-            raise ValueError(f"output = {self._output}: is a file of the source's stage, which must not be changed")
+            raise ValueError(f"output is {self._output}, a file of the source's stage; it must be another file")
         self._rest, self._targets = rest, targets
         self._source = None if source is None else Path(os.path.abspath(source))
         facts = {METADATA_KEY: {**_facts(metadata or {}), "prim": targets[0].prim}}
@@ -427,19 +427,19 @@ def frames_folder(output):
 def _check_output(output):
     refuse_path(output)
     if output.suffix not in _ENDINGS:
-        raise ValueError(f"output = {output}: must end with one of {', '.join(_ENDINGS)}")
+        raise ValueError(f"output is {output}; it must end with one of {', '.join(_ENDINGS)}")
     if not output.parent.is_dir():
         raise FileNotFoundError(f"output = {output}: the folder {output.parent} does not exist")
     if output.is_dir():
-        raise ValueError(f"output = {output}: is a folder, must be a file")
+        raise ValueError(f"output is {output}, a folder; it must be a file")
 
 
 def check_scene(fps, up_axis):
     """Refuses what a stage cannot have."""
     if not (np.isscalar(fps) and np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps = {fps}: must be positive and finite")
+        raise ValueError(f"fps is {fps}; it must be positive and finite")
     if up_axis not in ("Y", "Z"):
-        raise ValueError(f'up_axis = {up_axis!r}: must be "Y" or "Z"')
+        raise ValueError(f'up_axis is {up_axis!r}; it must be "Y" or "Z"')
 
 
 def _facts(metadata, where="metadata"):
@@ -451,7 +451,7 @@ def _facts(metadata, where="metadata"):
         else:
             facts[name] = value.item() if isinstance(value, np.generic) else value
             if not isinstance(facts[name], (bool, int, float, str)):
-                raise ValueError(f"{where}[{name!r}] = {value!r}: must be a number, a text, or a dict of those")
+                raise ValueError(f"{where}[{name!r}] is {value!r}; it must be a number, a text, or a dict of those")
     return facts
 
 

@@ -22,7 +22,7 @@ def check_directions(directions, mesh):
         if not (isinstance(name, str) and Sdf.Path.IsValidIdentifier(name)):
             raise ValueError(f"directions: {name!r} must be a name such as principal1, of letters, digits and _")
         if interpolation not in allowed:
-            raise ValueError(f"directions[{name!r}] = {interpolation!r}: must be {' or '.join(map(repr, allowed))}")
+            raise ValueError(f"directions[{name!r}] is {interpolation!r}; it must be {' or '.join(map(repr, allowed))}")
 
 
 def define_directions(stage, prim, mesh, directions, material, nowhere):

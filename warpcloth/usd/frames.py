@@ -81,7 +81,7 @@ class FrameSequence:
                 are asked of a prim whose transform is animated.
         """
         if attribute not in _VECTORS and not str(attribute).startswith("primvars:"):
-            raise ValueError(f'attribute = {attribute!r}: must be "points", "velocities" or a primvar, "primvars:<name>"')
+            raise ValueError(f'attribute is {attribute!r}; it must be "points", "velocities" or a primvar, "primvars:<name>"')
         path = followed(path)  # USD looks for the frames beside a link, and not beside the file that it stands for
         self._file = os.path.abspath(path)
         self._identity = identity(self._file)  # before it is opened, so that no change is missed

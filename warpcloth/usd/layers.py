@@ -33,7 +33,7 @@ def scene_layer(mesh, pins, up_axis, name):
         ValueError: The name, or that of a pin, is none.
     """
     if not Sdf.Path.IsValidIdentifier(name):
-        raise ValueError(f"prim = {name!r}: must be a name of letters, digits and _ where there is no source")
+        raise ValueError(f"prim is {name!r}; it must be a name of letters, digits and _ where there is no source")
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)

@@ -91,7 +91,7 @@ class MeasureWriter(ChunkWriter):
         check_primvars(primvars, mesh)
         check_directions(directions, mesh)
         if coloured is not None and coloured not in primvars:
-            raise ValueError(f"coloured = {coloured!r}: must be one of {', '.join(map(repr, primvars)) or 'none'}, or None")
+            raise ValueError(f"coloured is {coloured!r}; it must be one of {', '.join(map(repr, primvars)) or 'none'}, or None")
         self._with_points, self._stage = source is None, None
         if source is None:
             self._checked("points of the rest shape", mesh.points)
@@ -138,7 +138,7 @@ class MeasureWriter(ChunkWriter):
         """
         self._check_open()
         if not math.isfinite(time_code) or (self._span and time_code <= self._span[1]):
-            raise ValueError(f"time_code = {time_code} at frame {self.frames}: must be finite and after the one before")
+            raise ValueError(f"time_code is {time_code} at frame {self.frames}; it must be finite and after the one before")
         target, time = self._targets[0], float(time_code)
         primvars = self._checked_primvars(primvars, unknown=True)
         _check_given("colours", colours, target.coloured)

@@ -301,11 +301,11 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     """
     path = Path(os.path.abspath(followed(path)))
     if path.suffix not in (".usd", ".usda", ".usdc"):
-        raise ValueError(f"path = {path}: must end with one of .usd, .usda, .usdc")
+        raise ValueError(f"path is {path}; it must end with one of .usd, .usda, .usdc")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"path = {path}: the folder {path.parent} does not exist")
     if scene.stage is not None and os.path.realpath(path) == os.path.realpath(scene.stage.path):
-        raise ValueError(f"path = {path}: is the stage that the scene was read from, which must not be changed")
+        raise ValueError(f"path is {path}, the stage that the scene was read from; it must be another file")
     if not scene.terms:
         raise ValueError("scene.terms is empty; a scene in a stage must have one or more")
     for term in scene.terms:

@@ -134,7 +134,7 @@ def check_primvars(primvars, mesh):
         allowed = ("vertex", "uniform") if len(mesh.triangles) else ("vertex",)
         if interpolation not in allowed:
             of = "" if len(mesh.triangles) else " of a mesh of edges"
-            raise ValueError(f"primvars[{name!r}] = {interpolation!r}: must be {' or '.join(map(repr, allowed))}{of}")
+            raise ValueError(f"primvars[{name!r}] is {interpolation!r}; it must be {' or '.join(map(repr, allowed))}{of}")
 
 
 def vertex_normals(points, triangles):
