@@ -106,3 +106,10 @@ def test_an_evaluation_has_what_is_refreshed(name, device):
     tolerance = 1e-9 if "constrained" not in name else 1e-4  # whose inner solve has a residual that the sideways motion changes
     assert abs(x[0, 1] - expected[0, 1]) < tolerance and abs(v[0, 1] - speed[0, 1]) < 100.0 * tolerance
     assert speed[0, 1] < 0.0, "the spring pulls"
+
+
+@pytest.mark.parametrize("term", [Lift, Floor])
+def test_what_is_refreshed_is_not_damped(term):
+    """Both would set the rest state."""
+    with pytest.raises(ValueError, match=f"{term.__name__} changes during a run and cannot be damped; leave its damping out"):
+        scene(term(vertices=[0], stiffness=50.0, damping=0.1)).build()

@@ -79,6 +79,8 @@ class Vary:
         )
         if damping.any() and one.term.dissipation is None:
             raise ValueError(f"{one.label} cannot be damped; leave its damping out")
+        if damping.any() and one.refresh:  # damping sets rest states too
+            raise ValueError(f"{one.label} changes during a run and cannot be damped; leave its damping out")
         if not (given or self.has("positions")):
             return one, np.repeat(one.rest[None], self.copies, axis=0), stiffness, damping
         rest = []

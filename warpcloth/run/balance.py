@@ -52,17 +52,20 @@ class Elastic:
     def _gradient(self):
         return plan(self.model).gradient(terms=self.soft)
 
-    def energy(self, x, most=np.inf):
-        """U [J] of the soft terms of each copy at x, (B,), with no more than ``most`` of each term."""
-        energies = self._at_start if x is self.model.positions else self._energies_at(x)
-        return sum((np.minimum(energy, most) for energy in energies), np.zeros(self.model.copies))
+    def energy(self, x):
+        """U [J] of the soft terms of each copy at x, (B,)."""
+        return sum(self._energies_at(x), np.zeros(self.model.copies))
+
+    def below_0(self, x):
+        """The energy of those terms of which it is negative, (B,) [J]; what overflows to NaN counts as 0, as infinity does."""
+        return sum((np.fmin(energy, 0.0) for energy in self._energies_at(x)), np.zeros(self.model.copies))
 
     def _energies_at(self, x):
-        return [self._value(energy, x) for energy in self._energies]
+        return self._at_start if x is self.model.positions else [self._value(energy, x) for energy in self._energies]
 
     @cached_property
     def _at_start(self):
-        return self._energies_at(self.model.positions)
+        return [self._value(energy, self.model.positions) for energy in self._energies]
 
     def gaps(self, x, terms):
         """Computes ½Σ gap² of the constraints of terms, which is their energy with a stiffness of 1, (B,)."""
@@ -123,7 +126,7 @@ class Balance:
         self._moment, self._fastest = self._moments(points), np.zeros(model.copies)
         self._rounding = np.zeros(model.copies)
         self.elastic = Elastic(model)
-        self._lowest = self.elastic.energy(model.positions, most=0.0)
+        self._lowest = self.elastic.below_0(model.positions)
         # Rounding of positions gives a velocity of at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
         self._note_farthest(points)
         found = (source_of(part, self, stepper) for part in (stepper, *model.scene.declared))
@@ -161,7 +164,7 @@ class Balance:
                     if self._staggered and self.elastic.soft:
                         kinetic = np.fmin(kinetic, self.kinetic(self._at_positions(points, velocities)))
                     given = given + sum(source.stored(frame) for source in self.sources)
-                    height = height + self.elastic.energy(self.elastic.put(points), most=0.0)
+                    height = height + self.elastic.below_0(self.elastic.put(points))
                     before, self._lowest = self._lowest, np.fmin(self._lowest, height)
                     given = given + (before - self._lowest)
                 found = self._gain(kinetic, height, carried, given)
