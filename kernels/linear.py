@@ -64,6 +64,39 @@ def add_blocks(dtype):
 
 
 @cache
+def lock_blocks(dtype):
+    """Kernel over the blocks of the matrix: rows and columns of locked coordinates are 0 but for the diagonal.
+
+    That keeps an entry above 0 or not finite, for it has the scale of the matrix, and is else 1.
+    """
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def lock(
+        # elements
+        rows: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        mobility: wp.array(dtype=vec3),
+        # in and out
+        values: wp.array(dtype=mat33),
+    ):
+        s = wp.tid()
+        i = rows[s]
+        j = columns[s]
+        block = values[s]
+        for a in range(3):
+            for b in range(3):
+                if mobility[i][a] == dtype(0.0) or mobility[j][b] == dtype(0.0):
+                    entry = dtype(0.0)
+                    if i == j and a == b:
+                        entry = wp.where(block[a, b] <= dtype(0.0), dtype(1.0), block[a, b])
+                    block[a, b] = entry
+        values[s] = block
+
+    return lock
+
+
+@cache
 def multiply(dtype):
     """Kernel over block rows: q = A p, of the copies that are active."""
     vec3, mat33 = types(dtype)

@@ -243,6 +243,26 @@ def note_move(dtype):
 
 
 @cache
+def lock(dtype):
+    """Kernel over vertices: the components of vectors along axes on which a vertex does not move become 0."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def lock_coordinates(
+        # elements
+        mobility: wp.array(dtype=vec3),
+        # in and out
+        values: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        for axis in range(3):
+            if mobility[i][axis] == dtype(0.0):
+                values[i][axis] = dtype(0.0)
+
+    return lock_coordinates
+
+
+@cache
 def reset(dtype, led: bool):
     """Kernel over vertices: those of the copies that the mask (B,) has true start again, and what else is carried of these too.
 

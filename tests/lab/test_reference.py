@@ -323,6 +323,7 @@ def test_runs_that_diverge_are_left_out(folder, runs, monkeypatch):
         {"pins": [0]},
         {"pins": wc.Pins([0, 2], np.tile(wc.Mesh.grid(3, 3).points[[0, 2]], (1, 1, 1)))},
         {"gravity": (0.0, -9.0, 0.0)},
+        {"free_axes": np.arange(27).reshape(9, 3) != 4},
         {"fps": 30.0},
     ],
     ids=lambda change: next(iter(change)),

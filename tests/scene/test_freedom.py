@@ -44,7 +44,7 @@ def test_ranks(name, n):
     """Matches the closed form, and for small meshes the rank from singular values of J in another general position."""
     mesh, pairs, left = NETS[name](n)
     pairs = mesh.springs(pairs) if isinstance(pairs, str) else pairs
-    rank = rank_of(pairs, np.ones(len(mesh.points), dtype=bool))
+    rank = rank_of(pairs, np.ones(mesh.points.shape, dtype=bool))
     assert 3 * len(mesh.points) - rank == left
     if len(mesh.points) < 200 and len(pairs):
         points = mesh.points + np.random.default_rng(1).uniform(-0.1, 0.1, mesh.points.shape) / n
@@ -65,6 +65,18 @@ def test_pins_take_coordinates_and_rigid_motion(kind, pins, rigid):
     assert (found.coordinates, found.rigid, found.hard) == (3 * (n * n - len(pins)), rigid, True)
     assert found.left == found.coordinates - found.rank and found.locked == (kind != "edges")
     assert found.left == (rigid if found.locked else 3 + 4 * (n - 1) - 3 * len(pins))
+
+
+def test_locked_axes_take_coordinates_and_rigid_motion():
+    """On a plane of symmetry a disc keeps two translations and the rotation in that plane."""
+    mesh = wc.Mesh.grid(6, 6)
+    free = np.ones((36, 3), dtype=bool)
+    free[:6, 0] = False
+    scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(pairs="edges", stiffness=np.inf)], free_axes=free)
+    found = freedom(scene)
+    assert (found.coordinates, found.rigid, found.left) == (108 - 6, 3, 102 - len(mesh.edges))
+    bead = wc.Scene(wc.Mesh.chain(2), masses=[1, 1], pins=[0], free_axes=[[True] * 3, [False, True, False]])
+    assert freedom(bead).coordinates == 1
 
 
 def test_pieces_and_loose_vertices_count_by_themselves():

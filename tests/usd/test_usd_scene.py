@@ -78,6 +78,7 @@ def states():
         gravity=(0.1, 0.2, -1.62),
         duration=0.3,
         fps=30.0,
+        free_axes=random.random(sheet.points.shape) > 0.2,
     )
 
 
@@ -483,6 +484,8 @@ def own(name, type_name, value):
         (own("terms:threads:type", "Token", "Rope"), "type is 'Rope', must be one of Attachment, "),
         (own("terms:threads:vertices", "IntArray", [1]), "threads has vertices, which a Spring has not"),
         (own("terms:threads:stifness", "Double", 1.0), "threads:stifness is no attribute of a cloth, must be"),
+        (own("freeAxes", "Int3Array", [(1, 1, 2)] * 9), r"warpcloth:freeAxes\[0\] has 2, must be 0 or 1 for each axis"),
+        (own("freeAxes", "Int3Array", [(1, 1, 1)]), r"free_axes has shape \(1, 3\); it must be an array"),
         (own("mass", "Double", 1.0), "warpcloth:mass is no attribute of a cloth, must be one of .*density"),
         (
             {**OWN, "warpcloth:terms:threads:stiffness": ("Double", -1.0)},

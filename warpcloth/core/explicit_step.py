@@ -34,7 +34,7 @@ class ExplicitStep:
         self._ahead = model.vectors() if self._damped else None
         self._move_ahead = model.kernel(kernels.move_ahead, model.dtype)
         self._step = model.kernel(kernels.explicit_step, model.dtype, symplectic, compensated)
-        self._given = [model.inverse_mass, model.gravity, model.per_copy, h]
+        self._given = [model.inverse_mass, *model.free_gravity, h]
 
     def launch(self, steps, move_pins):
         """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
@@ -46,5 +46,6 @@ class ExplicitStep:
             if self._damped:
                 model.launch(self._move_ahead, model.count, [v, self._given[-1]], [self._ahead])
                 self._dissipative.add(x, self._gradient, self._ahead)
+            model.lock(self._gradient)
             model.launch(self._step, model.count, self._given, [self._gradient, x, v, self.residual])
             move_pins(*self._pins, x, v)

@@ -68,6 +68,9 @@ class _SparseBlocks:
 class Hessian:
     """∂²U/∂x² + scale·M in block compressed rows, pinned vertices replaced by the identity; or of the ``terms`` given.
 
+    A locked coordinate keeps its entry of the diagonal, or 1 where that is not above 0, and nothing else of its row and column
+    (Baraff and Witkin 1998), so that it stays and the rest do not notice.
+
     Attributes:
         offsets, columns: Block rows (N+1,) and the column of each block.
         diagonal: Index of each diagonal block (N,).
@@ -108,6 +111,7 @@ class Hessian:
         self.columns = put(unique % n)
         self.diagonal = put(index[:n])
         self.values = wp.zeros(len(unique), dtype=model.mat33, device=model.device)
+        self._rows = None if model.mobility is None else put(unique // n)
         self.gathers, start = [], n
         for source in sources:
             target = index[start : start + len(source)]
@@ -124,6 +128,9 @@ class Hessian:
         for of_term, gather in zip(self._of_terms, self.gathers, strict=True):
             of_term.launch(x, correction, self.policy)
             model.launch(self._add_blocks, len(self.values), [*gather, of_term.blocks.flatten()], [self.values])
+        if self._rows is not None:
+            lock = model.kernel(linear.lock_blocks, model.dtype)
+            model.launch(lock, len(self.values), [self._rows, self.columns, model.mobility], [self.values])
 
     def norms(self):
         """Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ of every vertex i, summed over elements, (N,) [N/m], each ‖·‖ by the bound √(‖·‖₁‖·‖∞)."""

@@ -51,6 +51,7 @@ class Reset:
         starts, words, carried = self._given
         given = [model.inverse_mass, model.positions, x, v, starts, mask, model.per_copy, words]
         model.launch(self._kernel, model.count, given, [carried, *stepper.state])
+        model.lock(stepper.state.v)
         if stepper.residual.any() or any(result is not Result.COMPLETED for result in stepper.results):
             chosen = mask.numpy()
             stepper.residual = np.where(chosen, 0.0, stepper.residual)

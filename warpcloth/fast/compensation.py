@@ -35,7 +35,7 @@ def packed_unit(model):
     scene, far = model.scene, _size(model.positions.numpy())
     if scene.pins.keyframes is not None:
         far = max(far, _size(scene.pins.keyframes))
-    if not len(scene.pins.vertices):
+    if not len(scene.fixed):
         speed, g, seconds = _size(model.velocities.numpy()), _size(model.gravity.numpy()), scene.duration
         far = max(far, (speed + 0.5 * g * seconds) * seconds / FARTHER)
     unit = FINER * _rounding(far)

@@ -57,6 +57,8 @@ class Plan:
             ValueError: If threads cannot share them, naming the term.
         """
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
+        if self.model.mobility is not None and pool.threads == 1:
+            return ExplicitStep(*given)
         if pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
             steps = SubdomainSteps(*given, pool)
@@ -99,6 +101,11 @@ def _refuse_undivided(model, backend, threads):
     """
     if backend != "blocks":
         raise ValueError(f"threads is {threads} with backend {backend!r}; more than 1 is for 'blocks'")
+    if model.mobility is not None:
+        raise ValueError(
+            f"threads is {threads} with one copy that has free_axes, whose steps Explicit cannot divide; threads=1 can, and "
+            "copies are shared out with every solver"
+        )
     for elements in model.terms:
         if elements.refresh:
             raise ValueError(

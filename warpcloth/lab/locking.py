@@ -223,7 +223,7 @@ def counted(holding, n):
 
 
 def _left(mesh, pairs):
-    return 3 * len(mesh.points) - rank_of(pairs, np.ones(len(mesh.points), dtype=bool))
+    return 3 * len(mesh.points) - rank_of(pairs, np.ones(mesh.points.shape, dtype=bool))
 
 
 def nearly_rigid(holding, degrees, device):

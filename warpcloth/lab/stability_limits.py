@@ -159,7 +159,7 @@ def concave_rate(model):
     """
     hessian = Hessian(model, policy=HessianPolicy.RAW)
     hessian.assemble(model.positions, 0.0)
-    root = np.repeat(np.sqrt(model.inverse_mass.numpy().astype(np.float64)), 3)
+    root = np.sqrt(model.coordinate_mobility())
     matrix = hessian.matrix().multiply(root[:, None]).multiply(root).tocsr()
     if matrix.shape[0] <= 300:
         return max(0.0, -float(np.linalg.eigvalsh(matrix.toarray())[0]))
@@ -329,7 +329,7 @@ def _share(mobility, compliance, record):
 
 def _inverse_masses(scene):
     inverse = 1.0 / scene.vertex_masses
-    inverse[scene.pins.vertices] = 0.0
+    inverse[scene.fixed] = 0.0
     return inverse
 
 

@@ -9,6 +9,7 @@ import warp as wp
 from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
+from ..kernels.step import lock
 from ..kernels.term import Term
 from ..kernels.vectors import types
 from ..mesh.selection import distinct_vertices
@@ -40,6 +41,8 @@ class Model:
     Attributes:
         positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
         mass, inverse_mass: (B·n,) [kg], [1/kg]; the inverse of a pinned vertex is 0.
+        mobility: Inverse masses along each axis, 0 where it is locked, (B·n,) vectors [1/kg]; None where no coordinate of a
+            vertex that moves is locked.
         gravity: (B,) vectors [m/s²].
         pins, keyframes: Moved pins (p,) and their positions (F, p) [m], or None.
         terms: One :class:`warpcloth.model.elements.DeviceElements` for each declared term.
@@ -79,10 +82,12 @@ class Model:
         masses = vary.masses(scene)
         with np.errstate(over="ignore"):  # an inverse that no precision holds is refused below
             inverse = 1.0 / np.where(masses > 0.0, masses, np.inf)
-        inverse[:, scene.pins.vertices] = 0.0
+        inverse[:, scene.fixed] = 0.0
         positions = vary.take("positions", scene.positions)
         velocities = vary.take("velocities", scene.velocities)
-        velocities[:, scene.pins.vertices] = 0.0
+        velocities[:, scene.fixed] = 0.0
+        if scene.locked is not None:
+            velocities[:, scene.locked] = 0.0
         if vary.has("positions"):
             for copy, start in enumerate(positions):
                 scene.pins.refuse_far(start, f" in copy {copy}")
@@ -91,7 +96,13 @@ class Model:
         self.velocities = self._put("velocity", "m/s", velocities, self.vec3)
         self.mass = self._put("mass", "kg", masses, self.dtype)
         self.inverse_mass = self._put("inverse mass", "1/kg", inverse, self.dtype)
-        self.gravity = self._put("gravity", "m/s²", vary.take("gravity", scene.gravity)[:, None], self.vec3, each=None)
+        gravity = vary.take("gravity", scene.gravity)[:, None]
+        self.gravity = self._put("gravity", "m/s²", gravity, self.vec3, each=None)
+        self.mobility = self._vertex_gravity = None
+        if scene.locked is not None:
+            free = ~scene.locked
+            self.mobility = self._put("inverse mass", "1/kg", inverse[..., None] * free, self.vec3)
+            self._vertex_gravity = self._put("gravity", "m/s²", gravity * free, self.vec3)
         self.pins = self.keyframes = None
         if scene.pins.keyframes is not None:
             keyframes, vertices = scene.pins.keyframes, scene.pins.vertices
@@ -120,6 +131,22 @@ class Model:
             return values
         return values.reshape(self.copies, self.per_copy, *values.shape[1:])[:, self.indices].reshape(values.shape)
 
+    @property
+    def free_gravity(self):
+        """Gravity along free axes, (G,) vectors [m/s²], and how many vertices in a row share an entry."""
+        return (self.gravity, self.per_copy) if self.mobility is None else (self._vertex_gravity, 1)
+
+    def lock(self, values):
+        """Launches values = 0 at coordinates that do not move, of vectors (N,); nothing where none is locked."""
+        if self.mobility is not None:
+            self.launch(self.kernel(lock, self.dtype), self.count, [self.mobility], [values])
+
+    def coordinate_mobility(self):
+        """The inverse mass of each coordinate on the host, 0 where it does not move, (3 B·n,) [1/kg] in double precision."""
+        if self.mobility is None:
+            return np.repeat(self.inverse_mass.numpy().astype(np.float64), 3)
+        return self.mobility.numpy().astype(np.float64).ravel()
+
     def with_terms(self, terms):
         """This model with other :class:`warpcloth.model.elements.DeviceElements`, all else shared."""
         other = shallow_copy(self)
@@ -147,8 +174,9 @@ class Model:
         n = self.per_copy
         other, of_copies, of_vertices = shallow_copy(self), slice(first, first + count), slice(first * n, (first + count) * n)
         other.copies, other.count, other.threads = count, count * n, 1
-        for name in ("positions", "velocities", "mass", "inverse_mass"):
-            setattr(other, name, getattr(self, name)[of_vertices])
+        for name in ("positions", "velocities", "mass", "inverse_mass", "mobility", "_vertex_gravity"):
+            if getattr(self, name) is not None:
+                setattr(other, name, getattr(self, name)[of_vertices])
         other.gravity = self.gravity[of_copies]
         other.terms = tuple(elements.part(first, count) for elements in self.terms)
         return other

@@ -48,7 +48,7 @@ class Vary:
                 raise ValueError(f"vary['density'] is {density[copy]} in copy {copy}; it must be above 0")
             masses = masses * (density / scene.density)[:, None]
         allowed = masses > 0.0
-        allowed[:, scene.pins.vertices] |= masses[:, scene.pins.vertices] == 0.0
+        allowed[:, scene.fixed] |= masses[:, scene.fixed] == 0.0
         for copy, vertex in np.argwhere(~allowed)[:1]:
             raise ValueError(
                 f"vary['masses'] of vertex {vertex} is {masses[copy, vertex]} kg in copy {copy}; it must be above 0, "

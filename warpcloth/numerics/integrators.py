@@ -36,20 +36,12 @@ class Euler:
 
     def launch_prediction(self):
         """x = x̃, v = (x̃ − x₀)/hₑ; pins where they are then."""
-        self._launch(kernels.predict, [self._gravity, self._n, self.he], list(self.stepper.state))
+        self._launch(kernels.predict, [*self.stepper.model.free_gravity, self.he], list(self.stepper.state))
         self.stepper.launch_pins()
 
     def launch_finish(self, correction):
         """The state at the end of the step."""
         self._launch(kernels.finish, [correction, self.he], list(self.stepper.state))
-
-    @property
-    def _gravity(self):
-        return self.stepper.model.gravity
-
-    @property
-    def _n(self):
-        return self.stepper.model.per_copy
 
     def _launch(self, factory, inputs, outputs):
         model = self.stepper.model
@@ -67,11 +59,12 @@ class Midpoint(Euler):
         return Moment(x, integrator="midpoint", move=v, scale=self.he)
 
     def launch_prediction(self):
-        self._launch(kernels.predict, [self._gravity, self._n, self.he], list(self.stepper.state))
+        self._launch(kernels.predict, [*self.stepper.model.free_gravity, self.he], list(self.stepper.state))
         self.stepper.launch_pins(parts=2)
 
     def launch_finish(self, correction):
-        given = [self._gravity, correction, self._n, self.he]
+        gravity, each = self.stepper.model.free_gravity
+        given = [gravity, correction, each, self.he]
         self._launch(kernels.finish_midpoint, given, list(self.stepper.state))
         self.stepper.launch_pins(parts=2)
 
@@ -122,7 +115,7 @@ class BDF2(Euler):
         return Moment(self.stepper.state.x, integrator="bdf2", move=self.move)
 
     def launch_prediction(self):
-        given = [self._gravity, self._n, self.he]
+        given = [*self.stepper.model.free_gravity, self.he]
         self._launch(kernels.predict_bdf2, given, [*self.stepper.state, self.move, self.v_before])
         self.stepper.launch_pins()
 

@@ -127,11 +127,11 @@ class Factorised:
         return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
     def lowest_eigenvalue(self, copy=0):
-        """Finds the lowest eigenvalue of a copy's matrix without its pinned vertices [N/m], see :func:`lowest_eigenvalue`."""
+        """Finds the lowest eigenvalue of a copy's matrix over coordinates that move [N/m], see :func:`lowest_eigenvalue`."""
         matrix = self.matrices[copy]
         matrix.data[:] = self.values.read()[self.starts[copy] : self.starts[copy + 1]]
-        n = self.model.per_copy
-        free = np.flatnonzero(np.repeat(self.model.inverse_mass.numpy()[copy * n : (copy + 1) * n] > 0.0, 3))
+        n = 3 * self.model.per_copy
+        free = np.flatnonzero(self.model.coordinate_mobility()[copy * n : (copy + 1) * n])
         return lowest_eigenvalue(matrix.tocsr()[free][:, free])
 
     def _mirror(self, array):

@@ -121,7 +121,7 @@ class Balance:
         self.total = self.mass.sum(axis=1)
         # A term of one vertex that is in no cell holds it where it is in space.
         held = any(elements.term.vertices == 1 and not elements.cells for elements in model.terms)
-        self._free = not (held or len(model.scene.pins.vertices))
+        self._free = not (held or len(model.scene.fixed) or model.mobility is not None)
         self._gravity = model.gravity.numpy().astype(np.float64)
         self._moment, self._fastest = self._moments(points), np.zeros(model.copies)
         self._rounding = np.zeros(model.copies)
@@ -219,4 +219,6 @@ class Balance:
         mass, shape = self.mass[..., None], (*self.mass.shape, 3)
         forces = mass * self._gravity[:, None] - self.elastic.gradient(self.elastic.put(points)).reshape(shape)
         kicks = np.divide(forces, mass, out=np.zeros(shape), where=mass > 0.0)
+        if self.model.mobility is not None:
+            kicks[:, self.model.scene.locked] = 0.0
         return velocities + 0.5 * self._h * kicks.reshape(-1, 3)

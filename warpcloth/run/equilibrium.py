@@ -195,7 +195,7 @@ def _nudge(model):
     """A move of the free vertices by about 1e-4 of the size of the cloth, the same at every call (n, 3) [m]."""
     size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
     noise = np.random.default_rng(0).normal(size=(model.count, 3))
-    return 1e-4 * size * noise * (model.inverse_mass.numpy() > 0.0)[:, None]
+    return 1e-4 * size * noise * (model.coordinate_mobility() > 0.0).reshape(-1, 3)
 
 
 def _frequency_scale(model):

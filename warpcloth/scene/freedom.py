@@ -29,7 +29,7 @@ class Freedom:
     Attributes:
         edges: Number of edges that hold their length. Each pair of vertices counts once, pairs of pinned vertices do not count.
         hard: Whether some of them are hard.
-        coordinates: Number of coordinates of the vertices that are not pinned.
+        coordinates: Number of coordinates of the vertices that are neither pinned nor locked.
         rank: Rank of the Jacobian of the lengths with respect to these coordinates.
         left: Degrees of freedom that are left, ``coordinates`` − ``rank``.
         rigid: Degrees of freedom of the pieces of cloth, each as one rigid body that hangs on its pins.
@@ -66,17 +66,17 @@ def freedom(scene):
     """
     mesh = scene.mesh
     pairs, hard = _held(scene)
-    free = np.ones(len(mesh.points), dtype=bool)
-    free[scene.pins.vertices] = False
-    coordinates, rigid = 3 * int(free.sum()), _rigid(mesh, pairs, free)
-    pairs = pairs[free[pairs].any(axis=1)]
-    counted = int(free.sum()) > MOST
+    free = np.ones((len(mesh.points), 3), dtype=bool) if scene.free_axes is None else scene.free_axes.copy()
+    free[scene.fixed] = False
+    coordinates, rigid = int(free.sum()), _rigid(mesh, pairs, free)
+    pairs = pairs[free[pairs].any(axis=(1, 2))]
+    counted = int(free.any(axis=1).sum()) > MOST
     rank = min(len(pairs), max(coordinates - rigid, 0)) if counted else rank_of(pairs, free)
     return Freedom(len(pairs), hard, coordinates, rank, coordinates - rank, rigid, counted)
 
 
 def rank_of(pairs, free):
-    """Rank of the Jacobian of the lengths of pairs (E, 2) with respect to the vertices that are free (n,), in general position.
+    """Rank of the Jacobian of the lengths of pairs (E, 2) with respect to free coordinates (n, 3), in general position.
 
     The rank is the number of nonzero eigenvalues of JᵀJ at random positions. The signs of the pivots of JᵀJ − ε, with a small
     ε, count them (Sylvester's law of inertia).
@@ -84,7 +84,7 @@ def rank_of(pairs, free):
     from scipy.sparse import csr_array, identity
     from scipy.sparse.linalg import splu
 
-    columns = np.flatnonzero(np.repeat(free, 3))
+    columns = np.flatnonzero(free)
     if not (len(pairs) and len(columns)):
         return 0
     points = np.random.default_rng(0).normal(size=(len(free), 3))
@@ -118,13 +118,20 @@ def _held(scene):
 
 
 def _rigid(mesh, pairs, free):
-    """Counts the degrees of freedom of the pieces of cloth, each a rigid body that can move about its pinned vertices."""
+    """Counts the degrees of freedom of the pieces of cloth, each a rigid body that moves along free axes (n, 3) alone."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     n = len(free)
     joined = np.concatenate([mesh.edges, pairs])
     _, piece = connected_components(coo_array((np.ones(len(joined)), tuple(joined.T)), shape=(n, n)), directed=False)
-    sizes, pinned = np.bincount(piece), np.bincount(piece, weights=~free).astype(int)
-    unpinned = np.array([0, 3, 5, 6])[np.minimum(sizes, 3)]
-    return int(np.maximum(unpinned - np.array([0, 3, 5, 6])[np.minimum(pinned, 3)], 0).sum())
+    moves = np.array([0, 3, 5, 6])[np.minimum(np.bincount(piece), 3)]
+    # What these moves do to each coordinate that is not free, in general position; of each piece its Gram matrix has the rank.
+    vertices, axes = np.nonzero(~free)
+    units = np.eye(3)[axes]
+    rows = np.hstack([units, np.cross(np.random.default_rng(0).normal(size=(n, 3))[vertices], units)])
+    gram = np.zeros((len(moves), 6, 6))
+    for i, j in np.ndindex(6, 6):
+        gram[:, i, j] = np.bincount(piece[vertices], weights=rows[:, i] * rows[:, j], minlength=len(moves))
+    values = np.linalg.eigvalsh(gram)
+    return int((moves - (values > _ZERO * values[:, -1:]).sum(axis=1)).sum())

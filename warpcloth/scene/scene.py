@@ -77,6 +77,9 @@ class Scene:
         name: For reports and files.
         stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; an animation is then written as a
             layer over that stage.
+        free_axes: Along which axes of space each vertex may move, (n, 3) truth values; all of them if not given. A locked
+            coordinate stays where it starts, and its velocity is 0, which makes planes of symmetry and rails. A vertex
+            without a free axis is a pin that stands still; what it says of pins does not matter.
 
     Raises:
         ValueError: If a value breaks a rule; the sentence names it.
@@ -101,6 +104,7 @@ class Scene:
     fps: float = 60.0
     name: str = "scene"
     stage: StageMesh | None = None
+    free_axes: Converted[ArrayLike | None, np.ndarray | None] = default(None)
 
     @property
     def declared(self) -> tuple[object, ...]:
@@ -128,6 +132,7 @@ class Scene:
         keep("positions", self.mesh.points if self.positions is None else array("positions", self.positions, (n, 3)))
         keep("velocities", np.zeros((n, 3)) if self.velocities is None else array("velocities", self.velocities, (n, 3)))
         keep("pins", checked_pins(self.pins, self.mesh))
+        keep("free_axes", _checked_axes(self.free_axes, n))
         self.pins.refuse_far(self.positions)
         if (self.density is None) == (self.masses is None):
             raise ValueError("exactly one of density and masses must be given")
@@ -153,7 +158,7 @@ class Scene:
     def _check_masses(self):
         masses = self.vertex_masses
         free = np.ones(len(masses), dtype=bool)
-        free[self.pins.vertices] = False
+        free[self.fixed] = False
         bad = np.flatnonzero(free & ~((masses > 0.0) & np.isfinite(masses)))
         if len(bad):
             raise ValueError(
@@ -170,6 +175,22 @@ class Scene:
             masses = self.density * (self.mesh.vertex_areas if len(self.mesh.triangles) else self.mesh.vertex_lengths)
         masses.setflags(write=False)
         return masses
+
+    @cached_property
+    def fixed(self) -> np.ndarray:
+        """Vertices that obey no forces, the pins and those without a free axis, (f,) int32."""
+        if self.free_axes is None:
+            return self.pins.vertices
+        return np.union1d(self.pins.vertices, np.flatnonzero(~self.free_axes.any(axis=1))).astype(np.int32)
+
+    @property
+    def locked(self) -> np.ndarray | None:
+        """Which coordinates are locked of vertices that move along other axes, (n, 3) truth values; None where none is."""
+        if self.free_axes is None:
+            return None
+        found = ~self.free_axes
+        found[self.fixed] = False
+        return found if found.any() else None
 
     @property
     def frames(self) -> int:
@@ -203,7 +224,25 @@ class Scene:
             f"  {self.duration:g} s in {self.frames} frames of 1/{self.fps:g} s",
             f"  pins: {len(pins.vertices)}" + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
         ]
+        if self.locked is not None:
+            counts = ", ".join(f"{count} {axis}" for axis, count in zip("xyz", self.locked.sum(axis=0), strict=True))
+            lines.append(f"  locked coordinates: {counts}")
         return "\n".join(lines + [f"  {_described(term)}" for term in self.terms])
+
+
+def _checked_axes(free_axes, n):
+    """Truth values (n, 3), or None."""
+    if free_axes is None:
+        return None
+    try:
+        found = np.array(free_axes)
+    except ValueError:  # rows of different lengths
+        found = np.empty(())
+    if found.dtype != bool or found.shape != (n, 3):
+        given = f"has shape {found.shape}" if found.dtype == bool else f"is {shown(free_axes)}"
+        raise ValueError(f"free_axes {given}; it must be an array ({n}, 3) of truth values, one for each axis of each vertex")
+    found.setflags(write=False)
+    return found
 
 
 def checked_pins(pins: Any, mesh: Mesh) -> Pins:

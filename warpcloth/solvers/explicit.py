@@ -45,7 +45,7 @@ class Explicit(Step):
 
     name = "explicit"
     needs = (FINITE,)
-    limited = True
+    limited = locks = True
     facts = Facts(
         method="symplectic Euler; a step above the limit is refused, with the limit; forward Euler on request",
         benchmarks=(Benchmark({}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),),
@@ -203,7 +203,7 @@ def _over_mass(hessian):
     """M^-½ A M^-½ as a scipy matrix (3n, 3n) [1/s²]."""
     from scipy.sparse import diags
 
-    root = diags(np.repeat(np.sqrt(hessian.model.inverse_mass.numpy().astype(np.float64)), 3))
+    root = diags(np.sqrt(hessian.model.coordinate_mobility()))
     return (root @ hessian.matrix() @ root).tocsr()
 
 

@@ -47,7 +47,7 @@ class Newton(ImplicitStep):
 
     name = "newton"
     needs = (FINITE,)
-    residual = Residual(UNBALANCED, "times the largest at the start of its step")
+    residual, locks = Residual(UNBALANCED, "times the largest at the start of its step"), True
     facts = Facts(
         method="implicit Euler, minimised by Newton's method with a line search; CG or a factorisation",
         benchmarks=(Benchmark({"substeps": 4}, cpu=(16, 32, 64), cuda=(32, 64, 128)),),

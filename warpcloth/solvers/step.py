@@ -12,7 +12,7 @@ from ..base.turns import methods_in_turn
 from ..core.status import Residual
 from ..model.model import Model
 from ..scene.scene import Scene
-from ..terms.needs import refuse_unmet
+from ..terms.needs import listed, refuse_unmet
 from .facts import Facts
 from .solver import Stepper
 from .threaded import ThreadedStepper
@@ -59,13 +59,14 @@ class Step:
         name: Its name on the command line and in benchmarks and charts; each record has its own.
         needs: What it needs of every term, of :mod:`warpcloth.terms.needs`, those to be told first at first.
         facts: The :class:`warpcloth.solvers.facts.Facts` by which it is measured and drawn.
+        locks: Whether it takes a scene that locks coordinates, ``free_axes``.
         limited: Whether it refuses steps above a limit, which :meth:`step_limits` then finds.
 
     Raises:
         ValueError: If both or neither are given, or they are not above 0.
     """
 
-    ordered = staggered = closes = False
+    ordered = staggered = closes = locks = False
     residual = None
     name, needs, facts, limited = None, (), Facts(), False
 
@@ -104,11 +105,14 @@ class Step:
             instead: The option that does not.
 
         Raises:
-            ValueError: Naming the term, the solver and what would work.
+            ValueError: Naming the term or `free_axes`, the solver and what would work.
         """
         if not isinstance(model, Model):
             given = "a Scene" if isinstance(model, Scene) else shown(model)
             raise ValueError(f"model is {given}; bind takes a model, which scene.build() makes")
+        if model.mobility is not None and not cls.locks:
+            able = [record.__name__ for record in SOLVERS.values() if record.locks]
+            raise ValueError(f"{cls.__name__} cannot take free_axes that lock some axes of a vertex; {listed(able)} can")
         if needs is None:
             refuse_unmet(model.terms, cls.__name__, cls.needs, {record.__name__: record.needs for record in SOLVERS.values()})
         else:

@@ -51,6 +51,11 @@ def lacks(elements, needs):
     return next((need for need in needs if not need.met(elements)), None)
 
 
+def listed(names):
+    """Joins names by commas and "or"."""
+    return ", ".join(names[:-1]) + " or " * (len(names) > 1) + "".join(names[-1:])
+
+
 def refuse_unmet(terms, solver, needs, others):
     """Refuses the first term that lacks something that a solver needs.
 
@@ -67,8 +72,7 @@ def refuse_unmet(terms, solver, needs, others):
         need = lacks(elements, needs)
         if need is not None:
             able = [name for name, theirs in others.items() if lacks(elements, theirs) is None]
-            listed = ", ".join(able[:-1]) + " or " * (len(able) > 1) + "".join(able[-1:])
-            instead = [f"{listed} can"] * bool(able) + [need.remedy] * bool(need.remedy)
+            instead = [f"{listed(able)} can"] * bool(able) + [need.remedy] * bool(need.remedy)
             raise ValueError(
                 f"{solver} cannot take {need.lack.format(label=elements.label)}; {', or '.join(instead) or 'no solver can'}"
             )

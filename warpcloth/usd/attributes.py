@@ -71,6 +71,7 @@ ATTRIBUTES = (
     Attribute("masses", "warpcloth:masses", "cloth", ("double[]",)),
     Attribute("positions", "warpcloth:positions", "cloth", ("double3[]",)),
     Attribute("velocities", "warpcloth:velocities", "cloth", ("double3[]",)),
+    Attribute("free_axes", "warpcloth:freeAxes", "cloth", ("int3[]",)),  # 1 along axes on which a vertex moves, 0 along others
     Attribute("gravity", "warpcloth:gravity", "cloth", ("double3",)),
     Attribute("duration", "warpcloth:duration", "cloth", ("double",)),
     # Positions of the pinned vertices, those of lower index first, a time sample for each frame.

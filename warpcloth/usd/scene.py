@@ -70,6 +70,7 @@ def _scene(stage, cloth, surroundings):
         velocities=values.get("velocities"),
         terms=terms,
         pins=Pins(vertices, keyframes),
+        free_axes=_free_axes(values),
         gravity=_gravity(stage, values, surroundings.up_axis),
         duration=duration,
         fps=fps,
@@ -267,6 +268,16 @@ def _samples(attribute, surroundings, frames, fps):
         yield value
 
 
+def _free_axes(values):
+    """Along which axes vertices may move, (n, 3) truth values, or None."""
+    free_axes = values.get("free_axes")
+    if free_axes is None:
+        return None
+    for i, axis in np.argwhere((free_axes != 0) & (free_axes != 1))[:1]:
+        raise ValueError(f"warpcloth:freeAxes[{i}] has {free_axes[i, axis]}, must be 0 or 1 for each axis")
+    return free_axes.astype(bool)
+
+
 def _gravity(stage, values, up_axis):
     gravity = values.get("gravity")
     if gravity is not None:
@@ -348,6 +359,8 @@ def _scene_values(scene):
         given["positions"] = scene.positions
     if scene.velocities.any():
         given["velocities"] = scene.velocities
+    if scene.free_axes is not None:
+        given["free_axes"] = scene.free_axes
     if not np.array_equal(mesh.points, mesh.points.astype(np.float32)):
         given["mesh.points"] = mesh.points
     if not len(mesh.triangles) and not np.array_equal(mesh.edges, np.unique(np.sort(mesh.edges, axis=1), axis=0)):

@@ -1,0 +1,189 @@
+"""Tests vertices that move along some axes alone: half a sheet on its plane of symmetry, one minimum, rails, pins."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from support import setups
+from support.setups import square
+from support.steps import after_one_step, newton_step, swinging
+
+# Eight substeps, for Explicit is not stable with fewer.
+SOLVERS = {name: replace(solver, substeps=8) for name, solver in setups.SOLVERS.items()}
+LOCKING = {name: solver for name, solver in SOLVERS.items() if solver.locks}
+N = 9  # vertices a side; odd, so that the cloth has a middle column
+
+
+def halves():
+    """A sheet that is pulled together along x, the indices of its half x ≤ 0, and that half by itself.
+
+    Springs along the cut have half the stiffness, lumped masses half the mass, and vertices there do not move along x.
+    """
+    grid = wc.Mesh.grid(N, N, pattern="alternating")
+    mesh = wc.Mesh(grid.points - grid.points.mean(axis=0), triangles=grid.triangles)
+    x = mesh.points[:, 0]
+    velocities = np.stack([-2.0 * x, 1.0 + np.abs(x), 0.0 * x], axis=1)
+    given = {"density": 0.1, "gravity": (0.0, -9.81, 1.0)}
+    whole = wc.Scene(mesh, terms=[wc.Spring(stiffness=100.0)], pins=[0, N - 1], velocities=velocities, **given)
+    kept = np.flatnonzero(x < 1e-9)
+    index = np.full(len(x), -1)
+    index[kept] = np.arange(len(kept))
+    triangles = index[mesh.triangles]
+    part = wc.Mesh(mesh.points[kept], triangles=triangles[(triangles >= 0).all(axis=1)])
+    cut = x[kept] > -1e-9
+    stiffness = np.where(cut[part.edges].all(axis=1), 50.0, 100.0)
+    free = np.ones((len(kept), 3), dtype=bool)
+    free[cut, 0] = False
+    half = wc.Scene(
+        part, terms=[wc.Spring(stiffness=stiffness)], pins=[0], velocities=velocities[kept], free_axes=free, **given
+    )
+    return whole, kept, half
+
+
+def rails(declared, seed=0):
+    """A scene of which a third of the coordinates is locked."""
+    free = np.random.default_rng(seed).random((len(declared.mesh.points), 3)) > 0.3
+    return replace(declared, free_axes=free)
+
+
+# A step that ends at its minimum is symmetric; one of few sweeps, in an order that is not, is not.
+@pytest.mark.parametrize("name", [name for name, solver in LOCKING.items() if not solver.ordered])
+def test_half_a_sheet_moves_as_the_whole(name, device):
+    """To rounding, which 48 steps add up and the tolerance of a residual hides to 1e-9 m; without the lock it tears apart."""
+    solver = LOCKING[name]
+    if hasattr(solver, "tolerance"):
+        solver = replace(solver, iterations=5_000, tolerance=1e-11)
+    whole, kept, half = halves()
+    run = {"device": device, "dtype": "float64", "frames": 6}
+    ends = [wc.simulate(each, solver, **run).points[-1] for each in (whole, half, replace(half, free_axes=None))]
+    assert np.abs(ends[1] - ends[0][kept]).max() < 1e-9
+    assert np.abs(ends[2] - ends[0][kept]).max() > 1e-2
+
+
+MINIMISE = {
+    "newton": wc.Newton(substeps=1, tolerance=1e-11),
+    "newton absolute": wc.Newton(substeps=1, tolerance=1e-11, hessian="absolute"),
+}
+
+
+@pytest.mark.parametrize("name", MINIMISE)
+def test_all_meet(name, device):
+    """At the minimum over the coordinates that are free, as they do without locks."""
+    declared = rails(swinging(8))
+    newton = newton_step(declared, device)
+    x, _ = after_one_step(declared, MINIMISE[name], device)
+    assert np.abs(x - newton).max() < 1e-8
+    assert np.abs(newton_step(replace(declared, free_axes=None), device) - newton).max() > 1e-3
+    # The gradient that is left is 0 along each free axis.
+    _, stepper = after_one_step(declared, MINIMISE[name], device)
+    assert stepper.residual[0] < 1e-9
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_vertices_without_a_free_axis_are_pins(name, device):
+    """To the bit, and to every solver."""
+    declared = square(solver=SOLVERS[name])
+    pinned, corner = replace(declared, pins=[0, 5]), np.ones((36, 3), dtype=bool)
+    corner[5] = False
+    locked = replace(declared, pins=[0], free_axes=corner)
+    runs = [wc.simulate(each, SOLVERS[name], device=device, frames=4).points[-1] for each in (pinned, locked)]
+    assert (runs[0] == runs[1]).all()
+
+
+@pytest.mark.parametrize("name", LOCKING)
+def test_locked_coordinates_stay_to_the_bit(name, device):
+    """In float32, in a batch, in another order, along gravity and after a reset to other positions, with a velocity of 0."""
+    declared = replace(rails(square(solver=SOLVERS[name], pins=[0])), velocities=np.ones((36, 3)))
+    model = declared.build(device=device, copies=2, order=np.arange(36)[::-1], vary={"Spring.stiffness": [50.0, 100.0]})
+    stepper = SOLVERS[name].bind(model)
+    locked = np.tile(declared.locked, (2, 1))
+    assert locked[:, 1].any()
+
+    def run(frames):
+        for _ in range(frames):
+            stepper.frame()
+        return (model.in_scene_order(array.numpy()) for array in stepper.state)
+
+    x, v = run(5)
+    start = model.in_scene_order(model.positions.numpy())
+    assert (x[locked] == start[locked]).all() and (v[locked] == 0.0).all()
+    assert (np.abs(x - start)[~locked].reshape(2, -1).max(axis=1) > 1e-3).all()
+    if "bdf2" not in name:
+        moved = start.reshape(2, 36, 3)[:, ::-1] + np.float32(0.1)
+        stepper.reset(positions=moved, velocities=np.ones((2, 36, 3)))
+        x, v = run(2)
+        moved = model.in_scene_order(moved.reshape(-1, 3))
+        pinned = np.isin(np.arange(72) % 36, declared.fixed)
+        assert (x[locked] == moved[locked]).all() and (v[locked] == 0.0).all()
+        assert np.isfinite(x).all() and (v[~locked & ~pinned[:, None]] != 0.0).all()
+
+
+def test_a_bead_on_a_rail_comes_to_rest(device):
+    """Its spring of length 1 goes from the origin to (1, y): k(1 − 1/l)y = −mg with l² = 1 + y²; U″ = k(1 − 1/l³)."""
+    bead = wc.Scene(
+        wc.Mesh.chain(2),
+        masses=[1.0, 1.0],
+        positions=[[0.0, 0.0, 0.0], [1.0, -0.1, 0.0]],
+        terms=[wc.Spring(stiffness=100.0)],
+        pins=[0],
+        free_axes=[[True] * 3, [False, True, False]],
+    )
+    for linear in ("factorised", "cg"):
+        rest = wc.equilibrium(bead, device=device, linear=linear)
+        x, y, z = rest.points[1]
+        length = np.hypot(1.0, y)
+        assert (x, z) == (1.0, 0.0)
+        assert 100.0 * (1.0 - 1.0 / length) * y == pytest.approx(-9.81, rel=1e-7)
+        assert rest.lowest_eigenvalue == pytest.approx(100.0 * (1.0 - length**-3), rel=1e-6)
+        assert rest.stable
+
+
+@pytest.mark.parametrize("name", LOCKING)
+def test_without_locks_nothing_is_there(name, device):
+    """No bytes, kernels or launches more where every axis is free."""
+    reports, launches = [], []
+    for free_axes in (None, np.ones((36, 3), dtype=bool)):
+        model = square(solver=SOLVERS[name], free_axes=free_axes).build(device=device)
+        stepper = SOLVERS[name].bind(model)
+        stepper.step()
+        reports.append(model.report())
+        launches.append(model.launches[0])
+    assert model.mobility is None
+    assert reports[0] == reports[1]
+    assert launches[0] == launches[1]
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("name", [name for name, solver in SOLVERS.items() if not solver.locks])
+def test_who_cannot_refuses(name):
+    rule = "cannot take free_axes that lock some axes of a vertex; .*Explicit.* or .* can$"
+    with pytest.raises(ValueError, match=f"^{type(SOLVERS[name]).__name__} {rule}"):
+        SOLVERS[name].bind(rails(square(solver=SOLVERS[name])).build())
+
+
+@pytest.mark.host
+def test_bad_masks_are_refused():
+    rule = r"it must be an array \(36, 3\) of truth values, one for each axis of each vertex$"
+    for free_axes, given in [
+        (np.ones((35, 3), dtype=bool), r"has shape \(35, 3\); "),
+        (np.ones((36, 3)), r"is array\(.*; "),
+        ([[True], [True, False]], r"is \[\[True\], \[True, False\]\]; "),
+        ("x", "is 'x'; "),
+    ]:
+        with pytest.raises(ValueError, match=f"^free_axes {given}{rule}"):
+            square(free_axes=free_axes)
+    with pytest.raises(ValueError, match="vertex 0 has mass 0"):
+        rails(wc.Scene(wc.Mesh.chain(2), masses=[0.0, 1.0], terms=[wc.Spring(stiffness=1.0)]), seed=3)
+    with pytest.raises(ValueError, match="with one copy that has free_axes, whose steps Explicit cannot divide; threads=1 can"):
+        wc.Explicit(substeps=1).bind(rails(square()).build(threads=2))
+
+
+@pytest.mark.host
+def test_a_scene_says_what_it_locks():
+    free = np.ones((36, 3), dtype=bool)
+    free[[3, 4, 5], 0] = False
+    free[7] = False
+    assert "  locked coordinates: 3 x, 0 y, 0 z\n" in str(square(free_axes=free))
+    assert "locked" not in str(square())
