@@ -19,6 +19,7 @@ from support.sheets import SPRINGS, TERMS, declared
 from warpcloth.cli import main
 from warpcloth.core.capture import Segment
 from warpcloth.core.thread_pool import ThreadPool
+from warpcloth.lab.counts import launches_of
 from warpcloth.model.threads import threads_on
 from warpcloth.solvers import solver as solvers
 
@@ -151,6 +152,19 @@ def test_threads_allocate_nothing(name, device):
         stepper.frame()
         with wp.ScopedMemoryTracker("frames", print=False) as tracker:
             assert allocations(tracker, lambda stepper=stepper: [stepper.frame() for _ in range(2)]) == 0
+
+
+@pytest.mark.parametrize("record", [wc.PBD(substeps=1, iterations=5), wc.XPBD(substeps=1, iterations=5)])
+def test_threads_wait_for_what_is_refreshed_once_a_step(record, device):
+    """Damping is set where a step begins, by one thread, and sweeps have no further barrier for it."""
+
+    def launches(threads, **fields):
+        scene = declared([replace(SPRINGS, **fields)], fps=60.0)
+        stepper = record.bind(scene.build(device=device, threads=threads))
+        return launches_of(stepper.step)
+
+    more = [launches(threads, damping=0.01) - launches(threads) for threads in (1, 2)]
+    assert more[0] == more[1] > 0
 
 
 def failing(pool, model):

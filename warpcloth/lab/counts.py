@@ -37,16 +37,17 @@ def launches_of(run):
     """
     with _one_by_one() as counted:
         run()
-    return counted[0]
+    return len(counted)
 
 
 @contextmanager
 def _one_by_one():
-    counted = [0]
+    counted = []  # to append is one operation, so that no launch of several threads is lost
 
     def counting(function, counts=lambda *_, **__: True):
         def call(*args, **kwargs):
-            counted[0] += counts(*args, **kwargs)
+            if counts(*args, **kwargs):
+                counted.append(function)
             return function(*args, **kwargs)
 
         return call

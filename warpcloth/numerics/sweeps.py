@@ -150,7 +150,8 @@ class GaussSeidelSweep(_Sweep):
         if kind == "coloured" and model.terms:
             self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True)
         # Cells fit themselves as they are swept.
-        self._refreshed = [elements for elements in self.elements if elements.refresh and not elements.cells]
+        refreshed = [elements for elements in self.elements if elements.refresh and not elements.cells]
+        self._refreshed = [elements for elements in refreshed if elements.refresh.when == EVALUATION]
         more = multipliers, spread is not None
         self._kernels = [
             model.kernel(correct_clusters, model.dtype, *more)
