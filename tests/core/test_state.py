@@ -6,6 +6,7 @@ import pytest
 import warpcloth as wc
 from support.setups import SOLVERS
 from warpcloth.core.state import State
+from warpcloth.core.status import Result
 
 MESH = wc.Mesh.grid(5, 5, pattern="alternating")
 
@@ -56,6 +57,22 @@ def test_states_of_a_shared_batch_go_with_the_whole(device):
     assert stepper.state == before and steps(stepper, 2) == after
     stepper.state.from_host(before.to_host())
     assert stepper.state == before and steps(stepper, 2) == after
+    before.x.fill_(0.5)
+    stepper.state.assign(before)
+    assert stepper.state == before and (stepper.state.x.numpy() == 0.5).all()
+
+
+def test_the_state_of_a_shared_batch_says_how_its_steps_ended(device):
+    if device != "cpu":
+        pytest.skip("threads are for the CPU")
+    one, two = (
+        wc.Newton(substeps=1, iterations=1, tolerance=1e-12).bind(moved().build(copies=3, threads=threads))
+        for threads in (1, 2)
+    )
+    of_one, of_two = steps(one, 1), steps(two, 1)
+    assert of_one.results == of_two.results == two.results == [Result.ITERATIONS_USED_UP] * 3
+    assert np.array_equal(of_one.residual, of_two.residual) and np.array_equal(of_two.residual, two.residual)
+    assert (of_two.residual > 0.0).all()
 
 
 def test_another_scene_has_another_state(device):

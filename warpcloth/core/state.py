@@ -28,7 +28,25 @@ class State:
 
     def __init__(self, x, v, batch_size, shares=()):
         self.arrays, self.starts, self.shares = {"x": x, "v": v}, {}, tuple(shares)
-        self.results, self.residual = [Result.COMPLETED] * batch_size, np.zeros(batch_size)
+        self._results, self._residual = [Result.COMPLETED] * batch_size, np.zeros(batch_size)
+
+    @property
+    def results(self):
+        """The worst result of each copy so far, those of the shares where there are any."""
+        return [result for share in self.shares for result in share.results] if self.shares else self._results
+
+    @results.setter
+    def results(self, results):
+        self._results = results
+
+    @property
+    def residual(self):
+        """The largest residual of each copy so far, likewise."""
+        return np.concatenate([share.residual for share in self.shares]) if self.shares else self._residual
+
+    @residual.setter
+    def residual(self, residual):
+        self._residual = residual
 
     @property
     def x(self):
@@ -63,10 +81,10 @@ class State:
 
     def assign(self, other):
         """Makes this state equal to another of the same solver and model; the arrays stay where they are."""
-        for name, array in self.arrays.items():
-            wp.copy(array, other.arrays[name])
         for share, of_other in zip(self.shares, other.shares, strict=True):
             share.assign(of_other)
+        for name, array in self.arrays.items():  # after the shares, whose x and v are parts of these
+            wp.copy(array, other.arrays[name])
         self.results, self.residual = list(other.results), other.residual.copy()
 
     def __eq__(self, other):

@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import numpy as np
 import warp as wp
 
 from ..core.reset import Reset
@@ -39,14 +38,6 @@ class ThreadedStepper(Stepper):
         """The stepper of the copies from ``first`` to ``end``."""
         n, model = self.model.per_copy, self.model.part(first, end - first)
         return stepper.part_of(tuple(array[first * n : end * n] for array in motion), self.options, model)
-
-    @property
-    def results(self):
-        return [result for part in self.parts for result in part.results]
-
-    @property
-    def residual(self):
-        return np.concatenate([part.residual for part in self.parts])
 
     @property
     def iterations(self):
