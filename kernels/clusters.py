@@ -83,15 +83,23 @@ def fit_targets(dtype, corrected: bool):
 
 
 @cache
-def correct_clusters(dtype, multipliers: bool, per_step: bool):
+def correct_clusters(dtype, multipliers: bool, per_step: bool, axes: bool = False):
     """Kernel of a Gauss–Seidel sweep: each cluster sees what those before it did, and all its vertices move at once.
 
     Δxᵢ = (tᵢ − α̃λᵢ/mᵢ)/(1 + α̃), α̃ = 1/(κh²), λᵢ += mᵢΔxᵢ; as :func:`.project.correct_in_place` for clusters, of which a thread
-    takes ``each``.
+    takes ``each``; with ``axes`` along those that are free.
     """
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(4, dtype), wp.types.matrix((1, 3), dtype)
     fit_cluster, spread = fit(dtype, True), spread_compliance(dtype)
+    mass_type = vec3 if axes else dtype
+
+    @wp.func
+    def largest(inverse_mass: mass_type):
+        if wp.static(axes):
+            return wp.max(inverse_mass)
+        else:
+            return inverse_mass
 
     @wp.kernel(module="unique", enable_backward=False)
     def correct(
@@ -102,7 +110,7 @@ def correct_clusters(dtype, multipliers: bool, per_step: bool):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         # state in
-        inverse_mass: wp.array(dtype=dtype),
+        inverse_mass: wp.array(dtype=mass_type),
         x: wp.array(dtype=vec3),
         # parameters
         turn: sweep_turn(dtype),
@@ -118,15 +126,20 @@ def correct_clusters(dtype, multipliers: bool, per_step: bool):
                 compliance = dtype(1.0) / (stiffness[e] * turn.h * turn.h)
                 if wp.static(per_step):
                     compliance = spread(dtype(1.0), compliance, turn.sweeps)
-                if inverse_mass[v] > dtype(0.0) and wp.isfinite(compliance):
+                mobility = largest(inverse_mass[v])
+                if mobility > dtype(0.0) and wp.isfinite(compliance):
                     t = vec3(rest[e][0], rest[e][1], rest[e][2])
                     if wp.static(multipliers):
-                        t = t - (compliance * inverse_mass[v]) * lambdas[e][0]
+                        t = t - (compliance * mobility) * lambdas[e][0]
                     move = (turn.relaxation / (dtype(1.0) + compliance)) * t
+                    if wp.static(axes):
+                        for axis in range(3):
+                            if inverse_mass[v][axis] == dtype(0.0):
+                                move[axis] = dtype(0.0)
                     d[v] = d[v] + move
                     if wp.static(multipliers):
                         after = lambdas[e]
-                        after[0] = after[0] + move / inverse_mass[v]
+                        after[0] = after[0] + move / mobility
                         lambdas[e] = after
 
     return correct

@@ -15,12 +15,13 @@ from .vectors import types
 
 
 @cache
-def local_steps(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
+def local_steps(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False, axes: bool = False):
     """Kernel over elements: z = factorₑ rows of :func:`.project.multiplier`, λ += factorₑ Δλ, for x̃ + d."""
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
-    y_type, change = wp.types.matrix((term.rows, 3), dtype), element_change(term, dtype, scalar, per_step)
+    y_type, change = wp.types.matrix((term.rows, 3), dtype), element_change(term, dtype, scalar, per_step, axes)
     shared, rest_of, put = load_shared(dtype), load(rest_type), store(y_type)
+    mass_type = vec3 if axes else dtype
 
     @wp.kernel(module="unique", enable_backward=False)
     def correct(
@@ -28,7 +29,7 @@ def local_steps(term: Term, dtype, scalar: bool, multipliers: bool = False, per_
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
-        inverse_mass: wp.array(dtype=dtype),
+        inverse_mass: wp.array(dtype=mass_type),
         factor: wp.array(dtype=dtype),
         # state in
         x: wp.array(dtype=vec3),

@@ -97,6 +97,28 @@ def lock_blocks(dtype):
 
 
 @cache
+def take_axes(dtype):
+    """Kernel over vertices: out = a along the axes where ``taken`` is 1."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def take(
+        # state in
+        a: wp.array(dtype=vec3),
+        # parameters
+        taken: wp.vec3i,
+        # in and out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        for axis in range(3):
+            if taken[axis] == 1:
+                out[i][axis] = a[i][axis]
+
+    return take
+
+
+@cache
 def multiply(dtype):
     """Kernel over block rows: q = A p, of the copies that are active."""
     vec3, mat33 = types(dtype)

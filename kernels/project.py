@@ -16,9 +16,11 @@ XPBD adds Δλ up in λ; for PBD λ is 0. With an infinite stiffness α̃ = 0 an
 2006 (*Position based dynamics*). A stencil of pins alone has nothing to move and gives 0, and so does no stiffness; one with
 so few free vertices that the matrix is singular moves y as near to p(y) as they can take it, by the pseudo-inverse.
 
-The factories share the key (term, dtype, scalar, multipliers, per_step): whether the scalar constraint is used, which is for
-terms that have one; whether there is λ, else the array may be None; whether finite stiffness is spread over the sweeps of a
-step.
+Where coordinates are locked W has an inverse mass for each axis, and the first of these steps is one for each column of y.
+
+The factories share the key (term, dtype, scalar, multipliers, per_step, axes): whether the scalar constraint is used, which is
+for terms that have one; whether there is λ, else the array may be None; whether finite stiffness is spread over the sweeps of a
+step; whether inverse masses are vectors, one for each axis.
 """
 
 from functools import cache
@@ -149,13 +151,91 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
 
 
 @cache
-def element_change(term: Term, dtype, scalar: bool, per_step: bool):
+def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
+    """The device function of :func:`multiplier` with inverse masses (K, 3) of the corners along each axis."""
+    K, M = wp.constant(term.vertices), wp.constant(term.rows)
+    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    corners, system_type = wp.types.matrix((term.vertices, 3), dtype), wp.types.matrix((term.rows, term.rows), dtype)
+    weight, project, prox = term.weight, term.project, term.prox
+    constraint, constraint_gradient = term.constraint, term.constraint_gradient
+    spread, share_of = spread_compliance(dtype), to_corner(term, dtype)
+
+    @wp.func
+    def system_of(r: rest_type, w: corners, axis: int):
+        system = system_type()
+        for i in range(K):
+            system += w[i, axis] * wp.outer(weight(r, i), weight(r, i))
+        return system
+
+    @wp.func
+    def of_projection(y: y_type, r: rest_type, w: corners, compliance: dtype, before: y_type, sweeps: int):
+        rows = y_type()
+        gap = project(y, r) - y
+        for axis in range(3):
+            system = system_of(r, w, axis)
+            mean = wp.trace(system) * dtype(wp.static(1.0 / term.rows))
+            if wp.where(compliance < dtype(wp.inf), mean, dtype(0.0)) != dtype(0.0):
+                own = compliance
+                if wp.static(per_step):
+                    own = spread(mean, compliance, sweeps)
+                if wp.static(term.rows == 1):
+                    rows[0, axis] = (gap[0, axis] - own * before[0, axis]) / (system[0, 0] + own)
+                else:
+                    for m in range(M):
+                        system[m, m] = system[m, m] + own
+                    inverse = pseudo_inverse2(system)
+                    for m in range(M):
+                        for n in range(M):
+                            rows[m, axis] = rows[m, axis] + inverse[m, n] * (gap[n, axis] - own * before[n, axis])
+        return rows, rows
+
+    @wp.func
+    def of_constraint(y: y_type, r: rest_type, w: corners, compliance: dtype, before: dtype, sweeps: int):
+        g = constraint_gradient(y, r)
+        total = dtype(0.0)
+        for i in range(K):
+            direction = share_of(r, i, g)
+            total += wp.dot(wp.cw_mul(w[i], direction), direction)
+        if wp.static(per_step):
+            compliance = spread(total, compliance, sweeps)
+        moves = wp.where(compliance < dtype(wp.inf), total, dtype(0.0)) != dtype(0.0)
+        change = wp.where(moves, -(constraint(y, r) + compliance * before) / (total + compliance), dtype(0.0))
+        return change, change * g
+
+    @wp.func
+    def of_prox(y: y_type, r: rest_type, w: corners, compliance: dtype, before: y_type, sweeps: int):
+        largest = dtype(0.0)
+        mean = dtype(0.0)
+        for axis in range(3):
+            system = system_of(r, w, axis)
+            mean = wp.max(mean, wp.trace(system) * dtype(wp.static(1.0 / term.rows)))
+            for m in range(M):
+                total = dtype(0.0)
+                for n in range(M):
+                    total += wp.abs(system[m, n])
+                largest = wp.max(largest, total)
+        if wp.static(per_step):
+            compliance = spread(mean, compliance, sweeps)
+        rows = y_type()
+        if wp.where(compliance < dtype(wp.inf), largest, dtype(0.0)) != dtype(0.0):
+            rows = (prox(y - largest * before, r, largest / compliance) - y) / largest
+        return rows, rows
+
+    if scalar:
+        return of_constraint
+    return of_projection if prox is None else of_prox
+
+
+@cache
+def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool = False):
     """The device function (element data, x̃, d, h, λ, sweeps) → (Δλ, rows) of :func:`multiplier` for one element at x̃ + d."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
-    rest_type, corners = wp.types.vector(term.parameters, dtype), wp.types.vector(term.vertices, dtype)
-    y_of, measure, change_of = local_coordinate(term, dtype, True), term.measure, multiplier(term, dtype, scalar, per_step)
-    lambda_type, number, vertex = multiplier_type(term, dtype, scalar), load(dtype), load(wp.int32, 2)
+    rest_type, mobility = wp.types.vector(term.parameters, dtype), vec3 if axes else dtype
+    corners = wp.types.matrix((term.vertices, 3), dtype) if axes else wp.types.vector(term.vertices, dtype)
+    change_of = (multiplier_by_axis if axes else multiplier)(term, dtype, scalar, per_step)
+    y_of, measure = local_coordinate(term, dtype, True), term.measure
+    lambda_type, number, vertex = multiplier_type(term, dtype, scalar), load(mobility), load(wp.int32, 2)
 
     @wp.func
     def change(
@@ -163,7 +243,7 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool):
         e: int,
         stiffness: dtype,
         r: rest_type,
-        inverse_mass: wp.array(dtype=dtype),
+        inverse_mass: wp.array(dtype=mobility),
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         h: dtype,
@@ -204,7 +284,7 @@ def nth_of_thread(first: int, each: int, thread: int, k: int):
 
 
 @cache
-def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
+def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False, axes: bool = False):
     """Kernel of a Gauss–Seidel sweep: each element sees what those before it did; d += ω Δx, λ += ω Δλ.
 
     A thread takes ``each`` elements one after the other, from first + thread·each on: on a GPU 1 of a colour, in which no two
@@ -214,8 +294,9 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
-    change, share_of = element_change(term, dtype, scalar, per_step), to_corner(term, dtype)
-    number, shared, vector, vertex = load(dtype), load_shared(dtype), load(vec3), load(wp.int32, 2)
+    change, share_of = element_change(term, dtype, scalar, per_step, axes), to_corner(term, dtype)
+    mass_type = vec3 if axes else dtype
+    number, shared, vector, vertex = load(mass_type), load_shared(dtype), load(vec3), load(wp.int32, 2)
     rest_of, put = load(rest_type), store(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -225,7 +306,7 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         # state in
-        inverse_mass: wp.array(dtype=dtype),
+        inverse_mass: wp.array(dtype=mass_type),
         x: wp.array(dtype=vec3),
         # parameters
         turn: sweep_turn(dtype),
@@ -245,8 +326,12 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
             for i in range(K):
                 v = vertex(stencil, K * e + i)
                 mobility = number(inverse_mass, v)
-                if mobility > dtype(0.0):
-                    put(d, v, vector(d, v) + (mobility * turn.relaxation) * share_of(r, i, rows))
+                if wp.static(axes):
+                    if wp.max(mobility) > dtype(0.0):
+                        put(d, v, vector(d, v) + wp.cw_mul(mobility * turn.relaxation, share_of(r, i, rows)))
+                else:
+                    if mobility > dtype(0.0):
+                        put(d, v, vector(d, v) + (mobility * turn.relaxation) * share_of(r, i, rows))
 
     return correct
 

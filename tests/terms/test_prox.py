@@ -118,13 +118,18 @@ SOLVERS = {
 }
 
 
+LOCKED = np.random.default_rng(0).random((30, 3)) < 0.1
+
+
+@pytest.mark.parametrize("free_axes", [None, ~LOCKED], ids=["free", "locked"])
 @pytest.mark.parametrize("name", SOLVERS)
-def test_solvers_that_take_it_end_where_newton_does(name, device):
-    """The energy of which is below 0 there."""
-    exact = newton_step(sheet(), device)
-    found, _ = after_one_step(sheet(), SOLVERS[name], device)
+def test_solvers_that_take_it_end_where_newton_does(name, free_axes, device):
+    """The energy of which is below 0 there; also with some locked coordinates."""
+    declared = sheet(free_axes=free_axes)
+    exact = newton_step(declared, device)
+    found, _ = after_one_step(declared, SOLVERS[name], device)
     assert np.abs(found - exact).max() < 1e-9
-    few, _ = after_one_step(sheet(), wc.XPBD(substeps=1, iterations=3), device)
+    few, _ = after_one_step(declared, wc.XPBD(substeps=1, iterations=3), device)
     assert np.abs(few - exact).max() > 1e-5, "few sweeps are not enough to say anything"
     heights = exact[:, 1] + 0.08
     assert heights.min() > 0.0 and -np.log(heights / 0.01).sum() < 0.0

@@ -25,7 +25,7 @@ class JacobiSweeps:
 
     def __init__(self, model, x, h, correction, multipliers, keys, factors, scale, spread):
         self.model, self.x, self.correction, self.multipliers = model, x, correction, multipliers
-        more = any(array is not None for array in multipliers), spread is not None
+        more = any(array is not None for array in multipliers), spread is not None, model.mobility is not None
         self._move, self._total = model.kernel(kernels.move_vertices, model.dtype), model.vectors()
         self._given, self._scale, self._terms = [h, spread or 1], scale, []
         factories = kernels.scatter_moves, kernels.gather_moves
@@ -49,9 +49,10 @@ class JacobiSweeps:
         for _ in range(sweeps):
             model.refresh(EVALUATION, Moment(self.x, d))
             for elements, kernel, factor, lambdas, z, transpose, data in self._terms:
-                given = [*elements.arguments, model.inverse_mass, factor, self.x, d, *self._given]
+                given = [*elements.arguments, model.local_mobility, factor, self.x, d, *self._given]
                 model.launch(kernel, elements.count, given, [lambdas, z])
                 transpose.add(data, self._total)
+            model.lock(self._total)
             model.launch(self._move, model.count, [model.inverse_mass, self._scale], [self._total, d])
 
     def parts(self, sweeps):

@@ -72,6 +72,8 @@ class Plan:
 
     def jacobi_sweeps(self, *given):
         """Returns Jacobi sweeps, see :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`, whose arguments they have."""
+        if self.model.mobility is not None:
+            return JacobiSweeps(self.model, *given)
         return {"core": JacobiSweeps, "blocks": ScatterSweeps, "gather": GatherSweeps}[self.backend](self.model, *given)
 
 

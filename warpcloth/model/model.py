@@ -136,6 +136,11 @@ class Model:
         """Gravity along free axes, (G,) vectors [m/s²], and how many vertices in a row share an entry."""
         return (self.gravity, self.per_copy) if self.mobility is None else (self._vertex_gravity, 1)
 
+    @property
+    def local_mobility(self):
+        """Inverse masses as local steps take them, (B·n,) numbers, or vectors where coordinates are locked."""
+        return self.inverse_mass if self.mobility is None else self.mobility
+
     def lock(self, values):
         """Launches values = 0 at coordinates that do not move, of vectors (N,); nothing where none is locked."""
         if self.mobility is not None:

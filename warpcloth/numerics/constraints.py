@@ -147,6 +147,7 @@ class Constraints:
         for part in self.parts:
             part.launch_transpose(rows, out, active)
         self.model.launch(self._weigh, self.model.count, [self.model.inverse_mass], [out])
+        self.model.lock(out)
 
     # As a matrix, see ConjugateGradients.
 
@@ -166,7 +167,7 @@ class Constraints:
     @cached_property
     def _on_host(self):
         """The inverse masses of coordinates, and the mirror of the compliances."""
-        return np.repeat(self.model.inverse_mass.numpy().astype(np.float64), 3), Mirror(self._compliance)
+        return self.model.coordinate_mobility(), Mirror(self._compliance)
 
     def matrices(self):
         """A of each copy on the host, scipy matrices in double precision."""

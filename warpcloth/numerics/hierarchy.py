@@ -301,4 +301,7 @@ def on_device(model, level):
         ]
     )
     view.inverse_mass = model.array(level.inverse_mass.ravel(), model.dtype)
+    if model.mobility is not None:
+        free = model.mobility.numpy() > 0.0
+        view.mobility = model.array(level.inverse_mass.reshape(-1, 1) * free, model.vec3)
     return view

@@ -356,6 +356,36 @@ class CopyFactors:
         return self._parts[array.ptr]
 
 
+class AxisFactors:
+    """Solves A x = b as :class:`CopyFactors` does where coordinates are locked: for each axis over the vertices free along it.
+
+    Arguments and attributes are those of :class:`CopyFactors`.
+    """
+
+    def __init__(self, model, matrices):
+        from scipy.sparse import diags
+
+        self.model, self._found, self._take = model, model.vectors(), model.kernel(linear.take_axes, model.dtype)
+        free = (model.mobility.numpy()[: model.per_copy] > 0.0).astype(np.float64)
+        self._parts = []
+        for column in np.unique(free, axis=1).T:
+            kept, rest = diags(column), diags(1.0 - column)
+            factors = CopyFactors(model, [(kept @ matrix @ kept + rest).tocsc() for matrix in matrices])
+            self._parts.append((factors, wp.vec3i(*(free == column[:, None]).all(axis=0).astype(int).tolist())))
+        self.seconds = sum(factors.seconds for factors, _ in self._parts)
+
+    def solve(self, b, x):
+        """x = A⁻¹ b of free coordinates, both (N,) vectors, and b of the others; a call of the host."""
+        for factors, taken in self._parts:
+            factors.solve(b, self._found)
+            self.model.launch(self._take, self.model.count, [self._found, taken], [x])
+
+
+def factorise_copies(model, matrices):
+    """Factorises a constant scalar matrix of each copy: :class:`CopyFactors`, or :class:`AxisFactors` of locked coordinates."""
+    return (CopyFactors if model.mobility is None else AxisFactors)(model, matrices)
+
+
 class DiagonalScaling:
     """x = D⁻¹ b, the step of a Jacobi iteration; runs on the device and may be captured.
 

@@ -152,7 +152,7 @@ class GaussSeidelSweep(_Sweep):
         # Cells fit themselves as they are swept.
         refreshed = [elements for elements in self.elements if elements.refresh and not elements.cells]
         self._refreshed = [elements for elements in refreshed if elements.refresh.when == EVALUATION]
-        more = multipliers, spread is not None
+        more = multipliers, spread is not None, model.mobility is not None
         self._kernels = [
             model.kernel(correct_clusters, model.dtype, *more)
             if elements.cells
@@ -198,7 +198,7 @@ class GaussSeidelSweep(_Sweep):
                 turn = kernels.sweep_turn(model.dtype)()
                 turn.first, turn.each = first + before * each, way * each_thread
                 turn.h, turn.sweeps, turn.relaxation = self.h, self.spread, self.relaxation
-                given = [*of_cells, *elements.arguments, model.inverse_mass, self.x, turn]
+                given = [*of_cells, *elements.arguments, model.local_mobility, self.x, turn]
                 if part:
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
                 pool.launch_barrier(model)

@@ -17,7 +17,7 @@ from ..kernels.accelerate import plain_step
 from ..model.model import Model
 from ..numerics.inertia import Inertia
 from ..numerics.iterate import GravityScale
-from ..numerics.linear import CopyFactors
+from ..numerics.linear import factorise_copies
 from ..numerics.local_weights import best_weights, curvatures
 from ..terms.needs import ELEMENTS, FINITE
 from ..terms.refresh import EVALUATION, Moment
@@ -94,7 +94,7 @@ class ADMM(ImplicitStep):
     """
 
     name = "admm"
-    needs = (ELEMENTS, FINITE)
+    needs, locks = (ELEMENTS, FINITE), True
     residual = Residual("largest acceleration of a vertex by the primal or the dual residual", "m/s²")
     facts = Facts(
         method="implicit Euler split by weights and multipliers, local problems in closed form or by Newton's method",
@@ -148,7 +148,7 @@ class ADMMStepper(ImplicitStepper):
         factors = [scale * ratio for scale, ratio in zip(scales, ratios, strict=True)]
         self._inertia, self._sums = Inertia(model, 1.0 / self.he**2), Sums(model)
         weighed = model.with_terms(elements.weighed(factor) for elements, factor in zip(model.terms, factors, strict=True))
-        self._factors = CopyFactors(model, constant_matrices(weighed, self._inertia.s))
+        self._factors = factorise_copies(model, constant_matrices(weighed, self._inertia.s))
         self.factorise_seconds = self._factors.seconds
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
         self._primal, self._dual = (Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device)) for _ in range(2))
@@ -221,6 +221,7 @@ class ADMMStepper(ImplicitStepper):
             transpose.add(of, *sums)
         self._inertia.add(self.correction, self._force)
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
+            model.lock(forces)
             self._sums.largest(model.inverse_mass, forces, largest.array)
 
     def _launch_move(self):

@@ -68,7 +68,7 @@ class ConstrainedDynamics(ImplicitStep):
     """
 
     name = "constrained-dynamics"
-    needs = (MERGED_DAMPING, ROWS, STEADY_ROWS)
+    needs, locks = (MERGED_DAMPING, ROWS, STEADY_ROWS), True
     facts = Facts(
         method="implicit Euler for positions and multipliers of compliant constraints, redundant ones too",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 1}, cpu=(8, 16, 32), cuda=(16, 32, 64)),),

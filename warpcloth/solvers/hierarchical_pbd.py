@@ -49,7 +49,7 @@ class HierarchicalPBD(Step):
     """
 
     name = "hierarchical-pbd"
-    needs = (MERGED_DAMPING, LOCAL_STEP)
+    needs, locks = (MERGED_DAMPING, LOCAL_STEP), True
     ordered = closes = True
     facts = Facts(
         method="PBD that sweeps over coarser and coarser levels first, so that fine cloth stretches little more than coarse",
@@ -121,7 +121,9 @@ class HierarchicalPBDStepper(LaunchedStepper):
         for sweep, followers in reversed(self._coarse):
             for _ in range(self.options.coarse_iterations):
                 sweep.launch()
-            pool.launch_alone(self.model, partial(self.model.launch, *followers))
+            pool.launch_alone(
+                self.model, partial(self.model.launch, *followers), partial(self.model.lock, self.sweep.correction)
+            )
 
     def _launch_last(self):
         if self.pool.leads:

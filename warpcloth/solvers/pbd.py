@@ -53,7 +53,7 @@ class PBD(Step):
     """
 
     name = "pbd"
-    needs = (MERGED_DAMPING, LOCAL_STEP)
+    needs, locks = (MERGED_DAMPING, LOCAL_STEP), True
     closes, multipliers = True, False  # λ does not add up over the sweeps of a step
     facts = Facts(
         method="position based dynamics: Gauss–Seidel sweeps by colour or in order, Jacobi ones averaged or relaxed",

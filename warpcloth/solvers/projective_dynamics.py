@@ -18,7 +18,7 @@ from ..numerics.accelerated_step import AcceleratedStep
 from ..numerics.acceleration import accelerated
 from ..numerics.inertia import Inertia
 from ..numerics.iterate import GravityScale
-from ..numerics.linear import CopyFactors, DiagonalScaling
+from ..numerics.linear import DiagonalScaling, factorise_copies
 from ..terms.needs import FINITE, MERGED_DAMPING, PROJECTION
 from .facts import Benchmark, Facts, grid
 from .implicit import ImplicitStepper
@@ -65,7 +65,7 @@ class ProjectiveDynamics(ImplicitStep):
     """
 
     name = "projective-dynamics"
-    needs = (FINITE, MERGED_DAMPING, PROJECTION)
+    needs, locks = (FINITE, MERGED_DAMPING, PROJECTION), True
     residual = Residual(UNBALANCED, "times the largest at the start of its step")
     facts = Facts(
         method="implicit Euler by local projections and a constant matrix; plain, Chebyshev, Anderson, L-BFGS",
@@ -117,7 +117,9 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self.inertia, self.sums = Inertia(model, 1.0 / self.he**2), Sums(model)
         matrices = constant_matrices(model, self.inertia.s)
         self._sizes = np.stack([np.asarray(abs(matrix).sum(axis=1)).ravel() for matrix in matrices])
-        self._linear = CopyFactors(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
+        self._linear = (
+            factorise_copies(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
+        )
         self.factorise_seconds = self._linear.seconds
         self._gradient_of = plan(model).gradient(corrected=True)
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))

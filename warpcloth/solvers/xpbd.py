@@ -69,7 +69,7 @@ class XPBD(ImplicitStep):
     """
 
     name = "xpbd"
-    needs = (MERGED_DAMPING, LOCAL_STEP)
+    needs, locks = (MERGED_DAMPING, LOCAL_STEP), True
     residual, multipliers = Residual(UNBALANCED, "m/s²"), True  # λ adds up over the sweeps of a step
     facts = Facts(
         method="the sweeps of PBD with compliance; many of them end at implicit Euler; the published scalar form to compare",
@@ -176,6 +176,7 @@ class XPBDStepper(LaunchedStepper):
             self._force.zero_()
             self._gradient.add(self.state.x, self._force, d)
         self._launch_momentum(1.0)
+        model.lock(self._force)
         self._sums.largest(model.inverse_mass, self._force, self._acceleration)
         model.launch(self._keep_largest, model.copies, [self._acceleration], [self._largest.array])
         self.launch_finish(d)
