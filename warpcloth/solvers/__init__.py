@@ -1,8 +1,8 @@
 """The catalogue of the solvers: one file, one record and two lines here for each.
 
-A file has the equation of a method and its source, its options, what it needs of every term, how it is measured and drawn, and
-the bound solver. What takes a solver by name, such as the command line, finds those of :data:`SOLVERS`; :func:`register` adds
-one from elsewhere.
+A file has the equation of a method and its source, its options, its needs of every term, the settings by which it is measured
+and drawn, and the bound solver. The command line and others that name a solver look it up in :data:`SOLVERS`; :func:`register`
+adds one from outside the package.
 """
 
 from .admm import ADMM

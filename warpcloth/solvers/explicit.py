@@ -1,4 +1,4 @@
-"""Explicit integration: symplectic and forward Euler, and the largest step that the first may take."""
+"""Explicit integration: symplectic and forward Euler, and the largest stable step of symplectic Euler."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -22,15 +22,16 @@ from .step import Step
 
 @dataclass(frozen=True)
 class Explicit(Step):
-    """Explicit Euler. Symplectic (kick, then drift): v += h a(x), x += h v; forward: x += h v, v += h a with the old both.
+    """Explicit Euler: symplectic, v += h a(x), then x += h v; or forward, x += h v and v += h a, both from the old x and v.
 
-    On x″ = −ω²x the symplectic scheme keeps v² + ω²x² − hω²xv and is stable for h < 2/ω; forward Euler multiplies the energy
-    by 1 + h²ω² a step, whatever h is (Provot 1995; Hairer, Lubich and Wanner 2006, *Geometric numerical integration*).
+    On x″ = −ω²x the symplectic scheme conserves v² + ω²x² − hω²xv and is stable for h < 2/ω; forward Euler multiplies the
+    energy by 1 + h²ω² in each step, so that no h is stable (Provot 1995; Hairer, Lubich and Wanner 2006, *Geometric numerical
+    integration*).
 
     Attributes:
         dt, substeps: See :class:`Step`.
         scheme: ``"symplectic"`` or ``"forward"``.
-        above_limit: ``"refuse"`` or ``"allow"`` a step that is unstable about the rest shape.
+        above_limit: ``"refuse"`` or ``"allow"``: whether a step that is unstable about the rest shape is refused.
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -79,8 +80,8 @@ class Explicit(Step):
         """The solver on ``model``, all scratch allocated.
 
         Warns:
-            UserWarning: If the step is above the bound in motion, see :func:`step_limits`, which counts hinges and
-                membranes as at rest.
+            UserWarning: If the step is above the limit in motion, see :func:`step_limits`, which takes hinges and membranes
+                at rest.
 
         Raises:
             ValueError: If the step is above the limit and that is not allowed, or a stiffness is infinite.
@@ -119,12 +120,12 @@ class Explicit(Step):
 def step_limits(model):
     """The largest stable steps of symplectic Euler [s]: about the rest shape, and in motion, see below.
 
-    The first is the h at which the largest eigenvalue of M⁻¹(h²K + 2hC) is 4, K = ∂²U/∂x² and C that of the damping at rest,
-    by Lanczos iteration; without damping that is 2/ω. The second takes for the eigenvalues Gershgorin's bounds, max over
-    vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is 2·Σk/m, which no motion exceeds,
-    and neither does one of quadratic bending. The Hessian of dihedral bending grows as the cloth folds or is compressed and
-    those of membranes as they stretch, so for scenes with these the second is no bound there: it counts them as at rest.
-    Limits, which at rest have no stiffness, are counted as reached, in both.
+    The first is the h at which the largest eigenvalue of M⁻¹(h²K + 2hC), found by Lanczos iteration, is 4; K = ∂²U/∂x² and the
+    damping matrix C are those at rest. Without damping that is 2/ω. The second replaces the eigenvalues by Gershgorin's bounds,
+    max over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is 2·Σk/m, a bound in any
+    motion; for quadratic bending it is such a bound too. The Hessian of dihedral bending grows as the cloth folds or is
+    compressed, and those of membranes grow as they stretch. The second limit takes these at rest, so for scenes with them it is
+    not a bound. Both limits take strain and spring limits, which have no stiffness at rest, as reached.
 
     Returns:
         (rest, motion); infinite where nothing is stiff.
@@ -139,7 +140,7 @@ def step_limits(model):
 
 @in_turn
 def limit_in_motion(model):
-    """The second of :func:`step_limits`, which is the smaller and far quicker to find.
+    """The second of :func:`step_limits`, which is the smaller one and far quicker to compute.
 
     Raises:
         ValueError: If a stiffness is infinite.

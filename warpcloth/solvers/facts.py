@@ -1,4 +1,4 @@
-"""How benchmarks, charts and `choose` measure a solver, and how they draw it: data that stand in its record."""
+"""The settings by which benchmarks, charts and `choose` measure a solver, and its style in charts, as data of its record."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ class Benchmark:
     """A scene of several sizes that `warpcloth bench` runs with a solver.
 
     Attributes:
-        options: Of the record; of a limited solver without a step, whose fewest stable substeps are taken.
+        options: Options of the solver, without a step if the solver is limited: its fewest stable substeps are taken.
         cpu, cuda: Resolutions of the scene, such that a frame takes less than about a second on one core and on an H200.
         scene: Name of the scene.
     """
@@ -26,11 +26,11 @@ class Facts:
     Attributes:
         method: The method, in a few words for tables.
         benchmarks: A :class:`Benchmark` each.
-        runs: Options of the settings that trade speed for accuracy: about what no other setting of the solver beats in both
-            error and time on ``hanging`` with 32² and 64² vertices, and around it. Substeps are of frames of 1/60 s; of a
-            limited solver ``fewest`` in their place is a multiple of the fewest stable ones.
-        one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler; of those with
-            a tolerance, none ends by it.
+        runs: Options of settings that trade speed for accuracy: those near the Pareto front of error and time on ``hanging``
+            with 32² and 64² vertices. Substeps are per 1/60 s; for a limited solver ``fewest``, a multiple of the fewest stable
+            substeps, replaces them.
+        one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler. A tolerance is
+            so small that no step ends by it.
         limits: Names of the limits, see :data:`warpcloth.lab.stability_limits.LIMITS`, that maps of stability draw.
         style: Colour and marker in every picture.
     """

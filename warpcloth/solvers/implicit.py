@@ -1,4 +1,4 @@
-"""The base of methods that iterate towards the minimiser of implicit Euler."""
+"""The base of the solvers that iterate towards the minimiser of a step and stop at a tolerance."""
 
 import numpy as np
 
@@ -8,9 +8,9 @@ from .solver import Stepper
 
 
 class ImplicitStepper(Stepper):
-    """A method with tolerance that iterates on the correction d = x − x̃.
+    """A solver that iterates on the correction d = x − x̃ until its residual is below a tolerance.
 
-    A subclass has ``correction`` (N,) [m] and the functions ``start``, ``measure`` and ``iterate`` of
+    A subclass has ``correction`` (N,) [m] and the methods ``start``, ``measure`` and ``iterate`` of
     :func:`warpcloth.numerics.iterate.iterate`; ``start`` includes the prediction. Its constructor ends with :meth:`ready`.
     """
 
@@ -19,7 +19,7 @@ class ImplicitStepper(Stepper):
         self.iterations = 0
 
     def ready(self):
-        """Records the end of a step; then the integrator may step."""
+        """Records the graph of the end of a step, and starts the integrator, which may step."""
         self._finish = Segment(self.model.device, lambda: self.launch_finish(self.correction))
         self.integrator.start()
 
@@ -30,6 +30,6 @@ class ImplicitStepper(Stepper):
         self.note(ended.results, ended.residual)
 
     def note(self, results, residual):
-        """Takes down how a step ended, for each copy."""
+        """Records how a step ended, for each copy."""
         self.results = [before.worse(now) for before, now in zip(self.results, results, strict=True)]
         self.residual = np.maximum(self.residual, residual)  # keeps NaN

@@ -19,19 +19,20 @@ from .step import ImplicitStep
 class Newton(ImplicitStep):
     """Implicit Euler: x(t+h) minimises 1/(2h²)‖x − x̃‖²_M + U(x), x̃ = x + h v + h² g (Baraff and Witkin 1998).
 
-    From a state in exact balance that is no minimum, such as a straight chain under pressure, it does not move.
-    Multiplies the energy of an oscillation by 1/(1 + ω²h²) a step; conserves linear, not angular momentum.
+    It does not leave a state in exact balance that is not a minimum, such as a straight chain under compression. Each step
+    multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved, angular momentum is not.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
-        tolerance: Of the residual, the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, over gravity's (without any,
-            over the largest at x̃). Where rounding leaves more than that, which in float32 it does in stiff cloth, a step ends
-            when nothing is left to gain, and says so.
-        iterations: The most Newton iterations a step.
-        hessian: What is done where the Hessian is indefinite (Choi and Ko 2002 for springs): ``"adaptive"`` clamps only in
-            an iteration whose matrix shows it, ``"clamp"`` and ``"absolute"`` always change each element, ``"raw"`` nothing.
-        linear: ``"cg"``, conjugate gradients no further than the Newton iteration needs, or ``"factorised"`` on the host
-            (3 to 6 times slower at 32² and 64² vertices of the hanging cloth, but for any stiffness).
+        tolerance: Tolerance of the residual, which is the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, divided by
+            gravity (or without gravity by the largest at x̃). If rounding leaves a larger residual, as in stiff cloth in
+            float32, a step ends when no progress is possible, and its result says so.
+        iterations: The most Newton iterations in a step.
+        hessian: Treatment of an indefinite Hessian (Choi and Ko 2002 for springs). ``"clamp"`` and ``"absolute"`` change the
+            block of each element in every iteration, ``"adaptive"`` clamps only in iterations whose matrix is found to be
+            indefinite, ``"raw"`` changes nothing.
+        linear: ``"cg"``, conjugate gradients to the accuracy that the Newton iteration needs, or ``"factorised"`` on the host,
+            which is 3 to 6 times slower for ``hanging`` with 32² and 64² vertices, but takes any stiffness.
 
     Raises:
         ValueError: If an option breaks a rule.

@@ -30,29 +30,30 @@ ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")
 
 @dataclass(frozen=True)
 class ProjectiveDynamics(ImplicitStep):
-    """Implicit Euler by a local and a global step in turn (Liu et al. 2013, Bouaziz et al. 2014), from x = x̃.
+    """Implicit Euler by alternating local and global steps, from x = x̃ (Liu et al. 2013, Bouaziz et al. 2014).
 
     For energies ½kA‖y − p(y)‖², y = Gx: with the projections p of all elements fixed, the objective of implicit Euler is least
-    where (M/h² + Σ k A GᵀG) x = (M/h²) x̃ + Σ k A Gᵀp. The matrix is constant and scalar and factorised once. As
-    ∂u/∂y = y − p(y), one iteration is d ← d − A⁻¹∇φ(d) in terms of d = x − x̃, so that rounding of the solve cures itself. The
-    objective φ never rises, and the fixed point is the x(t+h) of :class:`warpcloth.Newton`.
+    where S x = (M/h²) x̃ + Σ k A Gᵀp, with the matrix S = M/h² + Σ k A GᵀG. It is the same for all three coordinates and all
+    steps, and is factorised once. As ∂u/∂y = y − p(y), one iteration is d ← d − S⁻¹∇φ(d) with d = x − x̃, so that later
+    iterations correct the rounding of a solve. The objective φ never rises, and the fixed point is the x(t+h) of
+    :class:`warpcloth.Newton`.
 
-    Motion across stiff elements is slow: of one spring with a fixed end, of length l and rest length L, what is wrong across
-    shrinks by k(L/l)/(m/h² + k) an iteration, what is wrong along is gone after one. Hence the accelerations; a proposal whose
-    φ is above that of the plain iteration from the same point is dropped for that. Chebyshev needs a bound of that factor and
-    takes 1 − min m/(h²D), D the row sums of |A|.
+    Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
+    error perpendicular to it shrinks by the factor k(L/l)/(m/h² + k) in each iteration; the error along it is gone after one.
+    Hence the accelerations. If the accelerated iterate has a larger φ than the plain one from the same point, the plain one is
+    taken. Chebyshev needs a bound of that factor and takes 1 − min m/(h²D), D the row sums of |S|.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
-        iterations: The most iterations a step.
-        tolerance: Of the residual, as for :class:`warpcloth.Newton`: the largest unbalanced acceleration of any vertex over
-            gravity's (without any, over the largest at x̃).
+        iterations: The most iterations in a step.
+        tolerance: Tolerance of the residual, as for :class:`warpcloth.Newton`: the largest unbalanced acceleration of any
+            vertex, divided by gravity (or without gravity by the largest at x̃).
         acceleration: ``"none"``; ``"chebyshev"`` (Wang 2015); ``"anderson"`` (Peng et al. 2018), in the norm of the matrix;
             ``"l-bfgs"`` (Liu et al. 2017), with the matrix as first Hessian.
-        window: Steps that Anderson and L-BFGS remember.
-        linear: ``"factorised"``, or ``"jacobi"``: without the matrix, its row sums Dᵢ = Σⱼ|Aᵢⱼ| stand in for it, above which
-            it never is, so that φ falls as well, only slower (Wang 2015 for Chebyshev). An iteration then moves nothing further
-            than to the next vertices, and until it has converged linear momentum is not kept.
+        window: Number of iterations that Anderson and L-BFGS use.
+        linear: ``"factorised"``, or ``"jacobi"``, which replaces the matrix by the diagonal of its row sums Dᵢ = Σⱼ|Sᵢⱼ| (Wang
+            2015 for Chebyshev). As D ≥ S, φ still falls, only more slowly. An iteration then carries information to
+            neighbouring vertices only, and linear momentum is not conserved before convergence.
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -96,7 +97,7 @@ class ProjectiveDynamics(ImplicitStep):
         """The solver on ``model``, all scratch allocated.
 
         Raises:
-            ValueError: If a term has infinite stiffness, or an energy that is no squared distance.
+            ValueError: If a term has infinite stiffness, or an energy that is not a squared distance to a set.
         """
         self.refuse(model)
         return self._on(ProjectiveDynamicsStepper, model)
@@ -107,7 +108,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
 
     Attributes:
         correction: x − x̃ of the last step, (N,) [m].
-        gradient, w: ∇φ there, (N,) [N], and A⁻¹∇φ (N,) [m].
+        gradient, w: ∇φ there, (N,) [N], and S⁻¹∇φ (N,) [m].
         sums, inertia: :class:`warpcloth.core.sums.Sums` and :class:`warpcloth.numerics.inertia.Inertia`.
     """
 
@@ -150,9 +151,9 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._move()
 
     def slowest(self):
-        """A bound (B,) of the factor by which any part of the error shrinks in a plain iteration, 1 − min s mᵢ/Σⱼ|Aᵢⱼ|.
+        """A bound (B,) of the factor by which any part of the error shrinks in a plain iteration, 1 − min s mᵢ/Σⱼ|Sᵢⱼ|.
 
-        For A is at most its row sums, and the Hessian, where nothing is compressed, at least s M.
+        S is at most its row sums, and where nothing is compressed the Hessian is at least s M.
         """
         mass, free = (array.numpy().reshape(self._sizes.shape) for array in (self.model.mass, self.model.inverse_mass))
         part = np.where(free > 0.0, self.inertia.s * mass.astype(np.float64) / self._sizes, 1.0)

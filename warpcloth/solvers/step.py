@@ -31,7 +31,7 @@ def register(record):
         The same class, so that this is a decorator too.
 
     Raises:
-        ValueError: If it is no such class, or another one of that name is registered.
+        ValueError: If it is not such a class, or another one of that name is registered.
     """
     if not (isinstance(record, type) and issubclass(record, Step)) or record.name is None:
         raise ValueError(
@@ -54,16 +54,16 @@ class Step:
         substeps: Steps a frame.
         ordered: Whether the result depends on the order of elements by more than rounding.
         staggered: Whether velocities belong to a time half a step before that of the positions.
-        closes: Whether a step may close a gap regardless of the stiffness.
+        closes: Whether a step may close the gap of a constraint regardless of its stiffness.
         residual: The :class:`warpcloth.core.status.Residual` that its steps report, or None.
         name: Its name on the command line and in benchmarks and charts; each record has its own.
-        needs: What it needs of every term, of :mod:`warpcloth.terms.needs`, those to be told first at first.
+        needs: Its needs of every term, of :mod:`warpcloth.terms.needs`; the first that is not met is named.
         facts: The :class:`warpcloth.solvers.facts.Facts` by which it is measured and drawn.
         locks: Whether it takes a scene that locks coordinates, ``free_axes``.
         limited: Whether it refuses steps above a limit, which :meth:`step_limits` then finds.
 
     Raises:
-        ValueError: If both or neither are given, or they are not above 0.
+        ValueError: If both or neither are given, or the one given is not above 0.
     """
 
     ordered = staggered = closes = locks = False
@@ -96,13 +96,13 @@ class Step:
 
     @classmethod
     def refuse(cls, model, needs=None, options="", instead=None):
-        """Refuses what is no model, and terms that lack what the solver needs.
+        """Refuses arguments that are not a model, and models with terms that lack a property which the solver needs.
 
         Args:
             model: The model.
-            needs: Of a solver as it is set, where these are not those of the record.
-            options: The option that asks for them, as text.
-            instead: The option that does not.
+            needs: The needs, if an option changes those of the record.
+            options: That option, as text.
+            instead: The value of the option without these needs, as text.
 
         Raises:
             ValueError: Naming the term or `free_axes`, the solver and what would work.
@@ -120,7 +120,7 @@ class Step:
 
     @classmethod
     def step_limits(cls, model: Model) -> tuple[float, float]:
-        """Returns the largest stable steps [s] on a model, about the rest shape and in motion, of a ``limited`` solver."""
+        """Returns the largest stable steps [s] on a model, about the rest shape and in motion, for a ``limited`` solver."""
         raise NotImplementedError
 
     def stable(self, h: float, limit: float) -> bool:
@@ -128,14 +128,14 @@ class Step:
         return h < limit
 
     def without_limits(self) -> "Step":
-        """Returns the record without its check of limits, for maps, which go beyond them, and where they are kept anyway."""
+        """Returns the record without its check of limits, for stability maps and for callers that check them by themselves."""
         return self
 
     def _on(self, stepper, model):
-        """The :class:`Stepper` of type ``stepper`` on a model, or of copies for several threads one for each of these.
+        """The :class:`Stepper` of type ``stepper`` on a model; with several copies and threads, one for each thread.
 
         Raises:
-            ValueError: If several threads are to share one cloth, and cannot, or are more than its vertices.
+            ValueError: If several threads cannot share one cloth, or there are more threads than vertices.
         """
         threads = model.threads
         if threads > 1 and model.copies > 1:
@@ -176,13 +176,14 @@ class Step:
 class ImplicitStep(Step):
     """The step of a solver that minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x), where ``integrator`` says what hₑ and x̃ are.
 
-    On x″ = −ω²x implicit Euler, of first order, multiplies the energy by 1/(1 + ω²h²) a step; midpoint, of second order, keeps
-    it, and the noise of stiff springs with it; BDF2, of second order, damps by about 1 − ω⁴h⁴/2 where ωh is small and what is
-    stiff nearly at once. All three are stable for every h in linear motion and converged steps; in free fall, midpoint and BDF2
-    are exact. Midpoint does not forgive steps too large for what turns, nor few iterations: of 4 substeps a frame ``hanging``
-    diverges with projective dynamics and ADMM, and of more vertices with XPBD, whose sweeps go to and fro by midpoint, for
-    always in one order they made it grow at every step tried. BDF2 takes two steps of Euler when it is bound, to know what was
-    before; it may start out of balance or damped by as much as one likes.
+    On x″ = −ω²x implicit Euler, of first order, multiplies the energy by 1/(1 + ω²h²) in each step. Midpoint, of second order,
+    conserves the energy, and does not damp the noise of stiff springs. BDF2, of second order, multiplies the energy by about
+    1 − ω⁴h⁴/2 if ωh is small, and damps stiff modes almost at once. All three are stable for every h if the motion is linear
+    and steps converge; in free fall, midpoint and BDF2 are exact. Midpoint needs enough iterations, and steps that resolve
+    rotations: with 4 substeps a frame ``hanging`` diverges with projective dynamics and ADMM, and on finer meshes with XPBD.
+    With midpoint the sweeps of XPBD alternate in direction, because in one fixed order they diverged at every step tried. When
+    BDF2 is bound it takes two steps of Euler to find its past state; the scene may start out of balance, and damping may be as
+    large as one likes.
 
     Attributes:
         dt, substeps: See :class:`Step`.
@@ -196,5 +197,5 @@ class ImplicitStep(Step):
 
 
 def fewest_substeps(fps, rest, motion):
-    """The fewest steps a frame that are 10 % below the limit about the rest shape and below that in motion [s]."""
+    """The fewest steps a frame with a step 10 % below the limit ``rest`` [s] about the rest shape, and below ``motion`` [s]."""
     return math.floor(1.0 / (fps * min(rest / 1.1, motion))) + 1

@@ -1,6 +1,6 @@
 """The catalogue of the energies that a scene declares: one file, one record and two lines here for each.
 
-What takes an energy by name, such as a stage, finds those of :data:`TERMS`; :func:`register` adds one from elsewhere.
+Stages and others that name an energy look it up in :data:`TERMS`; :func:`register` adds one from outside the package.
 """
 
 from ..base.extensions import note
@@ -35,7 +35,7 @@ TERMS = {name: globals()[name] for name in __all__}
 def register(energy):
     """Adds the record of an energy to :data:`TERMS`, so that stages, charts and tests know it by its name.
 
-    One of that name from elsewhere, such as the same file loaded before, is replaced.
+    It replaces one of the same name from outside the package, such as the same file loaded before.
 
     Args:
         energy: A frozen dataclass that derives from :class:`warpcloth.terms.declared.Declared`.
@@ -44,7 +44,7 @@ def register(energy):
         The same class, so that this is a decorator too.
 
     Raises:
-        ValueError: If it is no such class, or has the name of an energy of the package.
+        ValueError: If it is not such a class, or has the name of an energy of the package.
     """
     if not (isinstance(energy, type) and issubclass(energy, Declared)):
         raise ValueError(f"{energy!r} is no energy; it must be a class that derives from warpcloth.terms.declared.Declared")

@@ -14,13 +14,13 @@ from .declared import Damped, indices, own_stencil, quantity
 
 @dataclass(frozen=True, kw_only=True)
 class Attachment(Damped):
-    """Vertices held by springs of no length, U = Σ ½k‖x − target‖²: a pin that gives way.
+    """Springs of rest length 0 from vertices to targets, U = Σ ½k‖x − target‖²: soft pins.
 
     Attributes:
         vertices: Indices (E,), or a selection such as ``"corners"``.
         stiffness: k [N/m], one or (E,).
-        targets: Positions (E, 3) [m], or one of all (3,), if not where the vertices start.
-        damping: β [N·s/m], one or (E,): a force −βv. Unlike that of other terms it acts in rigid motion too.
+        targets: Positions (E, 3) [m], or one for all (3,); by default the positions at the start.
+        damping: β [N·s/m], one or (E,): a force −βv. Unlike the damping of other terms it also acts on rigid motion.
         name: To tell two terms of one kind apart.
     """
 

@@ -1,4 +1,4 @@
-"""The base of energies of bending: a hinge is an edge and the two triangles at it."""
+"""The base of bending energies: a hinge is an edge with its two adjacent triangles."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from .declared import Damped
 
 @dataclass(frozen=True, kw_only=True)
 class Bending(Damped):
-    """An energy of the hinges of a mesh.
+    """A bending energy, whose elements are the hinges of a mesh.
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], one or (E,) in the order of ``mesh.hinges``.

@@ -12,12 +12,13 @@ Own = TypeVar("Own", bound="CorotatedMembrane")
 
 @dataclass(frozen=True, kw_only=True)
 class CorotatedMembrane(Membrane):
-    """A membrane of triangles without Poisson's effect, U = Σ ½kA‖F − R‖², R the polar rotation of F (Chao et al. 2010).
+    """A corotated membrane with Poisson's ratio 0, U = Σ ½kA‖F − R‖², F = RU the polar decomposition (Chao et al. 2010).
 
-    F (3×2) is the deformation gradient and A the rest area of a triangle. Linear in the stretch, and has a projection.
+    F (3×2) is the deformation gradient and A the rest area of a triangle. The stress is linear in the stretch U, and the energy
+    has a projection.
 
     Attributes:
-        stiffness: k = Et = 2μ [N/m], Young's modulus times thickness: force over width and strain of a strip that is pulled.
+        stiffness: k = Et = 2μ [N/m], Young's modulus times thickness: for a strip that is pulled, force per width and strain.
             One or (T,); ``math.inf`` for solvers that take hard constraints.
         damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
         name: To tell two terms of one kind apart.
@@ -28,5 +29,5 @@ class CorotatedMembrane(Membrane):
 
     @classmethod
     def from_material(cls: type[Own], youngs_modulus: float, thickness: float, **fields: Any) -> Own:
-        """Of a material with E [Pa] and ν = 0, ``thickness`` t [m] thick."""
+        """Returns the membrane of a material with E [Pa] and ν = 0, ``thickness`` t [m] thick."""
         return cls(stiffness=membrane_stiffness(cls, youngs_modulus, thickness), **fields)

@@ -1,4 +1,4 @@
-"""The base of the records of energies: fields that say what they take, checks, and the elements on a mesh."""
+"""The base of the records of energies: metadata and checks of their fields, and their elements on a mesh."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -21,12 +21,12 @@ class Elements:
         kind: Class name of the term.
         term: The energy.
         stencil: Vertices of each element, (E, K) int32.
-        stiffness: One value or (E,), or (C,) of cells [unit of the term].
-        rest: Rest state (E, P), or with weights that of cells (C, P).
-        damping: One value or (E,) [that times s].
-        cells: Of elements that belong to cells, E of them from cells[c] to cells[c+1] to cell c, (C+1,); else None.
-        weights: Of cells that are elements of any number of vertices, see :mod:`.sparse`, (E, M); else None.
-        refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
+        stiffness: One value or (E,); of cells one value or (C,) [unit of the term].
+        rest: Rest states (E, P); of sparse cells (C, P).
+        damping: One value or (E,) [unit of the term, times s].
+        cells: Offsets (C+1,) of cells: elements from cells[c] to cells[c+1] are the vertices of cell c. None without cells.
+        weights: Weights (E, M) of the vertices of sparse cells, see :mod:`.sparse`; else None.
+        refresh: The :class:`warpcloth.terms.refresh.Refresh` of a rest state that changes during a run, or None.
     """
 
     label: str
@@ -45,11 +45,11 @@ class Elements:
 class Quantity:
     """Metadata of a numeric field: one value for all elements or one for each, in SI.
 
-    Checks, copies that vary and USD follow from it.
+    Checks, ``vary`` of batches and USD attributes follow from it.
 
     Attributes:
-        rule: What values must be, for the sentence of an error, such as "must be above 0".
-        holds: (values as an array) → which of them are so.
+        rule: The rule for values, as in an error, such as "must be above 0".
+        holds: (array of values) → which of them follow the rule.
         shape: Shape of one value, () or (3,).
     """
 
@@ -63,8 +63,8 @@ class Indices:
     """Metadata of a field that names vertices by their indices.
 
     Attributes:
-        each: How many an element has.
-        text: What a text is: "selection", one of vertices; "word", one with a meaning of its own; "" where none is allowed.
+        each: Number of vertices of an element.
+        text: The meaning of a string: "selection" of vertices, or a "word" that the energy defines; "" if none is allowed.
     """
 
     each: int = 1
@@ -90,17 +90,17 @@ FINITE_FROM_0 = quantity("must be finite, 0 or more", lambda values: (values >= 
 class Declared:
     """The base of all terms: a stiffness, and a name to tell two terms of one kind apart.
 
-    An energy derives from it, sets ``term`` and defines ``stencil``; its numeric fields have the metadata of :func:`quantity`.
+    A subclass sets ``term`` and defines ``stencil``; its numeric fields have the metadata of :func:`quantity`.
 
     Attributes:
-        term: The energy, of ``kernels/terms``.
+        term: The :class:`warpcloth.kernels.term.Term` with the functions of the energy.
         stiffness: One or (E,) [unit of the term].
         name: To tell two terms of one kind apart.
-        part: The part of the mesh that it acts on, see :meth:`warpcloth.Mesh.join`; all where it is None. Selections, indices
-            and arrays are then those of the part.
+        part: The part of the mesh that it acts on, see :meth:`warpcloth.Mesh.join`, or None for the whole mesh. With a part,
+            selections, indices and arrays are relative to that part.
 
     Raises:
-        ValueError: If a value breaks a rule; lengths are compared with the number of elements when a scene is built.
+        ValueError: If a value breaks a rule. The lengths of arrays are checked when the scene is built.
     """
 
     term: ClassVar[Term]
@@ -174,7 +174,7 @@ class Declared:
         return replace(found, stencil=found.stencil + np.int32(first))
 
     def elements_on(self, mesh: Mesh, positions: np.ndarray) -> Elements:
-        """The elements on a whole mesh, see :meth:`elements`, which leads here with the part alone if there is one."""
+        """The elements on a mesh, which :meth:`elements` calls with the mesh of the part, if there is one."""
         stencil = self.stencil(mesh)
         if len(stencil) == 0:
             raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
@@ -189,19 +189,20 @@ class Declared:
         return self.term.rest_state(mesh.points, stencil)
 
     def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The pairs of vertices that it keeps from stretching, and how stiff, on a mesh as in :meth:`elements`.
+        """The pairs of vertices whose distance the term holds, and how stiffly, on a mesh as in :meth:`elements`.
 
         Returns:
-            (pairs (m, 2), K (m,) [N/m]): K is the stiffness of the sheet, force over width and strain. None by default.
+            (pairs (m, 2), K (m,) [N/m]): K is the stiffness of the sheet, force per width and strain. Empty by default.
         """
         return np.empty((0, 2), dtype=np.int32), np.empty(0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Damped(Declared):
-    """The base of terms that can be damped by β, of a dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖² a step, s the term's own invariant.
+    """The base of terms with damping β: each step adds the dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖², s an invariant
+    such as the length of a spring.
 
-    ``term.dissipation`` says what a damped term becomes.
+    ``term.dissipation`` defines s, see :class:`warpcloth.kernels.term.Dissipation`.
 
     Attributes:
         damping: β, one or (E,) [unit of the term, per unit of s², times s].
@@ -211,10 +212,10 @@ class Damped(Declared):
 
 
 def own_indices(name, given):
-    """Indices that a user gave as (E,) int32.
+    """Returns given indices as (E,) int32.
 
     Raises:
-        ValueError: If they are no whole numbers in a row.
+        ValueError: If they are not a list of whole numbers.
     """
     try:
         found = np.asarray(given)
@@ -227,7 +228,7 @@ def own_indices(name, given):
 
 
 def own_stencil(label, parameter, given, vertices, count):
-    """Indices that a user gave, (E, ``vertices``) or (E,) of single ones, as (E, ``vertices``) int32.
+    """Returns given indices, (E, ``vertices``) or if ``vertices`` is 1 (E,), as (E, ``vertices``) int32.
 
     Raises:
         ValueError: If the shape is another, or an element names a vertex twice or one outside [0, ``count``).

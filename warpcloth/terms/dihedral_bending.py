@@ -14,7 +14,7 @@ class DihedralBending(Bending):
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated as in :class:`warpcloth.QuadraticBending`.
-        damping: β [N·m·s], of the rate of θ.
+        damping: β [N·m·s]. It damps the rate of θ.
         name: To tell two terms of one kind apart.
     """
 

@@ -1,4 +1,4 @@
-"""The base of limits: a range about the rest shape without energy."""
+"""The base of limits, whose energy is 0 in a range about the rest shape."""
 
 import math
 from collections.abc import Sequence
@@ -15,10 +15,11 @@ FINITE_ABOVE_0 = quantity("must be finite, above 0", lambda values: (values > 0.
 
 @dataclass(frozen=True, kw_only=True)
 class Limit(Declared):
-    """A range about the rest shape without energy; beyond it the stiffness is infinite unless one is given.
+    """An energy that is 0 in a range about the rest shape; beyond it the stiffness is infinite by default.
 
     Attributes:
-        least, most: The ends of the range, σ_min and σ_max, ratios to the rest shape, one or (E,); at least one of the two.
+        least, most: The ends of the range, σ_min and σ_max, ratios to the rest shape, each one or (E,); at least
+            one is required.
         stiffness: k beyond the range, one or (E,).
     """
 

@@ -15,10 +15,10 @@ Own = TypeVar("Own", bound="IsotropicMembrane")
 
 @dataclass(frozen=True, kw_only=True)
 class Membrane(Damped):
-    """A membrane of triangles, a material whose energy and stress can be measured too.
+    """A membrane of triangles. :func:`warpcloth.analyze` can measure the energy and stress of its material too.
 
     Attributes:
-        material: What the command line calls it.
+        material: Its name on the command line.
         stiffness: k = Et [N/m], Young's modulus times thickness. One or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
     """
@@ -39,7 +39,7 @@ class Membrane(Damped):
 class IsotropicMembrane(Membrane):
     """An isotropic membrane in plane stress: k = Et, and Poisson's ratio ν.
 
-    In these μ = k/(2(1 + ν)) and λ = kν/(1 − ν²). A stiffness that varies leaves ν as it is.
+    Its Lamé parameters are μ = k/(2(1 + ν)) and λ = kν/(1 − ν²). If the stiffness varies in a batch, ν does not.
     """
 
     poisson_ratio: float | Sequence[float] | np.ndarray = field(
@@ -49,12 +49,12 @@ class IsotropicMembrane(Membrane):
 
     @classmethod
     def from_material(cls: type[Own], youngs_modulus: float, poisson_ratio: float, thickness: float, **fields: Any) -> Own:
-        """Of a material with E [Pa] and ν, ``thickness`` t [m] thick: μ = Et/(2(1 + ν)), λ = Eνt/(1 − ν²) [N/m]."""
+        """Returns the membrane of a material with E [Pa] and ν, t [m] thick: μ = Et/(2(1 + ν)), λ = Eνt/(1 − ν²) [N/m]."""
         return cls(stiffness=membrane_stiffness(cls, youngs_modulus, thickness), poisson_ratio=poisson_ratio, **fields)
 
     @classmethod
     def from_moduli(cls: type[Own], mu: float, lam: float, **fields: Any) -> Own:
-        """Of Lamé's moduli of the membrane, μ above 0 and λ above −μ [N/m]: ν = λ/(λ + 2μ), k = 2μ(1 + ν)."""
+        """Returns the membrane with Lamé parameters μ above 0 and λ above −μ [N/m]: ν = λ/(λ + 2μ), k = 2μ(1 + ν)."""
         first, second = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in (("mu", mu), ("lam", lam)))
         refuse(f"{cls.__name__}.mu", first, ~(first > 0.0), "must be above 0")
         ratio = second / (second + 2.0 * first)

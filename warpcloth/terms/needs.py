@@ -1,7 +1,7 @@
-"""The needs that a solver may have of every term, and the one sentence that refuses a term which lacks it.
+"""The properties that a solver may need of every term, and the refusal of a term that lacks one.
 
-The :class:`..kernels.term.Term` says whether it projects, has a scalar constraint or a prox of its own, is made of cells, and
-how its damping enters; its elements say whether a stiffness is infinite and whether they are damped.
+The :class:`..kernels.term.Term` says whether it has a projection, a scalar constraint or a prox, whether it has cells, and
+whether its damping merges with it; its elements say whether a stiffness is infinite and whether they are damped.
 """
 
 from collections.abc import Callable
@@ -14,9 +14,9 @@ class Need:
 
     Attributes:
         met: (elements) → whether a term has it; ``elements`` is a :class:`warpcloth.model.elements.DeviceElements`, or anything
-            else with ``term``, ``hard`` and ``damping`` (None of what is not damped).
-        lack: What a solver cannot take of a term that has it not, with {label} in it.
-        remedy: What a user can change in the term instead of the solver, if anything.
+            else with ``term``, ``hard`` and ``damping`` (None without damping).
+        lack: Description of a term that lacks the property, with {label} in it, for the sentence of the error.
+        remedy: A change to the term that a user can make instead of taking another solver, or "".
     """
 
     met: Callable
@@ -33,7 +33,7 @@ ROWS = Need(
     lambda elements: elements.term.project is not None or elements.term.constraint is not None,
     "{label}, whose energy is no square of a constraint",
 )
-# λ of a projection that moves would keep parts of earlier directions.
+# Where the projection changes from iteration to iteration, λ would keep parts of earlier directions.
 STEADY_ROWS = Need(
     lambda elements: not elements.hard or elements.term.constraint is not None or elements.term.linear or elements.term.cells,
     "{label} with infinite stiffness, as it has no scalar constraint",
@@ -62,7 +62,7 @@ def refuse_unmet(terms, solver, needs, others):
     Args:
         terms: Elements of each term, see :class:`Need`.
         solver: Name of the solver, for the sentence.
-        needs: Its needs, those to be told first at first.
+        needs: Its needs; the first that is not met is named.
         others: The needs of each solver that could be used instead, by name.
 
     Raises:

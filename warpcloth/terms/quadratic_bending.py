@@ -10,14 +10,14 @@ from .bending import Bending
 
 @dataclass(frozen=True, kw_only=True)
 class QuadraticBending(Bending):
-    """Quadratic bending of a sheet that is flat at rest, U = Σ ½D‖y‖²/(A₁+A₂) (Bergou et al. 2006). Linear forces.
+    """Quadratic bending of a sheet that is flat at rest, U = Σ ½D‖y‖²/(A₁+A₂) (Bergou et al. 2006). Forces are linear.
 
     Attributes:
-        stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh. A grid with one diagonal a
-            cell is 3 times as stiff where it curves along its diagonals, as stiff where it folds about them or curves along
-            its rows, and 0.75 times 15° off the rows away from them; one with alternating diagonals is 1 to 1.5 times.
-            The equilateral mesh has a Poisson's ratio of −1/3; the other meshes are not isotropic plates.
-        damping: β [N·m·s], of the rate of ‖y‖, which for a small angle θ is |e|·|θ|.
+        stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh, which has a Poisson's ratio
+            of −1/3. Other meshes are not isotropic plates. A grid with one diagonal per cell is 3 times as stiff if it curves
+            along its diagonals, as stiff if it folds about them or curves along its rows, and 0.75 times if it curves in
+            directions 15° off the rows, away from the diagonals. A grid with alternating diagonals is 1 to 1.5 times as stiff.
+        damping: β [N·m·s]. It damps the rate of ‖y‖, where ‖y‖ is |e|·|θ| for a small angle θ.
         name: To tell two terms of one kind apart.
 
     Examples:

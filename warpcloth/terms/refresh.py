@@ -1,6 +1,6 @@
-"""Rest states and stencils that change during a run: a term says when, and what is launched then.
+"""Rest states that change during a run: a term says when they are updated, and by which launch.
 
-Damping, rigid clusters and every term of stencils that come and go are set anew by this one mechanism. A solver calls
+Damping, rigid clusters and sparse energies use it. A solver calls
 :meth:`warpcloth.model.model.Model.refresh` where a step begins, and each evaluation of an energy, a force or a projection calls
 it with the positions that it is about to use. Neither knows a term by name.
 """
@@ -22,8 +22,9 @@ class Moment(NamedTuple):
         x: Positions (N,) vectors [m].
         correction: d (N,) [m] of an evaluation at x + d, or None of one at x.
         integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, whose step begins.
-        move: Of a step's beginning what its integrator knows of the motion until then (N,), times ``scale``; None for Euler.
-        scale: 1, or for velocities their time [s].
+        move: Array (N,) whose ``scale``-fold is, where a step begins, the last move of BDF2 or hₑ v of midpoint [m]; None for
+            Euler.
+        scale: 1 if ``move`` is in metres, or the time [s] by which velocities are multiplied.
     """
 
     x: wp.array
@@ -35,17 +36,18 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Refresh:
-    """The part of a term's elements that is set anew during a run.
+    """The update of a term's elements during a run.
 
-    A term of stencils that come and go has arrays for its capacity, and its launch fills the stencils and the rest states that
-    are in use; the stiffness of all others it sets to 0, by a count that stays on the device.
+    It writes rest states. If it writes stencils, the term has arrays for the most elements that it can have, and the launch
+    sets the stiffness of those not in use to 0. Stencils are read once when a solver is bound, for incidences on CUDA, the
+    pattern of the Hessian, colours and constant matrices, which then do not follow.
 
     Attributes:
         when: :data:`STEP` or :data:`EVALUATION`.
-        launch: Function of (model, elements, moment) that launches what writes ``elements``, the
-            :class:`warpcloth.model.elements.DeviceElements`, at a :class:`Moment`. It is recorded once and replayed: it
-            may neither read on the host nor allocate.
-        arrays: What it reads of each element, (B·E,); reordered with the elements.
+        launch: Function of (model, elements, moment) whose launches write the arrays of ``elements``, the
+            :class:`warpcloth.model.elements.DeviceElements`, at a :class:`Moment`. It is recorded once and replayed, so it
+            must neither read on the host nor allocate.
+        arrays: Arrays that it reads, with one entry per element, (B·E,); they are reordered with the elements.
     """
 
     when: str
@@ -53,5 +55,5 @@ class Refresh:
     arrays: tuple = ()
 
     def with_arrays(self, change):
-        """This refresh with each array as the function ``change`` makes it."""
+        """Returns this refresh with ``change`` applied to each array."""
         return replace(self, arrays=tuple(map(change, self.arrays)))

@@ -1,4 +1,4 @@
-"""Rigid bodies of cloth."""
+"""Rigid bodies, by shape matching."""
 
 import math
 from collections.abc import Sequence
@@ -19,18 +19,19 @@ from .refresh import EVALUATION, Refresh
 
 @dataclass(frozen=True, kw_only=True)
 class RigidCluster(Declared):
-    """Bodies, U = Σ (κ/2)Σ mᵢ‖xᵢ − (c + R qᵢ)‖² over their vertices, c and R the best motion of their rest shape (Müller et al.
+    """Rigid bodies by shape matching, U = Σ (κ/2)Σ mᵢ‖xᵢ − (c + R qᵢ)‖², c and R the best fit of the rest shape (Müller et al.
     2005).
 
-    Bodies that share a vertex hang together there. The mass of a vertex in several bodies counts in each. A pinned vertex
-    counts as a thousand times all others of its body, so that the body turns about it. A body on a line keeps no
-    orientation about it. Newton's method takes κM for the Hessian, which holds bodies back as a whole: steps with κh² near 1
-    or above take more iterations, and ``equilibrium`` of bodies that move far may use up its own.
+    Bodies that share a vertex are joined there. A vertex of several bodies has its whole mass in each of them. In the fit, a
+    pinned vertex weighs a thousand times as much as all others of its body, so that the body turns about it. A body whose
+    vertices lie on a line has no orientation about that line. Newton's method takes κM for the Hessian, which also resists
+    rigid motion: steps with κh² near 1 or above take more iterations, and ``equilibrium`` of bodies that move far may use up
+    its iterations.
 
     Attributes:
         vertices: Indices of the bodies, one after the other, (E,); or a list of an array for each body; or a selection such as
             ``"x < 0.1"`` for one body, or a list of them.
-        sizes: Vertices of each body, (C,), where ``vertices`` is one array of several bodies; else found.
+        sizes: Numbers of vertices of the bodies, (C,), if ``vertices`` is one array of several bodies.
         stiffness: κ [1/s²], one or (C,): the square of the frequency at which a vertex swings about its position in the body;
             infinite for solvers that take hard constraints.
         name: To tell two terms of one kind apart.
@@ -104,7 +105,7 @@ class RigidCluster(Declared):
 
 
 def _fit(model, elements, moment):
-    """Sets the targets of the clusters at x, or at x + d."""
+    """Fits the clusters at x, or at x + d, and sets their targets."""
     cells, d = elements.cells, moment.correction
     kernel = model.kernel(fit_targets, model.dtype, d is not None)
     given = [cells.offsets, elements.stencil, cells.shape, moment.x, d]

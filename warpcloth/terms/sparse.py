@@ -13,12 +13,12 @@ from .refresh import EVALUATION, Refresh
 class Sparse(Declared):
     """An energy U = Σ_c k A u(y_c) of cells with any number of vertices, y = Dx linear in all of them.
 
-    It defines ``operator`` and ``rest`` in place of a stencil and the weights of its ``term``, whose ``vertices`` are 0 and
-    whose ``weight`` is None. Explicit and Newton take it.
+    A subclass defines ``operator`` and ``rest``, and no ``stencil``. Its ``term`` has ``vertices`` 0 and ``weight`` None.
+    Explicit and Newton take it.
     """
 
     def operator(self, mesh):
-        """D as a scipy sparse matrix (C·M, n): rows cM to cM + M of the vertices of ``mesh`` are y of cell c."""
+        """D as a scipy sparse matrix (C·M, n), whose rows from cM to cM + M give y of cell c from the vertices of ``mesh``."""
         raise NotImplementedError  # every energy has its own
 
     def rest(self, mesh, positions, stencil):
@@ -58,7 +58,7 @@ class Sparse(Declared):
 
 
 def _evaluate(model, elements, moment):
-    """Sets the shares of the vertices at x, or at x + d."""
+    """Evaluates the cells at x, or at x + d, and sets the part of each vertex."""
     cells, d = elements.cells, moment.correction
     kernel = model.kernel(kernels.evaluate, cells.term, model.dtype, d is not None)
     given = [cells.offsets, elements.stencil, cells.weights, cells.rest, moment.x, d]

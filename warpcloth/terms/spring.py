@@ -14,17 +14,17 @@ from .declared import FINITE_FROM_0, Damped, indices, own_stencil
 
 @dataclass(frozen=True, kw_only=True)
 class Spring(Damped):
-    """Springs, U = Σ ½k(l − L)² (Provot 1995).
+    """Springs between vertex pairs, U = Σ ½k(l − L)² (Provot 1995).
 
     Attributes:
-        pairs: Which vertices: ``"edges"`` of the mesh; of a grid ``"structural"`` (along rows and columns), ``"shear"``
-            (both diagonals of each cell), ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge);
-            several of these in a tuple, where a pair that belongs to more than one kind is one spring; or own pairs (E, 2).
-            Arrays of the other fields have one value per pair. Own pairs keep their order. ``"edges"`` (and ``"structural"``
-            without a grid) have the order of ``mesh.edges``, which for an edge mesh is the order in which its edges were given.
-            All other kinds, and several kinds together, are in lexicographic order, the smaller index first.
+        pairs: Pairs of vertices (E, 2), or a kind, or a tuple of kinds, in which each pair is one spring. Kinds are ``"edges"``
+            of the mesh, and on a grid ``"structural"`` (along rows and columns), ``"shear"`` (both diagonals of each cell) and
+            ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge). Arrays of the other fields have one
+            value per pair, in this order: given pairs keep theirs; ``"edges"`` (and ``"structural"`` without a grid) have that
+            of ``mesh.edges``, which for an edge mesh is the order in which its edges were given; all other kinds, and several
+            kinds together, are in lexicographic order, the smaller index first.
         stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
-        rest_lengths: L [m], one or (E,), if not those of the mesh.
+        rest_lengths: L [m], one or (E,); by default the lengths in the rest shape.
         damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.
         name: To tell two terms of one kind apart.
 
@@ -51,7 +51,7 @@ class Spring(Damped):
         return np.broadcast_to(lengths, len(stencil))[:, None].copy()
 
     def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The pairs themselves; a net of them is as stiff as a sheet of K = 2k/√3."""
+        """Returns the pairs themselves; a net of them is as stiff as a sheet of K = 2k/√3."""
         found = self.elements(mesh, positions)
         return found.stencil, 2.0 / np.sqrt(3.0) * np.broadcast_to(found.stiffness, len(found.stencil))
 

@@ -1,4 +1,4 @@
-"""Limits of the lengths of pairs."""
+"""Limits on the distance of vertex pairs."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -15,13 +15,13 @@ from .spring import pairs_on
 
 @dataclass(frozen=True, kw_only=True)
 class SpringLimit(Limit):
-    """Limits of the lengths of pairs, U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L] (Provot 1995).
+    """Limits on the distance l of vertex pairs, U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L] (Provot 1995).
 
     Attributes:
-        least, most: σ_min, σ_max, ratios to the rest length L, one or (E,); at least one of the two.
+        least, most: σ_min, σ_max, ratios to the rest length L, each one or (E,); at least one of the two is required.
         pairs: Which vertices, and in which order, as in :class:`warpcloth.Spring`.
-        stiffness: k [N/m], one or (E,): of the springs that pairs beyond their limits are; infinite for PBD, which takes
-            hard constraints, finite for solvers that need forces.
+        stiffness: k [N/m], one or (E,): a pair beyond its limit is a spring of this stiffness. Infinite for solvers that take
+            hard constraints, such as PBD; finite for solvers that need forces.
         name: To tell two terms of one kind apart.
     """
 

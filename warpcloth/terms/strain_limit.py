@@ -1,4 +1,4 @@
-"""Limits of the stretches of triangles."""
+"""Limits on the stretches of triangles."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,13 +13,14 @@ from .limit import Limit
 
 @dataclass(frozen=True, kw_only=True)
 class StrainLimit(Limit):
-    """Limits of the principal stretches of triangles, U = Σ ½kA‖F − p‖², p the nearest with σ_min ≤ σᵢ ≤ σ_max (Thomaszewski
-    et al. 2009).
+    """Limits on the principal stretches of triangles, U = Σ ½kA‖F − p‖², p the matrix nearest to F with σ_min ≤ σᵢ ≤ σ_max
+    (Thomaszewski et al. 2009).
 
     Attributes:
-        least, most: σ_min, σ_max of the singular values of the deformation gradient F, one or (T,); at least one of the two.
-        stiffness: k [N/m], one or (T,), that of :class:`warpcloth.CorotatedMembrane` beyond the limits; infinite for PBD,
-            which takes hard constraints, finite for solvers that need forces.
+        least, most: Bounds σ_min, σ_max of the singular values σᵢ of the deformation gradient F, each one or (T,); at least
+            one of the two is required.
+        stiffness: k [N/m], one or (T,): beyond its limits a triangle is as stiff as a :class:`warpcloth.CorotatedMembrane`
+            of it. Infinite for solvers that take hard constraints, such as PBD; finite for solvers that need forces.
         name: To tell two terms of one kind apart.
     """
 
