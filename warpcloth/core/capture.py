@@ -9,7 +9,8 @@ from ..base.turns import TURN
 
 
 def on_host(device, what):
-    """Raises if ``device`` is recording: a host call inside a captured segment would see data that nothing has computed.
+    """Refuses a call on the host while ``device`` is recording, when arrays do not yet have the values of the recorded
+    launches.
 
     Raises:
         RuntimeError: If a graph is being captured on the device.
@@ -19,9 +20,9 @@ def on_host(device, what):
 
 
 class Mirror:
-    """A device array and its counterpart on the host, for what the host reads and writes between segments.
+    """A device array and its counterpart on the host, by which the host reads and writes between segments.
 
-    Built once; on the CPU both are one array. Reading and writing then allocate nothing.
+    Both are allocated when it is built, so reading and writing allocate nothing; on the CPU they are one array.
 
     Args:
         array: The device array.
@@ -58,7 +59,7 @@ class Mirror:
 
 @contextmanager
 def _uncollected():
-    """No collection of garbage meanwhile: what it frees on CUDA (the factors of cholespy) would break a capture."""
+    """Disables garbage collection meanwhile: memory that it frees on CUDA (the factors of cholespy) would break a capture."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -69,16 +70,16 @@ def _uncollected():
 
 
 class Segment:
-    """Launches that always run together: recorded when built, replayed by a call, on the CPU and on CUDA.
+    """Launches that always run together: recorded when it is built, replayed when it is called, on the CPU and on CUDA.
 
     Args:
         device: The Warp device.
-        record: Function that launches.
+        record: Function that does the launches.
     """
 
     def __init__(self, device, record):
         self.device = device
-        self.record = record  # the graph has addresses only; what the function refers to must not be freed
+        self.record = record  # the graph has only addresses of the arrays that the function refers to, which must not be freed
         with TURN, _uncollected(), wp.ScopedCapture(device=device) as capture:
             record()
         self.graph = capture.graph

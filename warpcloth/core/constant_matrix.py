@@ -1,4 +1,4 @@
-"""The constant matrix s·M + Σ k A GᵀG of a model, G the weights of y, which projective dynamics and ADMM factorise."""
+"""The constant matrix s·M + Σ k A GᵀG of a model, y = Gx, which projective dynamics and ADMM factorise."""
 
 import numpy as np
 import warp as wp
@@ -8,7 +8,7 @@ from ..model.host_values import host_values
 
 
 def constant_blocks(model, elements):
-    """k A GᵀG of each element, G the weights of y, (E, K, K) [N/m]."""
+    """k A GᵀG of each element, y = Gx, (E, K, K) [N/m]."""
     K = elements.term.vertices
     blocks = wp.zeros((elements.count, K * K), dtype=wp.float64, device=model.device)
     kernel = model.kernel(assemble.constant_blocks, elements.term, model.dtype)
@@ -17,7 +17,7 @@ def constant_blocks(model, elements):
 
 
 def constant_matrices(model, s):
-    """s·M + Σ k A GᵀG of each copy, G the weights of y, as scipy matrices (n, n) [N/m]; pins are the identity."""
+    """s·M + Σ k A GᵀG of each copy, y = Gx, as scipy matrices (n, n) [N/m]; rows of pins are those of the identity."""
     from scipy.sparse import coo_matrix
 
     n, B = model.per_copy, model.copies

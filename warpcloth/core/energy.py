@@ -8,7 +8,7 @@ from ..terms.refresh import EVALUATION, Moment
 
 
 class Energy:
-    """U of all terms [J], per copy; or of the ``terms`` given."""
+    """U of all terms of each copy [J], or of the ``terms`` given."""
 
     @in_turn
     def __init__(self, model, sums, corrected=False, terms=None):

@@ -1,4 +1,4 @@
-"""The explicit step as it is written: the gradient, then v += h(g − M⁻¹∇U), x += h v. Faster backends are compared with it."""
+"""The explicit step in plain form: the gradient, then v += h(g − M⁻¹∇U), x += h v. Tests compare faster backends with it."""
 
 from ..kernels import explicit_step as kernels
 from ..model.damping import dissipations
@@ -9,16 +9,16 @@ from .gradient import Gradient
 class ExplicitStep:
     """Steps of several launches, on any device.
 
-    Damping D is taken at x + h v about the state x, see :class:`warpcloth.kernels.term.Dissipation`; with compensated positions
-    forces are taken at x + residual.
+    The gradient of the dissipation D about the state x is taken at x + h v, see :class:`warpcloth.kernels.term.Dissipation`;
+    with compensated positions forces are taken at x + residual.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        state: x and v (N,), which steps move on.
+        state: x and v (N,), which the steps update.
         h: Step [s].
-        symplectic: Whether x moves on by the v after the step.
-        count: Steps that moved pins have made (B,) int32, or None.
-        compensated: Whether x is moved on by compensated summation.
+        symplectic: Whether x is updated with v after the step.
+        count: Number of steps that moving pins have made (B,) int32, or None.
+        compensated: Whether x is updated by compensated summation.
 
     Attributes:
         residual: Position residual of compensated summation (N,) [m], or None.
@@ -37,7 +37,7 @@ class ExplicitStep:
         self._given = [model.inverse_mass, *model.free_gravity, h]
 
     def launch(self, steps, move_pins):
-        """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        """Launches this number of steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
             model.refresh(STEP, Moment(x))

@@ -7,7 +7,7 @@ from .transpose import Transpose
 
 
 class Gradient:
-    """∂U/∂x of all terms [N], or of the ``terms`` given: Dᵀ(kA∂u/∂y), a launch for each."""
+    """∂U/∂x of all terms [N], or of the ``terms`` given: Dᵀ(kA∂u/∂y), one launch for each term."""
 
     @in_turn
     def __init__(self, model, corrected=False, terms=None):
@@ -20,7 +20,7 @@ class Gradient:
             self._sums.append((Transpose(model, elements, *factories, elements.term, model.dtype, corrected), data))
 
     def add(self, x, out, correction=None):
-        """out += ∂U/∂x at x, or at x + correction of one built ``corrected``."""
+        """out += ∂U/∂x at x, or at x + correction if it was built ``corrected``."""
         self.model.refresh(EVALUATION, Moment(x, correction), self.terms)
         for transpose, data in self._sums:
             data.x = x

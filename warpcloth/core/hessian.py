@@ -66,7 +66,7 @@ class _SparseBlocks:
 
 
 class Hessian:
-    """∂²U/∂x² + scale·M in block compressed rows, pinned vertices replaced by the identity; or of the ``terms`` given.
+    """∂²U/∂x² + scale·M of all terms, or of the ``terms`` given, in block compressed rows; rows of pins are the identity.
 
     A locked coordinate keeps its entry of the diagonal, or 1 where that is not above 0, and nothing else of its row and column
     (Baraff and Witkin 1998), so that it stays and the rest do not notice.
@@ -76,7 +76,8 @@ class Hessian:
         diagonal: Index of each diagonal block (N,).
         values: The blocks [N/m].
         policy: (B,) int32, a :class:`HessianPolicy` for each copy.
-        count, per_copy, vector, block: Unknowns, those of a copy, the types of one and of a diagonal block.
+        count, per_copy: Vertices of all copies, and of one copy.
+        vector, block: Types of an unknown and of a block.
     """
 
     @in_turn
@@ -93,7 +94,7 @@ class Hessian:
         self._find_pattern()
 
     def _find_pattern(self):
-        """The blocks of the matrix and, for each, the element blocks that it is the sum of."""
+        """Finds the blocks of the matrix and, for each, the element blocks of which it is the sum."""
         model, n = self.model, self.model.count
         fixed = model.inverse_mass.numpy() == 0.0
         keys, sources = [np.arange(n, dtype=np.int64) * (n + 1)], []
@@ -133,7 +134,7 @@ class Hessian:
             model.launch(lock, len(self.values), [self._rows, self.columns, model.mobility], [self.values])
 
     def norms(self):
-        """Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ of every vertex i, summed over elements, (N,) [N/m], each ‖·‖ by the bound √(‖·‖₁‖·‖∞)."""
+        """Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ of every vertex i, summed over elements, (N,) [N/m], with √(‖·‖₁‖·‖∞) as bound of each norm."""
         rows = np.zeros(self.model.count)
         for of_term in self._of_terms:
             sizes = np.abs(of_term.blocks.numpy().astype(np.float64))
@@ -147,7 +148,7 @@ class Hessian:
         self._invert_diagonal = self.model.kernel(linear.invert_diagonal, self.model.dtype)
 
     def multiply(self, p, q, active):
-        """q = A p, of the copies that are ``active`` (B,)."""
+        """q = A p for the copies that are ``active`` (B,)."""
         given = [self.offsets, self.columns, self.values, p, active, self.per_copy]
         self.model.launch(self._multiply, self.count, given, [q])
 
@@ -156,7 +157,7 @@ class Hessian:
         self.model.launch(self._invert_diagonal, self.count, [self.diagonal, self.values], [out])
 
     def matrices(self):
-        """The values of now on the host, for each copy a scipy matrix in block compressed rows (3n, 3n), double precision."""
+        """The present values on the host: for each copy a scipy matrix (3n, 3n) in block compressed rows, in float64."""
         from scipy.sparse import bsr_matrix
 
         n = self.model.per_copy

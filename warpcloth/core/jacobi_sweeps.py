@@ -1,4 +1,4 @@
-"""Jacobi sweeps as they are written: local steps of the elements, the transpose, a move. Faster ones are compared with it."""
+"""Jacobi sweeps in plain form: local steps of the elements, the transpose, a move. Tests compare faster backends with them."""
 
 import warp as wp
 
@@ -15,12 +15,12 @@ class JacobiSweeps:
         model: The :class:`warpcloth.model.model.Model`.
         x: x̃, (N,) vectors [m]; read only.
         h: Step [s].
-        correction: d (N,) [m], which sweeps move on.
-        multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, or Nones.
-        keys: Of each term (term, dtype, whether it is taken by its scalar constraint).
-        factors: Factors of Δλ, of each term (B·E,).
-        scale: Factors of the moves of vertices (N,).
-        spread: The number of sweeps that finite stiffness is spread over, or None.
+        correction: d (N,) [m], which the sweeps update.
+        multipliers: λ of each term, an array (B·E,) of numbers or M × 3 matrices, or None.
+        keys: For each term (term, dtype, whether its scalar constraint is used).
+        factors: Factors of Δλ for each term, (B·E,).
+        scale: Factors of the moves of the vertices, (N,).
+        spread: The number of sweeps that together make the correction of finite stiffness, or None.
     """
 
     def __init__(self, model, x, h, correction, multipliers, keys, factors, scale, spread):
@@ -44,7 +44,7 @@ class JacobiSweeps:
                 array.zero_()
 
     def launch(self, sweeps=1):
-        """Launches so many sweeps."""
+        """Launches this number of sweeps."""
         model, d = self.model, self.correction
         for _ in range(sweeps):
             model.refresh(EVALUATION, Moment(self.x, d))
@@ -56,5 +56,5 @@ class JacobiSweeps:
             model.launch(self._move, model.count, [model.inverse_mass, self._scale], [self._total, d])
 
     def parts(self, sweeps):
-        """Returns pairs of a function that launches and of how many times it runs, for so many sweeps."""
+        """Returns pairs of a function that launches and of how many times it runs, for this number of sweeps."""
         return [(self.launch, sweeps)]

@@ -1,4 +1,4 @@
-"""Copies put back to where they start, between steps."""
+"""The reset of copies to their start, between steps."""
 
 import numpy as np
 import warp as wp
@@ -11,7 +11,7 @@ from .status import Result
 
 
 class Reset:
-    """Puts copies of a stepper back, see :meth:`warpcloth.solvers.solver.Stepper.reset`.
+    """Resets copies of a stepper to their start, see :meth:`warpcloth.solvers.solver.Stepper.reset`.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
@@ -20,7 +20,7 @@ class Reset:
     def __init__(self, stepper):
         self.stepper, self.model = stepper, stepper.model
         self._kernel = None
-        self._buffers = {}  # of what comes from the host, made when first needed
+        self._buffers = {}  # for values from the host, made when first needed
 
     def _prepare(self):
         """Finds the kernel, and the arrays beside x and v with their starts, by address and size."""
@@ -105,7 +105,7 @@ class Reset:
         return isinstance(values, wp.array) and values.device == self.model.device
 
     def _buffered(self, name, dtype, count, values):
-        """The values in an array on the device that is kept."""
+        """The values in an array on the device that is used again in later calls."""
         if name not in self._buffers:
             self._buffers[name] = Mirror(wp.empty(count, dtype=dtype, device=self.model.device))
         self._buffers[name].write(values)

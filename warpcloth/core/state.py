@@ -1,4 +1,4 @@
-"""The state of a bound solver as a value: all that it carries from one step to the next."""
+"""The state of a bound solver as a value: everything that one step passes to the next."""
 
 import numpy as np
 import warp as wp
@@ -7,21 +7,21 @@ from .status import Result
 
 
 class State:
-    """Every array that a step reads and leaves to the next one, and what the steps so far have said.
+    """Every array that one step passes to the next, and the results of the steps so far.
 
-    A stepper adds what it carries beside x and v: the position residual of compensated summation, what a method knows of the
-    step before, how far keyframes have led the pins. Whoever copies, compares, resets or stores a state needs to know none of
-    these. What a step computes anew before it reads it is no part of a state.
+    A stepper registers its own arrays besides x and v with :meth:`add`, such as the position residual of compensated summation,
+    the move of the last step, or the number of steps that keyframes have made. Code that copies, compares, resets or stores a
+    state does not know which these are. Arrays that a step writes before it reads them do not belong to the state.
 
     Args:
         x: Positions (N,) vectors [m].
         v: Velocities (N,) vectors [m/s].
         batch_size: Copies of the scene, B.
-        shares: States of shares of the batch, whose x and v are views of these.
+        shares: States of the threads' shares of the batch, whose x and v are views of those of this state.
 
     Attributes:
-        arrays: All arrays on the device, by name, ``"x"`` and ``"v"`` among them; of N or of B entries.
-        starts: Values of these at the start of the model, of those of which it is neither 0 nor in the model.
+        arrays: All arrays on the device by name, with N or B entries, ``"x"`` and ``"v"`` among them.
+        starts: Values at the start, for those arrays that neither start at 0 nor have their start in the model.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).
     """
@@ -63,24 +63,24 @@ class State:
         return iter((self.x, self.v))
 
     def add(self, name, array):
-        """Takes an array in that is 0 at the start, or None, and returns it."""
+        """Registers an array that is 0 at the start, or None, and returns it."""
         if array is not None:
             self.arrays[name] = array
         return array
 
     def start_here(self, *names):
-        """Takes the values that the arrays of these names have now for those at the start."""
+        """Takes the present values of the arrays of these names as those at the start."""
         self.starts |= {name: wp.clone(self.arrays[name]) for name in names}
 
     def copy(self):
-        """A state of its own, equal to this one."""
+        """Returns an equal state with arrays of its own."""
         other = State(wp.clone(self.x), wp.clone(self.v), len(self.results), [share.copy() for share in self.shares])
         other.arrays |= {name: wp.clone(array) for name, array in self.arrays.items() if name not in other.arrays}
         other.starts, other.results, other.residual = self.starts, list(self.results), self.residual.copy()
         return other
 
     def assign(self, other):
-        """Makes this state equal to another of the same solver and model; the arrays stay where they are."""
+        """Copies the values of another state of the same solver and model into the arrays of this one."""
         for share, of_other in zip(self.shares, other.shares, strict=True):
             share.assign(of_other)
         for name, array in self.arrays.items():  # after the shares, whose x and v are parts of these
@@ -88,7 +88,7 @@ class State:
         self.results, self.residual = list(other.results), other.residual.copy()
 
     def __eq__(self, other):
-        """Whether every bit is the same; what is not a number equals itself."""
+        """Whether every bit is the same, so that a NaN equals itself."""
         if not isinstance(other, State):
             return NotImplemented
         mine, of_other = self.to_host(), other.to_host()
@@ -100,7 +100,7 @@ class State:
     __hash__ = None
 
     def to_host(self):
-        """Everything as NumPy arrays of their own, by name."""
+        """Returns everything as copies in NumPy arrays, by name."""
         found = {name: np.array(array.numpy()) for name, array in self.arrays.items()}
         found |= {"results": np.array([result.name for result in self.results]), "residual": np.array(self.residual)}
         for k, share in enumerate(self.shares):
@@ -108,10 +108,10 @@ class State:
         return found
 
     def from_host(self, values):
-        """Sets everything to what :meth:`to_host` gave for an equal scene and solver.
+        """Sets everything to the values that :meth:`to_host` returned for an equal scene and solver.
 
         Raises:
-            ValueError: If it is of another scene or solver.
+            ValueError: If they are of another scene or solver.
         """
         now = self.to_host()
         if now.keys() != values.keys() or any(now[name].shape != values[name].shape for name in now):

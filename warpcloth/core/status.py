@@ -1,4 +1,4 @@
-"""How a step and a run end; silence is not among the ways."""
+"""Results of steps and runs, and the sentence that says how a run ended."""
 
 from enum import Enum
 from typing import NamedTuple
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Result(Enum):
-    """How a step or a run ended, from good to bad; the value is what is shown."""
+    """How a step or a run ended, from best to worst; the value is the text that users see."""
 
     COMPLETED = "completed"
     CONVERGED = "converged"
@@ -26,7 +26,7 @@ class Result(Enum):
 
 UNBALANCED = "largest unbalanced acceleration of a vertex"
 
-# How a result can be used that is neither clearly good nor bad.
+# The use of a result that is neither clearly good nor clearly bad.
 _NEAR = "usable if this is near enough to the solution"
 
 
@@ -54,7 +54,7 @@ class Status(NamedTuple):
         message: One sentence: how it ended, whether the result can be used, and the residual with its unit and tolerance.
         good: The last good frame of each copy, (B,).
         measure: The quantity that the residual measures, or None for methods without a residual.
-        unit: The unit of the residual, with several copies that of the worst; or None.
+        unit: The unit of the residual, with several copies that of the worst one; or None.
     """
 
     result: Result
@@ -82,7 +82,7 @@ def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=No
         unit: Its unit.
         tolerance: The tolerance it was compared with, or None for methods that do not check it.
         copy: The copy whose residual it is, or None if there is one copy.
-        use: How the result can be used, if that differs from a run in time.
+        use: How the result can be used, if not as a run over time can.
     """
     use = use or {
         Result.COMPLETED: "usable" if measure is None else _NEAR,

@@ -1,11 +1,11 @@
-"""Sums and maxima of each copy, in two launches: chunks, and then their sum."""
+"""Sums and maxima of each copy, in two launches: over chunks, and then over the chunks' results."""
 
 import warp as wp
 
 from ..base.turns import in_turn
 from ..kernels import reduce
 
-# Chunks of a sum per copy: one on the CPU, which runs them in turn; on a GPU enough for it to be busy.
+# Chunks of a sum per copy on a GPU, enough to keep it busy; the CPU, which would run them one after another, has one.
 CHUNKS = 256
 
 
@@ -24,12 +24,12 @@ class Sums:
         self._finish_largest = model.kernel(reduce.finish_largest)
 
     def dot(self, a, b, out, active=None):
-        """out (B,) = Σ a·b over the vertices of each copy; anything for those not ``active`` (B,), if that is given."""
+        """out (B,) = Σ a·b over the vertices of each copy; undefined for copies not ``active`` (B,), if that is given."""
         self.model.launch(self._dot, self.partial.shape, [a, b, active, self.model.per_copy], [self.partial])
         self._add_chunks(0, out)
 
     def sum(self, values, per_copy, out, accumulate=0):
-        """out (B,) = Σ of the ``per_copy`` values of each copy, and what out held too where ``accumulate`` is 1."""
+        """out (B,) = Σ of the ``per_copy`` values of each copy, added to out if ``accumulate`` is 1."""
         self.model.launch(self._sum, self.partial.shape, [values, per_copy], [self.partial])
         self._add_chunks(accumulate, out)
 
@@ -43,7 +43,7 @@ class Sums:
 
 
 class RowSums(Sums):
-    """Sums and maxima of numbers that every copy has ``per_copy`` of, such as the rows of constraints."""
+    """Sums and maxima of arrays with ``per_copy`` numbers for each copy, such as the rows of constraints."""
 
     @in_turn
     def __init__(self, model, per_copy):
@@ -61,6 +61,6 @@ class RowSums(Sums):
         self._add_chunks(0, out)
 
     def largest(self, values, out):
-        """out (B,) = max of each copy of double precision ``values`` of 0 or more."""
+        """out (B,) = max of each copy of ``values``, which are 0 or more and in double precision."""
         self.model.launch(self._largest, self.partial.shape, [values, self.per_copy], [self.partial])
         self.model.launch(self._finish_largest, self.model.copies, [self.partial], [out])

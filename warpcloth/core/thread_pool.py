@@ -1,4 +1,4 @@
-"""Threads of this process that replay graphs side by side on the CPU: Warp leaves Python alone meanwhile."""
+"""Threads of this process that replay graphs in parallel on the CPU: Warp releases Python's lock meanwhile."""
 
 import ctypes
 import os
@@ -13,7 +13,7 @@ from ..kernels import barrier as kernels
 
 
 def _leave():
-    """The address of the C function that leaves the core to another thread."""
+    """The address of the C function that yields the core to another thread."""
     function = ctypes.windll.kernel32.SwitchToThread if sys.platform == "win32" else ctypes.CDLL(None).sched_yield
     return ctypes.cast(function, ctypes.c_void_p).value
 
@@ -22,7 +22,7 @@ class ThreadPool:
     """Threads of the CPU that share the steps of one stepper: each replays graphs of its own, and they meet at a barrier.
 
     Args:
-        threads: How many; one thread starts none, and waits for nobody.
+        threads: Number of threads. With 1 no thread is started, and there is no barrier.
     """
 
     def __init__(self, threads):
@@ -33,18 +33,18 @@ class ThreadPool:
             self._leave = _leave()
 
     def _start(self):
-        """Starts the threads, which a forked process does not take over."""
+        """Starts the threads; a forked process does not inherit them and starts its own."""
         self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="warpcloth")
         self._busy, self._running, self._process = threading.Lock(), None, os.getpid()
 
     @property
     def thread(self):
-        """The thread that a launch or a recording here is for, from 0."""
+        """Number of the thread, from 0, for which this thread launches or records."""
         return getattr(self._here, "thread", 0)
 
     @property
     def leads(self):
-        """Whether that is the first thread, which does the work that is not shared."""
+        """Whether :attr:`thread` is the first, which does the work that is not shared."""
         return self.thread == 0
 
     def as_thread(self, thread, launch):
@@ -60,29 +60,29 @@ class ThreadPool:
         return launch_part
 
     def part(self, count):
-        """Returns the (first, count) of ``count`` things that are for this thread."""
+        """Returns (first, count) of the share of this thread in ``count`` items."""
         first = count * self.thread // self.threads
         return first, count * (self.thread + 1) // self.threads - first
 
     def launch_barrier(self, model):
-        """Launches a barrier: a thread goes on when all have arrived. One thread needs none."""
+        """Launches a barrier: a thread continues when all have arrived. With one thread it launches nothing."""
         if self.threads > 1:
             model.launch(model.kernel(kernels.wait_at_barrier), 1, [self.threads, self._leave], [self._barrier])
 
     def launch_alone(self, model, *launches):
-        """Calls these in the first thread; the others wait until they are done."""
+        """Calls ``launches`` in the first thread; the other threads wait until they are done."""
         if self.leads:
             for launch in launches:
                 launch()
         self.launch_barrier(model)
 
     def run(self, functions):
-        """Calls one function in each thread, as many as there are or fewer, and returns when all have ended.
+        """Calls each function in a thread of its own, and returns when all have ended; there are at most as many as threads.
 
-        Calls from several threads, as of several steppers of one model, run one after another.
+        Calls from several threads, such as those of several steppers of one model, run one after another.
 
         Raises:
-            Exception: The first that a function raises. Threads that wait for it are let go.
+            Exception: The first one that a function raises. Threads that wait for that function at the barrier are released.
         """
         if self.threads == 1:
             for function in functions:

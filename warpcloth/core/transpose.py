@@ -2,13 +2,13 @@
 
 
 class Transpose:
-    """Adds Dᵀz up: on the CPU element by element, on CUDA vertex by vertex, in the same order every time.
+    """Adds Dᵀz to arrays of vertices: on the CPU element by element, on CUDA vertex by vertex, always in the same order.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        elements: Its :class:`warpcloth.model.elements.DeviceElements`.
+        elements: The :class:`warpcloth.model.elements.DeviceElements` of the term.
         scatter, gather: The factories of the two kernels, see :mod:`warpcloth.kernels.transpose`.
-        key: Arguments of both.
+        key: Arguments of both factories.
     """
 
     def __init__(self, model, elements, scatter, gather, *key):

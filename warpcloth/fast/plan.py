@@ -1,9 +1,10 @@
-"""The one door to code for speed alone: each backend does the work of the core, with the same results but for rounding.
+"""The one entry to code that exists for speed alone: each backend computes the same as the core, up to rounding.
 
-- ``core``, the readable one: gradients and corrections term by term, then an update of the vertices.
-- ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices, and of several threads each has a subdomain;
-  Jacobi sweeps scatter corrections while they compute them; gradients are those of the core.
-- ``gather``, for CUDA: gradients, Jacobi sweeps and explicit steps are one launch for all terms, or one for several steps.
+- ``core``, the plain one: gradients and corrections term by term, then an update of the vertices.
+- ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices, and with several threads each has a
+  subdomain; Jacobi sweeps scatter corrections as they are computed; gradients are those of the core.
+- ``gather``, for CUDA: a gradient, a Jacobi sweep or an explicit step is one launch for all terms; one launch may do several
+  explicit steps.
 
 Tests run each backend by its name and compare it with the core.
 """
@@ -25,7 +26,7 @@ BACKENDS = ("auto", "core", "blocks", "gather")
 
 
 class Plan:
-    """How the work of a model is done.
+    """The backend of a model: it makes the gradients, explicit steps and Jacobi sweeps that solvers ask for.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -33,28 +34,28 @@ class Plan:
 
     Attributes:
         model, backend: As given.
-        record: :class:`warpcloth.fast.step_record.StepRecord` of the explicit steps, once they are made; else None.
+        record: The :class:`warpcloth.fast.step_record.StepRecord` of the explicit steps, or None before they are made.
     """
 
     def __init__(self, model, backend):
         self.model, self.backend, self.record = model, backend, None
 
     def gradient(self, corrected=False, terms=None):
-        """Returns a :class:`warpcloth.core.gradient.Gradient`, or a faster one of the same methods."""
+        """Returns a :class:`warpcloth.core.gradient.Gradient`, or a faster class with the same methods."""
         return (GatherGradient if self.backend == "gather" else Gradient)(self.model, corrected, terms)
 
     def explicit_step(self, state, h, symplectic, count, pool):
-        """Returns explicit steps, see :class:`warpcloth.core.explicit_step.ExplicitStep`.
+        """Returns a :class:`warpcloth.core.explicit_step.ExplicitStep`, or a faster class with the same methods.
 
         Args:
-            state: x and v (N,), which steps move on.
+            state: x and v (N,), which the steps update.
             h: Step [s].
-            symplectic: Whether x moves on by the v after the step.
+            symplectic: Whether x is updated with v after the step.
             count: Steps that moved pins have made (B,) int32, or None.
             pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares them.
 
         Raises:
-            ValueError: If threads cannot share them, naming the term.
+            ValueError: If threads cannot share the steps; it names the term.
         """
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
         if self.model.mobility is not None and pool.threads == 1:
@@ -71,7 +72,7 @@ class Plan:
         return steps
 
     def jacobi_sweeps(self, *given):
-        """Returns Jacobi sweeps, see :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`, whose arguments they have."""
+        """Returns a :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`, or a faster class with the same interface."""
         if self.model.mobility is not None:
             return JacobiSweeps(self.model, *given)
         return {"core": JacobiSweeps, "blocks": ScatterSweeps, "gather": GatherSweeps}[self.backend](self.model, *given)
@@ -82,10 +83,10 @@ def plan(model, backend="auto"):
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        backend: One of :data:`BACKENDS`; ``"auto"`` is that of the device.
+        backend: One of :data:`BACKENDS`; ``"auto"`` is ``"gather"`` on CUDA and ``"blocks"`` on the CPU.
 
     Raises:
-        ValueError: If there is no such backend, or the device cannot have it.
+        ValueError: If there is no such backend, or the device does not support it.
     """
     choice("backend", backend, BACKENDS)
     if backend == "auto":
@@ -96,10 +97,10 @@ def plan(model, backend="auto"):
 
 
 def _refuse_undivided(model, backend, threads):
-    """Refuses one cloth with terms that subdomains do not have, and backends without subdomains.
+    """Refuses terms that subdomains cannot take, and backends without subdomains.
 
     Raises:
-        ValueError: Naming the term or the backend.
+        ValueError: It names the term or the backend.
     """
     if backend != "blocks":
         raise ValueError(f"threads is {threads} with backend {backend!r}; more than 1 is for 'blocks'")

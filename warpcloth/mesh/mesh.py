@@ -32,23 +32,24 @@ _BYTES_OF_A_VERTEX = 24 + 16 + 48
 class Mesh:
     """Triangles, or edges alone as for a chain or a net, in their rest shape.
 
-    Every array is copied, checked and made read-only. Edges are found at once, the rest of the topology when it is
-    first asked for, and kept.
+    Every array is copied, checked and made read-only. Edges are computed at once, and the rest of the topology when it is first
+    used.
 
     Attributes:
         points: Rest positions (n, 3) [m], float64.
         triangles: Vertices of each triangle (T, 3), int32, counter-clockwise from the front; (0, 3) of an edge mesh.
-        edges: Vertices of each edge (E, 2), int32. Of triangles: store every triangle edge, sort, drop duplicates; so
-            each row has its smaller index first, and rows are in lexicographic order. Of an edge mesh: as given.
+        edges: Vertices of each edge (E, 2), int32. Of triangles, each edge occurs once, with the smaller index first, and rows
+            are in lexicographic order. Of an edge mesh, edges are as given.
         texture_coordinates: One st pair for each vertex (n, 2), float64, or None.
         grid_shape: (nx, ny) if vertex i + nx·j is column i, row j of a grid of four-sided cells, or None.
-        up_axis: "Y" or "Z", which gravity and files follow; None if unknown, which they take as "Y".
-        parts: Of a mesh that :meth:`join` made (first vertex, number of vertices, grid_shape) of each part by name, or None.
+        up_axis: "Y" or "Z", the up axis of gravity and of files; None if unknown, which counts as "Y".
+        parts: For a mesh that :meth:`join` made, (first vertex, number of vertices, grid_shape) of each part by name, else
+            None.
 
     Raises:
         ValueError: An array has the wrong shape or type, is empty, or has an element (named by its index) that is not
-            finite, refers to no vertex, repeats a vertex, has no area or length, or (edges) occurs twice; or the up axis is
-            another.
+            finite, refers to no vertex, repeats a vertex, has no area or length, or (edges) occurs twice; or the up axis
+            is neither "Y" nor "Z".
 
     Examples:
         >>> import warpcloth as wc
@@ -116,21 +117,21 @@ class Mesh:
 
         - "diagonal": rectangular cells, all diagonals from (i, j) to (i+1, j+1).
         - "alternating": rectangular cells, the diagonals of neighbouring cells mirrored, like a checkerboard.
-        - "equilateral": rows along x of edge a = size/(nx−1), spaced a·√3/2 along z, odd rows shifted by a/2 along +x;
-          so the two sides at the ends of the rows zigzag by a/2, and there are no half triangles. It has no four-sided
-          cells and so no `grid_shape`. Hinge energies are isotropic on it, and are not on the other two.
+        - "equilateral": rows along x with edges of length a = size/(nx−1), spaced a·√3/2 along z, odd rows shifted by a/2 along
+          +x. So the boundary at the ends of the rows zigzags by a/2, and there are no half triangles. The grid has no
+          four-sided cells and so no `grid_shape`. Hinge energies are isotropic on this pattern only.
 
         Args:
             nx: Number of vertices of a row, at least 2.
             ny: Number of rows, at least 2.
             size: Width and depth (along x, along z) or one length for both [m]; of "equilateral" the length of a row.
-            pattern: How cells are cut into triangles.
+            pattern: How the grid is divided into triangles.
 
         Returns:
             Mesh: nx·ny vertices, 2(nx−1)(ny−1) triangles; texture coordinates fill the unit square.
 
         Raises:
-            ValueError: A count, the size or the pattern is none of those above.
+            ValueError: A count, the size or the pattern is not allowed.
         """
         nx, ny = _count("nx", nx), _count("ny", ny)
         if pattern not in ("diagonal", "alternating", "equilateral"):
@@ -163,8 +164,8 @@ class Mesh:
     def join(cls: type[Own], meshes: Mapping[str, "Mesh"]) -> Own:
         """One mesh of several, such as pieces of a garment: the vertices of the first part, then those of the next.
 
-        ``part(name)`` selects the vertices of a part, a term with ``part=name`` acts on that part alone, and own pairs of a
-        :class:`warpcloth.Spring` join two. Texture coordinates are kept if all parts have them.
+        The selection ``part(name)`` is the vertices of a part, a term with ``part=name`` acts on that part alone, and a
+        :class:`warpcloth.Spring` with given pairs can join two parts. Texture coordinates are kept if all parts have them.
 
         Args:
             meshes: The mesh of each part by its name, which must be an identifier.
@@ -175,7 +176,7 @@ class Mesh:
         return cls(**joined(meshes))
 
     def part(self, name: str) -> "Mesh":
-        """A part by itself, as it was joined.
+        """Returns the mesh of a part, as it was before it was joined.
 
         Raises:
             ValueError: The mesh has no part of that name.
@@ -211,7 +212,7 @@ class Mesh:
         Args:
             n: Number of vertices, at least 2.
             length: Length of the whole chain [m].
-            direction: The way that it runs, of any length but zero.
+            direction: Direction from the first vertex to the last; its length does not matter, but must not be 0.
 
         Returns:
             Mesh: An edge mesh.
@@ -236,7 +237,7 @@ class Mesh:
             prim: Name of the geometry, or path of the prim, where the file has several.
 
         Returns:
-            Mesh: Vertices in the order of the file; of the class that it is asked of.
+            Mesh: With vertices in the order of the file, of the class on which it was called.
         """
         read = READERS.get(Path(path).suffix.lower())
         if read is None:
@@ -244,7 +245,7 @@ class Mesh:
         return read(path, prim, cls)
 
     def select(self, text: str) -> np.ndarray:
-        """Vertices described by a text such as "z == 0 and not corners": see `selection.select`.
+        """Returns the vertices of a selection such as "z == 0 and not corners", see `selection.select`.
 
         Args:
             text: The description.
@@ -253,17 +254,17 @@ class Mesh:
             np.ndarray: Vertex indices, sorted, each once, int32.
 
         Raises:
-            ValueError: The text does not follow the grammar: where, and what is allowed there.
+            ValueError: The text does not follow the grammar; the message says where, and what is allowed there.
         """
         return select(self, text)
 
     def corners(self) -> np.ndarray:
         """Vertices at the corners.
 
-        Of a grid the four corners (0, 0), (nx−1, 0), (0, ny−1), (nx−1, ny−1). Of other triangle meshes the boundary
-        vertices nearest to the four corners of the boundary's bounding box, measured in the plane of its two largest
-        extents, in the same order; a vertex nearest to two of them is given once. An equilateral grid gets the same
-        four as the others. Of edge meshes the ends: vertices of exactly one edge.
+        For a grid, the four corners (0, 0), (nx−1, 0), (0, ny−1), (nx−1, ny−1), also with equilateral cells. For other triangle
+        meshes, the boundary vertices nearest to the four corners of the boundary's bounding box, measured in the plane of its
+        two largest extents, in the same order; a vertex nearest to two corners occurs once. For edge meshes, the ends: vertices
+        of exactly one edge.
 
         Returns:
             np.ndarray: Vertex indices, int32.
@@ -341,8 +342,8 @@ class Mesh:
         """The four vertices of every pair of triangles that share an edge (H, 4), int32, in the order of the edges.
 
         [x₀, x₁, x₂, x₃]: the first triangle, that of the lower index, runs along the shared edge from x₀ to x₁, so its
-        normal is (x₁−x₀)×(x₂−x₀) with x₂ its third vertex. x₃ is the third vertex of the second triangle; where both
-        have the same orientation the second runs from x₁ to x₀. Where they do not, it is a hinge all the same.
+        normal is (x₁−x₀)×(x₂−x₀) with x₂ its third vertex. x₃ is the third vertex of the second triangle; if both
+        triangles have the same orientation, the second runs from x₁ to x₀. If not, the pair is a hinge too.
 
         Raises:
             ValueError: More than two triangles share an edge, or two triangles have the same three vertices.
@@ -397,7 +398,7 @@ class Mesh:
 
     @cached_property
     def vertex_areas(self) -> np.ndarray:
-        """Lumped areas (n,) [m²]: a third of the adjacent triangles' areas that are finite; zero without any."""
+        """Lumped areas (n,) [m²]: a third of each finite area of an adjacent triangle; 0 without any."""
         third = np.repeat(np.where(np.isfinite(self.triangle_areas), self.triangle_areas, 0.0) / 3, 3)
         return _read_only(np.bincount(self.triangles.ravel(), weights=third, minlength=len(self.points)))
 
@@ -453,8 +454,8 @@ class Mesh:
 class Surface(Mesh):
     """A mesh that is only measured: a triangle may be flat or name a vertex twice, and a point need not be finite.
 
-    A garment then need not be refused for one bad triangle; whoever measures leaves out those that are `degenerate`, and says
-    so. Edges and what follows from them count such triangles too, so that an edge may join a vertex with itself.
+    So a garment is not refused for one bad triangle; measures leave out triangles that are `degenerate`, and report them. Edges
+    and topology include such triangles, so that an edge may join a vertex with itself.
     """
 
     @cached_property

@@ -1,8 +1,8 @@
-"""Implicit Euler, midpoint and BDF2, as what comes before and after one and the same minimisation.
+"""Implicit Euler, midpoint and BDF2, which share one minimisation.
 
-Each step of each of them minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x); they differ in the effective step hₑ, in x̃ and in what the
-minimiser is taken for (Hairer and Wanner 1996, *Solving ordinary differential equations II*). As solvers minimise over the
-correction d = x − x̃, velocities follow from d/hₑ = hₑ a with a = −∇U/m at the minimiser.
+Each step of each of them minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x); they differ in the effective step hₑ, in x̃ and in how the new
+state follows from the minimiser (Hairer and Wanner 1996, *Solving ordinary differential equations II*). As solvers minimise
+over the correction d = x − x̃, velocities follow from d/hₑ = hₑ a with a = −∇U/m at the minimiser.
 """
 
 import warp as wp
@@ -12,7 +12,7 @@ from ..terms.refresh import Moment
 
 
 class Euler:
-    """x̃ = x₀ + h v₀ + h² g; the minimiser is x₁, v₁ = (x₁ − x₀)/h. Of first order.
+    """x̃ = x₀ + h v₀ + h² g; the minimiser is x₁, v₁ = (x₁ − x₀)/h. First order.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper` that it belongs to.
@@ -27,20 +27,20 @@ class Euler:
         self.stepper, self.he = stepper, self.part * stepper.h
 
     def start(self):
-        """Before the first step: what a method needs that looks back."""
+        """Prepares the past state before the first step, for methods that need one."""
 
     @property
     def moment(self):
-        """The :class:`warpcloth.terms.refresh.Moment` where a step begins; (s − s̃)/hₑ is then the rate of damped s."""
+        """The :class:`warpcloth.terms.refresh.Moment` where a step begins, by which (s − s̃)/hₑ is the rate of a damped s."""
         return Moment(self.stepper.state.x)
 
     def launch_prediction(self):
-        """x = x̃, v = (x̃ − x₀)/hₑ; pins where they are then."""
+        """Sets x = x̃ and v = (x̃ − x₀)/hₑ, and moves the pins to the end of the step."""
         self._launch(kernels.predict, [*self.stepper.model.free_gravity, self.he], list(self.stepper.state))
         self.stepper.launch_pins()
 
     def launch_finish(self, correction):
-        """The state at the end of the step."""
+        """Sets the state at the end of the step."""
         self._launch(kernels.finish, [correction, self.he], list(self.stepper.state))
 
     def _launch(self, factory, inputs, outputs):
@@ -49,7 +49,7 @@ class Euler:
 
 
 class Midpoint(Euler):
-    """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Of second order. Pins of xₘ are those of t + h/2."""
+    """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Second order. At xₘ pins are where they are at t + h/2."""
 
     part = 0.5
 
@@ -72,18 +72,18 @@ class Midpoint(Euler):
 class BDF2(Euler):
     """hₑ = 2h/3, x̃ = (4x₀ − x₋₁)/3 + hₑ(4v₀ − v₋₁)/3 + hₑ² g; the minimiser is x₁, v₁ = (4v₀ − v₋₁)/3 + hₑ(a₁ + g).
 
-    Of second order. Two steps of Euler of hₑ from x₀, to v₁ and v₂, say what was before:
+    Second order. Two steps of Euler of hₑ from x₀, with velocities v₁ and v₂ after them, give the past state:
 
         v₋₁ = v₀ − h a₀, a₀ = (v₁ − v₀)/hₑ;  x₋₁ = x₀ − h v̄ + ½h²(v₂ − v₁)/hₑ, v̄ = 2v₁ − v₂
 
-    v̄ is v₀ but for O(h²) and for what is stiff or damped so much that the first step stops it, which x₋₁ must not have move on.
-    Errors of O(h) in accelerations keep the order, hₑ the one matrix for all steps, and from no start does linear motion gain
-    energy. Pins stand still before the start. Damping looks back over kinks of their motion: right after one its force has half
-    of the jump too much, which is just what (v₀ − v₋₁)/3 lacks.
+    v̄ is v₀ up to O(h²), except for modes so stiff or damped that the first step stops them, which must not move in x₋₁ either.
+    Errors of O(h) in accelerations do not change the order, steps of hₑ have the matrix of all other steps, and linear motion
+    gains energy from no start. Pins stand still before the start. Where the velocity of pins jumps, the past state is from
+    before the jump: the damping force is then too large by half of the jump, which is exactly what (v₀ − v₋₁)/3 lacks.
 
     Attributes:
         move: x₀ − x₋₁ (N,) [m].
-        v_before: v₋₁ (N,) [m/s]; unused of pins.
+        v_before: v₋₁ (N,) [m/s]; not used for pins.
     """
 
     part = 2.0 / 3.0
@@ -94,9 +94,10 @@ class BDF2(Euler):
         self.v_before = stepper.state.add("v before", stepper.model.vectors())
 
     def start(self):
-        """Finds what was before, by steps with x₋₁ = x₀ and v₋₁ = v₀, which are those of Euler of hₑ, and puts the state back.
+        """Finds the past state, by two steps with x₋₁ = x₀ and v₋₁ = v₀, which are steps of Euler of hₑ, and restores the
+        state.
 
-        How these steps end counts as it does of others.
+        The results of these steps count like those of other steps.
         """
         stepper, model, (x, v) = self.stepper, self.stepper.model, self.stepper.state
         for _ in range(2):

@@ -1,4 +1,4 @@
-"""The loop of the methods that iterate towards a minimiser, and the acceleration that their residuals are relative to."""
+"""The loop of the methods that iterate towards a minimiser, and the scale of their residuals."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ class Ended(NamedTuple):
     Attributes:
         results: A :class:`Result` of each copy, a list of B.
         residual: The last residual of each copy, (B,).
-        iterations: How many there were.
+        iterations: Number of iterations.
     """
 
     results: list
@@ -22,15 +22,15 @@ class Ended(NamedTuple):
 
 
 def iterate(method, tolerance, iterations):
-    """Iterates until every copy has converged, diverged or can come no nearer, or the iterations are used up.
+    """Iterates until each copy has converged, diverged or cannot improve, or the iterations are used up.
 
     Args:
-        method: What has the ``model`` and three functions:
+        method: An object with the ``model`` and three functions:
 
-            - ``start()`` goes to the first iterate;
-            - ``measure()`` returns the residual (B,) of the iterate, which is not finite in a copy that diverged, and a dict of
-              other :class:`Result` that copies may have ended with, each with truth values (B,);
-            - ``iterate(active)`` does one iteration of the copies that are active, (B,) truth values.
+            - ``start()`` sets the first iterate.
+            - ``measure()`` returns the residual (B,) of the iterate, which is not finite in a copy that diverged, and a dict
+              from any other :class:`Result` to the truth values (B,) that say which copies end with it.
+            - ``iterate(active)`` does one iteration of the active copies, (B,) truth values.
 
         tolerance: The residual at which a copy has converged.
         iterations: The most iterations.
@@ -58,19 +58,19 @@ def iterate(method, tolerance, iterations):
 
 
 class GravityScale:
-    """The acceleration that the residuals of each copy are relative to: gravity's, where there is any.
+    """The acceleration to which the residuals of each copy are relative: that of gravity, if there is any.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
 
     Attributes:
-        gravity: (B,) [m/s²].
+        gravity: Magnitude of gravity (B,) [m/s²].
     """
 
     def __init__(self, model):
         self.gravity = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1)
 
     def or_else(self, acceleration):
-        """Gravity's, without any the ``acceleration`` (B,) [m/s²] given, and 1 m/s² where that is 0, (B,)."""
+        """Returns gravity (B,) [m/s²]; ``acceleration`` (B,) where gravity is 0, and 1 m/s² where both are."""
         scale = np.where(self.gravity > 0.0, self.gravity, acceleration)
         return np.where(scale != 0.0, scale, 1.0)

@@ -27,8 +27,8 @@ from .frames_ahead import state_of
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
 
-# Of frames that a CUDA device has computed and nobody has taken yet: bytes on either side, the share of the free memory of the
-# device that these are at most, and how many.
+# Limits on the frames that a CUDA device computes ahead: their bytes on host and device each, their share of the free memory of
+# the device, and their number.
 AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
 
 
@@ -37,13 +37,13 @@ class Animation:
     """The result of a run: the start and every good frame after it.
 
     Attributes:
-        points: (frames+1, n, 3) [m]; in memory, or read from ``output`` when asked for (float32 then). Of B > 1 copies
-            (frames+1, B, n, 3).
+        points: (frames+1, n, 3) [m]; with B > 1 copies (frames+1, B, n, 3). With ``output`` they are float32 and read from the
+            file when asked for, else in memory.
         velocities: The same shape [m/s].
         times: (frames+1,) [s].
         status: :class:`warpcloth.core.status.Status`.
-        timings: ``compile`` (building the model and binding the solver, with compiling what was not in the cache),
-            ``factorise`` (constant matrices, a part of it) and ``frames`` (a list) [s].
+        timings: Times [s]: ``compile`` (building the model and binding the solver, which compiles kernels that are not in the
+            cache), ``factorise`` (of constant matrices, a part of ``compile``) and ``frames`` (a list).
         worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame; with B > 1 copies one value per copy, (B,), over
             its good frames.
         output: Path of the USD file, or None.
@@ -80,36 +80,36 @@ def simulate(
 ) -> Animation:
     """Runs a scene with a solver.
 
-    Large meshes whose neighbours are far apart in memory are renumbered for the run, see
-    :func:`warpcloth.mesh.ordering.order_of_run`; what comes out has the order of the scene. While a frame is written the next
+    For the run, the vertices of a large mesh are reordered if neighbours are far apart in memory, see
+    :func:`warpcloth.mesh.ordering.order_of_run`; the results have the order of the scene. While a frame is written the next
     one is computed. Calls from several threads of a process take turns frame by frame, see :mod:`warpcloth.base.turns`.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
-        solver: Its options, such as ``wc.Newton(dt=1/240)``.
-        output: Path of a USD file (.usd, .usda, .usdc, .usdz) to write, frame by frame; memory then stays flat. A scene that
-            was read from a stage is written as a layer over it.
+        solver: The solver with its options, such as ``wc.Newton(dt=1/240)``.
+        output: Path of a USD file (.usd, .usda, .usdc, .usdz) to write, frame by frame, so that memory does not grow. If the
+            scene was read from a stage, the animation is a layer over that stage.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
-        frames: Number of frames, if not those of the scene.
+        frames: Number of frames after the first; by default that of the scene.
         copies: See :class:`warpcloth.model.model.Model`; ``output`` takes one copy.
         vary: See :class:`warpcloth.model.model.Model`.
-        single_file: Whether ``output`` is to be one file in the end, with nothing beside it.
-        progress: Function called with (frame, frames) once each frame is kept, from 0, the start, on; or None.
+        single_file: Whether ``output`` is one file at the end, with nothing beside it.
+        progress: Function that is called with (frame, frames) after each frame is stored, from frame 0, the start; or None.
         threads: See :class:`warpcloth.model.model.Model`.
-        resume: Whether to go on with the run to ``output`` that was interrupted, from the last chunk of frames it finished, to
-            the bit of a run that was not interrupted. Everything but ``frames`` and ``single_file`` must be as it was.
+        resume: Whether to continue the interrupted run to ``output`` after its last finished chunk of frames. The result equals
+            that of an uninterrupted run bit for bit. All arguments but ``frames`` and ``single_file`` must be the same.
 
     Returns:
-        :class:`Animation`. A run that diverges ends with its last good frame and says so in ``status``. Of several copies the
-        others go on; one that diverged is NaN from there.
+        :class:`Animation`. A run that diverges ends with its last good frame, and ``status`` says so. With several copies the
+        others continue, and a copy that diverged is NaN from then on.
 
     Raises:
         BlockingIOError: If another process, or thread, is writing ``output``.
         Interrupted: A KeyboardInterrupt, if the user interrupts; the message says which frames are in ``output``.
         OSError: If a file cannot be written; the message also says which frames are in ``output``.
-        ValueError: If an argument breaks a rule, the scene's stage has changed and no longer fits the frames, or there is
-            nothing to resume, or another run.
+        ValueError: If an argument breaks a rule, the scene's stage has changed and no longer fits the frames, or ``output`` has
+            no run to resume or another one.
 
     Examples:
         >>> import warpcloth as wc
@@ -164,7 +164,7 @@ def simulate(
 
 @in_turn
 def _resume(checkpoint, frames, stepper, watch):
-    """Puts a stepper and a watch back to a checkpoint, and returns the number of its frame."""
+    """Sets a stepper and a watch to a checkpoint, and returns the number of its frame."""
     if frames < checkpoint.frame:
         raise ValueError(f"frames is {frames}; the run to be resumed has {checkpoint.frame} already, and this must be no less")
     stepper.state.from_host(checkpoint.state)
@@ -183,10 +183,10 @@ def _refuse_size(frames, scene, dtype, copies, output):
 
 
 def _ahead(model, output):
-    """How many frames are computed beyond the one that is watched and written.
+    """The number of frames that are computed ahead of the one that is watched and written.
 
-    On CUDA so many that the device waits for nobody until they fill ``AHEAD`` bytes, or a share of what is free. On the CPU
-    one, where there is a file to write and a core to spare; frames in memory are only watched.
+    On CUDA as many as fill ``AHEAD`` bytes or a share of the free memory, so that the device need not wait. On the CPU one, if
+    there is a file to write and a free core, else none.
     """
     if model.device.is_cuda:
         room = min(AHEAD, int(SHARE * model.device.free_memory))

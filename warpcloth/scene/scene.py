@@ -1,4 +1,4 @@
-"""Scenes: a scene is data, and holds no solver. Any solver that supports its terms runs it unchanged."""
+"""Scenes: a scene is data without a solver. Any solver that supports its terms runs it unchanged."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields
@@ -23,12 +23,12 @@ _MOST_FRAMES = 2**31 - 1  # what counts them on the device is int32
 
 @dataclass(frozen=True, eq=False)
 class Pins:
-    """Vertices that do not obey forces.
+    """Vertices whose motion is prescribed.
 
     Attributes:
         vertices: Indices (p,), or a selection of the mesh such as ``"x<0.01"``.
-        keyframes: Positions (F, p, 3) [m] at the scene's frames 0 … F−1, linear between them, at rest after the last; in the
-            order of ``vertices``. Without them the pins stay where they start.
+        keyframes: Positions (F, p, 3) [m] at frames 0 … F−1 of the scene, in the order of ``vertices``. Pins move
+            linearly between them and stand still after the last. Without keyframes they stay where they start.
 
     Examples:
         >>> import warpcloth as wc
@@ -59,22 +59,22 @@ class Pins:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A cloth, what acts on it, and for how long. SI units. ``dataclasses.replace`` changes fields of one.
+    """A cloth, what acts on it, and for how long, in SI units. ``dataclasses.replace`` returns a scene with other fields.
 
     Attributes:
         mesh: The :class:`Mesh`; its points are the rest shape.
-        density: Mass per area [kg/m²], lumped: a third of each adjacent triangle; of a mesh of edges alone per length
-            [kg/m], half of each adjacent edge.
-        masses: Mass of each vertex, (n,) [kg], in place of ``density``; of a scene with a density it is None, and
-            :attr:`vertex_masses` has those of both.
-        positions: Where the vertices start, (n, 3) [m]; the rest shape if not given.
-        velocities: How they start, (n, 3) [m/s]; at rest if not given. What they say of pinned vertices does not matter.
+        density: Mass per area [kg/m²]: each vertex has the mass of a third of each adjacent triangle. For an edge mesh, mass
+            per length [kg/m]: each vertex has the mass of half of each adjacent edge.
+        masses: Mass of each vertex, (n,) [kg], in place of ``density``, else None; :attr:`vertex_masses` has the masses in
+            either case.
+        positions: Positions at the start, (n, 3) [m]; by default the rest shape.
+        velocities: Velocities at the start, (n, 3) [m/s]; by default 0. Those of pinned vertices are ignored.
         terms: The energies, see :mod:`warpcloth.terms`.
-        pins: :class:`Pins`, or vertices or a selection of fixed ones.
+        pins: :class:`Pins`, or the indices or a selection of fixed vertices.
         gravity: Acceleration (3,) [m/s²]; by default 9.81 down the up axis of the mesh, or down y if it has none.
-        duration: [s], a whole number of frames.
+        duration: Duration [s], a whole number of frames.
         fps: Frames per second.
-        name: For reports and files.
+        name: Name in reports and files.
         stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; an animation is then written as a
             layer over that stage.
         free_axes: Along which axes of space each vertex may move, (n, 3) truth values; all of them if not given. A locked
@@ -108,7 +108,7 @@ class Scene:
 
     @property
     def declared(self) -> tuple[object, ...]:
-        """All that it declares beside the cloth itself, any of which may put energy in."""
+        """All that it declares besides the cloth itself; any of it may put energy into the cloth."""
         return (self.pins, *self.terms)
 
     def __post_init__(self) -> None:
@@ -246,10 +246,10 @@ def _checked_axes(free_axes, n):
 
 
 def checked_pins(pins: Any, mesh: Mesh) -> Pins:
-    """`Pins` whose vertices are indices of a mesh, int32, from all that a scene takes as pins.
+    """Returns `Pins` with indices of a mesh, int32, from anything that a scene takes as pins.
 
     Raises:
-        ValueError: A vertex that the mesh has not, or twice; keyframes of a wrong shape or not finite.
+        ValueError: A vertex is not in the mesh or occurs twice, or keyframes have a wrong shape or are not finite.
     """
     pins = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins)
     vertices = distinct_vertices("pins.vertices", pins.vertices, mesh)

@@ -1,4 +1,4 @@
-"""ADMM: implicit Euler split into the elements and the vertices, which meet by multipliers."""
+"""ADMM: implicit Euler split into element problems and a vertex problem, coupled by multipliers."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -36,18 +36,23 @@ class ADMM(ImplicitStep):
     """The alternating direction method of multipliers on 1/(2h²)‖x − x̃‖²_M + Σ U(z), z = Dx, from x = x̃, z = Dx̃, u = 0
     (Narain et al. 2016, Overby et al. 2017).
 
-    D gives the local coordinates y of all elements, W² = r k A weighs them. In turn z = argmin U(z) + ½‖W(Dx − z + u)‖², which
-    for U = ½kA‖z − p(z)‖² is (p(v) + r v)/(1 + r) with v = Dx + u, and for other energies is found by Newton's method with a
-    line search, W² being r s k A with the curvature s = ‖∂²u/∂y²‖ at rest; u += Dx − z; and
-    (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once. The fixed point is that of
-    :class:`warpcloth.ProjectiveDynamics` and the x(t+h) of :class:`warpcloth.Newton`. Only WD counts: iterates stay the same
-    when D is scaled and W inversely.
+    Dx are the local coordinates y of all elements, with weights W² = r k A. An iteration has three steps:
 
-    Too large a weight stalls, too small a one oscillates. An iteration multiplies the error of a mode with s = h²ω² by
-    (1 + r²s)/((1 + rs)(1 + r)), which is smallest for r = 1/√s. So ``"auto"`` is r = 1/(2hₑω) for each element, where ω² is the
-    largest eigenvalue of M⁻¹ s k A DᵀD of the element by itself; the factor 2 is there because a whole net is about twice as
-    fast. The table has the measured iterations of one step until 1e-4 of the way from x̃ is left, beside those of the best of 17
-    weights shared by all elements, from 1e-3 to 10:
+    - z = argmin U(z) + ½‖W(Dx − z + u)‖². For U = ½kA‖z − p(z)‖² that is (p(v) + r v)/(1 + r) with v = Dx + u. For other
+      energies W² is r s k A with the curvature s = ‖∂²u/∂y²‖ at rest, and Newton's method with a line search finds z.
+    - u += Dx − z.
+    - (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once.
+
+    The fixed point is that of
+    :class:`warpcloth.ProjectiveDynamics` and the x(t+h) of :class:`warpcloth.Newton`. Only the product WD matters:
+    if D is scaled and W inversely, the iterates stay the same.
+
+    With too large a weight the iteration stalls, with too small a one it oscillates. An iteration multiplies the error of a
+    mode with s = h²ω² by (1 + r²s)/((1 + rs)(1 + r)), which is smallest for r = 1/√s. So ``"auto"`` is r = 1/(2hₑω) for each
+    element, where ω² is the largest eigenvalue of M⁻¹ s k A DᵀD of the element alone; the factor 2 is there because the highest
+    frequency of a whole net is about twice as high. The table has the measured iterations of one step until the distance to the
+    solution is 1e-4 of that from x̃, with ``"auto"``, with the best of 17 weights shared by all elements, from 1e-3 to 10, and
+    with r = 1:
 
     =============================  =======  =======  =======
     hanging of 8 × 8, 1/240 s      "auto"   best     r = 1
@@ -66,20 +71,20 @@ class ADMM(ImplicitStep):
     chain, straight                37       1        1
     =============================  =======  =======  =======
 
-    With few iterations a small weight leaves the cloth soft, and the next step turns what is unfinished into a velocity.
+    With few iterations a small weight leaves the cloth soft, and in the next step the remaining error becomes a velocity.
     Therefore, with n iterations, ``"auto"`` is at least c/n, and at most 1, where c is 2 for Euler, 4 for BDF2 and 20 for
-    midpoint, which keeps most of that velocity. With this bound ``hanging`` at 1e5 N/m and a cantilever have a smaller error
-    than with r = 1 over 2 to 100 iterations a step, and do not tear, as they do with a weight of 0.03. Energies that are
-    concave somewhere, hinges above all, need not converge with a small weight.
+    midpoint, which damps that velocity least. With this bound ``hanging`` at 1e5 N/m and a cantilever have a smaller error
+    than with r = 1 over 2 to 100 iterations a step, and do not tear, as they do with a weight of 0.03. For energies that
+    are concave somewhere, hinges above all, it may not converge with a small weight.
 
-    ``residual`` is the larger of the primal and the dual residual, and both are accelerations over gravity's (in m/s² without
-    any), the largest of any vertex: of the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before) over the masses. The first is
-    at least that of stiffness k, by which the forces of U at Dx and at z differ: without it a small weight would pass for
-    convergence.
+    ``residual`` is the larger of the primal and the dual residual. Both are the largest acceleration of any vertex, relative to
+    gravity (in m/s² without gravity): the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before), divided by the masses. The
+    first factor gives the primal residual at least the stiffness k, by which the forces of U at Dx and at z differ: otherwise
+    a small weight would look like convergence.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
-        iterations: The most iterations a step.
+        iterations: The most iterations in a step.
         tolerance: Tolerance of both residuals.
         weight: r = W²/(kA) > 0 for all elements, or ``"auto"``.
 
@@ -209,7 +214,7 @@ class ADMMStepper(ImplicitStepper):
             self.model.launch(start, elements.count, [elements.stencil, elements.rest, self.state.x], [of])
 
     def _launch_local(self):
-        """z and u, and the forces that follow: of the gaps, of the changes, and what the matrix is to take away."""
+        """Launches z and u, the forces of the gaps and of the changes, and the right-hand side of the linear system."""
         model = self.model
         sums = [self._gaps, self._changes, self._force]
         for array in sums:

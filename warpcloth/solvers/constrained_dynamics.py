@@ -1,4 +1,4 @@
-"""Constrained dynamics with dual variables: implicit Euler for positions and the multipliers of compliant constraints."""
+"""Constrained dynamics: implicit Euler for positions and for the multipliers of compliant constraints."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -39,29 +39,30 @@ class ConstrainedDynamics(ImplicitStep):
         [M̃, −Jᵀ; J, α̃][Δx; Δλ] = −[M(x − x̃) − Jᵀλ; C(x) + α̃λ]
 
     through (J M̃⁻¹Jᵀ + α̃)Δλ = −(C + α̃λ) + J M̃⁻¹(M(x − x̃) − Jᵀλ). Springs and hinges have the published scalar C; other
-    terms have the rows C = y − p(y) with p held in an iteration, which is the step of projective dynamics; limits have none
-    inside their range. No stiffness is too large for the system, and the fixed point is the x(t+h) of
-    :class:`warpcloth.Newton`, for infinite stiffness the point of C = 0 that is nearest to x̃.
+    terms have the rows C = y − p(y) with p fixed in an iteration, as in projective dynamics; limits have none inside their
+    range. The system admits any stiffness. The fixed point is the x(t+h) of :class:`warpcloth.Newton`, and for infinite
+    stiffness the point of C = 0 that is nearest to x̃.
 
-    One iteration with M̃ = M is the method as published. It leaves out −λ∂²C, across which a spring in tension overshoots once
-    the tension is above about m l/h², so that more iterations need a safeguard. Geometric stiffness (Tournier et al. 2015)
-    takes the positive half of it into M̃; here exactly, as rows B of compliance 1 with BᵀB = [−λ∂²C]₊, which keep M diagonal
-    and linear momentum to rounding. A line search uses that Δx leads down 1/(2h²)‖x − x̃‖²_M + U (it is that of Gauss and
-    Newton).
+    One iteration with M̃ = M is the method as published. It leaves out −λ∂²C, so that a spring overshoots perpendicular to
+    itself once its tension is above about m l/h², and more iterations need a safeguard. Geometric stiffness (Tournier et al.
+    2015) adds the positive part of that matrix to M̃; here exactly, as rows B of compliance 1 with BᵀB = [−λ∂²C]₊, which keep M
+    diagonal and conserve linear momentum to rounding. A line search is possible because Δx, a Gauss–Newton step, is a descent
+    direction of 1/(2h²)‖x − x̃‖²_M + U.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
-        iterations: The most iterations a step.
-        tolerance: Of the residual: the largest unbalanced acceleration of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), or the largest
-            that would close C + α̃λ = 0 of a single constraint in a step, over gravity's (without any, over the first).
+        iterations: The most iterations in a step.
+        tolerance: Tolerance of the residual, the larger of two accelerations, relative to gravity (or without gravity to its
+            value at the first iterate): the largest unbalanced one of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest by
+            which a single constraint would meet C + α̃λ = 0 in a step.
         stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
         linear: ``"cg"``, or ``"factorised"`` on the host.
 
-    Redundant constraints are no matter to either: no α̃ is below ε^0.7 of the diagonal of J W Jᵀ, so that of several λ the least
-    is found, and hard constraints stay open by that part of the move that they cause in a step (1e-11, in float32 1e-5).
-    Those that contradict one another meet half-way, and the status says so, with what they stay open by as residual. A
-    constraint between pins alone has nothing to move and is left out. A hard spring without length has no direction, and need
-    not converge; XPBD takes it.
+    Both linear solvers take redundant constraints: every α̃ is at least ε^0.7 of the diagonal of J W Jᵀ, so that the smallest of
+    all possible λ is found, and hard constraints keep a gap of that fraction of the move that they cause in a step (1e-11, in
+    float32 1e-5). Constraints that contradict one another meet half-way; the status says so, and their gap is the residual. A
+    constraint between pins alone is left out, because it can move nothing. A hard spring of rest length 0 has no direction and
+    may not converge; XPBD takes it.
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -176,7 +177,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._stuck = self._stepped.read() == 0.0
 
     def note(self, results, residual):
-        """Takes down how a step ended; hard constraints that stay open contradict one another."""
+        """Records how a step ended; hard constraints that keep a gap contradict one another."""
         carried = self._carried.read() / (self._scale * self.he**2)
         resolved = self._carried.read() > self._rounding.read()  # positions and lengths contradict by rounding too
         contradicted = np.isfinite(residual) & resolved & (carried > max(self.options.tolerance, CARRIED))

@@ -1,4 +1,4 @@
-"""Hierarchical position based dynamics: PBD that first moves few vertices far, then more and more of them a little."""
+"""Hierarchical position based dynamics: PBD that sweeps over coarse levels before fine ones."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -20,28 +20,29 @@ from .step import Step
 class HierarchicalPBD(Step):
     """Hierarchical position based dynamics (Müller 2008, *Hierarchical position based dynamics*).
 
-    A sweep of :class:`warpcloth.PBD` carries information over one constraint, or few, so that cloth stretches the more the
-    finer it is. Here a step sweeps over levels of fewer and fewer vertices first, the coarsest one first; what a level drops
-    then follows by dᵢ = Σ (dⱼ/Lᵢⱼ) / Σ (1/Lᵢⱼ) over the kept vertices j it is linked to, d = x − x̃; the last are the sweeps
-    of PBD over all terms. Each level costs a quarter of the finer one in a sheet, a half in a chain.
+    A sweep of :class:`warpcloth.PBD` carries information over one or a few constraints, so that finer cloth stretches more.
+    Here a step first sweeps over levels of fewer vertices, from the coarsest on. The vertices that a level drops then follow by
+    dᵢ = Σ (dⱼ/Lᵢⱼ) / Σ (1/Lᵢⱼ) over the kept vertices j that they are linked to, d = x − x̃. The sweeps of PBD over all terms
+    come last. Each level costs a quarter of the next finer one in a sheet, a half in a chain.
 
-    The constraints of a level are one-sided: ‖xᵢ − xⱼ‖ ≤ L with L the length of the shortest way over finer bounds, so that
-    what meets those is left alone, and the levels hinder neither folds nor shear of a net. Springs, limits with σ_max and
-    membranes bound; bending, attachments and damping take part in the last sweeps alone, and without bounds the solver is
-    PBD. A level is as stiff as the way in series, times what keeps Σ kL² of the finer one; where the cloth is hard, it is too.
-    A vertex of a level has the mass of what follows it, Mⱼ = mⱼ + Σ wᵢⱼ mᵢ, so that linear momentum is kept; angular is not.
+    The constraints of a level are one-sided: ‖xᵢ − xⱼ‖ ≤ L with L the length of the shortest path over finer bounds. So cloth
+    that meets the finer bounds is not moved, and the levels hinder neither folds nor shear of a net. Springs, limits with σ_max
+    and membranes give bounds; bending, attachments and damping take part in the last sweeps only, and without bounds the solver
+    is PBD. A bound has the stiffness of its path in series, scaled so that a level keeps Σ kL² of the finer one; it is infinite
+    where the cloth's is. A vertex of a level has the mass of the vertices that follow it too, Mⱼ = mⱼ + Σ wᵢⱼ mᵢ, so that
+    linear momentum is conserved; angular momentum is not.
 
-    What it costs: soft cloth comes out stiffer than by PBD, as all sweeps add up: a chain of 80 springs that its material
-    stretches by 40 % stretches by 4.7 % with PBD, 4 × 20 sweeps a frame, and by 1.1 % here. Cloth that starts much stretched
-    is flung, as all of the gap is closed in a step. What follows its level is rough, most near pins, which the last sweeps
-    must smooth: levels pay where much is stretched over many vertices, and where x̃ is near the constraints already, PBD alone
-    leaves less. Repeating the levels in a step did no better in the same time.
+    It has drawbacks. Soft cloth is stiffer than with PBD, because the corrections of all levels add up: a chain of 80 springs
+    whose exact stretch is 40 % stretches by 4.7 % with PBD (4 × 20 sweeps a frame) and by 1.1 % here. Cloth that starts far
+    stretched is flung, because a step closes all of the gap. Vertices that follow a level move unevenly, most of all near pins,
+    and the last sweeps must smooth that. So levels pay if large errors extend over many vertices; if x̃ is near the constraints
+    already, PBD alone leaves smaller errors. Repeating the levels in a step was no better in the same time.
 
     Attributes:
         dt, substeps: See :class:`Step`.
         iterations: Sweeps over all terms a step, Gauss–Seidel by colour.
         coarse_iterations: Sweeps over each level.
-        levels: The most levels above the finest; 0 is PBD, None as many as have bounds.
+        levels: The most levels above the finest; 0 is PBD, None means all levels that have bounds.
         relaxation: ω > 0, a factor of every move of a sweep.
 
     Raises:
@@ -79,7 +80,7 @@ class HierarchicalPBD(Step):
         """The solver on ``model``, all scratch allocated.
 
         Raises:
-            ValueError: If a term has nothing to project on.
+            ValueError: If a term has no projection, scalar constraint or ``prox``.
         """
         self.refuse(model)
         return self._on(HierarchicalPBDStepper, model)

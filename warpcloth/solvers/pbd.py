@@ -1,4 +1,4 @@
-"""Position based dynamics: predict, then move the vertices onto their constraints, and call the move a velocity."""
+"""Position based dynamics: predict, then move the vertices onto their constraints, and take velocities from the move."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,27 +18,27 @@ from .step import Step
 class PBD(Step):
     """Position based dynamics (Müller et al. 2006).
 
-    A sweep moves the vertices of each constraint, weighted by inverse mass (equal masses: half and half), by
-    Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y) with α̃ = 1/(kAh²): fully onto it for infinite stiffness k, the classical method; with a
-    finite one by the part s = w/(w + α̃) that the material would move by itself in a step. Corrected by s in every sweep, cloth
-    becomes stiffer with iterations and with 1/h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest, n the iterations.
-    Corrected by s in a step, which is s′ = 1 − (1−s)^(1/n) in each sweep, it stretches by g h²(1−s)/s whatever n is, which with
-    this s is mg/k; where constraints meet, the result still depends on n.
+    A sweep moves the vertices of each constraint by W GᵀΔλ, Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y), with inverse masses W and
+    α̃ = 1/(kAh²). For infinite stiffness k, the classical method, they move fully onto the constraint. For finite stiffness they
+    move by the fraction s = w/(w + α̃), w = G W Gᵀ, by which an element alone would move in a step. If every sweep corrects by
+    s, cloth becomes stiffer with iterations n and with 1/h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest. If
+    every sweep corrects by s′ = 1 − (1−s)^(1/n), all sweeps together correct by s, and the mass stretches by g h²(1−s)/s = mg/k
+    for any n; where constraints share vertices, the result still depends on n.
 
-    Jacobi sweeps move by the sum of all corrections at once. Times ω it diverges iff ω λ_max(D⁻¹JWJᵀ) > 2. Averaged by vertex
-    (Σx_new + αx)/(n + α), n its constraints, it converges for every α ≥ 0, but momentum is not conserved; averaged by
-    constraint, with 1/max n of its vertices for all of them, linear momentum is. Gauss–Seidel sweeps conserve linear
-    momentum too and converge in fewer sweeps; their order changes the result.
+    Jacobi sweeps add up all corrections and then move. With the sum times ω they diverge iff ω λ_max(D⁻¹JWJᵀ) > 2. Averaged by
+    vertex, (Σx_new + αx)/(n + α) with the n constraints of the vertex, they converge for every α ≥ 0, but do not conserve
+    momentum. Averaged by constraint, where all vertices of a constraint have the factor 1/max n, they conserve linear momentum.
+    Gauss–Seidel sweeps conserve linear momentum too and converge in fewer sweeps; their order changes the result.
 
     Attributes:
         dt, substeps: See :class:`Step`.
         iterations: Sweeps a step.
         sweep: Jacobi ``"vertex-averaged"``, ``"constraint-averaged"`` or plain ``"jacobi"``; Gauss–Seidel ``"coloured"``, or
-            ``"sequential"``: elements in the order of the scene, by one thread, which on a GPU is for small scenes.
+            ``"sequential"``: elements in the order of the scene, by one thread; on a GPU it suits small scenes only.
         alpha: α ≥ 0, weight of the old position when averaging by vertex.
         relaxation: ω > 0, a factor of every move.
-        correction: Whether a constraint of finite stiffness is corrected by the part s ``"per-sweep"``, or ``"per-step"``, with
-            s′ in each sweep.
+        correction: Whether constraints of finite stiffness are corrected by s in each sweep, ``"per-sweep"``, or by s in a
+            step, ``"per-step"``, which is s′ in each sweep.
 
     Raises:
         ValueError: If an option breaks a rule.
@@ -98,7 +98,7 @@ class PBD(Step):
         """The solver on ``model``, all scratch allocated.
 
         Raises:
-            ValueError: If a term has nothing to project on.
+            ValueError: If a term has no projection, scalar constraint or ``prox``.
         """
         self.refuse(model)
         return self._on(PBDStepper, model)

@@ -1,4 +1,4 @@
-"""The state of a bound solver, and what all of them share."""
+"""The base of bound solvers: the state, the step and the frame."""
 
 from functools import partial
 
@@ -16,22 +16,22 @@ from ..terms.refresh import STEP
 
 
 class Stepper:
-    """A solver bound to a model: all it needs is allocated, and ``step`` moves the state on by one step.
+    """A solver bound to a model: all arrays are allocated, and ``step`` advances the state by one step.
 
-    The constructor of one that takes an integrator ends with ``integrator.start()``, which may step.
+    With an integrator, the constructor of a subclass ends with ``integrator.start()``, which may step.
 
     Attributes:
         state: The :class:`warpcloth.core.state.State`.
         h: Step [s].
-        model: The model with the terms that its steps take, damped and ordered as they have them.
-        integrator: What leads to x̃ and away from the minimiser, see :mod:`warpcloth.numerics.integrators`; None of steps that
-            have no x̃.
-        he: Its hₑ [s], else h.
+        model: The model, whose terms include damping and are in the order in which steps take them.
+        integrator: The integrator, see :mod:`warpcloth.numerics.integrators`, which computes x̃, and the new state from the
+            minimiser; None for solvers without x̃.
+        he: Effective step hₑ of the integrator [s], else h.
         steps_per_frame: Steps a frame.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
-        residual: The largest residual of each copy so far, (B,); 0 of methods that have none.
-        iterations: Iterations of the last step; sweeps of methods that sweep, 1 of methods that do not iterate.
-        factorise_seconds: What factorising constant matrices took, once, [s]; 0 of methods that have none.
+        residual: The largest residual of each copy so far, (B,); 0 for methods that have none.
+        iterations: Iterations or sweeps of the last step; 1 for methods that do not iterate.
+        factorise_seconds: Time of factorising the constant matrices [s]; 0 for methods that have none.
     """
 
     factorise_seconds = 0.0
@@ -101,7 +101,7 @@ class Stepper:
         model.launch(add_one, model.copies, [], [count])
 
     def launch_prediction(self):
-        """Refreshes what a step begins with; then x = x̃, and the pins where they are then."""
+        """Updates what changes where a step begins, then sets x = x̃ and moves the pins to the end of the step."""
         self.model.refresh(STEP, self.integrator.moment)
         self.integrator.launch_prediction()
 
@@ -118,26 +118,26 @@ class Stepper:
 
     @in_turn
     def frame(self):
-        """One frame, to the bit what ``steps_per_frame`` times `step` makes."""
+        """One frame, equal bit for bit to ``steps_per_frame`` calls of `step`."""
         for _ in range(self.steps_per_frame):
             self.step()
 
     @in_turn
     def reset(self, mask=None, positions=None, velocities=None):
-        """Puts copies back to their start, by one launch; from there on each is to the bit what it was in its first steps.
+        """Resets copies to their start, by one launch; they then repeat their first steps bit for bit.
 
-        What the stepper knows of them starts again as well: keyframes, ``results`` and ``residual``. The other copies do not
-        notice. After the first call it allocates nothing; with everything on the device, of solvers without residual the
-        host waits for nothing.
+        Keyframes, ``results`` and ``residual`` of these copies start again as well. The other copies are not affected. After
+        the first call it allocates nothing. If all arguments are on the device and the solver has no residual, the host does
+        not wait.
 
         Args:
-            mask: Which copies, (B,) truth values; all of them where it is None.
-            positions: Where they start (B, n, 3) [m], if not where the model does; of other copies any finite values. What
-                terms know of the start stays, and vertices with keyframes begin where these do.
-            velocities: Likewise [m/s]; pinned vertices have none.
+            mask: Which copies to reset, (B,) truth values; None for all.
+            positions: Their start positions (B, n, 3) [m], by default those of the model; any finite values for other copies.
+                Rest states that terms took from the start do not change, and vertices with keyframes begin at these.
+            velocities: Their start velocities (B, n, 3) [m/s]; those of pinned vertices are ignored.
 
-        Each is a Warp array, which on the device has the precision of the model and is read in place, or what NumPy takes for
-        an array.
+        Each is a Warp array or anything that NumPy converts to an array. A Warp array on the device must have the precision of
+        the model, and is read in place.
 
         Raises:
             ValueError: If an argument breaks a rule, or positions or velocities are given with ``integrator="bdf2"``.
@@ -152,9 +152,9 @@ LAUNCHES = 64
 
 
 class LaunchedStepper(Stepper):
-    """A solver whose steps are launches alone, so that a frame is few graphs of several steps each.
+    """A solver whose steps consist of launches only, so that a frame is a few graphs of several steps each.
 
-    The constructor ends with `record`, and ``integrator.start()`` if it takes an integrator.
+    The constructor of a subclass ends with `record`, and with an integrator with ``integrator.start()``.
 
     Attributes:
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool` of the model's threads, which share each step.
@@ -170,8 +170,8 @@ class LaunchedStepper(Stepper):
         """Records a step.
 
         Args:
-            parts: Pairs of a function that launches, what is for the thread of the pool that it is called as, and of how many
-                times it runs.
+            parts: Pairs of a function and of how many times it runs. The function launches the part of the thread of the pool
+                that calls it.
         """
         launches = self.model.launches
         self._parts = [(launch, times) for launch, times in parts if times]
@@ -187,7 +187,7 @@ class LaunchedStepper(Stepper):
         return [Segment(self.model.device, pool.as_thread(thread, launch)) for thread in range(pool.threads)]
 
     def launch_steps(self, steps):
-        """So many steps."""
+        """Launches this number of steps."""
         for _ in range(steps):
             for launch, times in self._parts:
                 for _ in range(times):
@@ -224,4 +224,4 @@ class LaunchedStepper(Stepper):
         self._replay(self._frame)
 
     def note(self):
-        """Takes down how the steps since the last call ended; of methods that have no residual nothing."""
+        """Records how the steps since the last call ended, for methods with a residual."""

@@ -11,15 +11,15 @@ from .solver import Stepper
 
 
 class ThreadedStepper(Stepper):
-    """A batch for several threads: each has a stepper of its own, on neighbouring copies.
+    """A batch that several threads share: each has a stepper of its own, for a range of copies.
 
     Args:
-        options: Of the solver.
-        stepper: The type of its steppers.
+        options: The record of the solver.
+        stepper: The class of the steppers.
         model: The model.
 
     Attributes:
-        parts: The stepper of each thread, whose state is a part of ``state``.
+        parts: The stepper of each thread. Its state is a view of ``state``.
     """
 
     def __init__(self, options, stepper, model):

@@ -1,4 +1,4 @@
-"""Extended position based dynamics: projections with compliance and multipliers, whose stiffness is that of the material."""
+"""Extended position based dynamics: projections with compliance and multipliers that converge to the material's stiffness."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -29,29 +29,29 @@ class XPBD(ImplicitStep):
     With form ``"vector"`` the constraint of an element is p(y) − y, whose Jacobian is the constant G of weights:
     Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y − α̃λ), λ += Δλ, x += W Gᵀ Δλ, α̃ = 1/(kAh²). As M(x − x̃) = Gᵀλ holds throughout, its
     fixed point for finite stiffness is implicit Euler, the x(t+h) of :class:`warpcloth.Newton`. Form ``"scalar"`` is the
-    published one on C = ‖y − p(y)‖ with its changing gradient, Δλ = −(C + α̃λ)/(Σw‖∇C‖² + α̃): its fixed point stops short
-    by the change of ∇C within the step. Terms that have only one of the two forms are taken by that: dihedral bending by the
-    scalar, quadratic bending and attachments by the vector form.
+    published one on C = ‖y − p(y)‖ with its changing gradient, Δλ = −(C + α̃λ)/(Σw‖∇C‖² + α̃): its fixed point misses
+    implicit Euler by the change of ∇C within the step. Terms that have only one of the two forms use that one: dihedral bending
+    the scalar form, quadratic bending and attachments the vector form.
 
-    One hanging mass stretches by mg/k at rest for any iterations and step. Few iterations leave a cloth too soft, the more so
-    the finer it is; more substeps cure that better than more iterations (Macklin et al. 2019, *Small steps*): ``hanging`` with
+    One hanging mass stretches by mg/k at rest for any iterations and step. With few iterations cloth is too soft, and finer
+    cloth is softer; more substeps help better than more iterations (Macklin et al. 2019, *Small steps*): ``hanging`` with
     32² vertices stretches by 26 % with 4 × 20 a frame and by 5 % with 80 × 1. Infinite stiffness is α̃ = 0: constraints are met,
-    but not at the positions that are nearest to x̃, for λ keeps parts of earlier directions.
+    but not at the positions nearest to x̃, because λ keeps parts of earlier directions.
 
-    By midpoint Gauss–Seidel sweeps go forward and backward in turn. Always in one order, they give to the motion what they
-    leave unbalanced on one side: a ``hanging`` of 32² vertices then diverges in most settings. Two ways converge more slowly
-    than one, so that the integrators that damp keep one.
+    With midpoint, Gauss–Seidel sweeps alternate between forward and backward. Always in one order, their one-sided error feeds
+    energy into the motion: ``hanging`` with 32² vertices then diverges in most settings. Alternating sweeps converge more
+    slowly, so the integrators that damp keep one order.
 
-    ``residual`` says how far from implicit Euler a step ended: the largest unbalanced acceleration ‖∇ᵢ‖/mᵢ over gravity's (in
-    m/s² without any). With infinite stiffness, where there is no such force, it is the largest move of the last sweep, over h²,
-    instead.
+    ``residual`` says how far from implicit Euler a step ended: the largest unbalanced acceleration ‖∇ᵢ‖/mᵢ relative to gravity
+    (in m/s² without gravity). With infinite stiffness that force is not defined, and the residual is the largest move of the
+    last sweep, divided by h².
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
-        iterations: Sweeps a step; by midpoint an even number.
-        sweep: Gauss–Seidel ``"coloured"``, or ``"sequential"``: elements in the order of the scene, by one thread, which on a
-            GPU is for small scenes; or Jacobi ``"constraint-averaged"``: each Δλ over the most constraints at any of its
-            vertices, which takes some thirty times the sweeps on ``hanging``.
+        iterations: Sweeps a step; with midpoint an even number.
+        sweep: Gauss–Seidel ``"coloured"``, or ``"sequential"``: elements in the order of the scene, by one thread, on a GPU for
+            small scenes only; or Jacobi ``"constraint-averaged"``: each Δλ divided by the largest number of constraints at any
+            of its vertices, which takes some thirty times as many sweeps on ``hanging``.
         form: ``"vector"`` or ``"scalar"``.
         relaxation: ω > 0, a factor of every Δλ.
 
@@ -116,7 +116,8 @@ class XPBD(ImplicitStep):
         """The solver on ``model``, all scratch allocated.
 
         Raises:
-            ValueError: If a term has nothing to project on, or infinite stiffness with an integrator other than Euler.
+            ValueError: If a term has no projection, scalar constraint or ``prox``, or infinite stiffness with an integrator
+                other than Euler.
         """
         self.refuse(model)
         if self.integrator != "euler":
@@ -163,7 +164,7 @@ class XPBDStepper(LaunchedStepper):
         self.sweep.launch(backward=True)
 
     def _launch_last(self):
-        """The force that the sweeps leave unbalanced, or of hard constraints the last sweep and its move; the end of a step."""
+        """Launches the end of a step and its residual: the unbalanced force, or with hard constraints the last move."""
         if self._gradient is None:
             self.pool.launch_alone(self.model, self._force.zero_, lambda: self._launch_momentum(-1.0))
             self.sweep.launch()
