@@ -164,6 +164,9 @@ COMPLETIONS = [
     ("deform bar", ["bar_twist"]),
     ("run hanging --solver xpbd -s substeps=4 sweep=", ["coloured", "sequential", "constraint-averaged"]),
     ("chart work-precision net -p kind=s", ["structural", "shear"]),
+    ("run hanging --import mod", ["module.py"]),
+    ("run hanging --import module.py --solver hier", ["hierarchical-pbd"]),
+    ("run hanging --import gone.py --solver hier", ["hierarchical-pbd"]),
 ]
 
 
@@ -172,6 +175,7 @@ def test_a_shell_completes(line, words, tmp_path):
     line = f"warpcloth {line}"
     asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9", "_ARGCOMPLETE_IFS": "\n"}
     asked |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "words"), "_ARGCOMPLETE_COMP_WORDBREAKS": " \t\n\"'><=;|&(:"}
+    (tmp_path / "module.py").touch()
     environment = os.environ | asked | {"PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-m", "warpcloth"], env=environment, cwd=tmp_path, capture_output=True, check=True)
     assert (tmp_path / "words").read_text(encoding="utf-8").split() == words

@@ -112,6 +112,9 @@ def test_both_go_through_usd(scene, outside, capfd, tmp_path):
 def test_the_command_line_knows_them(outside, capfd):
     refused(capfd, ["info", "slide.py"], "No module named 'plane'")
     refused(capfd, ["info", "hanging", "--import", "nothing"], "nothing cannot be imported: ModuleNotFoundError")
+    refused(capfd, ["info", "hanging", "--import"], "argument --import: expected one argument; see warpcloth info --help")
+    Path("exits.py").write_text("raise SystemExit(0)", encoding="utf-8")
+    refused(capfd, ["info", "hanging", "--import", "exits.py"], "exits.py cannot be imported: SystemExit: 0")
     code, out, _ = run(capfd, "info", "slide.py", *IMPORTS, "--solver", "descent", "-s", "substeps=4", "--json")
     facts = json.loads(out)
     assert code == 0 and facts["solver"]["solver"] == "descent"

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -158,6 +159,9 @@ def test_more_frames_may_be_asked_for_and_not_fewer(tmp_path, device):
     whole = wc.simulate(scene, solver, output=str(tmp_path / "whole.usdc"), device=device, frames=30)
     assert same(whole, wc.simulate(scene, solver, output=output, device=device, resume=True, frames=30))
     interrupted(scene, solver, output, 21, device=device)
+    assert len(wc.simulate(scene, solver, output=output, device=device, resume=True, frames=19).points) == 20
+    interrupted(scene, solver, output, 21, device=device)
+    Path(output).unlink()
     assert len(wc.simulate(scene, solver, output=output, device=device, resume=True, frames=19).points) == 20
 
 

@@ -1,7 +1,7 @@
 """The energy of docs/extending.md, one file outside the package, through all that takes one; identities in test_terms.py."""
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -12,8 +12,9 @@ from support.outside import FILES, Plane
 from support.steps import after_one_step, newton_step
 from warpcloth import terms
 from warpcloth.solvers import SOLVERS
-from warpcloth.terms.declared import Declared
+from warpcloth.terms.declared import Declared, indices, quantity
 from warpcloth.usd import read_scene, write_scene
+from warpcloth.usd.attributes import attributes
 
 NORMAL = np.array([1.0, 2.0, 2.0]) / 3.0
 # A scene in a file that defines the energy too.
@@ -96,7 +97,7 @@ def test_a_stage_with_an_unknown_energy_is_refused(tmp_path):
     terms.register(Plane)
     path = write_scene(sheet(), tmp_path / "plane.usda")
     del terms.TERMS["Plane"]
-    with pytest.raises(ValueError, match=r"is no attribute of a cloth|type is 'Plane', must be one of"):
+    with pytest.raises(ValueError, match=r"terms:Plane:type is 'Plane', must be one of .*is imported \(--import\)"):
         read_scene(path)
 
 
@@ -153,6 +154,43 @@ def test_what_is_no_energy_is_not_registered():
 
     with pytest.raises(ValueError, match="Spring is the name of an energy of warpcloth"):
         terms.register(Spring)
-    with pytest.raises(ValueError, match="must be a class that derives from"):
+    with pytest.raises(ValueError, match="must be a class with a term that derives from"):
         terms.register(Plane(stiffness=1.0))
+    with pytest.raises(ValueError, match="must be a class with a term that derives from"):
+        terms.register(Declared)
     assert terms.register(terms.Spring) is terms.TERMS["Spring"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wide(Plane):
+    """It has fields of shapes for which USD has a type, and for which it has none."""
+
+    pair: tuple = field(default=(0.0, 1.0), metadata=quantity("must be finite", np.isfinite, shape=(2,)))
+    table: tuple = field(default=((0.0,) * 5,), metadata=quantity("must be finite", np.isfinite, shape=(1, 5)))
+    six: np.ndarray | None = field(default=None, metadata=indices(each=6))
+
+
+def test_a_field_without_a_type_in_usd_keeps_no_stage_from_being_read(tmp_path):
+    terms.register(Wide)
+    try:
+        other = replace(sheet(), terms=[wc.Spring(stiffness=50.0)])
+        assert len(read_scene(write_scene(other, tmp_path / "other.usda")).terms) == 1
+        names = {row.name.split(":")[-1] for row in attributes()}
+        assert "pair" in names and not {"table", "six"} & names
+    finally:
+        del terms.TERMS["Wide"]
+
+
+@pytest.mark.parametrize(
+    ("method", "found", "message"),
+    [
+        ("stencil", np.array([[0, 1]]), r"stencil has shape \(1, 2\) .* must be 1 of the 30 vertices for each element"),
+        ("stencil", np.array([[30]]), "stencil has .* vertices 30 to 30; it must be 1 of the 30 vertices"),
+        ("stencil", np.array([[-1]]), "stencil has .* vertices -1 to -1; it must be 1 of the 30 vertices"),
+        ("rest", np.zeros((18, 3)), r"rest state has shape \(18, 3\); it must be \(…, 4\)"),
+    ],
+)
+def test_elements_that_are_none_of_its_term_are_refused(method, found, message):
+    wrong = type("Wrong", (Plane,), {method: lambda *_: found})
+    with pytest.raises(ValueError, match=f"Wrong: the {message}"):
+        replace(sheet(), terms=[wrong(vertices="boundary", stiffness=1.0)]).build()

@@ -301,7 +301,7 @@ def _frame(label, reason):
 
 def _frames_first(name, frames, mesh):
     """Returns frames and mesh; takes them in the other order, which was that of before, with a warning."""
-    if isinstance(frames, Mesh) or frames is None:
+    if isinstance(frames, Mesh) or (frames is None and mesh is not None and not isinstance(mesh, Mesh)):
         warnings.warn(f"{name}: frames come first now, {name}(frames, mesh)", DeprecationWarning, stacklevel=3)
         return mesh, frames
     return frames, mesh

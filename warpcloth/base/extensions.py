@@ -47,7 +47,7 @@ def load_extension(name):
         else:
             importlib.import_module(name)
             _names.add(name)
-    except Exception as error:  # whatever the module raises
+    except (Exception, SystemExit) as error:  # whatever the module raises
         raise ValueError(f"{name} cannot be imported: {type(error).__name__}: {error}") from error
 
 

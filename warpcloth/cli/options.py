@@ -5,6 +5,7 @@ it has from running the scene.
 """
 
 import argparse
+import contextlib
 import os
 import sys
 import warnings
@@ -121,13 +122,19 @@ def load_extensions(argv):
     Raises:
         ValueError: A module of the command line cannot be imported.
     """
-    if "_ARGCOMPLETE" in os.environ:
+    completes = "_ARGCOMPLETE" in os.environ
+    if completes:
         argv = os.environ.get("COMP_LINE", "").split()
     only = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     add_import(only)
     load_installed()
-    for name in only.parse_known_args(argv)[0].imports:
-        load_extension(name)
+    try:
+        names = only.parse_known_args(argv)[0].imports
+    except argparse.ArgumentError:  # no name after it, as the parser of all options says better
+        return
+    for name in names:
+        with contextlib.suppress(*[ValueError] * completes):  # the name may be what is being completed
+            load_extension(name)
 
 
 def complete(parser):
@@ -137,6 +144,7 @@ def complete(parser):
     import argcomplete
 
     files = {"scene": argcomplete.FilesCompleter((*STAGE_ENDINGS, ".py")), "mesh": argcomplete.FilesCompleter()}
+    files["imports"] = argcomplete.FilesCompleter((".py",))
     _add_completers(parser, files)
     argcomplete.autocomplete(parser)
 
@@ -146,6 +154,8 @@ def _add_completers(parser, files):
         if isinstance(action.choices, dict) and action.dest == "==SUPPRESS==":
             for command in action.choices.values():
                 _add_completers(command, files)
+        elif action.dest == "imports":
+            action.completer = files["imports"]
         elif action.dest in files:
             action.completer = partial(_scenes, files[action.dest])
         elif action.dest == "s":

@@ -171,7 +171,8 @@ class Mesh:
             meshes: The mesh of each part by its name, which must be an identifier.
 
         Raises:
-            ValueError: There is none, triangles are mixed with edges alone, the up axes differ, or a name is no identifier.
+            ValueError: There is none, one has parts itself, triangles are mixed with edges alone, the up axes differ, or a name
+                is no identifier.
         """
         return cls(**joined(meshes))
 

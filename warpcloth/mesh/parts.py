@@ -4,6 +4,7 @@ The vertices of a part follow one another, and no triangle or edge joins two par
 pairs of vertices of the whole.
 """
 
+import operator
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -37,6 +38,9 @@ def joined(meshes):
     """
     if not (isinstance(meshes, Mapping) and meshes and all(hasattr(mesh, "triangles") for mesh in meshes.values())):
         raise ValueError(f"parts is {shown(meshes)}; it must be a mapping of names to meshes, with one part or more")
+    nested = [name for name, mesh in meshes.items() if mesh.parts]
+    if nested:
+        raise ValueError(f"parts: the mesh {nested[0]!r} has parts itself; each must be joined by itself, and all at once")
     each = list(meshes.values())
     of_triangles = [len(mesh.triangles) > 0 for mesh in each]
     if any(of_triangles) != all(of_triangles):
@@ -74,12 +78,17 @@ def checked_parts(parts, count, elements):
     Raises:
         ValueError: If a name is no identifier, the parts are not all vertices, one part after another, or an element joins two.
     """
-    found = {name: Part(*part) for name, part in parts.items()}
+    try:
+        rows = {name: (operator.index(first), operator.index(count), *grid) for name, (first, count, *grid) in parts.items()}
+        found = {name: Part(*row) for name, row in rows.items()}
+    except (AttributeError, TypeError, ValueError):
+        raise ValueError(f"parts is {shown(parts)}; it must be a dict of (first, count, grid_shape) by name") from None
     for name in found:
         if not (isinstance(name, str) and name.isidentifier()):
             raise ValueError(f"parts: the name {name!r} must be letters, digits and underscores, and begin with no digit")
     ends = np.cumsum([0, *(part.count for part in found.values())])
-    if not found or ends[-1] != count or any(part.first != first for part, first in zip(found.values(), ends, strict=False)):
+    follow = [part.first == first and part.count > 0 for part, first in zip(found.values(), ends, strict=False)]
+    if not (found and all(follow)) or ends[-1] != count:
         raise ValueError(f"parts is {shown(found)}; it must have all {count} vertices, one part after another")
     of_part = np.searchsorted(ends, elements, side="right")
     apart = np.flatnonzero((of_part != of_part[:, :1]).any(axis=1))

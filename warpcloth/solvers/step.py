@@ -33,7 +33,7 @@ def register(record):
     Raises:
         ValueError: If it is not such a class, or another one of that name is registered.
     """
-    if not (isinstance(record, type) and issubclass(record, Step)) or record.name is None:
+    if not (isinstance(record, type) and issubclass(record, Step) and isinstance(record.name, str)):
         raise ValueError(
             f"{record!r} is no solver; it must be a class with a name that derives from warpcloth.solvers.step.Step"
         )

@@ -46,8 +46,10 @@ def register(energy):
     Raises:
         ValueError: If it is not such a class, or has the name of an energy of the package.
     """
-    if not (isinstance(energy, type) and issubclass(energy, Declared)):
-        raise ValueError(f"{energy!r} is no energy; it must be a class that derives from warpcloth.terms.declared.Declared")
+    if not (isinstance(energy, type) and issubclass(energy, Declared) and hasattr(energy, "term")):
+        raise ValueError(
+            f"{energy!r} is no energy; it must be a class with a term that derives from warpcloth.terms.declared.Declared"
+        )
     if energy.__name__ in __all__ and energy is not globals()[energy.__name__]:
         raise ValueError(f"{energy.__name__} is the name of an energy of warpcloth; it must have another")
     TERMS[energy.__name__] = energy

@@ -178,10 +178,18 @@ class Declared:
         stencil = self.stencil(mesh)
         if len(stencil) == 0:
             raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
+        of_stencil = np.shape(stencil)[1:]
+        if of_stencil != (self.term.vertices,) or np.min(stencil) < 0 or np.max(stencil) >= len(mesh.points):
+            raise ValueError(
+                f"{self.label}: the stencil has shape {np.shape(stencil)} and vertices {np.min(stencil)} to {np.max(stencil)}; "
+                f"it must be {self.term.vertices} of the {len(mesh.points)} vertices for each element"
+            )
         stiffness = self._stiffness(len(stencil))
         damped = getattr(self, "damping", None) is not None
         damping = self.of_elements("damping", len(stencil)) if damped else np.zeros(())
         rest = self.rest(mesh, positions, stencil)
+        if np.shape(rest)[1:] != (self.term.parameters,):
+            raise ValueError(f"{self.label}: the rest state has shape {np.shape(rest)}; it must be (…, {self.term.parameters})")
         return Elements(self.label, type(self).__name__, self.term, stencil, stiffness, rest, damping)
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:

@@ -100,7 +100,7 @@ ATTRIBUTES = (
 TERMS_NAMESPACE = "warpcloth:terms"
 
 _OF_TEXT = {"": (), "word": ("token", "token[]"), "selection": ("string", "token[]")}
-_OF_NUMBERS = {(): ("double", "double[]"), (3,): ("double3", "double3[]")}
+_OF_NUMBERS = {(): ("double", "double[]")} | {(n,): (f"double{n}", f"double{n}[]") for n in (2, 3, 4)}
 _OF_INDICES = {1: "int[]", 2: "int2[]", 3: "int3[]", 4: "int4[]"}
 
 
@@ -113,12 +113,13 @@ def attributes():
     }
     for energy in TERMS.values():
         for field in fields(energy):
-            if "quantity" in field.metadata:
-                types = _OF_NUMBERS[field.metadata["quantity"].shape]
-            elif "indices" in field.metadata:
-                indices = field.metadata["indices"]
+            quantity, indices = field.metadata.get("quantity"), field.metadata.get("indices")
+            types = ()  # of values of a shape that USD has no type for
+            if quantity and quantity.shape in _OF_NUMBERS:
+                types = _OF_NUMBERS[quantity.shape]
+            elif indices and indices.each in _OF_INDICES:
                 types = (*_OF_TEXT[indices.text], _OF_INDICES[indices.each])
-            else:
+            if not types:
                 continue
             rows[field.name] = tuple(dict.fromkeys((*rows.get(field.name, ()), *types)))
     of_terms = [
@@ -151,6 +152,8 @@ class Values:
         known = {row.name.replace("<name>", key) for row in attributes() for key in self.terms or [""]}
         unknown = sorted(set(names) - known)
         if unknown:
+            for key in self.terms:  # whose type may be the reason
+                kind_of_term(self, key)
             allowed = ", ".join(row.name for row in attributes() if row.name.startswith("warpcloth:"))
             raise ValueError(f"{unknown[0]} is no attribute of a cloth, must be one of {allowed}")
 
@@ -192,6 +195,22 @@ class Values:
         return None
 
 
+def kind_of_term(values, key):
+    """The name of the energy of a term.
+
+    Raises:
+        ValueError: There is none of that name.
+    """
+    kind = values.get("terms.type", key)
+    if kind not in TERMS:
+        given = "not given" if kind is None else repr(kind)
+        raise ValueError(
+            f"{TERMS_NAMESPACE}:{key}:type is {given}, must be one of {', '.join(TERMS)}, or of an energy from elsewhere that "
+            "is imported (--import)"
+        )
+    return kind
+
+
 def _kind(type_name):
     """Describes a type without its precision: text, numbers or unknown, one or several, and the number of components."""
     default = type_name.scalarType.defaultValue
@@ -220,7 +239,9 @@ def author(cloth, field, value, key=None, time=None):
     """Writes a value under the name and as the type that the table has for its field."""
     row = next((row for row in attributes() if row.field == field), None)
     if row is None:
-        raise ValueError(f"{field} has no attribute; its field must have the metadata of a quantity or of indices")
+        raise ValueError(
+            f"{field} has no attribute; its field must have the metadata of a quantity or of indices, of a shape in USD"
+        )
     if isinstance(value, str) or np.ndim(value) == 0:
         type_name = row.types[0]
         value = value if isinstance(value, str) else float(value)

@@ -160,8 +160,9 @@ class ChunkWriter:
             with deferred(0 if isinstance(sys.exc_info()[1], KeyboardInterrupt) else 1):
                 self._packing = single_file or self._packed
                 self._write_chunk(last=True)
-                if self._stale and not keep:
+                if self._chunks and ((self._stale and not keep) or not Path(self.path).exists()):
                     self._write_root(self._chunks)
+                if not keep:
                     self._remove_stale()
                 self._closed = True
                 if self._chunks:

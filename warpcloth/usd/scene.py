@@ -12,7 +12,7 @@ from ..mesh.mesh import Mesh
 from ..mesh.parts import Part
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
-from .attributes import TERMS_NAMESPACE, Values, attributes, author, has_api
+from .attributes import TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of_term
 from .chunks import export
 from .layers import scene_layer
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics
@@ -185,15 +185,12 @@ def _terms(values, mesh):
 
 
 def _term(values, key):
-    prefix = f"{TERMS_NAMESPACE}:{key}"
-    given = {}
+    prefix, kind, given = f"{TERMS_NAMESPACE}:{key}", kind_of_term(values, key), {}
     for row in attributes():
         if row.name.startswith(f"{TERMS_NAMESPACE}:"):
             value = values.get(row.field, key)
             given |= {} if value is None else {row.field.removeprefix("terms."): value}
-    kind = given.pop("type", None)
-    if kind not in TERMS:
-        raise ValueError(f"{prefix}:type is {'not given' if kind is None else repr(kind)}, must be one of {', '.join(TERMS)}")
+    given.pop("type", None)
     known = {field.name: field for field in fields(TERMS[kind])}
     wrong = sorted(set(given) - set(known))
     if wrong:
