@@ -77,9 +77,9 @@ class Scene:
         name: Name in reports and files.
         stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; an animation is then written as a
             layer over that stage.
-        free_axes: Along which axes of space each vertex may move, (n, 3) truth values; all of them if not given. A locked
-            coordinate stays where it starts, and its velocity is 0, which makes planes of symmetry and rails. A vertex
-            without a free axis is a pin that stands still; what it says of pins does not matter.
+        free_axes: The axes of space along which each vertex may move, (n, 3) truth values; by default all. A locked coordinate
+            keeps its value, and its velocity is 0, which makes planes of symmetry and rails. A vertex without a free axis is
+            a pin that stands still. Values of pinned vertices are ignored.
 
     Raises:
         ValueError: If a value breaks a rule; the sentence names it.
@@ -185,7 +185,7 @@ class Scene:
 
     @property
     def locked(self) -> np.ndarray | None:
-        """Which coordinates are locked of vertices that move along other axes, (n, 3) truth values; None where none is."""
+        """The locked coordinates of vertices that move along other axes, (n, 3) truth values; None if there are none."""
         if self.free_axes is None:
             return None
         found = ~self.free_axes
