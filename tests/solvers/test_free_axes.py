@@ -67,6 +67,14 @@ def test_half_a_sheet_moves_as_the_whole(name, device):
     assert np.abs(ends[2] - ends[0][kept]).max() > 1e-2
 
 
+def test_half_a_sheet_hangs_as_the_whole(device):
+    whole, kept, half = halves()
+    rest = [wc.equilibrium(each, device=device) for each in (whole, half)]
+    assert rest[0].stable and rest[1].stable
+    assert np.abs(rest[1].points - rest[0].points[kept]).max() < 1e-7
+    assert np.abs(rest[0].points - whole.positions).max() > 0.1
+
+
 NEWTON, PD = wc.Newton(substeps=1, tolerance=1e-11), wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=5_000)
 MINIMISE = {
     "newton": NEWTON,
