@@ -129,11 +129,11 @@ def _parser():
         sub.add_argument("--prim", help="path or name of the cloth's prim, for a stage with several meshes")
         sub.add_argument("--pins", metavar="SELECTION", help="vertices that stand still; replaces the scene's pins")
     infos.add_argument("--advise", action="store_true", help="try which terms, precision and resolution matter")
-    infos.add_argument("--tolerance", metavar="SHARE", help="of --advise: the largest change that does not matter (1%%)")
-    infos.add_argument("--frames", type=int, metavar="N", help="of --advise: frames to try (30)")
+    infos.add_argument("--tolerance", metavar="SHARE", help="with --advise, the largest change that does not matter (1%%)")
+    infos.add_argument("--frames", type=int, metavar="N", help="with --advise, frames to try (30)")
     runs.add_argument("--tolerance", metavar="SHARE", help="choose solver and settings of this error, such as 1%%; see choose")
     runs.add_argument("--budget", metavar="TIME", help="choose the most accurate within this time per frame, such as 16ms")
-    runs.add_argument("--frames", type=int, metavar="N", help="frames after the first; those of the scene if not given")
+    runs.add_argument("--frames", type=int, metavar="N", help="frames after the first; by default those of the scene")
     for sub in (runs, infos, deforms, analyzes, compares, chooses, benches):
         sub.add_argument("--device", default="cpu", help="device: cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print one JSON object")
@@ -150,7 +150,7 @@ def _parser():
     runs.add_argument(
         "--resume",
         action="store_true",
-        help="go on with the run to that file that was interrupted, after its last chunk of frames",
+        help="continue an interrupted run to the same file, after its last complete chunk of frames",
     )
     for sub in (runs, deforms, analyzes):
         sub.add_argument("--single-file", action="store_true", help="merge everything into one file, with no folder of frames")

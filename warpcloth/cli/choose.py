@@ -26,7 +26,7 @@ def add_arguments(parser):
     add("--tolerance", metavar="SHARE", help="largest error, such as 1%% of the size of the cloth")
     add("--budget", metavar="TIME", help="longest frame, such as 16ms")
     add("--solvers", nargs="+", metavar="NAME", help="solvers to choose among (default: all)")
-    add("--frames", type=int, metavar="N", help="frames to run; those of the scene if not given")
+    add("--frames", type=int, metavar="N", help="frames to run; by default those of the scene")
     add("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of a run (default: 60)")
     add_dask(parser)
 

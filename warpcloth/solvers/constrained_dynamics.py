@@ -71,7 +71,7 @@ class ConstrainedDynamics(ImplicitStep):
     name = "constrained-dynamics"
     needs, locks = (MERGED_DAMPING, ROWS, STEADY_ROWS), True
     facts = Facts(
-        method="implicit Euler for positions and multipliers of compliant constraints, redundant ones too",
+        method="implicit Euler for positions and multipliers of compliant constraints, which may be redundant",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 1}, cpu=(8, 16, 32), cuda=(16, 32, 64)),),
         runs=(
             *grid([(4, 1), (8, 1), (16, 1), (32, 1)], integrator="midpoint"),
