@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import warpcloth as wc
+from support.outside import write_files
 from warpcloth import usd
 
 ROOT = Path(__file__).parents[2]
@@ -97,6 +98,9 @@ def test_types_of_the_package_and_of_programs_agree(tmp_path):
     program = tmp_path / "program.py"
     program.write_text(RIGHT)
     checked = mypy(*cache, program)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    write_files(tmp_path)
+    checked = mypy(*cache, tmp_path / "descent.py")
     assert checked.returncode == 0, checked.stdout + checked.stderr
     program.write_text(RIGHT + WRONG)
     found = mypy(*cache, "--no-error-summary", program).stdout.splitlines()

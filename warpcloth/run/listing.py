@@ -87,7 +87,8 @@ def _options(record, classes):
     found = {}
     for base in record.bases:
         found |= _options(classes[base.id], classes) if getattr(base, "id", None) in classes else {}
-    fields = [node for node in record.body if isinstance(node, ast.AnnAssign)]
+    annotated = [node for node in record.body if isinstance(node, ast.AnnAssign)]
+    fields = [node for node in annotated if not ast.unparse(node.annotation).startswith("ClassVar")]
     return found | {field.target.id: _words(field.annotation) for field in fields}
 
 

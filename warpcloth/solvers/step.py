@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from ..base.checks import choice, number, shown, whole
 from ..base.extensions import note
@@ -12,7 +12,7 @@ from ..base.turns import methods_in_turn
 from ..core.status import Residual
 from ..model.model import Model
 from ..scene.scene import Scene
-from ..terms.needs import listed, refuse_unmet
+from ..terms.needs import Need, listed, refuse_unmet
 from .facts import Facts
 from .solver import Stepper
 from .threaded import ThreadedStepper
@@ -66,9 +66,15 @@ class Step:
         ValueError: If both or neither are given, or the one given is not above 0.
     """
 
-    ordered = staggered = closes = locks = False
-    residual = None
-    name, needs, facts, limited = None, (), Facts(), False
+    ordered: ClassVar[bool] = False
+    staggered: ClassVar[bool] = False
+    closes: ClassVar[bool] = False
+    locks: ClassVar[bool] = False
+    residual: ClassVar[Residual | None] = None
+    name: ClassVar[str | None] = None
+    needs: ClassVar[tuple[Need, ...]] = ()
+    facts: ClassVar[Facts] = Facts()
+    limited: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
