@@ -469,7 +469,7 @@ def test_arrays_follow_the_edges_as_given(pairs, order, device):
         own = [scale[tuple(sorted(named[pair].tolist()))] for pair in elements.stencil.numpy()]
         lengths = np.linalg.norm(np.diff(made.mesh.points[named[elements.stencil.numpy()]], axis=1)[:, 0], axis=1)
         found = [elements.stiffness.numpy(), *elements.rest.numpy().T]
-        if elements.kind == "Spring":
+        if elements.damping is not None:
             found.append(elements.damping.numpy())
         else:
             found[1:] = [found[1] / lengths, found[2] / lengths]

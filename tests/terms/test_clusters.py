@@ -449,6 +449,8 @@ def test_a_mobile_moves_alike_with_two_methods(device):
         ({"vertices": [[0, 1], "all"]}, "RigidCluster.vertices has both selections and indices"),
         ({"vertices": ["all", 3]}, "RigidCluster.vertices has both selections and indices"),
         ({"vertices": 3}, "RigidCluster.vertices is 3; it must be a list of bodies or a selection"),
+        ({"vertices": [[2**32 + 1, 2, 3]]}, r"RigidCluster.vertices\[0\]\[0\] is 4294967297; it must be below 2\^31"),
+        ({"vertices": [0, 1], "sizes": [2**32 + 2]}, r"RigidCluster.sizes\[0\] is 4294967298; it must be below 2\^31"),
         ({"vertices": [0, 1, 2], "sizes": [2, 2]}, r"RigidCluster.sizes is \[2, 2\]; it must be 1 or more each and 3 in all"),
         ({"vertices": [[0, 1]], "sizes": [2]}, "RigidCluster has sizes and a list for each body"),
         ({"vertices": "all", "sizes": [16]}, "RigidCluster has sizes and selections"),

@@ -19,7 +19,7 @@ class DeviceElements:
     """The elements of one term in all copies, on the device.
 
     Attributes:
-        label, kind, term: As in :class:`warpcloth.terms.declared.Elements`.
+        label, term: As in :class:`warpcloth.terms.declared.Elements`.
         per_copy: Elements of one copy, E.
         stencil: (B·E, K) int32.
         stiffness: (B·E,); of stride 0 where all elements share one value.
@@ -31,7 +31,6 @@ class DeviceElements:
     """
 
     label: str
-    kind: str
     term: Term
     per_copy: int
     stencil: wp.array
@@ -153,7 +152,6 @@ def elements_on(model, term, positions, vary):
         release(rest)
     found = DeviceElements(
         label=one.label,
-        kind=one.kind,
         term=declared,
         per_copy=E,
         stencil=keep(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), wp.int32, model.device),

@@ -290,7 +290,6 @@ def on_device(model, level):
         [
             DeviceElements(
                 label="bounds",
-                kind="bounds",
                 term=SPRING_LIMIT,
                 per_copy=E,
                 stencil=wp.array(stencil.reshape(-1, 2).astype(np.int32), dtype=wp.int32, device=model.device),

@@ -18,7 +18,6 @@ class Elements:
 
     Attributes:
         label: Name of the term within its scene.
-        kind: Class name of the term.
         term: The energy.
         stencil: Vertices of each element, (E, K) int32.
         stiffness: One value or (E,); of cells one value or (C,) [unit of the term].
@@ -30,7 +29,6 @@ class Elements:
     """
 
     label: str
-    kind: str
     term: Term
     stencil: np.ndarray
     stiffness: np.ndarray
@@ -190,7 +188,7 @@ class Declared:
         rest = self.rest(mesh, positions, stencil)
         if np.shape(rest)[1:] != (self.term.parameters,):
             raise ValueError(f"{self.label}: the rest state has shape {np.shape(rest)}; it must be (…, {self.term.parameters})")
-        return Elements(self.label, type(self).__name__, self.term, stencil, stiffness, rest, damping)
+        return Elements(self.label, self.term, stencil, stiffness, rest, damping)
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         """Rest state (E, P) of the elements, from the rest shape of the mesh."""
@@ -232,7 +230,10 @@ def own_indices(name, given):
     found = found.astype(np.int32) if found.size == 0 else found
     if found.ndim != 1 or found.dtype.kind not in "iu":
         raise ValueError(f"{name} is {shown(given)}; it must be a list of whole numbers")
-    return found.astype(np.int32)
+    held = found.astype(np.int32)
+    for k in np.flatnonzero(held != found)[:1]:
+        raise ValueError(f"{name}[{k}] is {found[k]}; it must be below 2^31")
+    return held
 
 
 def own_stencil(label, parameter, given, vertices, count):

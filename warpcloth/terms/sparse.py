@@ -45,7 +45,6 @@ class Sparse(Declared):
         stencil, count = (keys % n).astype(np.int32)[:, None], len(cells) - 1
         return Elements(
             label=self.label,
-            kind=type(self).__name__,
             term=self.term,
             stencil=stencil,
             stiffness=self.of_elements("stiffness", count),
