@@ -79,7 +79,7 @@ class ThreadPool:
     def run(self, functions):
         """Calls each function in a thread of its own, and returns when all have ended; there are at most as many as threads.
 
-        Calls from several threads, such as those of several steppers of one model, run one after another.
+        Calls from several threads run one after another.
 
         Raises:
             Exception: The first one that a function raises. Threads that wait for that function at the barrier are released.
