@@ -231,3 +231,10 @@ def test_a_scene_without_a_digest_runs_and_cannot_be_resumed(tmp_path, device):
     interrupted(scene, solver, output, STOP, device=device)
     with pytest.raises(ValueError, match="there is nothing to resume"):
         wc.simulate(scene, solver, output=output, device=device, resume=True)
+
+
+def test_limits_that_are_kept_may_be_checked_again(tmp_path, device):
+    """The command line finds the largest stable step and checks it no more; Python may name that step."""
+    scene, output = moved(), str(tmp_path / "out.usdc")
+    interrupted(scene, wc.Explicit(substeps=4, above_limit="allow"), output, STOP, device=device)
+    assert len(wc.simulate(scene, wc.Explicit(substeps=4), output=output, device=device, resume=True).points) == LAST + 1
