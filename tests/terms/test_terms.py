@@ -1336,6 +1336,12 @@ def test_a_cylinder_costs_its_curvature(name, pattern, degrees, least, most, dev
     ("name", "changes", "wanted", "sentence"),
     [
         ("Spring", {"hard": True}, [needs.FINITE], "Spring with infinite stiffness; B can, or give a finite stiffness"),
+        (  # a finite stiffness would not do
+            "DihedralBending",
+            {"hard": True},
+            [needs.FINITE, needs.PROJECTION],
+            "DihedralBending with infinite stiffness; B can",
+        ),
         ("RigidCluster", {}, [needs.ELEMENTS], "RigidCluster, whose bodies are no elements by themselves; B or C can"),
         (
             "DihedralBending",

@@ -72,7 +72,9 @@ def refuse_unmet(terms, solver, needs, others):
         need = lacks(elements, needs)
         if need is not None:
             able = [name for name, theirs in others.items() if lacks(elements, theirs) is None]
-            instead = [f"{listed(able)} can"] * bool(able) + [need.remedy] * bool(need.remedy)
+            # Of several needs that are not met, a remedy for one would not do where another solver takes the term as it is.
+            suffices = need.remedy and (not able or sum(not each.met(elements) for each in needs) == 1)
+            instead = [f"{listed(able)} can"] * bool(able) + [need.remedy] * bool(suffices)
             raise ValueError(
                 f"{solver} cannot take {need.lack.format(label=elements.label)}; {', or '.join(instead) or 'no solver can'}"
             )
