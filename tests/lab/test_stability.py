@@ -733,6 +733,6 @@ def test_the_command(tmp_path, capfd, monkeypatch):
 )
 def test_wrong_use_is_said_in_a_line(words, says, capfd, tmp_path, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
-    monkeypatch.setattr("warpcloth.cli.stability.sweep", None)  # nothing is measured before
+    monkeypatch.setattr("warpcloth.lab.campaign.sweep", None)  # nothing is measured before
     code, out, err = run(capfd, "hanging", *words.split())
     assert code == 2 and says in err and err.count("\n") == 1 and not out

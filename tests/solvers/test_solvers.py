@@ -271,7 +271,7 @@ def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
         (lambda: wc.PBD(substeps=1, alpha=1.0), "alpha is 1; it belongs to sweep='vertex-averaged'"),
         (lambda: wc.PBD(substeps=1, relaxation=0.0), "relaxation is 0.0"),
         (lambda: wc.PBD(substeps=1, sweep="gauss"), "sweep is 'gauss'; it must be one of 'vertex-averaged'"),
-        (lambda: wc.PBD(substeps=1, stiffness="1e3"), "stiffness is '1e3'"),
+        (lambda: wc.PBD(substeps=1, correction="1e3"), "correction is '1e3'"),
         (lambda: wc.HierarchicalPBD(substeps=1, iterations=0), "iterations is 0"),
         (lambda: wc.HierarchicalPBD(substeps=1, coarse_iterations=0), "coarse_iterations is 0"),
         (lambda: wc.HierarchicalPBD(substeps=1, levels=-1), "levels is -1"),
