@@ -1,4 +1,4 @@
-"""Factories of kernels that measure how triangles deform: gradients, strains, stresses; of neighbourhoods see :mod:`.fits`.
+"""Factories of kernels that measure how triangles deform. For neighbourhoods of points see :mod:`.neighbourhood_fit`.
 
 A gradient is F̂ (3×3) in the tangent frame T = [t₁, t₂, N] of its element in the reference: its first two columns are the
 deformation gradient F (3×2) of the surface, F̂ Tᵀ maps reference to current vectors. Of a triangle the third column is the unit

@@ -62,9 +62,9 @@ def test_affine_maps_of_triangles(mesh, dtype, device):
     """F = GT, and what follows from it, on every triangle, though no two are alike."""
     rng = np.random.default_rng(1)
     maps = [random_map(rng) for _ in range(6)]
-    places = [mesh.points @ G.T + b for G, b in maps]
-    found = wc.analyze(places, mesh, measures=STATIC, dtype=dtype, device=device)
-    T, bound = frames(mesh), rounding(mesh, places, dtype)
+    positions = [mesh.points @ G.T + b for G, b in maps]
+    found = wc.analyze(positions, mesh, measures=STATIC, dtype=dtype, device=device)
+    T, bound = frames(mesh), rounding(mesh, positions, dtype)
     for k, (G, _) in enumerate(maps):
         check_triangles(found, k, G @ T[:, :, :2], T, bound)
     assert not found.excluded
@@ -74,10 +74,10 @@ def test_affine_maps_of_triangles(mesh, dtype, device):
 def test_any_motion_of_triangles(dtype, device):
     """F = Σ xᵢ ⊗ ∇φᵢ T of the linear functions φᵢ of the rest shape's corners."""
     mesh = jittered(lift=hill)
-    places = [drifting(mesh, t) for t in (0.0, 0.3, 0.6)]
-    found = wc.analyze(places, mesh, measures=STATIC, dtype=dtype, device=device)
-    T, bound = frames(mesh), rounding(mesh, places, dtype)
-    for k, x in enumerate(places):
+    positions = [drifting(mesh, t) for t in (0.0, 0.3, 0.6)]
+    found = wc.analyze(positions, mesh, measures=STATIC, dtype=dtype, device=device)
+    T, bound = frames(mesh), rounding(mesh, positions, dtype)
+    for k, x in enumerate(positions):
         check_triangles(found, k, gradients(mesh, x) @ T[:, :, :2], T, bound)
 
 
@@ -88,9 +88,9 @@ def test_warp_and_weft_of_texture_coordinates(dtype, device):
     mesh, (G, b) = flat(st=st), random_map(np.random.default_rng(9))
     lines = TILT[:, :2] @ np.linalg.inv(st)
     lines /= np.linalg.norm(lines, axis=0)
-    places = [mesh.points, mesh.points @ G.T + b]
-    found = wc.analyze(places, mesh, measures=("length_ratio", "angle"), directions="st", dtype=dtype, device=device)
-    bound = rounding(mesh, places, dtype)
+    positions = [mesh.points, mesh.points @ G.T + b]
+    found = wc.analyze(positions, mesh, measures=("length_ratio", "angle"), directions="st", dtype=dtype, device=device)
+    bound = rounding(mesh, positions, dtype)
     for k, A in enumerate((lines, G @ lines)):
         bounded(found["length_ratio"][k], np.linalg.norm(A, axis=0), 4.0 * bound)
         cos = A[:, 0] @ A[:, 1] / np.linalg.norm(A, axis=0).prod()
@@ -128,10 +128,10 @@ def test_affine_maps_of_neighbourhoods(neighbourhood, dtype, device):
     """On a flat mesh F = GP + nNᵀ, P the projection to its plane; no stretch along the normal."""
     mesh, rng = flat(), np.random.default_rng(2)
     maps = [random_map(rng) for _ in range(4)]
-    places = [mesh.points @ G.T + b for G, b in maps]
+    positions = [mesh.points @ G.T + b for G, b in maps]
     measures = ("deformation_gradient", "stretch", "directions")
-    found = wc.analyze(places, mesh, measures=measures, neighbourhood=neighbourhood, dtype=dtype, device=device)
-    bound, N = rounding(mesh, places, dtype), TILT[:, 2]
+    found = wc.analyze(positions, mesh, measures=measures, neighbourhood=neighbourhood, dtype=dtype, device=device)
+    bound, N = rounding(mesh, positions, dtype), TILT[:, 2]
     for k, (G, _) in enumerate(maps):
         n = np.cross(G @ TILT[:, 0], G @ TILT[:, 1])
         F = G @ (np.eye(3) - np.outer(N, N)) + np.outer(n / np.linalg.norm(n), N)
@@ -178,10 +178,10 @@ def test_simple_shear(before, after, rate, dtype, device):
     """G = I + γ e₁e₂ᵀ: λ = √(1 + γ²/4) ± γ/2, atan(γ/2), D₁₂ = W₁₂ = γ̇/2, by every method, as L² = 0."""
     mesh, dt = flat(), 0.02
     e1, e2, N = TILT.T
-    places = [mesh.points @ (np.eye(3) + g * np.outer(e1, e2)).T for g in (before, after)]
+    positions = [mesh.points @ (np.eye(3) + g * np.outer(e1, e2)).T for g in (before, after)]
     names = (*STATIC, *RATES, "length_ratio", "angle", "length_rate", "angle_rate")
-    found = wc.analyze(places, mesh, dt=dt, measures=names, rates=rate, directions=e1, dtype=dtype, device=device)
-    bound = rounding(mesh, places, dtype) * (1.0 + abs(after)) ** 2
+    found = wc.analyze(positions, mesh, dt=dt, measures=names, rates=rate, directions=e1, dtype=dtype, device=device)
+    bound = rounding(mesh, positions, dtype) * (1.0 + abs(after)) ** 2
     lines = []
     for k, g in enumerate((before, after)):
         root, half = np.sqrt(1.0 + g * g / 4.0), abs(g) / 2.0
@@ -221,10 +221,10 @@ def test_uniaxial_stretch(neighbourhood, rate, dtype, device):
     """G = diag(s, s^−½): λ, and D = diag(ṡ/s, −½ ṡ/s); the logarithm knows ṡ/s of s = exp(εt) exactly."""
     mesh, dt, speed = flat(), 0.1, 3.0
     values = np.exp(speed * dt * np.arange(1, 4))
-    places = [mesh.points @ (TILT @ np.diag([s, s**-0.5, 1.0]) @ TILT.T).T for s in values]
+    positions = [mesh.points @ (TILT @ np.diag([s, s**-0.5, 1.0]) @ TILT.T).T for s in values]
     given = {"neighbourhood": neighbourhood, "rates": rate, "dtype": dtype, "device": device}
-    found = wc.analyze(places, mesh, dt=dt, measures=("stretch", "rotation_angle", *RATES), **given)
-    bound = rounding(mesh, places, dtype) * values[-1]
+    found = wc.analyze(positions, mesh, dt=dt, measures=("stretch", "rotation_angle", *RATES), **given)
+    bound = rounding(mesh, positions, dtype) * values[-1]
     for k, s in enumerate(values):
         wanted = (s, s**-0.5) if neighbourhood is None else (s, 1.0, s**-0.5)
         bounded(found["stretch"][k], wanted, bound)
@@ -253,13 +253,13 @@ def test_a_sheet_rolled_to_a_cylinder(dtype, device):
     mesh = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")
     X, _, Z = mesh.points.T
     h, bends = 1.0 / (n - 1), np.array([0.5, 1.0, 3.0])
-    places = [np.stack([np.sin(k * X) / k, (1.0 - np.cos(k * X)) / k, Z], axis=1) for k in bends]
+    positions = [np.stack([np.sin(k * X) / k, (1.0 - np.cos(k * X)) / k, Z], axis=1) for k in bends]
     given = {"dt": dt, "rates": "logarithm", "dtype": dtype, "device": device}
     names = ("stretch", "rotation_angle", "stretch_rate")
     found = wc.analyze(
-        places, mesh, measures=(*names, "area_ratio", "green_strain", "length_ratio"), directions=(1, 0, 0), **given
+        positions, mesh, measures=(*names, "area_ratio", "green_strain", "length_ratio"), directions=(1, 0, 0), **given
     )
-    bound, chords = rounding(mesh, places, dtype), np.sin(bends * h / 2.0) / (bends * h / 2.0)
+    bound, chords = rounding(mesh, positions, dtype), np.sin(bends * h / 2.0) / (bends * h / 2.0)
     sides = X[mesh.triangles]
     middle = 0.5 * (sides.min(axis=1) + sides.max(axis=1))
     for k, chord in enumerate(chords):
@@ -271,7 +271,7 @@ def test_a_sheet_rolled_to_a_cylinder(dtype, device):
         if k:
             bounded(found["stretch_rate"][k], (0.0, np.log(chord / chords[k - 1]) / dt), 2.0 * bound / dt)
     names = (*names, "directions", "rotation")
-    found = wc.analyze(places, mesh, measures=names, neighbourhood="1-ring", **given)
+    found = wc.analyze(positions, mesh, measures=names, neighbourhood="1-ring", **given)
     inner = np.setdiff1d(np.arange(n * n), mesh.boundary)
     slopes = np.sin(bends * h) / (bends * h)
     for k, slope in enumerate(slopes):
@@ -300,13 +300,13 @@ TURNED = {  # how each measure follows x → Qx
 def test_objectivity(neighbourhood, rate, dtype, device):
     """What a turned observer sees: stretches, energy and their rates are the same, L, D, W and σ turn with him."""
     mesh, Q, dt = jittered(lift=hill), turn((1.0, -3.0, 2.0), 2.0), 0.1
-    places = [drifting(mesh, t) for t in (0.3, 0.3 + dt)]
+    positions = [drifting(mesh, t) for t in (0.3, 0.3 + dt)]
     given = {"dt": dt, "rates": rate, "neighbourhood": neighbourhood, "dtype": dtype, "device": device, "measures": "all"}
     if neighbourhood is None:
         given |= {"directions": (1.0, 0.3, 0.2), "material": wc.NeoHookeanMembrane(stiffness=1.0, poisson_ratio=0.3)}
-    found, turned_found = (wc.analyze([x @ A.T for x in places], mesh, **given) for A in (np.eye(3), Q))
+    found, turned_found = (wc.analyze([x @ A.T for x in positions], mesh, **given) for A in (np.eye(3), Q))
     # On this motion λ₂ > 0.4 and λ₁ − λ₂ > 0.02 λ₁; the fits of one-sided rings are worse by up to 16.
-    bound, gap = 16.0 * rounding(mesh, places, dtype) / 0.4, 0.02
+    bound, gap = 16.0 * rounding(mesh, positions, dtype) / 0.4, 0.02
     low = found["stretch"][:, :, 1 if neighbourhood is None else 2].min()
     assert low > 0.4
     seen = set()
@@ -339,18 +339,18 @@ def test_objectivity(neighbourhood, rate, dtype, device):
 def test_the_reference_does_not_matter_to_the_velocity_gradient(rate, dtype, device):
     """L = ḞF⁻¹ of two frames, whatever F is measured from."""
     mesh, dt = jittered(lift=hill), 0.1
-    places = [drifting(mesh, t) for t in (0.3, 0.3 + dt, 0.3 + 2 * dt)]
+    positions = [drifting(mesh, t) for t in (0.3, 0.3 + dt, 0.3 + 2 * dt)]
     other = wc.Mesh(drifting(mesh, 0.6), mesh.triangles)
     names = ("velocity_gradient", "rate_of_strain", "spin")
     given = {"dt": dt, "measures": names, "rates": rate, "dtype": dtype, "device": device}
     found = [
-        wc.analyze(places, mesh, **given),
-        wc.analyze(places, other, **given),
-        wc.analyze(places, mesh, reference="first", **given),
-        wc.analyze(places, mesh, reference="previous", **given),
+        wc.analyze(positions, mesh, **given),
+        wc.analyze(positions, other, **given),
+        wc.analyze(positions, mesh, reference="first", **given),
+        wc.analyze(positions, mesh, reference="previous", **given),
     ]
     # L is at most 4 here and F₁ − F₀ is known to ε|x| over the altitude of either reference.
-    bound = 2.0 * max(rounding(one, places, dtype) for one in (mesh, other)) / dt
+    bound = 2.0 * max(rounding(one, positions, dtype) for one in (mesh, other)) / dt
     for name in names:
         for one in found[1:]:
             bounded(one[name][-1], found[0][name][-1], bound)
@@ -428,12 +428,12 @@ def test_the_cross_covariance_is_no_gradient(dtype, device):
     for size, scale in (((1.0, 1.0), 1.0), ((2.0, 1.0), 1.0), ((2.0, 1.0), 10.0)):
         n = 9
         mesh = wc.Mesh.grid(n, n, size=tuple(scale * s for s in size), pattern="alternating")
-        places = [mesh.points @ (turn((1, 2, 3), 1.0) @ np.diag([s, 1.0, 1.0])).T for s in (1.0, 1.5)]
+        positions = [mesh.points @ (turn((1, 2, 3), 1.0) @ np.diag([s, 1.0, 1.0])).T for s in (1.0, 1.5)]
         names = ("cross_covariance", "stretch", "deformation_gradient")
-        found = wc.analyze(places, mesh, measures=names, neighbourhood="1-ring", dtype=dtype, device=device)
+        found = wc.analyze(positions, mesh, measures=names, neighbourhood="1-ring", dtype=dtype, device=device)
         eight = [i for i, ring in enumerate(rings(mesh)) if len(ring) == 9]
         assert len(eight) == 25
-        bound, (a, b) = rounding(mesh, places, dtype), (scale * s / (n - 1) for s in size)
+        bound, (a, b) = rounding(mesh, positions, dtype), (scale * s / (n - 1) for s in size)
         for k, stretch in enumerate((1.0, 1.5)):
             H = found["cross_covariance"][k][eight].astype(np.float64)
             bounded(np.linalg.svd(H, compute_uv=False) / (6.0 * a * a), (stretch, (b / a) ** 2, 0.0), 4.0 * bound)
@@ -448,10 +448,10 @@ def test_the_best_rotation_of_a_set_is_not_that_in_its_gradient(dtype, device):
     """A pure stretch aslant to a ring with Σppᵀ = diag(s₁, s₂) turns it by atan(G₁₂(s₁ − s₂)/(G₁₁s₁ + G₂₂s₂)) at best."""
     mesh = wc.Mesh.grid(9, 9, size=(2.0, 1.0), pattern="alternating")
     G = np.array([[1.3, 0.0, 0.4], [0.0, 1.0, 0.0], [0.4, 0.0, 0.9]])
-    places = [mesh.points @ G.T]
+    positions = [mesh.points @ G.T]
     names = ("rotation_angle", "deformation_gradient")
-    found = wc.analyze(places, mesh, measures=names, neighbourhood="1-ring", dtype=dtype, device=device)
+    found = wc.analyze(positions, mesh, measures=names, neighbourhood="1-ring", dtype=dtype, device=device)
     inner = np.setdiff1d(np.arange(81), mesh.boundary)
-    bound = rounding(mesh, places, dtype)
+    bound = rounding(mesh, positions, dtype)
     bounded(found["rotation_angle"][0][inner], np.arctan(0.4 * (4.0 - 1.0) / (1.3 * 4.0 + 0.9 * 1.0)), 4.0 * bound)
     bounded(found["deformation_gradient"][0], G, 4.0 * bound)

@@ -42,11 +42,11 @@ def test_turning(axis, neighbourhood, mesh, dtype, device):
     """30° a frame about any axis: D = 0 by midpoint and logarithm, W = 2 tan(ωΔt/2)/Δt and ω; forward a spurious D."""
     dt, angle = 0.04, np.radians(30.0)
     a = AXES[axis] / np.linalg.norm(AXES[axis])
-    places = [mesh.points @ turn(a, k * angle).T + k * np.array([0.1, -0.2, 0.3]) for k in range(7)]
-    bound, given = rounding(mesh, places, dtype), {"neighbourhood": neighbourhood, "dtype": dtype, "device": device}
+    positions = [mesh.points @ turn(a, k * angle).T + k * np.array([0.1, -0.2, 0.3]) for k in range(7)]
+    bound, given = rounding(mesh, positions, dtype), {"neighbourhood": neighbourhood, "dtype": dtype, "device": device}
     names = ("stretch", "stretch_rate", "rotation_angle", "rate_of_strain", "spin")
     for method, size in (("midpoint", 2.0 * np.tan(angle / 2.0)), ("logarithm", angle), ("forward", np.sin(angle))):
-        found = wc.analyze(places, mesh, dt=dt, measures=names, rates=method, **given)
+        found = wc.analyze(positions, mesh, dt=dt, measures=names, rates=method, **given)
         bounded(found["stretch"], 1.0, bound)
         bounded(found["stretch_rate"][1:] * dt, 0.0, 2.0 * bound)
         bounded(found["rotation_angle"], (angle * np.arange(7))[:, None], bound)
@@ -54,7 +54,7 @@ def test_turning(axis, neighbourhood, mesh, dtype, device):
         wanted = 0.0
         if method == "forward":
             wanted = np.cos(angle) - 1.0
-            wanted *= np.array([in_plane(mesh, x, np.eye(3) - np.outer(a, a), neighbourhood) for x in places[:-1]])
+            wanted *= np.array([in_plane(mesh, x, np.eye(3) - np.outer(a, a), neighbourhood) for x in positions[:-1]])
             if np.ptp(mesh.points @ a) < 1e-12:  # the mesh turns in its plane
                 spurious = np.linalg.eigvalsh(found["rate_of_strain"][1:] * dt)
                 bounded(spurious, (np.cos(angle) - 1.0, np.cos(angle) - 1.0, 0.0), 2.0 * bound)
@@ -86,15 +86,17 @@ def test_a_constant_velocity_gradient(name, neighbourhood, dtype, device):
     LDt[:2, :2] = CONSTANT[name]
     LDt = TILT @ LDt @ TILT.T
     motion = constant(LDt / dt)
-    places = [motion(mesh.points, k * dt) for k in range(3)]
+    positions = [motion(mesh.points, k * dt) for k in range(3)]
     # The step F₁F₀⁻¹ is known to its condition, and tanh and log have slopes of up to 1/(1 + cos) near half a turn.
     step = expm(LDt)
     near_half = 2.0 / abs(np.linalg.eigvals(expm(LDt) + np.eye(3))).min()
-    bound = 4.0 * rounding(mesh, places, dtype) * np.linalg.cond(step) * np.linalg.norm(step, 2) ** 2 * near_half**2
+    bound = 4.0 * rounding(mesh, positions, dtype) * np.linalg.cond(step) * np.linalg.norm(step, 2) ** 2 * near_half**2
     given = {"neighbourhood": neighbourhood, "dtype": dtype, "device": device}
     wanted = {"logarithm": LDt, "midpoint": 2.0 * tanhm(0.5 * LDt), "forward": step - np.eye(3)}
     for method, L in wanted.items():
-        found = wc.analyze(places, mesh, dt=dt, measures=("velocity_gradient", "rate_of_strain", "spin"), rates=method, **given)
+        found = wc.analyze(
+            positions, mesh, dt=dt, measures=("velocity_gradient", "rate_of_strain", "spin"), rates=method, **given
+        )
         bounded(found["velocity_gradient"][1:] * dt, L, bound)
         bounded(found["rate_of_strain"][1:] * dt, 0.5 * (L + L.T), bound)
         bounded(found["spin"][1:] * dt, 0.5 * (L - L.T), bound)
@@ -130,10 +132,10 @@ def test_what_a_turn_does_to_the_rate_of_strain(axis, degrees, neighbourhood, de
         E = np.zeros((3, 3))
         E[:2, :2] = plane
         E = size * TILT @ E @ TILT.T
-        places = [mesh.points, mesh.points @ (turn(a, angle) @ expm(E)).T]
+        positions = [mesh.points, mesh.points @ (turn(a, angle) @ expm(E)).T]
         for method in ("midpoint", "logarithm", "forward"):
             given = {"rates": method, "neighbourhood": neighbourhood, "device": device}
-            found = wc.analyze(places, mesh, dt=1.0, measures=("rate_of_strain", "stretch_rate"), **given)
+            found = wc.analyze(positions, mesh, dt=1.0, measures=("rate_of_strain", "stretch_rate"), **given)
             steep = 1.0 / np.cos(angle / 2.0) ** 4  # second derivatives in E
             bounded(
                 found["rate_of_strain"][1], turned_rate(method, a, angle, E, TILT[:, 2]), 4.0 * steep * size**2 + 1e-12 * steep
@@ -154,8 +156,8 @@ def test_what_a_turn_does_to_a_dilation(degrees, device):
     largest = []
     for name, method in zip(TURNS, ("midpoint", "logarithm", "midpoint", "logarithm", "logarithm"), strict=True):
         axis = TILT[:, 0] + TILT[:, 2] if name == "45°" else AXES[name]
-        places = [mesh.points, np.exp(e) * mesh.points @ turn(axis, angle).T]
-        found = wc.analyze(places, mesh, dt=1.0, measures=("rate_of_strain",), rates=method, device=device)
+        positions = [mesh.points, np.exp(e) * mesh.points @ turn(axis, angle).T]
+        found = wc.analyze(positions, mesh, dt=1.0, measures=("rate_of_strain",), rates=method, device=device)
         largest.append(np.linalg.eigvalsh(found["rate_of_strain"][1]).max() / e)
     assert [float(cell) for cell in row] == pytest.approx(largest, abs=6e-4)
     assert largest[:2] == pytest.approx([2.0 * np.sinh(e) / (np.cosh(e) + np.cos(angle)) / e, 1.0], rel=1e-9)
@@ -167,9 +169,9 @@ def test_half_a_turn_is_undefined(rate, neighbourhood, device):
     """It has no sense of rotation: NaN, and a sentence, never a number."""
     mesh = flat()
     for axis in AXES.values():
-        places = [mesh.points, mesh.points @ turn(axis, np.pi).T + 1.0]
+        positions = [mesh.points, mesh.points @ turn(axis, np.pi).T + 1.0]
         given = {"neighbourhood": neighbourhood, "rates": rate, "device": device}
-        found = wc.analyze(places, mesh, dt=1.0, measures=("velocity_gradient", "rate_of_strain", "spin"), **given)
+        found = wc.analyze(positions, mesh, dt=1.0, measures=("velocity_gradient", "rate_of_strain", "spin"), **given)
         for name in found:
             assert np.isnan(found[name][1]).all()
         assert any("180°" in str(exclusion) for exclusion in found.excluded)
@@ -201,9 +203,9 @@ def test_rates_converge(neighbourhood, method, device):
         wanted = {name: values[0] for name, values in wanted.items()}
     errors = {name: [] for name in wanted}
     for dt in (0.02, 0.01, 0.005):
-        places = [motion(mesh.points, middle + s * dt / 2.0) for s in (-1.0, 1.0)]
+        positions = [motion(mesh.points, middle + s * dt / 2.0) for s in (-1.0, 1.0)]
         found = wc.analyze(
-            places, mesh, dt=dt, measures=tuple(wanted), rates=method, neighbourhood=neighbourhood, device=device, **threads
+            positions, mesh, dt=dt, measures=tuple(wanted), rates=method, neighbourhood=neighbourhood, device=device, **threads
         )
         for name, values in wanted.items():
             difference = np.reshape(found[name][1] - values, (len(found[name][1]), -1))

@@ -62,8 +62,8 @@ def test_stress_is_the_derivative_of_the_energy(name, device):
     F, delta = gradients_of(np.random.default_rng(6), 50), 1e-5
     mesh, x = separate(F)
     shifts = delta * np.eye(6).reshape(6, 3, 2)
-    places = [x, *(separate(F + sign * shift)[1] for shift in shifts for sign in (1.0, -1.0))]
-    found = wc.analyze(places, mesh, measures=NAMES, material=membrane, device=device)
+    positions = [x, *(separate(F + sign * shift)[1] for shift in shifts for sign in (1.0, -1.0))]
+    found = wc.analyze(positions, mesh, measures=NAMES, material=membrane, device=device)
     u = found["energy_density"][1:].reshape(6, 2, len(F))
     wanted = (u[:, 0] - u[:, 1]).T.reshape(-1, 3, 2) / (2.0 * delta)
     scale = (2.0 * mu + lam) * 27.0

@@ -1,4 +1,4 @@
-"""What README.md and docs/ show works as it stands there: blocks, links, tables and names."""
+"""README.md and docs/ hold as they stand: blocks run, links resolve, tables and names are those of the code."""
 
 import importlib.util
 import json

@@ -16,7 +16,7 @@ def test_folders_mirror_the_packages():
 
 
 def test_no_test_file_imports_another():
-    """What several need is in tests/support. pytest finds files by their names, so no two have the same."""
+    """Code that several test files share is in tests/support. pytest finds files by their names, so no two have the same."""
     files = [path for path in TESTS.rglob("test_*.py")]
     names = {path.stem for path in files}
     assert len(names) == len(files)

@@ -13,7 +13,7 @@ MOST = 12
 
 
 def faults(path):
-    """What is wrong with the signatures of the kernels of a file, a sentence each."""
+    """Returns the faults in the signatures of the kernels of a file, a sentence each."""
     text = path.read_text(encoding="utf-8")
     lines, found = text.splitlines(), []
     for function in ast.walk(ast.parse(text)):

@@ -232,7 +232,7 @@ def test_processes_end_with_the_one_that_started_them(tmp_path):
 
 
 def read(pipe):
-    """What comes next, b"" once nobody has the other end; what takes five minutes hangs."""
+    """Returns the next bytes, b"" once nobody has the other end; a wait of five minutes counts as a hang."""
     assert select.select([pipe], [], [], 300.0)[0]
     return pipe.read(4)
 

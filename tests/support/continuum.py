@@ -48,9 +48,9 @@ def bounded(found, wanted, bound):
     assert error <= bound, f"{error:.2e} > {bound:.2e}"
 
 
-def rounding(mesh, places, dtype):
-    """2 ε(1 + |x|/a), a the shortest altitude: a side is a difference of places that are rounded by ε|x|/2 each."""
-    size = max(np.abs(x).max() for x in (mesh.points, *places))
+def rounding(mesh, positions, dtype):
+    """2 ε(1 + |x|/a), a the shortest altitude: a side is a difference of positions that are rounded by ε|x|/2 each."""
+    size = max(np.abs(x).max() for x in (mesh.points, *positions))
     return 2.0 * EPS[dtype] * (1.0 + size / altitude(mesh.points, mesh.triangles))
 
 
@@ -63,8 +63,8 @@ def jittered(n=9, seed=0, lift=None, embed=None, st=None):
     Args:
         n: Points of a side.
         seed: Of the moves.
-        lift: Maps (n², 2) to places (n², 3); None for the plane of the first two axes.
-        embed: Rotation (3, 3) of the places.
+        lift: Maps (n², 2) to positions (n², 3); None for the plane of the first two axes.
+        embed: Rotation (3, 3) of the positions.
         st: Texture coordinates (2, 2): st = st·(u, v).
     """
     rng = np.random.default_rng(seed)
@@ -76,9 +76,9 @@ def jittered(n=9, seed=0, lift=None, embed=None, st=None):
     sides = uv[triangles[:, 1:]] - uv[triangles[:, :1]]
     areas = 0.5 * (sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
     triangles = triangles[areas > 1e-3 / n**2]  # none but slivers on the outline, which lies on lines up to rounding
-    places = np.pad(uv, ((0, 0), (0, 1))) if lift is None else lift(uv)
-    places = places if embed is None else places @ embed.T
-    return wc.Mesh(places, triangles, texture_coordinates=None if st is None else uv @ np.asarray(st).T)
+    positions = np.pad(uv, ((0, 0), (0, 1))) if lift is None else lift(uv)
+    positions = positions if embed is None else positions @ embed.T
+    return wc.Mesh(positions, triangles, texture_coordinates=None if st is None else uv @ np.asarray(st).T)
 
 
 TILT = turn((1.0, 2.0, -1.0), 0.8)
@@ -225,7 +225,7 @@ def fitted(mesh, x, sets):
     """F of a least-squares system of each set with (l̄N, l̄n) as a row, and R and its residual from SciPy, (n, …) each."""
     F, R, residual = [], [], []
     for N, n, ring in zip(corner_normals(mesh, mesh.points), corner_normals(mesh, x), sets, strict=True):
-        p, q = (places[ring] - places[ring].mean(axis=0) for places in (mesh.points, x))
+        p, q = (positions[ring] - positions[ring].mean(axis=0) for positions in (mesh.points, x))
         mean = np.sqrt((p**2).sum() / len(p))
         F.append(np.linalg.lstsq(np.vstack([p, mean * N]), np.vstack([q, mean * n]), rcond=None)[0].T)
         found, distance = Rotation.align_vectors(q, p)
@@ -296,7 +296,7 @@ def drifting(mesh, t):
 
 
 def separate(F):
-    """A mesh of right triangles, one for each F (E, 3, 2), and its places: differences that are not rounded."""
+    """A mesh of right triangles, one for each F (E, 3, 2), and its positions: differences that are not rounded."""
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     mesh = wc.Mesh(np.tile(corners, (len(F), 1)), np.arange(3 * len(F)).reshape(-1, 3))
     return mesh, np.concatenate([np.zeros((len(F), 1, 3)), F.mT], axis=1).reshape(-1, 3)

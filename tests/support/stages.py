@@ -115,7 +115,7 @@ DIRECTIONS = {"principal1": "uniform", "corner": "vertex"}
 
 
 def measured(mesh, frame, sign=1.0):
-    """What `append` takes, with values that tell the frame and the element; element `frame` and the last have none."""
+    """Arguments of `append`, with values that tell the frame and the element; element `frame` and the last have none."""
     n, count = len(mesh.points), len(mesh.triangles)
     element = np.arange(count or n, dtype=np.float64)
     stretch = sign * (100.0 * frame + element)

@@ -19,7 +19,7 @@ class Window(NamedTuple):
     """The arrays of consecutive vertices of a model that a step reads, numbered from the first of them.
 
     Attributes:
-        terms: Their :class:`warpcloth.model.model.DeviceElements`.
+        terms: Their :class:`warpcloth.model.elements.DeviceElements`.
         inverse_mass: (N,) [1/kg].
         pins, keyframes: Those of the moved pins that are among them, or None.
     """

@@ -13,7 +13,7 @@ class GatherGradient:
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         corrected: Whether it is taken at x + correction.
-        terms: :class:`warpcloth.model.model.DeviceElements`, if not all of the model.
+        terms: :class:`warpcloth.model.elements.DeviceElements`, if not all of the model.
     """
 
     @in_turn
