@@ -7,7 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from warpcloth.cli import _parser
-from warpcloth.cli.options import _of_solver
+from warpcloth.cli.options import _of_solver, _values
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS
 from warpcloth.terms.needs import lacks
@@ -107,7 +107,11 @@ def options():
             said = (action.help or "") % vars(action) if action.help else ""
             choices = ", ".join(map(str, action.choices or ()))
             allowed = f"one of {choices}" if choices not in said else ""
-            default = f"default {action.default}" if action.choices and isinstance(action.default, str) else ""
+            default = (
+                f"default {action.default}"
+                if action.choices and isinstance(action.default, str) and "default" not in said
+                else ""
+            )
             meaning = "; ".join(part for part in (said, allowed, default) if part)
             more = f" {values}" if action.option_strings and values else ""
             rows.append([f"`{flags}{more}`", meaning.replace("|", "\\|")])
@@ -120,7 +124,7 @@ def solver_options():
     found = {}
     for name, record in SOLVERS.items():
         for row in _of_solver(name)["rows"]:
-            found.setdefault((row["name"], row["allowed"]), []).append((record.__name__, row["default"]))
+            found.setdefault((row["name"], _values(row)), []).append((record.__name__, row["default"]))
     rows = []
     for (name, allowed), having in found.items():
         by_default = {}

@@ -89,7 +89,7 @@ def test_both_lists_at_once_and_no_run(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["run", "hanging", "--solver", "pbd", "-s", "help", "-p", "help"]) == 0
     out = capfd.readouterr().out
-    assert "-s of pbd: Position based dynamics" in out and "give dt or substeps" in out and "-p of " in out
+    assert "-s of pbd: Position based dynamics" in out and "give dt (the step [s]) or substeps" in out and "-p of " in out
     assert not list(tmp_path.iterdir())
 
 

@@ -226,7 +226,10 @@ def test_a_hard_constraint_has_another_residual(device):
     """There is no force to be unbalanced, and the sentence names what is measured instead."""
     hard = replace(scene("hanging", n=4), terms=[wc.Spring(stiffness=np.inf)])
     status = wc.simulate(hard, wc.XPBD(substeps=2), device=device, frames=1).status
-    assert f": largest move of a vertex in the last sweep, over h², {digits(status.residual)} times gravity (" in status.message
+    assert (
+        f": largest move of a vertex in the last sweep (divided by h²) {digits(status.residual)} times gravity ("
+        in status.message
+    )
 
 
 def test_rounding_is_no_failure():

@@ -10,7 +10,7 @@ from functools import cache
 from .checks import number
 from .renamed import new_name
 
-WORDS = {bool: "true or false", int: "a whole number", float: "a number, or two as in 1/240", str: "a text"}
+WORDS = {bool: "true or false", int: "a whole number", float: "a number, or a fraction such as 1/240", str: "a text"}
 _TRUTH = dict.fromkeys(("true", "yes", "on", "1"), True) | dict.fromkeys(("false", "no", "off", "0"), False)
 
 

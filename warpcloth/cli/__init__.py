@@ -93,7 +93,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser():
-    parser = _Parser(prog="warpcloth", description="Cloth simulation, written as USD.", allow_abbrev=False)
+    parser = _Parser(prog="warpcloth", description="Simulate cloth and write it as USD.", allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"warpcloth {_version()}")
     parser.set_defaults(command=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
@@ -107,55 +107,74 @@ def _parser():
         return sub
 
     runs = add("run", run.run, "Run a scene and write its animation as USD.", epilog=run.EPILOG)
-    infos = add("info", info.info, "Say what is in a scene, and what is built from it.", epilog=info.EPILOG)
+    infos = add("info", info.info, "Show what a scene contains and what is built from it.", epilog=info.EPILOG)
     deforms = add("deform", deform.deform, "Deform a mesh as rigidly as its handles allow.", epilog=deform.EPILOG)
     deform.add_arguments(deforms)
     analyzes = add("analyze", analyze.analyze, "Measure how an animated cloth deforms.", epilog=analyze.EPILOG)
     analyze.add_arguments(analyzes)
-    compares = add("compare", compare.compare, "Say how far two animations are apart.", epilog=compare.EPILOG)
+    compares = add("compare", compare.compare, "Measure the distance between two animations.", epilog=compare.EPILOG)
     compare.add_arguments(compares)
     charts = commands.add_parser("chart", help=chart.TEXT, description=chart.TEXT, allow_abbrev=False)
     chart.add_arguments(charts)
     chooses = add("choose", choose.choose, "Choose the cheapest solver and settings for a scene.", epilog=choose.EPILOG)
     choose.add_arguments(chooses)
-    benches = add("bench", bench.bench, "Measure what frames cost, and compare two results.", epilog=bench.EPILOG)
+    benches = add("bench", bench.bench, "Measure the time and memory of frames, or compare two results.", epilog=bench.EPILOG)
     bench.add_arguments(benches)
     for sub in (runs, infos):
-        sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-        sub.add_argument("--solver", choices=options.solvers(), help="the solver; newton if not given")
+        sub.add_argument(
+            "scene",
+            metavar="SCENE",
+            help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
+        )
+        sub.add_argument("--solver", choices=options.solvers(), help="the solver (default: newton)")
         for option, of, text in (("-s", "option", "options of the solver"), ("-p", "parameter", "parameters of the scene")):
             text = f"{text}; '{option} help' lists them"
             sub.add_argument(option, nargs="+", action="extend", default=[], metavar=f"{of}=value", help=text)
-        sub.add_argument("--prim", help="path or name of the cloth's prim, for a stage with several meshes")
-        sub.add_argument("--pins", metavar="SELECTION", help="vertices that stand still; replaces the scene's pins")
-    infos.add_argument("--advise", action="store_true", help="try which terms, precision and resolution matter")
-    infos.add_argument("--tolerance", metavar="SHARE", help="with --advise, the largest change that does not matter (1%%)")
-    infos.add_argument("--frames", type=int, metavar="N", help="with --advise, frames to try (30)")
-    runs.add_argument("--tolerance", metavar="SHARE", help="choose solver and settings of this error, such as 1%%; see choose")
-    runs.add_argument("--budget", metavar="TIME", help="choose the most accurate within this time per frame, such as 16ms")
-    runs.add_argument("--frames", type=int, metavar="N", help="frames after the first; by default those of the scene")
-    for sub in (runs, infos, deforms, analyzes, compares, chooses, benches):
-        sub.add_argument("--device", default="cpu", help="device: cpu (default), cuda:0, …")
-        sub.add_argument("--json", action="store_true", help="print one JSON object")
-    for sub in (runs, benches):
+        sub.add_argument("--prim", help="path or name of the cloth's prim, if the stage has several meshes")
         sub.add_argument(
-            "--threads", type=int, default=1, metavar="N", help="threads that share the steps on the CPU (default: 1)"
+            "--pins", metavar="SELECTION", help="pin these vertices in place of the scene's pins, such as 'x < 0.1'"
         )
+    infos.add_argument(
+        "--advise", action="store_true", help="find out which terms, precision, step and resolution change the result"
+    )
+    infos.add_argument("--tolerance", metavar="SHARE", help="with --advise: smaller changes do not matter (default: 1%%)")
+    infos.add_argument(
+        "--frames", type=int, metavar="N", help="with --advise: number of frames to simulate (default: at most 30)"
+    )
+    runs.add_argument(
+        "--tolerance",
+        metavar="SHARE",
+        help="use the cheapest solver and settings within this error, such as 1%%; see 'warpcloth choose'",
+    )
+    runs.add_argument(
+        "--budget", metavar="TIME", help="use the most accurate solver and settings within this time per frame, such as 16ms"
+    )
+    runs.add_argument(
+        "--frames", type=int, metavar="N", help="number of frames after the start (default: the scene's duration)"
+    )
+    for sub in (runs, infos, deforms, analyzes, compares, chooses, benches):
+        sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+        sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    for sub in (runs, benches):
+        sub.add_argument("--threads", type=int, default=1, metavar="N", help="number of CPU threads (default: 1)")
     for sub in (runs, infos, deforms, analyzes, chooses, benches):
-        sub.add_argument("--dtype", choices=DTYPES, default="float64" if sub in (deforms, analyzes) else "float32")
+        default = "float64" if sub in (deforms, analyzes) else "float32"
+        sub.add_argument("--dtype", choices=DTYPES, default=default, help=f"precision (default: {default})")
     for sub in (runs, deforms):
         text = "the .usd, .usda, .usdc or .usdz file to write"
-        text += "" if sub is deforms else "; by default NAME.usdc, where NAME is the scene's, which must not exist yet"
+        text += "" if sub is deforms else " (default: the scene's name and .usdc; an existing file is then not replaced)"
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
     runs.add_argument(
         "--resume",
         action="store_true",
-        help="continue an interrupted run to the same file, after its last complete chunk of frames",
+        help="continue the interrupted run to this output from its last checkpoint; there is one every ten frames",
     )
     for sub in (runs, deforms, analyzes):
-        sub.add_argument("--single-file", action="store_true", help="merge everything into one file, with no folder of frames")
+        sub.add_argument("--single-file", action="store_true", help="write one file instead of a file and a folder of frames")
     lists = add("scenes", scenes.scenes, "List scenes and their parameters.")
-    lists.add_argument("folder", nargs="?", help="a folder of .py files; those of scenes known by name if not given")
+    lists.add_argument(
+        "folder", metavar="FOLDER", nargs="?", help="a folder of scene files (default: ./scenes and the included scenes)"
+    )
     return parser
 
 

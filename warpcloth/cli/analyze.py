@@ -10,9 +10,10 @@ from ..base.texts import convert
 from .terminal import Progress, check_writable, frames_folder_of, json_text, location
 
 EPILOG = """\
-INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays, .npz or .npy.
---measure help lists the measures. --colour shows one number of a measure: stretch_1, area_ratio, rate_of_strain_norm. What
-cannot be measured, such as triangles without area or points that are not finite, is left out and listed.
+INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays in .npz or .npy.
+--measure help lists the measures. --colour shows one component of a measure, such as stretch_1, or a measure that is one
+number, such as area_ratio. What cannot be measured, such as triangles without area or points that are not finite, is left out
+and listed.
 
   warpcloth analyze cache.usdc --measure stretch area_ratio -o measured.usdc --plot measured.png
   warpcloth analyze frames/ --fps 24 --rest pattern.obj --neighbourhood 1-ring --measure rotation residual --csv table.csv
@@ -25,55 +26,84 @@ _SENTENCES = 8
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
-    add("input", metavar="INPUT", nargs="?", help="the animation: a stage, a folder or pattern of mesh files, .npz or .npy")
-    add("--prim", help="path or name of the prim, or geometry, of a file with several")
-    add("--fps", type=float, help="frames per second, if the input does not say; rates need it")
+    add(
+        "input",
+        metavar="INPUT",
+        nargs="?",
+        help="the animation: a USD stage, a folder or pattern of mesh files, a .npz or a .npy file",
+    )
+    add("--prim", help="path or name of the mesh, if the file has several")
+    add("--fps", type=float, help="frames per second (default: that of the input); rates need it")
     add(
         "--rest",
         metavar="MESH",
-        help="the rest shape, a mesh file or stage with the same triangles; if not given that of INPUT, or its first frame",
+        help="mesh file or stage with the rest shape (default: the rest shape in INPUT, else its first frame)",
     )
-    add("--rest-prim", metavar="PRIM", help="as --prim, in the file of the rest shape")
-    add("--measure", nargs="+", default=["stretch"], metavar="NAME", help="measures, all, or help (default: stretch)")
-    add("--neighbourhood", metavar="N", help="measure vertices: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%")
-    add("--reference", metavar="R", help="the reference: rest (default), first, previous, or the number of a frame")
-    add("--pairs", metavar="A:B,…", help="pairs of reference and frame, such as 1:2,1:3,72:75, in place of --reference")
-    add("--lag", type=int, metavar="K", help="compare each frame with the one K before it, in place of --reference")
-    add("--every", type=int, default=1, metavar="K", help="measure every K-th frame only")
-    add("--rates", choices=("midpoint", "forward", "logarithm"), default="midpoint", help="how rates are computed")
-    add("--directions", metavar="D", help="warp and weft: st, or a vector such as 1,0,0 for the warp")
-    add("--material", metavar="M", help="for energy and stress: neo-hookean (default with --stiffness), stvk or corotated")
+    add("--rest-prim", metavar="PRIM", help="path or name of the mesh in the file of --rest")
+    add(
+        "--measure",
+        nargs="+",
+        default=["stretch"],
+        metavar="NAME",
+        help="measures to compute, or all; '--measure help' lists them (default: stretch)",
+    )
+    add(
+        "--neighbourhood",
+        metavar="N",
+        help="measure vertices instead of triangles: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%",
+    )
+    add("--reference", metavar="R", help="compare each frame with rest (default), first, previous, or a frame number")
+    add("--pairs", metavar="A:B,…", help="compare these pairs of reference and frame instead, such as 1:2,1:3,72:75")
+    add("--lag", type=int, metavar="K", help="compare each frame with the one K frames earlier instead")
+    add("--every", type=int, default=1, metavar="K", help="measure only every K-th frame")
+    add(
+        "--rates",
+        choices=("midpoint", "forward", "logarithm"),
+        default="midpoint",
+        help="formula of rates, see docs/measuring.md",
+    )
+    add("--directions", metavar="D", help="direction of the warp: st for texture coordinates, or a vector such as 1,0,0")
+    add(
+        "--material",
+        metavar="M",
+        help="membrane for energy and stress: neo-hookean (default with --stiffness), stvk or corotated",
+    )
     add("--stiffness", type=float, metavar="K", help="stiffness of the material, Young's modulus times thickness [N/m]")
     add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material (default: 0)")
-    add("-o", "--output", metavar="FILE", help="a .usd, .usda, .usdc or .usdz file: measures as primvars, one as colour")
+    add(
+        "-o",
+        "--output",
+        metavar="FILE",
+        help="write a .usd, .usda, .usdc or .usdz file with the measures as primvars, and one as colour",
+    )
     add(
         "--colour",
         metavar="NAME",
-        help="the number that is shown as colour, such as stretch_1, or none (default: the first)",
+        help="the value shown as colour, such as stretch_1, or none (default: the first one measured)",
     )
     add(
         "--range",
         type=float,
         nargs=2,
         metavar=("LOW", "HIGH"),
-        help="range of the colours (default: that of all frames, without the last 1 %%)",
+        help="values at the ends of the colour scale (default: from the 1st to the 99th percentile)",
     )
-    add("--up-axis", choices=("Y", "Z"), help="up axis of an input that does not say (default: Y)")
-    add("--curves", action="store_true", help="show the principal directions as curves")
-    add("--csv", metavar="FILE", help="a table: percentiles of every frame, the worst element and its position")
-    add("--report", metavar="FILE", help="the same, with what could not be measured, as JSON")
-    add("--npz", metavar="FILE", help="the measures themselves, (frames, elements, …)")
-    add("--plot", metavar="FILE", help="percentiles over time, .png, .svg or .pdf")
-    add("--still", metavar="FILE", help="pictures, .png; the frame number goes before the ending")
-    add("--azimuth", type=float, metavar="DEGREES", help="azimuth of the viewer in --still (default: -38)")
-    add("--elevation", type=float, metavar="DEGREES", help="elevation of the viewer in --still (default: 24)")
-    add("--both-sides", action="store_true", help="show the cloth from the opposite side too in each --still")
+    add("--up-axis", choices=("Y", "Z"), help="up axis, if the input does not say (default: Y)")
+    add("--curves", action="store_true", help="draw the principal directions as curves in the stage and in stills")
+    add("--csv", metavar="FILE", help="write a table: percentiles of each measure in each frame, and where its extremes are")
+    add("--report", metavar="FILE", help="write the table of --csv as JSON, with a list of what could not be measured")
+    add("--npz", metavar="FILE", help="write the measures as arrays (frames, elements, …)")
+    add("--plot", metavar="FILE", help="plot percentiles over time (.png, .svg, .pdf)")
+    add("--still", metavar="FILE", help="write pictures (.png); the frame number is added to the name")
+    add("--azimuth", type=float, metavar="DEGREES", help="azimuth of the camera of --still (default: -38)")
+    add("--elevation", type=float, metavar="DEGREES", help="elevation of the camera of --still (default: 24)")
+    add("--both-sides", action="store_true", help="also show the opposite side of the cloth in each still")
     add(
         "--colormap",
         metavar="NAME",
         help="a colour map of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
     )
-    add("--still-frames", type=float, nargs="+", metavar="FRAME", help="frames of --still (default: the last)")
+    add("--still-frames", type=float, nargs="+", metavar="FRAME", help="frames to show with --still (default: the last)")
 
 
 def analyze(arguments):

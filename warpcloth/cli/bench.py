@@ -11,23 +11,24 @@ from .setup import named_scene, solver_setup
 from .terminal import Interrupted, check_writable, json_text, open_bar, say
 
 EPILOG = """\
-Without SCENE, every solver runs hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of net; this takes
-a few minutes. Each row is measured in a process of its own, one after another. If no step is given it is that of run.
+Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
+scene net; this takes a few minutes. Each row is measured in a process of its own, one after another. Without dt or substeps
+the step is that of 'warpcloth run'.
 
 Columns:
-  ms         a warm frame with its points on the host, median and quartiles
-  cloths/s   cloths of a batch that make a frame in a second
-  ns         a frame over elements of all terms × iterations × substeps (Newton iterations; of hierarchical PBD sweeps over
-             all terms)
-  GB/s       the bytes that a step has to move, over its time: positions in and out once, inverse masses and the arrays of all
-             terms once an iteration, velocities in and out once
-  share      GB/s over that of the faster of two ways to copy on this device; small scenes stay in its caches and may exceed
-             100 %
-  launches   of a step: kernels, fills and copies
-  start      from the start of a process to its first frame, with all kernels in the cache
-  compile    how much longer that takes with none there
-  factor     constant matrices
-  MB         most memory, of the process on a CPU, of Warp's pool on CUDA
+  ms a frame  time of a frame after warm-up, with its points copied to the host: median
+  quartiles   of that time
+  cloths/s    frames per second, summed over all cloths of a batch
+  ns          time of a frame per element of all terms, iteration and substep (for newton per Newton iteration, for
+              hierarchical-pbd per sweep over all terms)
+  GB/s        bytes that a step must move, divided by its time: per iteration, positions read and written, inverse masses and
+              the arrays of all terms read; per step, velocities read and written
+  share       GB/s relative to the faster of two copies on this device; small scenes fit into its caches and may exceed 100 %
+  launches    kernel launches, fills and copies per step
+  start s     from the start of a process to its first frame, with all kernels compiled before
+  compile s   additional time of a start that compiles all kernels
+  factor s    time to factorise constant matrices
+  MB          peak memory: of the process on a CPU, of Warp's memory pool on CUDA
 
   warpcloth bench --json > before.json
   warpcloth bench hanging --solver xpbd -s substeps=4 iterations=20 --sizes 32 64 128
@@ -41,21 +42,42 @@ _OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": 
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
-    add("scene", nargs="?", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    add("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
-    add("--solver", choices=solvers(), help="the solver; newton if not given")
-    add("-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver")
-    add("--sizes", nargs="+", type=int, default=[], metavar="N", help="resolutions of the scene, values of its parameter")
+    add(
+        "scene",
+        nargs="?",
+        metavar="SCENE",
+        help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
+    )
+    add(
+        "-p",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="parameter=value",
+        help="parameters of the scene; '-p help' lists them",
+    )
+    add("--solver", choices=solvers(), help="the solver (default: newton)")
+    add(
+        "-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver; '-s help' lists them"
+    )
+    add(
+        "--sizes",
+        nargs="+",
+        type=int,
+        default=[],
+        metavar="N",
+        help="resolutions to measure: values of the scene's parameter n, links or elements",
+    )
     add(
         "--frames",
         type=int,
         default=_OF_A_RUN["frames"],
         metavar="N",
-        help="the most frames to time (default: 20); after 10 s 3 are enough",
+        help="frames to time (default: 20); fewer if they take over 10 s, but at least 3",
     )
-    add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="size of a batch that runs at once (default: 1)")
-    add("--csv", metavar="FILE", help="write a table")
-    add("--compare", nargs=2, metavar=("OLD", "NEW"), help="print the ratios of two results of --json")
+    add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="number of cloths in a batch (default: 1)")
+    add("--csv", metavar="FILE", help="write the measurements as a table")
+    add("--compare", nargs=2, metavar=("OLD", "NEW"), help="print the ratios of two results that --json printed")
 
 
 def bench(arguments):

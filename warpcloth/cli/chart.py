@@ -14,33 +14,35 @@ from .options import add_import, solvers
 from .setup import named_scene
 from .terminal import DTYPES, add_dask, check_outputs, json_text, measuring
 
-TEXT = "Chart speed against accuracy, stability and failures."
+TEXT = "Draw charts of accuracy against time, of stability, and of failures."
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
 
 EPILOG = """\
 Diagrams:
-  time       the error of a motion against the time for a second of it, for steps and iterations of all solvers; RMS over
-             vertices and frames, relative to a reference solution of the same mesh
-  solver     how much of the objective of one step is left by methods that minimise it, against iterations and time
-  physics    errors of rest shapes relative to closed forms, against mesh size and time, for cantilever (on meshes of four
-             patterns, turned), chain and catenary
-  spectrum   errors of projective dynamics beside those that the spectrum of its matrix predicts, for few vertices
+  time       error of a motion against the compute time of one second of it, for many settings of every solver; the error
+             is the RMS distance over vertices and frames to a reference solution of the same mesh
+  solver     one step: how much of its objective is left, against iterations and time, for solvers that minimise it
+  physics    error of rest shapes against mesh size and time, relative to closed forms; for the scenes cantilever (on four
+             mesh patterns, straight and turned), chain and catenary
+  spectrum   error of each iteration of projective dynamics, and the error that the eigenvalues of its matrix predict; for
+             small meshes
 Settings that diverge, are refused or take too long are listed with the reason.
 
-Measurements are kept in WARPCLOTH_CACHE, or ~/.cache/warpcloth, and not repeated by the same code; after an interruption the
-same command goes on. Several processes measure at the same time, one thread each, so compare times only within a chart.
+Measurements are stored in WARPCLOTH_CACHE, or ~/.cache/warpcloth, and reused while the code is the same; after an
+interruption the same command continues. Several processes measure at the same time, one thread each, so compare times only
+within a chart.
 
   warpcloth chart work-precision hanging -p n=16 --solvers newton xpbd -o chart.png --csv chart.csv
 """
 
 FAILURE_EPILOG = """\
 Failures:
-  locking      irregular meshes strain, wrinkle or stay flat
+  locking      cloth on irregular meshes that is too stiff to bend
   isometry     quadratic bending of cloth that stretches, or is curved at rest
-  slivers      gradient and explicit step of thin triangles, and hinges folded flat
-  cotangents   negative weights, and what deformation makes of them
-  rank         rotations of points in a plane, on a line, at one position
-Points are measured with the terms, solvers and fits themselves; lines are closed forms. Measurements are kept.
+  slivers      gradient and largest explicit step of thin triangles and of hinges folded flat
+  cotangents   deformation with negative cotangent weights
+  rank         rotations fitted to points in a plane, on a line or at one position
+In the chart, points are measured and lines are closed forms. Measurements are stored and reused.
 
   warpcloth chart failure slivers -o slivers.png --csv slivers.csv
 """
@@ -52,7 +54,7 @@ def add_arguments(parser):
     charts = parser.add_subparsers(title="charts", metavar="CHART")
     _add_work_precision(charts)
     _add_failure(charts)
-    text = "Map where methods are stable, inaccurate or diverge."
+    text = "Map where solvers are stable, are inaccurate, or diverge."
     stability.add_arguments(add(charts, "stability", stability.chart, text, stability.EPILOG))
 
 
@@ -61,33 +63,57 @@ def add(charts, name, command, text, epilog):
     form = argparse.RawDescriptionHelpFormatter
     sub = charts.add_parser(name, help=text, description=text, epilog=epilog, allow_abbrev=False, formatter_class=form)
     sub.set_defaults(command=command)
-    sub.add_argument("--device", default="cpu", help="device: cpu (default), cuda:0, …")
-    sub.add_argument("--workers", type=int, metavar="N", help="processes at the same time (default: the cores, on a GPU one)")
+    sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+    sub.add_argument("--workers", type=int, metavar="N", help="number of processes (default: one per core, or one on a GPU)")
     add_dask(sub)
-    sub.add_argument("-o", "--output", metavar="FILE", help=f"draw it, as {', '.join(PICTURES)}")
-    sub.add_argument("--csv", metavar="FILE", help="write a table")
-    sub.add_argument("--json", action="store_true", help="print one JSON object")
+    sub.add_argument("-o", "--output", metavar="FILE", help=f"draw the chart ({', '.join(PICTURES)})")
+    sub.add_argument("--csv", metavar="FILE", help="write the measurements as a table")
+    sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
     add_import(sub)
     return sub
 
 
 def _add_work_precision(charts):
-    sub = add(charts, "work-precision", work_precision, "Error over time, of settings of all solvers.", EPILOG)
-    sub.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    sub.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
-    sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="which diagram")
-    sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure these solvers only")
-    sub.add_argument("--frames", type=int, metavar="N", help="frames to run (default: half), or before a step (a third)")
-    sub.add_argument("--dtype", choices=DTYPES, help="default: float32 for motion, float64 for a step")
+    sub = add(charts, "work-precision", work_precision, "Chart the error of solvers against their compute time.", EPILOG)
     sub.add_argument(
-        "--limit", type=float, default=20.0, metavar="SECONDS", help="of a setting (default: 20); a reference has six times it"
+        "scene",
+        metavar="SCENE",
+        help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
+    )
+    sub.add_argument(
+        "-p",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="parameter=value",
+        help="parameters of the scene; '-p help' lists them",
+    )
+    sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="diagram to measure")
+    sub.add_argument(
+        "--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure only these solvers (default: all)"
+    )
+    sub.add_argument(
+        "--frames",
+        type=int,
+        metavar="N",
+        help="frames to simulate (default: half of the scene's); for solver and spectrum those before the step (a third)",
+    )
+    sub.add_argument("--dtype", choices=DTYPES, help="precision (default: float32 for the diagram time, else float64)")
+    sub.add_argument(
+        "--limit",
+        type=float,
+        default=20.0,
+        metavar="SECONDS",
+        help="time limit of each setting (default: 20); a reference may take six times as long",
     )
 
 
 def _add_failure(charts):
     names = list_failures()
-    sub = add(charts, "failure", failure, "Chart where terms, weights and fits fail, beside theory.", FAILURE_EPILOG)
+    sub = add(
+        charts, "failure", failure, "Chart where energies, weights and fits fail, and what theory predicts.", FAILURE_EPILOG
+    )
     sub.add_argument("failure", metavar="FAILURE", choices=names, help=f"one of {', '.join(names)}")
 
 

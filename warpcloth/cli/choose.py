@@ -9,9 +9,9 @@ from .setup import named_scene
 from .terminal import Interrupted, Settings, add_dask, executing, json_text
 
 EPILOG = """\
-Each solver goes from coarse settings to fine ones, until it meets the tolerance or costs more than one that does. Errors are
-RMS distances over vertices and frames to a reference solution, divided by the longest side of the cloth. Measurements are
-kept.
+Settings of each solver are tried from coarse to fine, until one meets the tolerance or costs more than a setting that does.
+The error is the RMS distance over vertices and frames to a reference solution, divided by the longest side of the cloth.
+Measurements are stored and reused.
 
   warpcloth choose hanging -p n=32 --tolerance 1%
   warpcloth choose hanging --budget 16ms
@@ -21,13 +21,24 @@ kept.
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    add("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
-    add("--tolerance", metavar="SHARE", help="largest error, such as 1%% of the size of the cloth")
-    add("--budget", metavar="TIME", help="longest frame, such as 16ms")
+    add(
+        "scene",
+        metavar="SCENE",
+        help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
+    )
+    add(
+        "-p",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="parameter=value",
+        help="parameters of the scene; '-p help' lists them",
+    )
+    add("--tolerance", metavar="SHARE", help="largest error allowed, such as 1%% of the size of the cloth")
+    add("--budget", metavar="TIME", help="longest time per frame allowed, such as 16ms")
     add("--solvers", nargs="+", metavar="NAME", help="solvers to choose among (default: all)")
-    add("--frames", type=int, metavar="N", help="frames to run; by default those of the scene")
-    add("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of a run (default: 60)")
+    add("--frames", type=int, metavar="N", help="number of frames to simulate (default: the scene's duration)")
+    add("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
     add_dask(parser)
 
 

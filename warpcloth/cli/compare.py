@@ -14,9 +14,10 @@ _SHOWN = 8  # frames or exclusions of each that the summary names
 
 EPILOG = """\
 A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames that
-both have at one time are compared, and the others are listed. If the triangles are the same, vertices are compared, and
-stretches relative to each rest shape; otherwise only the surfaces are. The rest shape of a folder or an .npz file is its first
-frame, unless --rest-a or --rest-b gives another. If one is Y up and the other Z up, B is turned to the axis of A.
+both have at the same time are compared, and the others are listed. If A and B have the same triangles, vertices and stretches
+are compared, otherwise only surfaces. Stretches are relative to the rest shape of each. The rest shape of a folder or an .npz
+file is its first frame, unless --rest-a or --rest-b gives another. If one is Y up and the other Z up, B is turned to the up
+axis of A.
 
   warpcloth compare hanging.usdc frames --fps-b 24 --rest-b rest.obj --csv apart.csv
 """
@@ -25,17 +26,17 @@ frame, unless --rest-a or --rest-b gives another. If one is Y up and the other Z
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     for name, of in (("a", "A"), ("b", "B")):
-        parser.add_argument(name, metavar=of, help="an animation" if of == "A" else "another")
+        parser.add_argument(name, metavar=of, help="the first animation" if of == "A" else "the second animation")
     for name, of in (("a", "A"), ("b", "B")):
         parser.add_argument(f"--prim-{name}", metavar="PRIM", help=f"path or name of the prim of {of}, if it has several")
         parser.add_argument(f"--rest-{name}", metavar="MESH", help=f"mesh file with the rest shape of {of}")
-        parser.add_argument(f"--fps-{name}", type=float, metavar="FPS", help=f"frames per second of {of} alone")
-        parser.add_argument(f"--up-axis-{name}", choices=("Y", "Z"), help=f"up axis of {of} alone")
-    parser.add_argument("--fps", type=float, help="frames per second of both, if they do not say")
-    parser.add_argument("--up-axis", choices=("Y", "Z"), help="up axis of both, which overrides their own")
-    parser.add_argument("--frames", type=int, metavar="N", help="frames after the first (default: all)")
-    parser.add_argument("--csv", metavar="FILE", help="write a line for each frame")
-    parser.add_argument("--plot", metavar="FILE", help=f"draw the distances over time, as {', '.join(PICTURES)}")
+        parser.add_argument(f"--fps-{name}", type=float, metavar="FPS", help=f"frames per second of {of}; overrides its own")
+        parser.add_argument(f"--up-axis-{name}", choices=("Y", "Z"), help=f"up axis of {of}; overrides its own")
+    parser.add_argument("--fps", type=float, help="frames per second of A and B; overrides their own")
+    parser.add_argument("--up-axis", choices=("Y", "Z"), help="up axis of A and B; overrides their own")
+    parser.add_argument("--frames", type=int, metavar="N", help="compare the first frame and N frames after it (default: all)")
+    parser.add_argument("--csv", metavar="FILE", help="write a table with one row per frame")
+    parser.add_argument("--plot", metavar="FILE", help=f"plot the distances over time ({', '.join(PICTURES)})")
 
 
 def compare(arguments):

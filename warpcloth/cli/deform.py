@@ -20,12 +20,18 @@ from .terminal import Progress, check_writable, frames_folder_of, json_text, loc
 _FRAMES, _FPS = 24, 24.0
 
 EPILOG = """\
---fix holds vertices where they are. --move moves others, by the --rotate and --translate that follow it, up to the next
---move. --rotate turns them by DEGREES about AXIS through (CX, CY, CZ), or through their centroid; --translate shifts them.
-Both are spread evenly over the frames. The rotation is applied first, in whatever order the two are given; 720 degrees are
-two turns. AXIS is x, y, z or a vector such as 1,0,-1. A turn between two frames must be less than 180 degrees. A SELECTION is
-a text such as "y < 0.1 and not boundary" or "nearest(0, 1.5, 0, 40)", in metres and in world space, whatever the units of the
-file.
+--fix holds vertices where they are. --move moves vertices by the --rotate and --translate that follow it, before the next
+--move. --rotate turns them by DEGREES about AXIS, which passes through (CX, CY, CZ), or through their centroid if that is not
+given. AXIS is x, y, z or a vector such as 1,0,-1. 720 degrees are two turns, but between two frames a turn must be less than
+180 degrees. The rotation is applied before the translation, in whatever order they are given, and both are spread evenly
+over the frames.
+
+A SELECTION is a text such as "y < 0.1 and not boundary" or "nearest(0, 1.5, 0, 40)", in metres and in world space, whatever
+the units of the file.
+
+--weights: cotangent (may be negative), intrinsic (cotangents of the intrinsic Delaunay triangulation), uniform, or clamped
+(negative cotangents set to 0). --energy: spokes (the edges at a vertex), or spokes_and_rims (also the edges opposite to it
+in its triangles; only with cotangent weights).
 
   warpcloth deform bunny.usd --fix "y < 0.2" --move "y > 1.3" --rotate 60 x --translate 0 0 0.3 -o out.usdc
 """
@@ -44,24 +50,53 @@ def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     # argparse would take "-1e-3" and "-1,0,0" for options, before Python 3.14.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
-    text = "a mesh file, a USD stage, or a scene whose pins move: a .py file or a known name"
+    text = "a mesh file, a USD stage, or a scene with moving pins (a name or a .py file)"
     parser.add_argument("mesh", metavar="MESH", help=text)
-    hold = "vertices that stay; may be repeated"
+    hold = "vertices to hold in place; may be repeated"
     parser.add_argument("--fix", action="append", default=[], metavar="SELECTION", help=hold)
-    take = "vertices that move as what follows says; may be repeated"
+    take = "vertices to move by the --rotate and --translate that follow; may be repeated"
     parser.add_argument("--move", action=_AddMove, dest="moves", default=[], metavar="SELECTION", help=take)
-    turn = "of the --move before it: DEGREES AXIS [CX CY CZ]"
+    turn = "rotate the vertices of the preceding --move: DEGREES AXIS, or DEGREES AXIS CX CY CZ"
     parser.add_argument("--rotate", action=_AddRotation, dest="moves", nargs="+", metavar=("DEGREES", "AXIS"), help=turn)
-    shift = "of the --move before it [m]"
+    shift = "translate the vertices of the preceding --move [m]"
     parser.add_argument("--translate", action=_AddTranslation, dest="moves", nargs=3, metavar=("X", "Y", "Z"), help=shift)
-    parser.add_argument("--frames", type=int, metavar="N", help=f"frames after the first: {_FRAMES}, or the scene's keyframes")
-    parser.add_argument("--fps", type=float, help=f"frames per second: the stage's or scene's, or {_FPS:g}")
-    parser.add_argument("--prim", help="path or name of the prim, or geometry, of a file with several")
-    parser.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
-    parser.add_argument("--weights", choices=("cotangent", "intrinsic", "uniform", "clamped"), default="cotangent")
-    parser.add_argument("--energy", choices=("spokes", "spokes_and_rims"), default="spokes")
-    parser.add_argument("--iterations", type=int, default=500, metavar="N", help="the most iterations per frame (default: 500)")
-    parser.add_argument("--tolerance", type=float, default=1e-6, help="at which a frame has converged (default: 1e-6)")
+    parser.add_argument(
+        "--frames",
+        type=int,
+        metavar="N",
+        help=f"number of frames after the first (default: {_FRAMES}; for a scene, one per keyframe)",
+    )
+    parser.add_argument("--fps", type=float, help=f"frames per second (default: that of the stage, else {_FPS:g})")
+    parser.add_argument("--prim", help="path or name of the mesh, if the file has several")
+    parser.add_argument(
+        "-p",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="parameter=value",
+        help="parameters of the scene; '-p help' lists them",
+    )
+    parser.add_argument(
+        "--weights",
+        choices=("cotangent", "intrinsic", "uniform", "clamped"),
+        default="cotangent",
+        help="weights of the edges (default: cotangent)",
+    )
+    parser.add_argument(
+        "--energy",
+        choices=("spokes", "spokes_and_rims"),
+        default="spokes",
+        help="kind of energy (default: spokes)",
+    )
+    parser.add_argument(
+        "--iterations", type=int, default=500, metavar="N", help="maximum number of iterations per frame (default: 500)"
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=1e-6,
+        help="stop when an iteration lowers the energy by less than this fraction (default: 1e-6)",
+    )
 
 
 class _AddMove(argparse.Action):

@@ -44,7 +44,7 @@ def _of_solver(name):
     name = name or DEFAULT
     record = SOLVERS[name]
     found = _listed(f"-s of {name}", record.__doc__, record, parameters_of(record))
-    return found | {"note": "give dt or substeps, not both; without either a step is chosen"}
+    return found | {"note": "give dt (the step [s]) or substeps (steps per frame), not both; without either a step is chosen"}
 
 
 def _of_scene(name):
@@ -76,7 +76,7 @@ def _listed(title, doc, call, parameters):
 
 def _text(found):
     lines = [found["of"] + (f": {found['meaning']}" if found["meaning"] else "")]
-    rows = [(row["name"], _default(row), row["allowed"]) for row in found["rows"]]
+    rows = [(row["name"], _default(row), _values(row)) for row in found["rows"]]
     if not rows:
         return "\n".join([*lines, "  it has none"])
     widths = [max(map(len, columns)) for columns in zip(*rows, strict=True)]
@@ -85,7 +85,12 @@ def _text(found):
 
 
 def _default(row):
-    return "needed" if row["needed"] else "none" if row["default"] is None else str(row["default"])
+    return "needed" if row["needed"] else "–" if row["default"] is None else str(row["default"])
+
+
+def _values(row):
+    """The allowed values; the default None is left out, because it is what an option has that is not given."""
+    return row["allowed"].removesuffix(", or none" if row["default"] is None and not row["needed"] else "")
 
 
 class _Refused:
@@ -112,7 +117,7 @@ def _allowed(call, name, parameter):
 
 def add_import(parser):
     """Adds the option that names modules from outside the package."""
-    text = "a module, or a .py file, that registers energies or solvers; see docs/extending.md"
+    text = "load energies or solvers from a module or a .py file; may be repeated (see docs/extending.md)"
     parser.add_argument("--import", dest="imports", action="append", default=[], metavar="MODULE", help=text)
 
 

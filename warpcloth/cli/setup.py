@@ -14,9 +14,9 @@ _STEPS_A_SECOND = 240
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
-If neither dt nor substeps is given, solvers with a limit of stability, such as explicit, take the fewest substeps that are
-10 % below the limit about the rest shape and below the bound for motion (exact for springs; hinges count as at rest). All
-others take those whose step is nearest to 1/240 s.
+The step by default: solvers with a stability limit, such as explicit, take the fewest substeps that are stable. Their step
+is 10 % below the limit for small motion about the rest shape, and below a bound for any motion. (The bound is exact for
+springs; hinges count as at rest.) All other solvers take a step of about 1/240 s.
 """
 
 

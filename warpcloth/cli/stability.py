@@ -12,14 +12,16 @@ _COUNT = 9
 
 EPILOG = f"""\
 Axes: {", ".join(AXES)}.
-Stiffness and mass-ratio are factors of what the scene has, compression is 1 − l/L at the start, and resolution is a parameter
-n, links or elements of the scene. A METHOD is NAME or NAME:option=value,option=value.
+Stiffness and mass-ratio are multiples of the scene's own, compression is 1 − l/L at the start, and resolution is the scene's
+parameter n, links or elements. A METHOD is the NAME of a solver, or NAME:option=value,option=value.
 
-All cells are compared over the same time of motion. Runs with large steps go on for --steps, to show whether they diverge;
-small steps cost the most. A run has diverged if it has three times the energy that its start, falling and moving pins can
-have put in. It is inaccurate if its distance to the reference, RMS over vertices and frames and divided by the size of the
-cloth, exceeds --accuracy by more than the error of the reference. It is unsure if the reference cannot tell. The reference is
-Newton's method with BDF2 and a quarter of the step, in float64. Rows that are measured are kept, and not measured again.
+All runs are compared over the same simulated time. A run with a large step continues until it has taken --steps steps, to
+show whether it diverges. Runs with small steps cost the most. The verdicts:
+  diverged     its energy is three times what the start, falling and moving pins can have put in
+  inaccurate   its error exceeds --accuracy by more than the error of the reference; it is the RMS distance to the reference
+               over vertices and frames, divided by the size of the cloth
+  unsure       the reference is not accurate enough to tell
+The reference is Newton's method with BDF2 and a quarter of the step, in float64. Measured rows are stored and reused.
 
   warpcloth chart stability hanging -p n=8 --x stiffness --y dt -o map.png
   warpcloth chart stability net -p n=12 stiffness=inf --x resolution --y relaxation --solvers pbd:sweep=jacobi -o jacobi.png
@@ -28,24 +30,53 @@ Newton's method with BDF2 and a quarter of the step, in float64. Rows that are m
 
 def add_arguments(parser):
     """Adds what the command takes but for what all charts do."""
-    parser.add_argument("scene", metavar="SCENE", help="a .py file with a function scene(), a USD stage, or a known name")
-    parser.add_argument("-p", nargs="+", action="extend", default=[], metavar="parameter=value", help="parameters of the scene")
+    parser.add_argument(
+        "scene",
+        metavar="SCENE",
+        help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
+    )
+    parser.add_argument(
+        "-p",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="parameter=value",
+        help="parameters of the scene; '-p help' lists them",
+    )
     for of in "xy":
-        parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"what varies along {of}, see below")
+        parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"quantity on the {of} axis")
         parser.add_argument(
-            f"--{of}-range", nargs=3, metavar=("LOW", "HIGH", "N"), help="ends and number of values, a constant factor apart"
+            f"--{of}-range",
+            nargs=3,
+            metavar=("LOW", "HIGH", "N"),
+            help="lowest value, highest value and number of values, spaced logarithmically",
         )
-    parser.add_argument("--at", nargs="+", action="extend", default=[], metavar="axis=value", help="of other axes (dt=1/60)")
-    parser.add_argument("--solvers", nargs="+", metavar="METHOD", help="methods, see below; all if not given")
     parser.add_argument(
-        "--duration", type=float, metavar="SECONDS", help="time of motion that is compared (default: half of that of the scene)"
+        "--at",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="axis=value",
+        help="values of axes that are not drawn, such as dt=1/60",
     )
-    parser.add_argument("--steps", type=int, default=120, metavar="N", help="the fewest steps of each run (default: 120)")
     parser.add_argument(
-        "--accuracy", type=float, default=ACCURACY, metavar="SHARE", help=f"largest error (default: {ACCURACY:g}), 0 for none"
+        "--solvers", nargs="+", metavar="METHOD", help="solvers, each as NAME or NAME:option=value,option=value (default: all)"
     )
-    parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="of each run (default: 60)")
-    parser.add_argument("--dtype", choices=DTYPES, default="float64")
+    parser.add_argument(
+        "--duration", type=float, metavar="SECONDS", help="simulated time that is compared (default: half of the scene's)"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=120, metavar="N", help="minimum number of steps of each run (default: 120)"
+    )
+    parser.add_argument(
+        "--accuracy",
+        type=float,
+        default=ACCURACY,
+        metavar="SHARE",
+        help=f"runs with a larger error are inaccurate (default: {ACCURACY:g}); with 0 errors are not measured",
+    )
+    parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
+    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default: float64)")
 
 
 def chart(arguments):

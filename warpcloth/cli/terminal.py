@@ -83,7 +83,7 @@ def open_bar(total, text, counts):
 
 def add_dask(parser):
     """Adds what runs measurements elsewhere."""
-    text = "measure on the Dask cluster of the scheduler at ADDRESS, such as tcp://host:8786, or of a scheduler file"
+    text = "measure on a Dask cluster: the address of its scheduler, such as tcp://host:8786, or its scheduler file"
     parser.add_argument("--dask", metavar="ADDRESS", help=text)
 
 

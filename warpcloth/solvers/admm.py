@@ -100,9 +100,9 @@ class ADMM(ImplicitStep):
 
     name = "admm"
     needs, locks = (ELEMENTS, FINITE), True
-    residual = Residual("largest acceleration of a vertex by the primal or the dual residual", "m/s²")
+    residual = Residual("largest primal or dual residual of a vertex (as an acceleration)", "m/s²")
     facts = Facts(
-        method="implicit Euler split by weights and multipliers, local problems in closed form or by Newton's method",
+        method="implicit Euler by the alternating direction method of multipliers",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64), cuda=(32, 64, 128, 256)),),
         runs=(
             *grid([(16, 2), (32, 2), (48, 2)], integrator="midpoint"),

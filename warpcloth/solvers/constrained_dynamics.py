@@ -71,7 +71,7 @@ class ConstrainedDynamics(ImplicitStep):
     name = "constrained-dynamics"
     needs, locks = (MERGED_DAMPING, ROWS, STEADY_ROWS), True
     facts = Facts(
-        method="implicit Euler for positions and multipliers of compliant constraints, which may be redundant",
+        method="implicit Euler with hard or compliant constraints, solved for positions and Lagrange multipliers",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 1}, cpu=(8, 16, 32), cuda=(16, 32, 64)),),
         runs=(
             *grid([(4, 1), (8, 1), (16, 1), (32, 1)], integrator="midpoint"),
@@ -86,7 +86,7 @@ class ConstrainedDynamics(ImplicitStep):
         style=("tab:green", "p"),
     )
     residual = Residual(
-        "largest acceleration that a vertex lacks, or a constraint to be met", "times the largest at the start of its step"
+        "largest residual of a vertex or a constraint (as an acceleration)", "times its value at the start of the step"
     )
 
     iterations: int = 20

@@ -48,7 +48,7 @@ class Explicit(Step):
     needs = (FINITE,)
     limited = locks = True
     facts = Facts(
-        method="symplectic Euler; refuses a step above the stability limit; forward Euler on request",
+        method="symplectic Euler, or forward Euler; a step above the stability limit is refused",
         benchmarks=(Benchmark({}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),),
         runs=tuple({"fewest": factor} for factor in (1.0, 1.5, 2.0)),
         limits=("forward Euler", "2/ω_max", "2/√(2 Σk/m)"),

@@ -53,7 +53,7 @@ class HierarchicalPBD(Step):
     needs, locks = (MERGED_DAMPING, LOCAL_STEP), True
     ordered = closes = True
     facts = Facts(
-        method="PBD that sweeps over coarser and coarser levels first, so that fine cloth stretches little more than coarse",
+        method="PBD that also sweeps over coarser levels of the mesh, so that fine cloth stretches less",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),),
         runs=grid([(8, 2), (15, 2), (30, 2), (60, 2), (120, 2)]),
         style=("tab:purple", "P"),

@@ -48,9 +48,9 @@ class Newton(ImplicitStep):
 
     name = "newton"
     needs = (FINITE,)
-    residual, locks = Residual(UNBALANCED, "times the largest at the start of its step"), True
+    residual, locks = Residual(UNBALANCED, "times its value at the start of the step"), True
     facts = Facts(
-        method="implicit Euler, minimised by Newton's method with a line search; CG or a factorisation",
+        method="implicit Euler by Newton's method with a line search",
         benchmarks=(Benchmark({"substeps": 4}, cpu=(16, 32, 64), cuda=(32, 64, 128)),),
         runs=(
             *({"substeps": substeps} for substeps in (1, 4, 16)),

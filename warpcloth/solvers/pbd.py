@@ -56,7 +56,7 @@ class PBD(Step):
     needs, locks = (MERGED_DAMPING, LOCAL_STEP), True
     closes, multipliers = True, False  # λ does not add up over the sweeps of a step
     facts = Facts(
-        method="position based dynamics: Gauss–Seidel sweeps by colour or in order, Jacobi ones averaged or relaxed",
+        method="position based dynamics, by Gauss–Seidel or Jacobi sweeps over the constraints",
         benchmarks=(
             Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),
             # Jacobi sweeps alone: so many that what a frame takes besides, its points on the host above all, does not count.
