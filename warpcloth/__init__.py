@@ -1,34 +1,105 @@
 """Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD.
 
-Its names are those of :mod:`warpcloth.api`, which is imported when one of them is first used, and Warp with it.
+A name is imported from its module when it is first used, and Warp with it.
 """
 
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from .base import interrupts as interrupts  # first: it handles interrupts while the other modules load, which takes a second
+from .base.extensions import load_installed
 from .base.quiet import prepare_warp
 
-if TYPE_CHECKING:  # type checkers do not read an __all__ that another is added to
-    from .api import *  # noqa: F403
+if TYPE_CHECKING:  # the table below, as type checkers read it
+    from .analysis.analysis import Analyzer as Analyzer
+    from .analysis.analysis import analyze as analyze
+    from .analysis.compare import Comparison as Comparison
+    from .analysis.compare import compare as compare
+    from .analysis.samples import Analysis as Analysis
+    from .base import checks as checks
+    from .deformation.arap import Arap as Arap
+    from .deformation.deform import Deformation as Deformation
+    from .deformation.deform import deform as deform
+    from .mesh import ordering as ordering
+    from .mesh.mesh import Mesh as Mesh
+    from .mesh.sequences import Sequence as Sequence
+    from .mesh.sequences import as_sequence as as_sequence
+    from .mesh.sequences import open_sequence as open_sequence
+    from .numerics.rotation import kabsch as kabsch
+    from .numerics.rotation import polar as polar
+    from .numerics.rotation import svd as svd
+    from .run.equilibrium import Equilibrium as Equilibrium
+    from .run.equilibrium import equilibrium as equilibrium
+    from .run.simulate import Animation as Animation
+    from .run.simulate import simulate as simulate
+    from .scene.scene import Pins as Pins
+    from .scene.scene import Scene as Scene
     from .solvers import *  # noqa: F403
     from .terms import *  # noqa: F403
-else:
 
-    def __getattr__(name):
-        if not name.startswith("__") or name == "__all__":  # of all else Python and its tools ask every module
-            api = import_module(".api", __name__)
-            if hasattr(api, name):
-                globals()[name] = getattr(api, name)
-            if name in globals():  # or a package that came with it, such as solvers
-                return globals()[name]
+# The module of each public name; those of the two catalogues are added to them.
+_MODULES = {
+    "Analyzer": "analysis.analysis",
+    "analyze": "analysis.analysis",
+    "Comparison": "analysis.compare",
+    "compare": "analysis.compare",
+    "Analysis": "analysis.samples",
+    "checks": "base",
+    "Arap": "deformation.arap",
+    "Deformation": "deformation.deform",
+    "deform": "deformation.deform",
+    "ordering": "mesh",
+    "Mesh": "mesh.mesh",
+    "Sequence": "mesh.sequences",
+    "as_sequence": "mesh.sequences",
+    "open_sequence": "mesh.sequences",
+    "kabsch": "numerics.rotation",
+    "polar": "numerics.rotation",
+    "svd": "numerics.rotation",
+    "Equilibrium": "run.equilibrium",
+    "equilibrium": "run.equilibrium",
+    "Animation": "run.simulate",
+    "simulate": "run.simulate",
+    "Pins": "scene.scene",
+    "Scene": "scene.scene",
+}
+_CATALOGUES = ("solvers", "terms")
+
+
+def __getattr__(name):
+    if name == "__all__":
+        value = [*_MODULES, *(public for room in _CATALOGUES for public in _from(room, "__all__"))]
+    elif name.startswith("__"):  # Python and its tools ask every module for these
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    else:
+        import_module(".usd", __name__)  # whatever is used may be given a stage
+        value = _find(name)
+        prepare_warp()
+        load_installed()
+    return globals().setdefault(name, value)
 
 
-if sys.modules.get("warp"):  # whose settings may be changed from here on
-    prepare_warp()
+def _find(name):
+    if name in _MODULES:
+        return _from(_MODULES[name], name)
+    for catalogue in _CATALOGUES:
+        if name in _from(catalogue, "__all__"):
+            return _from(catalogue, name)
+    if find_spec(f".{name}", __name__):  # a package of this one, such as solvers
+        return import_module(f".{name}", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _from(module, name):
+    """Returns what ``from .module import name`` gives."""
+    return getattr(__import__(f"{__name__}.{module}", fromlist=[name]), name)
 
 
 def __dir__():
     return __getattr__("__all__")
+
+
+if sys.modules.get("warp"):  # whose settings may be changed from here on
+    prepare_warp()

@@ -78,3 +78,21 @@ print(json.dumps([before, missing, "warp" in sys.modules, "pxr.Usd" in sys.modul
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == [[], [], True, False, True]
     assert set(warpcloth.solvers.__all__) | set(warpcloth.terms.__all__) < set(warpcloth.__all__)
+
+
+def test_a_name_loads_no_more_than_its_module_needs():
+    own = "{name.split('.')[1] for name in sys.modules if name.startswith('warpcloth.')}"
+    code = f"import sys, warpcloth as wc; wc.Scene; print(*{own})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == {"base", "kernels", "mesh", "model", "scene", "terms", "usd"}
+
+
+def test_type_checkers_see_the_names_that_are_imported():
+    """The table of names stands twice in the package, for Python and for what reads it without running it."""
+    body = ast.parse((PACKAGE / "__init__.py").read_bytes()).body
+    (checked,) = [node.body for node in body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    found = [(node.module, name.name) for node in checked for name in node.names if name.asname == name.name]
+    assert found == [(module, name) for name, module in warpcloth._MODULES.items()]
+    assert [(node.module, name.name) for node in checked for name in node.names if not name.asname] == [
+        (catalogue, "*") for catalogue in warpcloth._CATALOGUES
+    ]
