@@ -42,7 +42,7 @@ def solvers():
         takes = "all" if not soft else f"all but {listed(soft)}"
         hard = [name for name in hard if name not in soft]
         if len(soft) + len(hard) == len(TERMS):
-            takes += "; finite stiffness"
+            takes += "; finite stiffness only"
         else:
             takes += "; infinite stiffness too" + (f", but not for {listed(hard)}" if hard else "")
         rows.append([f"`{record.__name__}`", record.facts.method, takes])

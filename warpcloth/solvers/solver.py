@@ -124,7 +124,7 @@ class Stepper:
 
     @in_turn
     def reset(self, mask=None, positions=None, velocities=None):
-        """Resets copies to their start, by one launch; they then repeat their first steps bit for bit.
+        """Resets copies to their start, by one launch or, with free axes, two; they then repeat their first steps bit for bit.
 
         Keyframes, ``results`` and ``residual`` of these copies start again as well. The other copies are not affected. After
         the first call it allocates nothing. If all arguments are on the device and the solver has no residual, the host does
