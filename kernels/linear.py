@@ -13,6 +13,8 @@ import warp as wp
 
 from .vectors import types
 
+MODULE = "warpcloth.conjugate_gradients"  # of the kernels over copies
+
 
 @cache
 def set_inertia(dtype):
@@ -123,7 +125,7 @@ def multiply(dtype):
     """Kernel over block rows: q = A p, of the copies that are active."""
     vec3, mat33 = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def multiply_rows(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -197,7 +199,7 @@ def invert_diagonal(dtype):
     """
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.conjugate_gradients.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def invert_blocks(
         # elements
         diagonal: wp.array(dtype=wp.int32),
@@ -222,7 +224,7 @@ def invert_diagonal(dtype):
 def _unknowns(dtype, numbers):
     """Type of an unknown, type of a diagonal block, name of the module."""
     vec3, mat33 = types(dtype)
-    name = f"warpcloth.conjugate_gradients.{dtype.__name__}"
+    name = f"{MODULE}.{dtype.__name__}"
     return (dtype, dtype, f"{name}.numbers") if numbers else (vec3, mat33, name)
 
 
@@ -258,7 +260,7 @@ def start_iteration(dtype, numbers: bool = False):
 def start_copies():
     """Kernel over copies: every wanted copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0."""
 
-    @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
+    @wp.kernel(module=MODULE, enable_backward=False)
     def start(
         # state in
         rz: wp.array(dtype=wp.float64),
@@ -325,7 +327,7 @@ def advance(dtype, numbers: bool = False):
 def check_copies():
     """Kernel over copies: stops those that are done; ratio = new rᵀz / old rᵀz; proceed = 1 while one is left."""
 
-    @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
+    @wp.kernel(module=MODULE, enable_backward=False)
     def check(
         # state in
         new_rz: wp.array(dtype=wp.float64),
@@ -358,42 +360,6 @@ def check_copies():
 
 
 @cache
-def begin_check():
-    """Kernel of one thread, before :func:`check_copies`: counts the iteration; proceed = 0."""
-
-    @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
-    def begin(
-        # in and out
-        iteration: wp.array(dtype=wp.int32),
-        # out
-        proceed: wp.array(dtype=wp.int32),
-    ):
-        iteration[0] = iteration[0] + 1
-        proceed[0] = 0
-
-    return begin
-
-
-@cache
-def limit_iterations():
-    """Kernel of one thread, after :func:`check_copies`: proceed = 0 once the iterations are used up."""
-
-    @wp.kernel(module="warpcloth.conjugate_gradients", enable_backward=False)
-    def limit(
-        # state in
-        iteration: wp.array(dtype=wp.int32),
-        # parameters
-        most: int,
-        # out
-        proceed: wp.array(dtype=wp.int32),
-    ):
-        if iteration[0] >= most:
-            proceed[0] = 0
-
-    return limit
-
-
-@cache
 def new_direction(dtype, numbers: bool = False):
     """Kernel over unknowns: p = z + ratio p."""
     vector, _block, module = _unknowns(dtype, numbers)
@@ -415,23 +381,3 @@ def new_direction(dtype, numbers: bool = False):
             p[i] = z[i] + dtype(ratio[copy]) * p[i]
 
     return turn
-
-
-@cache
-def scale(dtype):
-    """Kernel over vertices: out = sᵢ aᵢ."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def scale_vertices(
-        # elements
-        s: wp.array(dtype=dtype),
-        # state in
-        a: wp.array(dtype=vec3),
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        out[i] = s[i] * a[i]
-
-    return scale_vertices

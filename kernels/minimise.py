@@ -10,13 +10,15 @@ import warp as wp
 
 from .vectors import types
 
+MODULE = "warpcloth.minimise"  # of the kernels over copies
+
 
 @cache
 def set_trial(dtype):
     """Kernel over vertices: trial = d + step·p with the step length of the copy; clears the gradient."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def set_each_trial(
         # state in
         correction: wp.array(dtype=vec3),
@@ -40,7 +42,7 @@ def add_inertia(dtype):
     """Kernel over vertices: gradient += s m d − load m g, and 0 for pins; work[i] = s/2 m d·d − load m g·d [J]."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def add(
         # elements
         mass: wp.array(dtype=dtype),
@@ -71,28 +73,10 @@ def add_inertia(dtype):
 
 
 @cache
-def negate(dtype):
-    """Kernel over vertices: out = −a."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
-    def negate_vertices(
-        # state in
-        a: wp.array(dtype=vec3),
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        out[i] = -a[i]
-
-    return negate_vertices
-
-
-@cache
 def begin_search():
     """Kernel over copies: step 1 for those that still iterate and 0 for the rest."""
 
-    @wp.kernel(module="warpcloth.minimise", enable_backward=False)
+    @wp.kernel(module=MODULE, enable_backward=False)
     def begin(
         # parameters
         active: wp.array(dtype=wp.int32),
@@ -119,7 +103,7 @@ def check_trial():
     with φ(α) ≤ φ(0) + noise (the approximate Wolfe condition of Hager and Zhang 2005). NaN is never accepted.
     """
 
-    @wp.kernel(module="warpcloth.minimise", enable_backward=False)
+    @wp.kernel(module=MODULE, enable_backward=False)
     def check(
         # state in
         start: wp.array(dtype=wp.float64),
@@ -150,39 +134,3 @@ def check_trial():
                     step[copy] = wp.float64(0.0)
 
     return check
-
-
-@cache
-def begin_trial():
-    """Kernel of one thread, before :func:`check_trial`: counts the trial; proceed = 0."""
-
-    @wp.kernel(module="warpcloth.minimise", enable_backward=False)
-    def begin(
-        # in and out
-        trials: wp.array(dtype=wp.int32),
-        # out
-        proceed: wp.array(dtype=wp.int32),
-    ):
-        trials[0] = trials[0] + 1
-        proceed[0] = 0
-
-    return begin
-
-
-@cache
-def end_trial():
-    """Kernel of one thread, after :func:`check_trial`: one more evaluation after the last halving, then the end."""
-
-    @wp.kernel(module="warpcloth.minimise", enable_backward=False)
-    def end(
-        # state in
-        trials: wp.array(dtype=wp.int32),
-        # parameters
-        most: int,
-        # in and out
-        proceed: wp.array(dtype=wp.int32),
-    ):
-        if trials[0] > most:
-            proceed[0] = 0
-
-    return end

@@ -18,6 +18,12 @@ def stands_aside(active: wp.array(dtype=wp.int32), copy: int):
     return False
 
 
+@wp.func
+def larger(most: wp.float64, value: wp.float64):
+    """The larger of two numbers; NaN stays."""
+    return wp.where(most == most and not (value <= most), value, most)
+
+
 @cache
 def partial_sum():
     """Kernel over (copies, chunks): out[copy, chunk] = Σ values."""
@@ -41,15 +47,16 @@ def partial_sum():
 
 
 @cache
-def partial_dot(dtype):
-    """Kernel over (copies, chunks): out[copy, chunk] = Σ a·b over vertices; of the copies that are active, if any are named."""
-    vec3, _ = types(dtype)
+def partial_dot(dtype, numbers: bool = False):
+    """Kernel over (copies, chunks): out[copy, chunk] = Σ a·b of vectors or ``numbers``; of the copies that are active, if any
+    are named."""
+    value = dtype if numbers else types(dtype)[0]
 
     @wp.kernel(module="unique", enable_backward=False)
     def dot_chunks(
         # state in
-        a: wp.array(dtype=vec3),
-        b: wp.array(dtype=vec3),
+        a: wp.array(dtype=value),
+        b: wp.array(dtype=value),
         # parameters
         active: wp.array(dtype=wp.int32),
         per_copy: int,
@@ -60,37 +67,15 @@ def partial_dot(dtype):
         if stands_aside(active, copy):
             return
         total = wp.float64(0.0)
-        for i in range(chunk, per_copy, out.shape[1]):
-            total += wp.float64(wp.dot(a[copy * per_copy + i], b[copy * per_copy + i]))
+        for j in range(chunk, per_copy, out.shape[1]):
+            i = copy * per_copy + j
+            if wp.static(numbers):
+                total += wp.float64(a[i]) * wp.float64(b[i])
+            else:
+                total += wp.float64(wp.dot(a[i], b[i]))
         out[copy, chunk] = total
 
     return dot_chunks
-
-
-@cache
-def partial_product(dtype):
-    """Kernel over (copies, chunks): out[copy, chunk] = Σ a b of numbers; of the copies that are active, if any are named."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def multiply_chunks(
-        # state in
-        a: wp.array(dtype=dtype),
-        b: wp.array(dtype=dtype),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        # out
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        copy, chunk = wp.tid()
-        if stands_aside(active, copy):
-            return
-        total = wp.float64(0.0)
-        for i in range(chunk, per_copy, out.shape[1]):
-            total += wp.float64(a[copy * per_copy + i]) * wp.float64(b[copy * per_copy + i])
-        out[copy, chunk] = total
-
-    return multiply_chunks
 
 
 @cache
@@ -137,9 +122,7 @@ def partial_largest(dtype):
         most = wp.float64(0.0)
         for j in range(chunk, per_copy, out.shape[1]):
             i = copy * per_copy + j
-            value = wp.float64(weights[i]) * wp.float64(wp.length(a[i]))
-            if most == most and not (value <= most):
-                most = value
+            most = larger(most, wp.float64(weights[i]) * wp.float64(wp.length(a[i])))
         out[copy, chunk] = most
 
     return largest_of_chunks
@@ -161,9 +144,7 @@ def partial_largest_number():
         copy, chunk = wp.tid()
         most = wp.float64(0.0)
         for i in range(chunk, per_copy, out.shape[1]):
-            value = values[copy * per_copy + i]
-            if most == most and not (value <= most):
-                most = value
+            most = larger(most, values[copy * per_copy + i])
         out[copy, chunk] = most
 
     return largest_number_of_chunks
@@ -183,8 +164,7 @@ def finish_largest():
         copy = wp.tid()
         most = wp.float64(0.0)
         for chunk in range(partial.shape[1]):
-            if most == most and not (partial[copy, chunk] <= most):
-                most = partial[copy, chunk]
+            most = larger(most, partial[copy, chunk])
         out[copy] = most
 
     return largest_chunk
@@ -202,7 +182,6 @@ def keep_largest():
         out: wp.array(dtype=wp.float64),
     ):
         copy = wp.tid()
-        if out[copy] == out[copy] and not (values[copy] <= out[copy]):
-            out[copy] = values[copy]
+        out[copy] = larger(out[copy], values[copy])
 
     return keep

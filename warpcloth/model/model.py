@@ -216,6 +216,10 @@ class Model:
         """A new array of one zero vector for each vertex of all copies."""
         return wp.zeros(self.count, dtype=self.vec3, device=self.device)
 
+    def scalars(self, dtype=wp.float64):
+        """A new array of one zero for each copy."""
+        return wp.zeros(self.copies, dtype=dtype, device=self.device)
+
     @in_turn
     def kernel(self, factory, *key):
         """The kernel that ``factory(*key)`` makes, noted for :meth:`report` as factory(variant).Term."""
@@ -231,6 +235,14 @@ class Model:
     def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
         self.launches[0] += 1
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
+
+    def launcher(self, *made):
+        """Finds the kernels of each (factories, *key), and returns the function (factory, dim, inputs, outputs) to launch them.
+
+        All are found before the first is launched, so that those that share a module are compiled at once.
+        """
+        kernels = {factory: self.kernel(factory, *key) for factories, *key in made for factory in factories}
+        return lambda factory, dim, inputs, outputs: self.launch(kernels[factory], dim, inputs, outputs)
 
     def constant(self, value, count):
         """An array (count,) of one value, of stride 0."""

@@ -27,11 +27,10 @@ class AcceleratedStep:
         self.partial = wp.zeros((B, CHUNKS if device.is_cuda else 1, 4 * m), dtype=wp.float64, device=device)
         self.products = Mirror(wp.zeros((B, 4 * m), dtype=wp.float64, device=device))
         self.coefficients = Mirror(wp.zeros((B, 1 + 2 * m), dtype=wp.float64, device=device))
-        self.plain_energy, self.energy = (Mirror(wp.zeros(B, dtype=wp.float64, device=device)) for _ in range(2))
+        self.plain_energy, self.energy = (Mirror(model.scalars()) for _ in range(2))
         self.energy_of = Energy(model, stepper.sums, corrected=True)
-        names = ("note_change", "partial_products", "combine", "accept")
-        self.kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
-        self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in ("finish_products", "next_slot")}
+        of_vertices = kernels.note_change, kernels.partial_products, kernels.combine, kernels.accept
+        self._launch = model.launcher((of_vertices, model.dtype), ((kernels.finish_products, kernels.next_slot),))
         self._note = Segment(device, self._launch_note)
 
     def start(self):
@@ -55,10 +54,10 @@ class AcceleratedStep:
     def _launch_note(self):
         stepper, model = self.stepper, self.stepper.model
         given = [stepper.gradient, stepper.w, self.slot]
-        self._launch("note_change", model.count, given, [self.last_gradient, self.last_w, self.y, self.z])
+        self._launch(kernels.note_change, model.count, given, [self.last_gradient, self.last_w, self.y, self.z])
         given = [stepper.gradient, self.s, self.y, self.z, self.slot, model.per_copy]
-        self._launch("partial_products", self.partial.shape, given, [self.partial])
-        self._launch("finish_products", self.products.array.shape, [self.partial], [self.products.array])
+        self._launch(kernels.partial_products, self.partial.shape, given, [self.partial])
+        self._launch(kernels.finish_products, self.products.array.shape, [self.partial], [self.products.array])
 
     def launch_move(self):
         """d = the better of the plain and the accelerated step."""
@@ -66,12 +65,12 @@ class AcceleratedStep:
         N, n, d = model.count, model.per_copy, stepper.correction
         stepper.launch_plain_step(self.plain)
         given = [d, stepper.w, self.s, self.z, self.coefficients.array, n]
-        self._launch("combine", N, given, [self.accelerated])
+        self._launch(kernels.combine, N, given, [self.accelerated])
         self._launch_energy(self.plain, self.plain_energy.array)
         self._launch_energy(self.accelerated, self.energy.array)
-        self._launch("next_slot", 1, [self.method.window], [self.slot])
+        self._launch(kernels.next_slot, 1, [self.method.window], [self.slot])
         given = [self.plain, self.accelerated, self.plain_energy.array, self.energy.array, self.slot, n]
-        self._launch("accept", N, given, [d, self.s])
+        self._launch(kernels.accept, N, given, [d, self.s])
 
     def _launch_energy(self, d, out):
         """out (B,) = φ(d)."""
@@ -79,6 +78,3 @@ class AcceleratedStep:
         stepper.inertia.add(d, self.unused)
         stepper.sums.sum(stepper.inertia.work, model.per_copy, out)
         self.energy_of.add(stepper.state.x, out, d)
-
-    def _launch(self, name, dim, inputs, outputs):
-        self.stepper.model.launch(self.kernels[name], dim, inputs, outputs)

@@ -25,8 +25,8 @@ class ClusterRows:
     def __init__(self, model, elements):
         self.model, self.elements, self.cells = model, elements, elements.cells
         self.count = 3 * elements.per_copy
-        names = ("linearise_clusters", "apply_cluster_rows", "pull_clusters")
-        self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in names}
+        factories = kernels.linearise_clusters, kernels.apply_cluster_rows, kernels.pull_clusters
+        self._launch = model.launcher((factories, model.dtype))
         self._stencil, self._offsets = host_values(elements.stencil)[:, 0], host_values(self.cells.offsets)
         self._mass = elements.rest.numpy()[:, 3].astype(np.float64)
         self._rest = host_values(self.cells.shape).astype(np.float64)
@@ -53,17 +53,17 @@ class ClusterRows:
         """As :meth:`warpcloth.numerics.constraints.TermRows.launch_linearise`."""
         cells = self.cells
         given = [cells.offsets, cells.shape, *self.elements.arguments, x, d, h, least, self.layout]
-        self._launch("linearise_clusters", cells.count, given, [self._rotations, values])
+        self._launch(kernels.linearise_clusters, cells.count, given, [self._rotations, values])
 
     def launch_apply(self, v, out, active=None):
         """out += J v, of all copies."""
         given = [*self._shape(), self.elements.stencil, self.elements.rest, v, self.layout]
-        self._launch("apply_cluster_rows", self.cells.count, given, [out])
+        self._launch(kernels.apply_cluster_rows, self.cells.count, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
         """out += Jᵀ rows, of all copies."""
         given = [*self._shape(), self.elements.rest, rows, self.layout]
-        self._launch("pull_clusters", self.cells.count, given, [self._pulls.z])
+        self._launch(kernels.pull_clusters, self.cells.count, given, [self._pulls.z])
         given = [*self._incidences, self.elements.rest, self._pulls]
         self.model.launch(self._gather_pulls, len(self._incidences[0]) - 1, given, [out])
 
@@ -92,6 +92,3 @@ class ClusterRows:
 
     def _shape(self):
         return [self.cells.offsets, self.cells.shape, self._inertia, self._rotations]
-
-    def _launch(self, name, dim, inputs, outputs):
-        self.model.launch(self._kernels[name], dim, inputs, outputs)

@@ -12,7 +12,7 @@ from ..core.capture import Mirror
 from ..core.transpose import Transpose
 from ..kernels import constraint_jacobian as jacobian
 from ..kernels import constraint_rows as kernels
-from ..kernels.constraint_step import scale_rows, weigh
+from ..kernels.elementwise import scale
 from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 from .cluster_rows import ClusterRows
@@ -125,7 +125,7 @@ class Constraints:
         self._values.compliance, self._values.inverse = self._compliance, self._inverse
         self._values.residual, self._values.rounding, self._values.carried = self.residual, self.rounding, self.carried
         self._vectors = model.vectors()
-        self._weigh, self._scale = (model.kernel(factory, model.dtype) for factory in (weigh, scale_rows))
+        self._weigh, self._scale = (model.kernel(scale, model.dtype, numbers) for numbers in (False, True))
         self.vector = self.block = model.dtype
         # Of redundant hard rows A would be singular, and what they share of λ undetermined.
         self.least = float(np.finfo(model.numpy_dtype).eps) ** 0.7
@@ -146,7 +146,7 @@ class Constraints:
         out.zero_()
         for part in self.parts:
             part.launch_transpose(rows, out, active)
-        self.model.launch(self._weigh, self.model.count, [self.model.inverse_mass], [out])
+        self.model.launch(self._weigh, self.model.count, [self.model.inverse_mass, out], [out])
         self.model.lock(out)
 
     # As a matrix, see ConjugateGradients.

@@ -22,6 +22,7 @@ class Euler:
     """
 
     part = 1.0  # hₑ/h
+    pin_parts = 1  # in which the pins make the way of a step
 
     def __init__(self, stepper):
         self.stepper, self.he = stepper, self.part * stepper.h
@@ -37,7 +38,7 @@ class Euler:
     def launch_prediction(self):
         """Sets x = x̃ and v = (x̃ − x₀)/hₑ, and moves the pins to the end of the step."""
         self._launch(kernels.predict, [*self.stepper.model.free_gravity, self.he], list(self.stepper.state))
-        self.stepper.launch_pins()
+        self.stepper.launch_pins(self.pin_parts)
 
     def launch_finish(self, correction):
         """Sets the state at the end of the step."""
@@ -51,22 +52,18 @@ class Euler:
 class Midpoint(Euler):
     """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Second order. At xₘ pins are where they are at t + h/2."""
 
-    part = 0.5
+    part, pin_parts = 0.5, 2
 
     @property
     def moment(self):
         x, v = self.stepper.state
         return Moment(x, integrator="midpoint", move=v, scale=self.he)
 
-    def launch_prediction(self):
-        self._launch(kernels.predict, [*self.stepper.model.free_gravity, self.he], list(self.stepper.state))
-        self.stepper.launch_pins(parts=2)
-
     def launch_finish(self, correction):
         gravity, each = self.stepper.model.free_gravity
         given = [gravity, correction, each, self.he]
         self._launch(kernels.finish_midpoint, given, list(self.stepper.state))
-        self.stepper.launch_pins(parts=2)
+        self.stepper.launch_pins(self.pin_parts)
 
 
 class BDF2(Euler):

@@ -9,6 +9,8 @@ import warp as wp
 from ..base.interrupts import deferred
 from ..core.capture import Mirror, on_host
 from ..kernels import linear
+from ..kernels.elementwise import scale
+from ..kernels.loop import count_pass, limit_passes
 
 # Most unknowns for which all eigenvalues are computed at once.
 SMALL = 100
@@ -41,30 +43,25 @@ class ConjugateGradients:
         self.r, self.z, self.p, self.q = (per_unknown(matrix.vector) for _ in range(4))
         self.preconditioner = per_unknown(matrix.block)
 
-        def per_copy(dtype):
-            return wp.zeros(model.copies, dtype=dtype, device=model.device)
-
-        self.rz, self.new_rz, self.pq, self.first, self.ratio = (per_copy(wp.float64) for _ in range(5))
-        self.active, self.negative, self.tolerance = (
-            per_copy(wp.int32),
-            Mirror(per_copy(wp.int32)),
-            Mirror(per_copy(wp.float64)),
-        )
+        self.rz, self.new_rz, self.pq, self.first, self.ratio = (model.scalars() for _ in range(5))
+        self.active, self.negative = model.scalars(wp.int32), Mirror(model.scalars(wp.int32))
+        self.tolerance = Mirror(model.scalars())
         self.proceed, self.iteration = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
-        numbers = matrix.vector is model.dtype
-        names = ("start_iteration", "advance", "new_direction")
-        self.kernels = {name: model.kernel(getattr(linear, name), model.dtype, numbers) for name in names}
-        names = ("start_copies", "begin_check", "check_copies", "limit_iterations")
-        self.kernels |= {name: model.kernel(getattr(linear, name)) for name in names}
+        of_unknowns = linear.start_iteration, linear.advance, linear.new_direction
+        self._launch = model.launcher(
+            (of_unknowns, model.dtype, matrix.vector is model.dtype),
+            ((linear.start_copies, linear.check_copies),),
+            ((count_pass, limit_passes), linear.MODULE),
+        )
 
     def solve(self, b, x, wanted):
         """x = A⁻¹ b to the relative ``tolerance`` (B,) of each copy that is wanted, 0 for the rest."""
         N, B = self.matrix.count, self.model.copies
         self.matrix.invert_diagonal(self.preconditioner)
-        self._launch("start_iteration", N, [self.preconditioner, b], [x, self.r, self.z, self.p])
+        self._launch(linear.start_iteration, N, [self.preconditioner, b], [x, self.r, self.z, self.p])
         self.sums.dot(self.r, self.z, self.rz)
         self.negative.array.zero_()
-        self._launch("start_copies", B, [self.rz, wanted], [self.first, self.active, self.iteration, self.proceed])
+        self._launch(linear.start_copies, B, [self.rz, wanted], [self.first, self.active, self.iteration, self.proceed])
         wp.capture_while(self.proceed, self._iterate, x=x)
 
     def _iterate(self, x):
@@ -72,17 +69,14 @@ class ConjugateGradients:
         self.matrix.multiply(self.p, self.q, self.active)
         self.sums.dot(self.p, self.q, self.pq, self.active)
         scalars = [self.rz, self.pq, self.active, self.iteration, n]
-        self._launch("advance", N, [self.preconditioner, self.p, self.q, *scalars], [x, self.r, self.z])
+        self._launch(linear.advance, N, [self.preconditioner, self.p, self.q, *scalars], [x, self.r, self.z])
         self.sums.dot(self.r, self.z, self.new_rz, self.active)
-        self._launch("begin_check", 1, [], [self.iteration, self.proceed])
+        self._launch(count_pass, 1, [], [self.iteration, self.proceed])
         given = [self.new_rz, self.pq, self.first, self.tolerance.array]
         changed = [self.rz, self.active, self.negative.array, self.ratio, self.proceed]
-        self._launch("check_copies", B, given, changed)
-        self._launch("limit_iterations", 1, [self.iteration, self.iterations], [self.proceed])
-        self._launch("new_direction", N, [self.z, self.ratio, self.active, n], [self.p])
-
-    def _launch(self, name, dim, inputs, outputs):
-        self.model.launch(self.kernels[name], dim, inputs, outputs)
+        self._launch(linear.check_copies, B, given, changed)
+        self._launch(limit_passes, 1, [self.iteration, self.iterations], [self.proceed])
+        self._launch(linear.new_direction, N, [self.z, self.ratio, self.active, n], [self.p])
 
 
 class Factorised:
@@ -102,7 +96,7 @@ class Factorised:
         self.matrices = hessian.matrices()
         self.starts = np.cumsum([0, *(len(matrix.data) for matrix in self.matrices)])
         self.values = Mirror(hessian.values)
-        self.negative = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
+        self.negative = Mirror(model.scalars(wp.int32))
         self._mirrors = {}
 
     def solve(self, b, x, wanted):
@@ -143,7 +137,6 @@ class Factorised:
     def _factor(self, copy, values, shift=0.0, unresolved=0.0):
         """The factors of a copy's matrix, or None; with ``shift`` times its largest entry + ``unresolved`` on the diagonal."""
         from scipy.sparse import identity
-        from scipy.sparse.linalg import splu
 
         matrix = self.matrices[copy]
         matrix.data[:] = values[self.starts[copy] : self.starts[copy + 1]]
@@ -153,11 +146,21 @@ class Factorised:
         if shift:
             added = shift * np.abs(columns.diagonal()).max() + unresolved
             columns = columns + added * identity(columns.shape[0], format="csc")
-        options = {"SymmetricMode": True, "Equil": False}
         try:
-            return splu(columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            return symmetric_factors(columns)
         except RuntimeError:  # exactly singular
             return None
+
+
+def symmetric_factors(columns):
+    """The factors of a symmetric matrix in compressed columns by scipy's SuperLU, without pivots.
+
+    Raises:
+        RuntimeError: If the matrix is exactly singular.
+    """
+    from scipy.sparse.linalg import splu
+
+    return splu(columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False})
 
 
 def lowest_eigenvalue(matrix):
@@ -174,7 +177,7 @@ def lowest_eigenvalue(matrix):
             NaN if an entry is not finite.
     """
     from scipy.sparse import identity
-    from scipy.sparse.linalg import LinearOperator, eigsh, splu
+    from scipy.sparse.linalg import LinearOperator, eigsh
 
     n, columns = matrix.shape[0], matrix.tocsc().astype(np.float64)
     if n == 0:
@@ -184,11 +187,9 @@ def lowest_eigenvalue(matrix):
     if n <= SMALL:
         return float(np.linalg.eigvalsh(columns.toarray())[0])
     shift = 1e3 * np.finfo(np.float64).eps * (np.abs(columns.diagonal()).max() or 1.0)
-    options = {"SymmetricMode": True, "Equil": False}
     while True:
         try:
-            shifted = columns + shift * identity(n, format="csc")
-            factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            factor = symmetric_factors(columns + shift * identity(n, format="csc"))
             if (factor.U.diagonal() > 0.0).all():
                 break
         except RuntimeError:  # exactly singular
@@ -219,7 +220,6 @@ class FactorisedRows:
     def solve(self, b, x, wanted):
         """x = A⁻¹ b of each copy that is wanted, NaN where A or b is not finite, 0 for the rest."""
         from scipy.sparse import diags
-        from scipy.sparse.linalg import splu
 
         right, left, wanted = (self._mirrors[array.ptr] for array in (b, x, wanted))
         sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
@@ -232,8 +232,7 @@ class FactorisedRows:
             diagonal = A.diagonal()
             scale = np.divide(1.0, np.sqrt(diagonal), out=np.zeros_like(diagonal), where=diagonal > 0.0)
             A, side = diags(scale) @ A @ diags(scale) + diags((scale == 0.0).astype(float)), scale * side
-            options = {"SymmetricMode": True, "Equil": False}
-            factor = splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            factor = symmetric_factors(A.tocsc())
             found = factor.solve(side)
             found += factor.solve(side - A @ found)  # redundant rows leave A hardly definite
             solution[copy] = scale * found
@@ -299,12 +298,9 @@ class LUFactor:
     """
 
     def __init__(self, matrix, device, dtype):
-        from scipy.sparse.linalg import splu
-
-        options = {"SymmetricMode": True, "Equil": False}
         try:
             start = time.perf_counter()
-            self.factors = splu(_finite_columns(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            self.factors = symmetric_factors(_finite_columns(matrix))
             self.seconds = time.perf_counter() - start
         except RuntimeError:  # exactly singular
             raise ValueError(_INDEFINITE) from None
@@ -398,7 +394,7 @@ class DiagonalScaling:
 
     def __init__(self, model, diagonal):
         self.model, self._inverse = model, model.array(1.0 / diagonal.ravel(), model.dtype)
-        self._scale = model.kernel(linear.scale, model.dtype)
+        self._scale = model.kernel(scale, model.dtype)
 
     def solve(self, b, x):
         """x = D⁻¹ b, both (N,) vectors."""

@@ -7,7 +7,7 @@ from ..core.capture import Mirror, Segment
 from ..core.hessian import Hessian
 from ..core.status import Result
 from ..core.sums import Sums
-from ..kernels import minimise as kernels
+from ..kernels.elementwise import negate
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
 from .iterate import GravityScale, iterate
@@ -61,11 +61,8 @@ class Minimiser:
         self.right = model.vectors()
         self.work, self.lost = (wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2))
 
-        def per_copy(dtype):
-            return wp.zeros(model.copies, dtype=dtype, device=model.device)
-
-        self.square, self.rounding, self.lost_energy, self.acceleration = (per_copy(wp.float64) for _ in range(4))
-        self.active = per_copy(wp.int32)
+        self.square, self.rounding, self.lost_energy, self.acceleration = (model.scalars() for _ in range(4))
+        self.active = model.scalars(wp.int32)
         self._active, self._policy = Mirror(self.active), Mirror(self.hessian.policy)
         search = self.search
         read = (search.energy, self.square, self.rounding, self.lost_energy, search.step, search.slope)
@@ -73,7 +70,7 @@ class Minimiser:
         self._acceleration = Mirror(self.acceleration)
         self.edge = float(np.median(model.scene.mesh.edge_lengths))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
-        self.kernels = {"negate": model.kernel(kernels.negate, model.dtype), "rounding": model.kernel(rounding, model.dtype)}
+        self._launch = model.launcher(((negate, rounding), model.dtype))
         self._record()
         self.gravity_scale, self._given_scale = GravityScale(model), None
         self.residual, self.iterations = np.zeros(model.copies), 0
@@ -188,10 +185,11 @@ class Minimiser:
 
     def _launch_assemble(self):
         self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
-        self._launch("negate", self.model.count, [self.search.gradient], [self.right])
         hessian, model = self.hessian, self.model
+        self._launch(negate, model.count, [self.search.gradient], [self.right])
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
-        self._launch("rounding", model.count, [*given, np.finfo(model.numpy_dtype).eps, self.edge], [self.work, self.lost])
+        given += [np.finfo(model.numpy_dtype).eps, self.edge]
+        self._launch(rounding, model.count, given, [self.work, self.lost])
         for values, total in ((self.work, self.rounding), (self.lost, self.lost_energy)):
             self.sums.sum(values, model.per_copy, total)
 
@@ -207,6 +205,3 @@ class Minimiser:
         gradient = self.search.gradient
         self.sums.dot(gradient, gradient, self.square)
         self.sums.largest(self.model.inverse_mass, gradient, self.acceleration)
-
-    def _launch(self, name, dim, inputs, outputs):
-        self.model.launch(self.kernels[name], dim, inputs, outputs)

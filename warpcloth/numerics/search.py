@@ -6,6 +6,7 @@ import warp as wp
 from ..core.energy import Energy
 from ..fast.plan import plan
 from ..kernels import minimise as kernels
+from ..kernels.loop import count_pass, limit_passes
 from .inertia import Inertia
 
 # Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
@@ -34,19 +35,17 @@ class Search:
         self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), Energy(model, sums, corrected=True)
         self.correction, self.trial, self.gradient, self.direction = (model.vectors() for _ in range(4))
 
-        def per_copy(dtype):
-            return wp.zeros(model.copies, dtype=dtype, device=model.device)
-
-        scalars = (per_copy(wp.float64) for _ in range(5))
-        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step = scalars
-        self.searching = per_copy(wp.int32)
+        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step = (model.scalars() for _ in range(5))
+        self.searching = model.scalars(wp.int32)
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        self._launch = model.launcher(
+            ((kernels.set_trial,), model.dtype),
+            ((kernels.begin_search, kernels.check_trial),),
+            ((count_pass, limit_passes), kernels.MODULE),
+        )
         # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
         # energy to 2ε/e, so that √ε covers strains down to √ε.
         self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
-        self.kernels = {"set_trial": model.kernel(kernels.set_trial, model.dtype)}
-        names = ("begin_search", "check_trial", "begin_trial", "end_trial")
-        self.kernels |= {name: model.kernel(getattr(kernels, name)) for name in names}
 
     def launch_start(self):
         """d = 0, with its φ and ∇φ."""
@@ -59,7 +58,8 @@ class Search:
     def launch(self, active):
         """d += step·p, with the longest step of 1, ½, ¼ … that lowers φ, of the copies that are ``active`` (B,)."""
         self.sums.dot(self.gradient, self.direction, self.slope)
-        self._launch("begin_search", self.model.copies, [active], [self.step, self.searching, self.trials, self.proceed])
+        started = [self.step, self.searching, self.trials, self.proceed]
+        self._launch(kernels.begin_search, self.model.copies, [active], started)
         wp.capture_while(self.proceed, self._try_step)
         wp.copy(self.correction, self.trial)
         wp.copy(self.energy, self.trial_energy)
@@ -68,7 +68,8 @@ class Search:
         """trial = d + step·p with its φ, ∇φ and slope φ'."""
         model = self.model
         N, n = model.count, model.per_copy
-        self._launch("set_trial", N, [self.correction, self.direction, self.step, n], [self.trial, self.gradient])
+        given = [self.correction, self.direction, self.step, n]
+        self._launch(kernels.set_trial, N, given, [self.trial, self.gradient])
         self.gradient_of.add(self.base, self.gradient, self.trial)
         self.inertia.add(self.trial, self.gradient)
         self.sums.sum(self.inertia.work, n, self.trial_energy)
@@ -77,10 +78,8 @@ class Search:
 
     def _try_step(self):
         self._launch_trial()
-        self._launch("begin_trial", 1, [], [self.trials, self.proceed])
+        self._launch(count_pass, 1, [], [self.trials, self.proceed])
         given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
-        self._launch("check_trial", self.model.copies, given, [self.step, self.searching, self.proceed])
-        self._launch("end_trial", 1, [self.trials, HALVINGS], [self.proceed])
-
-    def _launch(self, name, dim, inputs, outputs):
-        self.model.launch(self.kernels[name], dim, inputs, outputs)
+        self._launch(kernels.check_trial, self.model.copies, given, [self.step, self.searching, self.proceed])
+        # One more evaluation after the last halving.
+        self._launch(limit_passes, 1, [self.trials, HALVINGS + 1], [self.proceed])

@@ -15,7 +15,6 @@ What puts energy in are the sources of :mod:`warpcloth.run.sources`.
 from functools import cached_property
 
 import numpy as np
-import warp as wp
 
 from ..base.turns import TURN
 from ..core.energy import Energy
@@ -86,7 +85,7 @@ class Elastic:
         return model.array(points.reshape(-1, 3), model.vec3)
 
     def _value(self, energy, x):
-        found = wp.zeros(self.model.copies, dtype=wp.float64, device=self.model.device)
+        found = self.model.scalars()
         energy.add(x, found)
         return found.numpy()
 

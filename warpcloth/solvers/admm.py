@@ -156,8 +156,8 @@ class ADMMStepper(ImplicitStepper):
         self._factors = factorise_copies(model, constant_matrices(weighed, self._inertia.s))
         self.factorise_seconds = self._factors.seconds
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
-        self._primal, self._dual = (Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device)) for _ in range(2))
-        self._active = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
+        self._primal, self._dual = (Mirror(model.scalars()) for _ in range(2))
+        self._active = Mirror(model.scalars(wp.int32))
         self._split = [self._split_of(*each) for each in zip(model.terms, ratios, scales, strict=True)]
         factories = kernels.start_admm, kernels.split
         self._kernels = [

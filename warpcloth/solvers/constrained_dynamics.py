@@ -10,7 +10,7 @@ from ..base.checks import number, whole
 from ..core.capture import Mirror, Segment
 from ..core.status import Residual, Result
 from ..core.sums import RowSums, Sums
-from ..kernels import constraint_step as kernels
+from ..kernels import elementwise as kernels
 from ..model.model import Model
 from ..numerics.constraints import Constraints
 from ..numerics.iterate import GravityScale
@@ -133,23 +133,19 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
             self.correction, self._direction, self._step = self._search.correction, self._search.direction, self._search.step
         else:
             self.correction, self._direction = model.vectors(), model.vectors()
-            self._step = wp.zeros(model.copies, dtype=wp.float64, device=device)
+            self._step = model.scalars()
         self._moves, self._mismatch = model.vectors(), model.vectors()
         self._right, self._change = (wp.zeros(self.constraints.count, dtype=model.dtype, device=device) for _ in range(2))
         self._ones = model.constant(1.0, model.count)
 
-        def per_copy(dtype):
-            return Mirror(wp.zeros(model.copies, dtype=dtype, device=device))
-
-        self._active, self._stepped = per_copy(wp.int32), Mirror(self._step)
+        self._active, self._stepped = Mirror(model.scalars(wp.int32)), Mirror(self._step)
         if options.linear == "cg":
             self._linear = ConjugateGradients(self.constraints, self._row_sums, LINEAR_ITERATIONS)
         else:
             self._linear = FactorisedRows(self.constraints, (self._right, self._change, self._active.array))
-        self._unbalanced, self._open, self._rounding, self._carried = (per_copy(wp.float64) for _ in range(4))
-        self._kernels = {name: model.kernel(getattr(kernels, name), model.dtype) for name in ("mismatch", "negate_rows")}
-        self._add_step = [model.kernel(kernels.add_step, model.dtype, vectors) for vectors in (True, False)]
-        self._begin_step = model.kernel(kernels.begin_step)
+        self._unbalanced, self._open, self._rounding, self._carried = (Mirror(model.scalars()) for _ in range(4))
+        self._of_vectors = model.launcher(((kernels.mismatch, kernels.add_step), model.dtype), ((kernels.begin_step,),))
+        self._of_rows = model.launcher(((kernels.negate, kernels.add_step), model.dtype, True))
         self._gravity_scale = GravityScale(model)
         self._start = Segment(device, self._launch_start)
         self._solve = Segment(device, self._launch_solve) if self._linear.capturable else self._launch_solve
@@ -203,8 +199,8 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         constraints, model = self.constraints, self.model
         constraints.launch_linearise(self.state.x, self.correction)
         constraints.launch_moves(constraints.multipliers, self._moves)
-        self._launch("mismatch", model.count, [self.correction, self._moves], [self._mismatch])
-        self._launch("negate_rows", constraints.count, [constraints.gap], [self._right])
+        self._of_vectors(kernels.mismatch, model.count, [self.correction, self._moves], [self._mismatch])
+        self._of_rows(kernels.negate, constraints.count, [constraints.gap], [self._right])
         constraints.launch_apply(self._mismatch, self._right)
         self._sums.largest(self._ones, self._mismatch, self._unbalanced.array)
         self._row_sums.largest(constraints.residual, self._open.array)
@@ -218,15 +214,13 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         """Δx = W JᵀΔλ − (x − x̃ − W Jᵀλ), and a step along Δx and Δλ."""
         model, constraints = self.model, self.constraints
         constraints.launch_moves(self._change, self._moves)
-        self._launch("mismatch", model.count, [self._moves, self._mismatch], [self._direction])
+        self._of_vectors(kernels.mismatch, model.count, [self._moves, self._mismatch], [self._direction])
         if self._search:
             self._search.launch(self._active.array)
         else:
-            model.launch(self._begin_step, model.copies, [self._active.array], [self._step])
-            model.launch(self._add_step[0], model.count, [self._step, self._direction, model.per_copy], [self.correction])
+            self._of_vectors(kernels.begin_step, model.copies, [self._active.array], [self._step])
+            given = [self._step, self._direction, model.per_copy]
+            self._of_vectors(kernels.add_step, model.count, given, [self.correction])
         given = [self._step, self._change, constraints.per_copy]
-        model.launch(self._add_step[1], constraints.count, given, [constraints.multipliers])
+        self._of_rows(kernels.add_step, constraints.count, given, [constraints.multipliers])
         self._launch_linearise()
-
-    def _launch(self, name, dim, inputs, outputs):
-        self.model.launch(self._kernels[name], dim, inputs, outputs)

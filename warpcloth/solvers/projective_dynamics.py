@@ -124,8 +124,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self.factorise_seconds = self._linear.seconds
         self._gradient_of = plan(model).gradient(corrected=True)
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
-        self._acceleration = Mirror(wp.zeros(model.copies, dtype=wp.float64, device=model.device))
-        self._active = Mirror(wp.zeros(model.copies, dtype=wp.int32, device=model.device))
+        self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._gravity_scale = GravityScale(model)
         method = accelerated(options.acceleration, model, options.window, self.slowest)

@@ -50,7 +50,7 @@ class Stepper:
         self.h = 1.0 / (fps * self.steps_per_frame)
         motion = self._motion or (wp.clone(model.positions), wp.clone(model.velocities))
         self.state = State(*motion, model.copies)
-        self.count = None if model.pins is None else wp.zeros(model.copies, dtype=wp.int32, device=model.device)
+        self.count = None if model.pins is None else model.scalars(wp.int32)
         self.state.add("steps of keyframes", self.count)
         self._reset = None
         self.integrator, self.he = None, self.h

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import warp as wp
 
 from ..base.checks import number, whole
 from ..core.capture import Mirror
@@ -144,9 +143,8 @@ class XPBDStepper(LaunchedStepper):
         soft = not any(elements.hard for elements in model.terms)
         self._gradient = plan(model).gradient(corrected=True, terms=self.sweep.elements) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
-        self._acceleration = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
-        largest = wp.zeros(model.copies, dtype=wp.float64, device=model.device)
-        self._largest = Mirror(self.state.add("largest acceleration", largest))
+        self._acceleration = model.scalars()
+        self._largest = Mirror(self.state.add("largest acceleration", model.scalars()))
         self._keep_largest = model.kernel(keep_largest)
         self._scale = GravityScale(model).or_else(1.0)
         sweeps = self.sweep.parts(options.iterations - (not soft))
