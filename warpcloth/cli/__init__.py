@@ -51,7 +51,7 @@ def main(argv=None):
                 return 2
             debug = arguments.debug
             with interrupts.loading():
-                from .. import api  # noqa: F401
+                from .. import simulate  # noqa: F401  loads Warp, which takes most of the time
             if options.asks_for_help(arguments):
                 return options.show_help(arguments)
             return arguments.command(arguments)
