@@ -143,6 +143,79 @@ def move_pins(dtype):
 
 
 @cache
+def guide_pins(dtype):
+    """Kernel over (copies, pins): :func:`move_pins` for pins that hold some axes, whose v = (x − x h earlier)/h along these.
+
+    Both positions are those of the keyframes, because a step may have moved x from where it was.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def position(keyframes: wp.array2d(dtype=vec3), p: int, step: int, steps_per_frame: int):
+        last = keyframes.shape[0] - 1
+        frame = wp.min(step // steps_per_frame, last)
+        found = keyframes[frame, p]
+        if frame < last:
+            part = dtype(step - frame * steps_per_frame) / dtype(steps_per_frame)
+            found = (dtype(1.0) - part) * found + part * keyframes[frame + 1, p]
+        return found
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def guide(
+        # elements
+        pins: wp.array(dtype=wp.int32),
+        keyframes: wp.array2d(dtype=vec3),
+        axes: wp.array(dtype=vec3),
+        # state in
+        step: wp.array(dtype=wp.int32),
+        # parameters
+        steps_per_frame: int,
+        per_copy: int,
+        h: dtype,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+    ):
+        copy, p = wp.tid()
+        i = copy * per_copy + pins[p]
+        after = position(keyframes, p, step[copy] + 1, steps_per_frame)
+        before = position(keyframes, p, wp.max(step[copy], 0), steps_per_frame)
+        for axis in range(3):
+            if axes[p][axis] > dtype(0.0):
+                v[i][axis] = (after[axis] - before[axis]) / h
+                x[i][axis] = after[axis]
+
+    return guide
+
+
+@cache
+def note_guided(dtype):
+    """Kernel over (copies, pins): move = h v along the axes that pins hold, after :func:`note_move`."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def note(
+        # elements
+        pins: wp.array(dtype=wp.int32),
+        axes: wp.array(dtype=vec3),
+        # state in
+        v: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        h: dtype,
+        # in and out
+        move: wp.array(dtype=vec3),
+    ):
+        copy, p = wp.tid()
+        i = copy * per_copy + pins[p]
+        for axis in range(3):
+            if axes[p][axis] > dtype(0.0):
+                move[i][axis] = h * v[i][axis]
+
+    return note
+
+
+@cache
 def count_step():
     """Kernel over copies: step += 1."""
 

@@ -178,6 +178,86 @@ def test_locked_coordinates_stay_to_the_bit(name, device):
         assert np.isfinite(x).all() and (v[~locked & ~pinned[:, None]] != 0.0).all()
 
 
+def rollers(solver=None, frames=9, **given):
+    """A square whose corners of the side z = 0 are clamped, led along x alone, and may not leave the plane z = 0 in turns."""
+    declared = square(solver=solver, **given)
+    vertices = [0, 5, 2, 3]
+    keyframes = np.repeat(declared.positions[vertices][None], frames, axis=0)
+    rise = 0.05 * (1.0 - np.cos(0.7 * np.arange(frames)))
+    keyframes += rise[:, None, None] * np.array([1.0, 0.3, 0.2])
+    return replace(declared, pins=wc.Pins(vertices, keyframes, axes=["xyz", "x", "zy", "z"]))
+
+
+@pytest.mark.parametrize("name", LOCKING)
+def test_pins_hold_their_axes(name, device):
+    """Along them they are where the keyframes say and as fast, and along the others the cloth takes them where it goes."""
+    declared, solver = rollers(LOCKING[name]), LOCKING[name]
+    run = wc.simulate(declared, solver, device=device, dtype="float64", frames=6)
+    held = declared.pins.held
+    assert held.tolist() == [[True] * 3, [True, False, False], [False, True, True], [False, False, True]]
+    vertices, keyframes = declared.pins.vertices, declared.pins.keyframes
+    speeds = np.diff(keyframes, axis=0)[:6] * declared.fps
+    np.testing.assert_allclose(run.points[:, vertices][:, held], keyframes[:7, held], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(run.velocities[1:, vertices][:, held], speeds[:, held], rtol=0.0, atol=1e-12)
+    assert np.abs(run.points[6, vertices] - keyframes[6])[~held].min() > 1e-4
+
+
+@pytest.mark.parametrize("name", ["explicit", "newton", "newton midpoint", "newton bdf2", "xpbd", "admm"])
+def test_pins_that_hold_axes_are_rails_and_moved_pins(name, device):
+    """Standing ones are free_axes; one whose other axes are locked is a pin that holds all of them."""
+    declared = square(solver=LOCKING[name], damping=1e-3)
+    free = np.ones((36, 3), dtype=bool)
+    free[[5, 7]] = [True, False, True]
+    still = [replace(declared, pins=wc.Pins([5, 7], axes="y")), replace(declared, free_axes=free)]
+    moved = rollers(LOCKING[name])
+    keyframes = moved.pins.keyframes.copy()
+    keyframes[..., 1:] = keyframes[:1, :, 1:]
+    free[moved.pins.vertices] = [True, False, False]
+    moved = replace(moved, terms=declared.terms)
+    led = [
+        replace(moved, pins=wc.Pins(moved.pins.vertices, keyframes)),
+        replace(moved, pins=wc.Pins(moved.pins.vertices, keyframes, axes="x"), free_axes=free),
+    ]
+    led[0] = replace(led[0], free_axes=np.where(np.isin(np.arange(36), [5, 7])[:, None], [True, False, True], True))
+    run = {"device": device, "dtype": "float64", "frames": 5}
+    for pair in (still, led):
+        ends = [wc.simulate(each, LOCKING[name], **run).points[-1] for each in pair]
+        np.testing.assert_allclose(ends[1], ends[0], rtol=0.0, atol=1e-13)
+
+
+def test_a_symmetric_half_is_pinned_by_its_normal(device):
+    """As pins of the plane's vertices along x, which is how rollers are written."""
+    _whole, _kept, half = halves()
+    pinned = wc.Pins(np.r_[0, np.flatnonzero(~half.free_axes[:, 0])], axes=["xyz", *["x"] * (~half.free_axes[:, 0]).sum()])
+    ends = [wc.equilibrium(each, device=device).points for each in (half, replace(half, free_axes=None, pins=pinned))]
+    np.testing.assert_array_equal(ends[1], ends[0])
+
+
+@pytest.mark.host
+@pytest.mark.parametrize(
+    ("axes", "sentence"),
+    [
+        ("w", "pins.axes is 'w'; it must be some of the letters x, y and z, each once, such as 'xz'"),
+        ("", "pins.axes is ''; it must be some"),
+        ("xx", "pins.axes is 'xx'; it must be some"),
+        (3, "pins.axes[0] is 3; it must be some"),
+        (["x", "q"], "pins.axes[1] is 'q'; it must be some"),
+        (["x"], "pins.axes has 1 texts for 2 pins; it must be one text, or one for each pin"),
+    ],
+)
+def test_bad_axes_of_pins_are_refused(axes, sentence):
+    with pytest.raises(ValueError) as found:
+        square(pins=wc.Pins([0, 1], axes=axes))
+    assert sentence in str(found.value)
+
+
+@pytest.mark.host
+def test_handles_hold_all_axes():
+    mesh = wc.Mesh.grid(3, 3)
+    with pytest.raises(ValueError, match=r"^pins\.axes leaves some axes of a handle free; deform takes handles that hold all"):
+        wc.deform(mesh, wc.Pins([0], keyframes=[mesh.points[[0]]], axes="x"))
+
+
 def test_a_bead_on_a_rail_comes_to_rest(device):
     """Its spring of length 1 goes from the origin to (1, y): k(1 − 1/l)y = −mg with l² = 1 + y²; U″ = k(1 − 1/l³)."""
     bead = wc.Scene(
@@ -219,7 +299,7 @@ def test_who_cannot_refuses():
         locks = False
 
     able = "Explicit, Newton, .* or .*"
-    with pytest.raises(ValueError, match=f"^Rigid cannot take free_axes that lock some axes of a vertex; {able} can$"):
+    with pytest.raises(ValueError, match=f"^Rigid cannot take a vertex that is locked along some axes, .*; {able} can$"):
         Rigid(substeps=1).bind(rails(square()).build())
 
 
@@ -236,7 +316,7 @@ def test_bad_masks_are_refused():
             square(free_axes=free_axes)
     with pytest.raises(ValueError, match="vertex 0 has mass 0"):
         rails(wc.Scene(wc.Mesh.chain(2), masses=[0.0, 1.0], terms=[wc.Spring(stiffness=1.0)]), seed=3)
-    with pytest.raises(ValueError, match="with one copy that has free_axes, whose steps Explicit cannot divide; threads=1 can"):
+    with pytest.raises(ValueError, match="locked along some axes Explicit cannot divide; threads=1 can"):
         wc.Explicit(substeps=1).bind(rails(square()).build(threads=2))
 
 

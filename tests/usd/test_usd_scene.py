@@ -126,7 +126,17 @@ def awkward_names():
     return wc.Scene(mesh(), density=0.1, terms=[*terms, wc.QuadraticBending(stiffness=1.0, name="Spring")], name="")
 
 
-SCENES = [every_term, hard_springs, states, keyframes, one_keyframe, equilateral, chain, net, awkward_names]
+def rollers():
+    points = mesh().points[[4, 1, 2]]
+    pins = wc.Pins([4, 1, 2], [points, points + 1 / 3], axes=["yx", "xyz", "z"])
+    return wc.Scene(mesh(), density=0.1, terms=[wc.Spring(stiffness=1.0)], pins=pins)
+
+
+def symmetry():
+    return wc.Scene(mesh(), density=0.1, terms=[wc.Spring(stiffness=1.0)], pins=wc.Pins([0, 1], axes="zx"))
+
+
+SCENES = [rollers, symmetry, every_term, hard_springs, states, keyframes, one_keyframe, equilateral, chain, net, awkward_names]
 
 
 def assert_same(one, other, what):
@@ -143,6 +153,7 @@ def assert_same(one, other, what):
 def assert_same_scene(read, scene):
     order = np.argsort(scene.pins.vertices)
     np.testing.assert_array_equal(read.pins.vertices, scene.pins.vertices[order])
+    np.testing.assert_array_equal(read.pins.held, scene.pins.held[order])
     if scene.pins.keyframes is None:
         assert read.pins.keyframes is None
     else:

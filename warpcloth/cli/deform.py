@@ -221,7 +221,7 @@ def _given(arguments):
         if arguments.frames is not None:  # pins are at rest after the last keyframe
             _refuse_size(arguments.frames, scene.mesh, keyframes.shape[1])
             keyframes = keyframes[np.minimum(np.arange(arguments.frames + 1), len(keyframes) - 1)]
-        pins = Pins(scene.pins.vertices, keyframes)
+        pins = Pins(scene.pins.vertices, keyframes, scene.pins.axes)
         given = {"mesh": scene.mesh, "pins": pins, "fps": scene.fps, "stage": scene.stage, "up_axis": scene.up_axis}
         return scene.name, values, given
     _refuse(arguments, ("p",), "is a mesh and has no parameters")

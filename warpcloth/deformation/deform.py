@@ -114,6 +114,8 @@ def deform(
     whole("iterations", iterations, least=0)
     number("tolerance", tolerance, least=0.0)
     pins = checked_pins(pins, mesh)
+    if not pins.held.all():
+        raise ValueError("pins.axes leaves some axes of a handle free; deform takes handles that hold all three")
     if pins.keyframes is None:
         raise ValueError("pins.keyframes is None; a deformation needs positions of its handles, (F, p, 3), in each frame")
     frames = len(pins.keyframes)

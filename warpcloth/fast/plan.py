@@ -106,8 +106,8 @@ def _refuse_undivided(model, backend, threads):
         raise ValueError(f"threads is {threads} with backend {backend!r}; more than 1 is for 'blocks'")
     if model.mobility is not None:
         raise ValueError(
-            f"threads is {threads} with one copy that has free_axes, whose steps Explicit cannot divide; threads=1 can, and "
-            "copies are shared out with every solver"
+            f"threads is {threads} with one copy, whose vertices that are locked along some axes Explicit cannot divide; "
+            "threads=1 can, and copies are shared out with every solver"
         )
     for elements in model.terms:
         if elements.refresh:

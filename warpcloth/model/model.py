@@ -45,6 +45,7 @@ class Model:
             vertex that moves is locked.
         gravity: (B,) vectors [m/s²].
         pins, keyframes: Moved pins (p,) and their positions (F, p) [m], or None.
+        pin_axes: 1 along axes that each moved pin holds and 0 along others, (p,) vectors; None where all hold all axes.
         terms: One :class:`warpcloth.model.elements.DeviceElements` for each declared term.
         rest_points: Rest shape of one copy, (n, 3) [m].
         order: As given, int32, or None.
@@ -103,7 +104,7 @@ class Model:
             free = ~scene.locked
             self.mobility = self._put("inverse mass", "1/kg", inverse[..., None] * free, self.vec3)
             self._vertex_gravity = self._put("gravity", "m/s²", gravity * free, self.vec3)
-        self.pins = self.keyframes = None
+        self.pins = self.keyframes = self.pin_axes = None
         if scene.pins.keyframes is not None:
             keyframes, vertices = scene.pins.keyframes, scene.pins.vertices
             refuse_coarse(
@@ -111,6 +112,8 @@ class Model:
             )
             self.pins = wp.array(self.in_model(vertices), dtype=wp.int32, device=self.device)
             self.keyframes = self.array(keyframes, self.vec3)
+            if not scene.pins.held.all():
+                self.pin_axes = self.array(scene.pins.held, self.vec3)
         self.terms = tuple(elements_on(self, term, positions, vary) for term in scene.terms)
         vary.refuse_rest()
 

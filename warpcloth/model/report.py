@@ -12,7 +12,7 @@ def report(model):
     labels = [elements.label for elements in model.terms]
     before = [labels[:i].count(label) for i, label in enumerate(labels)]
     arrays = [model.positions, model.velocities, model.mass, model.inverse_mass, model.gravity]
-    arrays += [array for array in (model.pins, model.keyframes, model.mobility) if array is not None]
+    arrays += [array for array in (model.pins, model.keyframes, model.pin_axes, model.mobility) if array is not None]
     arrays += [model.free_gravity[0]] * (model.mobility is not None)
     terms = [
         {

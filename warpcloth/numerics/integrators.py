@@ -119,7 +119,12 @@ class BDF2(Euler):
 
     def launch_finish(self, correction):
         super().launch_finish(correction)
-        self._launch(kernels.note_move, [correction, self.stepper.state.v, self.stepper.h], [self.move])
+        stepper, model = self.stepper, self.stepper.model
+        self._launch(kernels.note_move, [correction, stepper.state.v, stepper.h], [self.move])
+        if model.pin_axes is not None:
+            given = [model.pins, model.pin_axes, stepper.state.v, model.per_copy, stepper.h]
+            note = model.kernel(kernels.note_guided, model.dtype)
+            model.launch(note, (model.copies, len(model.pins)), given, [self.move])
 
 
 INTEGRATORS = {"euler": Euler, "midpoint": Midpoint, "bdf2": BDF2}

@@ -187,7 +187,7 @@ def _move_pins(pins, base, part):
     before = min(int(at), len(pins.keyframes) - 1)
     one, two = pins.keyframes[before], pins.keyframes[min(before + 1, len(pins.keyframes) - 1)]
     points = base.numpy()
-    points[pins.vertices] = one + (at - before) * (two - one)
+    points[pins.vertices] = np.where(pins.held, one + (at - before) * (two - one), points[pins.vertices])
     base.assign(points)
 
 

@@ -98,9 +98,9 @@ class MovingPins(Source):
         scene, self._balance = balance.model.scene, balance
         self._stored, self._seen = np.zeros(balance.model.copies), 0
         self._kicked, pins = 0.0, scene.pins
-        self._points, self._frames = scene.positions, pins.keyframes
+        self._points, self._frames = scene.positions, np.where(pins.held, pins.keyframes, pins.keyframes[:1])
         self._patches = self._found()
-        share = np.where(np.isin(np.arange(len(self._points)), pins.vertices), 0.0, scene.vertex_masses)
+        share = np.where(np.isin(np.arange(len(self._points)), pins.clamped), 0.0, scene.vertex_masses)
         share = share / share.sum() if share.any() else share
         points = np.column_stack([self._points, np.ones(len(self._points))])
         spread, middle = (share[:, None] * points).T @ points, share @ points
@@ -179,5 +179,5 @@ class MovingPins(Source):
 @source_of.register
 def _moving(pins: Pins, balance, _stepper):
     keyframes = pins.keyframes
-    moves = keyframes is not None and keyframes.shape[1] and (keyframes != keyframes[0]).any()
+    moves = keyframes is not None and keyframes.shape[1] and (keyframes != keyframes[0])[:, pins.held].any()
     return MovingPins(balance) if moves else None

@@ -1,6 +1,6 @@
 """Scenes: a scene is data without a solver. Any solver that supports its terms runs it unchanged."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -23,12 +23,15 @@ _MOST_FRAMES = 2**31 - 1  # what counts them on the device is int32
 
 @dataclass(frozen=True, eq=False)
 class Pins:
-    """Vertices whose motion is prescribed.
+    """Vertices whose motion is prescribed, along all axes or some.
 
     Attributes:
         vertices: Indices (p,), or a selection of the mesh such as ``"x<0.01"``.
         keyframes: Positions (F, p, 3) [m] at frames 0 … F−1 of the scene, in the order of ``vertices``. Pins move
-            linearly between them and stand still after the last. Without keyframes they stay where they start.
+            linearly between them and stand still after the last. Without keyframes they stay where they start. Along axes
+            that a pin does not hold they do not matter.
+        axes: The axes that the pins hold, such as ``"xz"``, or such a text for each pin (p,). A pin that holds ``"y"`` is a
+            roller that moves freely along x and z, and one that holds the normal of a plane is a symmetry.
 
     Examples:
         >>> import warpcloth as wc
@@ -41,6 +44,18 @@ class Pins:
 
     vertices: Converted[str | ArrayLike, np.ndarray] = default(MISSING)
     keyframes: Converted[ArrayLike | None, np.ndarray | None] = default(None)
+    axes: str | Sequence[str] = "xyz"
+
+    @cached_property
+    def held(self) -> np.ndarray:
+        """The axes that each pin of a scene holds, (p, 3) truth values."""
+        each = [self.axes] * len(self.vertices) if isinstance(self.axes, str) else self.axes
+        return np.array([[axis in axes for axis in "xyz"] for axes in each], dtype=bool).reshape(-1, 3)
+
+    @property
+    def clamped(self) -> np.ndarray:
+        """Vertices that are held along every axis, (c,)."""
+        return self.vertices[self.held.all(axis=1)]
 
     def refuse_far(self, positions: np.ndarray, copy: str = "") -> None:
         """Refuses pins whose first keyframe is not where their vertices start, at ``positions`` (n, 3) [m].
@@ -50,7 +65,7 @@ class Pins:
         """
         if self.keyframes is None:
             return
-        gap = np.abs(self.keyframes[0] - positions[self.vertices]).max(initial=0.0)
+        gap = np.abs(self.keyframes[0] - positions[self.vertices])[self.held].max(initial=0.0)
         # Either may have been float32 once, whose rounding grows with the distance from the origin.
         near = 1e-6 * np.ptp(positions, axis=0).max() + 2.0 * np.finfo(np.float32).eps * np.abs(positions).max()
         if gap > near:
@@ -178,17 +193,25 @@ class Scene:
 
     @cached_property
     def fixed(self) -> np.ndarray:
-        """Vertices that obey no forces, the pins and those without a free axis, (f,) int32."""
-        if self.free_axes is None:
-            return self.pins.vertices
-        return np.union1d(self.pins.vertices, np.flatnonzero(~self.free_axes.any(axis=1))).astype(np.int32)
+        """Vertices that obey no forces, those that pins hold along every axis and those without a free one, (f,) int32."""
+        axes = self._unlocked
+        return self.pins.vertices if axes is None else np.flatnonzero(~axes.any(axis=1)).astype(np.int32)
+
+    @cached_property
+    def _unlocked(self) -> np.ndarray | None:
+        """The axes along which vertices move, (n, 3) truth values; None where that is all axes of all but pins."""
+        if self.free_axes is None and self.pins.held.all():
+            return None
+        found = np.ones((len(self.mesh.points), 3), dtype=bool) if self.free_axes is None else self.free_axes.copy()
+        found[self.pins.vertices] &= ~self.pins.held
+        return found
 
     @property
     def locked(self) -> np.ndarray | None:
         """The locked coordinates of vertices that move along other axes, (n, 3) truth values; None if there are none."""
-        if self.free_axes is None:
+        if self._unlocked is None:
             return None
-        found = ~self.free_axes
+        found = ~self._unlocked
         found[self.fixed] = False
         return found if found.any() else None
 
@@ -222,7 +245,9 @@ class Scene:
             f"{self.name}: {len(mesh.points)} vertices, {len(mesh.triangles)} triangles, {len(mesh.edges)} edges",
             f"  mass {self.vertex_masses.sum():.4g} kg, gravity {self.gravity.tolist()} m/s²",
             f"  {self.duration:g} s in {self.frames} frames of 1/{self.fps:g} s",
-            f"  pins: {len(pins.vertices)}" + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
+            f"  pins: {len(pins.vertices)}"
+            + ("" if pins.held.all() else f", {len(pins.vertices) - len(pins.clamped)} of them along some axes")
+            + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
         ]
         if self.locked is not None:
             counts = ", ".join(f"{count} {axis}" for axis, count in zip("xyz", self.locked.sum(axis=0), strict=True))
@@ -249,7 +274,8 @@ def checked_pins(pins: Any, mesh: Mesh) -> Pins:
     """Returns `Pins` with indices of a mesh, int32, from anything that a scene takes as pins.
 
     Raises:
-        ValueError: A vertex is not in the mesh or occurs twice, or keyframes have a wrong shape or are not finite.
+        ValueError: A vertex is not in the mesh or occurs twice, keyframes have a wrong shape or are not finite, or axes are
+            none.
     """
     pins = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins)
     vertices = distinct_vertices("pins.vertices", pins.vertices, mesh)
@@ -259,7 +285,20 @@ def checked_pins(pins: Any, mesh: Mesh) -> Pins:
             raise ValueError("pins.keyframes has no frame; it must have one or more, (F, p, 3)")
         count = len(keyframes) if np.ndim(keyframes) == 3 else 1
         keyframes = array("pins.keyframes", keyframes, (count, len(vertices), 3))
-    return Pins(vertices, keyframes)
+    return Pins(vertices, keyframes, _checked_pin_axes(pins.axes, len(vertices)))
+
+
+def _checked_pin_axes(axes, count):
+    """One text, or a tuple of them if pins differ."""
+    rule = "it must be some of the letters x, y and z, each once, such as 'xz'"
+    each = [axes] if isinstance(axes, str) else list(axes) if isinstance(axes, Iterable) else [axes]
+    for k, one in enumerate(each):
+        if not isinstance(one, str) or not one or len(set(one)) < len(one) or set(one) - set("xyz"):
+            raise ValueError(f"pins.axes{'' if isinstance(axes, str) else f'[{k}]'} is {shown(one)}; {rule}")
+    if not isinstance(axes, str) and len(each) != count:
+        raise ValueError(f"pins.axes has {len(each)} texts for {count} pins; it must be one text, or one for each pin")
+    each = ["".join(sorted(one)) for one in each]
+    return each[0] if len(set(each)) == 1 else tuple(each) if each else "xyz"
 
 
 def _described(term):

@@ -95,9 +95,11 @@ class Stepper:
             return
         model = self.model
         dim = (model.copies, len(pins))
-        move, add_one = model.kernel(kernels.move_pins, model.dtype), model.kernel(kernels.count_step)
-        given = [pins, keyframes, count, parts * self.steps_per_frame, model.per_copy, self.h / parts]
-        model.launch(move, dim, given, [x, v])
+        partly = model.pin_axes is not None  # then they are those of the model, for its steps are not divided
+        move = model.kernel(kernels.guide_pins if partly else kernels.move_pins, model.dtype)
+        add_one = model.kernel(kernels.count_step)
+        given = [pins, keyframes, *[model.pin_axes] * partly, count, parts * self.steps_per_frame, model.per_copy]
+        model.launch(move, dim, [*given, self.h / parts], [x, v])
         model.launch(add_one, model.copies, [], [count])
 
     def launch_prediction(self):

@@ -59,7 +59,7 @@ class Step:
         name: Its name on the command line and in benchmarks and charts; each record has its own.
         needs: Its needs of every term, of :mod:`warpcloth.terms.needs`; the first that is not met is named.
         facts: The :class:`warpcloth.solvers.facts.Facts` by which it is measured and drawn.
-        locks: Whether it takes a scene that locks coordinates, ``free_axes``.
+        locks: Whether it takes a scene that locks coordinates, by ``free_axes`` or the axes of pins.
         limited: Whether it refuses steps above a limit, which :meth:`step_limits` then finds.
 
     Raises:
@@ -118,7 +118,10 @@ class Step:
             raise ValueError(f"model is {given}; bind takes a model, which scene.build() makes")
         if model.mobility is not None and not cls.locks:
             able = [record.__name__ for record in SOLVERS.values() if record.locks]
-            raise ValueError(f"{cls.__name__} cannot take free_axes that lock some axes of a vertex; {listed(able)} can")
+            raise ValueError(
+                f"{cls.__name__} cannot take a vertex that is locked along some axes, by free_axes or its pin; "
+                f"{listed(able)} can"
+            )
         if needs is None:
             refuse_unmet(model.terms, cls.__name__, cls.needs, {record.__name__: record.needs for record in SOLVERS.values()})
         else:

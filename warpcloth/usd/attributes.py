@@ -76,6 +76,8 @@ ATTRIBUTES = (
     Attribute("duration", "warpcloth:duration", "cloth", ("double",)),
     # Positions of the pinned vertices, those of lower index first, a time sample for each frame.
     Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", ("double3[]",)),
+    # The axes that the pins hold, such as "xz", or one text for each pin, those of lower index first.
+    Attribute("pins.axes", "warpcloth:pins:axes", "cloth", ("token", "token[]")),
     # What the prim's own points and curves lose. Used while they agree with these: an artist's edit wins.
     Attribute("mesh.points", "warpcloth:points", "cloth", ("double3[]",)),  # in the prim's own space
     Attribute("mesh.edges", "warpcloth:edges", "cloth", ("int2[]",)),  # of curves, in order

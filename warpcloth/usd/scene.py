@@ -69,7 +69,7 @@ def _scene(stage, cloth, surroundings):
         positions=positions if own_positions is None else own_positions,
         velocities=values.get("velocities"),
         terms=terms,
-        pins=Pins(vertices, keyframes),
+        pins=Pins(vertices, keyframes, values.get("pins.axes") or "xyz"),
         free_axes=_free_axes(values),
         gravity=_gravity(stage, values, surroundings.up_axis),
         duration=duration,
@@ -329,8 +329,11 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     cloth = stage.GetPrimAtPath(target.prim)
     for field, value in _scene_values(scene).items():
         author(cloth, field, value)
+    order = np.argsort(scene.pins.vertices)
+    if not scene.pins.held.all():
+        axes = scene.pins.axes
+        author(cloth, "pins.axes", axes if isinstance(axes, str) else [axes[k] for k in order])
     if scene.pins.keyframes is not None:
-        order = np.argsort(scene.pins.vertices)
         for frame, positions in enumerate(scene.pins.keyframes[:, order]):
             author(cloth, "pins.keyframes", positions, time=frame)
     keys = _term_keys(scene.terms)
