@@ -1,0 +1,465 @@
+"""Kernels of the ray caster: normals, bounds of tubes, the rays of a pixel, and its colour."""
+
+from functools import cache
+
+import warp as wp
+
+# Of the size of the coordinates beside a point: what a ray starts above its surface, some ten roundings of float32.
+OFFSET = wp.constant(wp.float32(4e-6))
+FAR = wp.constant(wp.float32(1e30))
+# Of the plastic number g, g³ = g + 1: 1/g and 1/g², the most even additive sequence of pairs (Roberts 2018).
+PLASTIC_1 = wp.constant(wp.float32(0.7548776662))
+PLASTIC_2 = wp.constant(wp.float32(0.5698402910))
+
+
+@wp.struct
+class Geometry:
+    """Triangles and tubes in coordinates of the picture; a ball is a tube of no length."""
+
+    mesh: wp.uint64  # 0 without triangles
+    triangles: wp.array(dtype=wp.int32)
+    points: wp.array(dtype=wp.vec3)
+    normals: wp.array(dtype=wp.vec3)  # of the corners of triangles
+    tree: wp.uint64  # of tubes, 0 without
+    ends: wp.array(dtype=wp.vec2i)
+    radii: wp.array(dtype=wp.float32)
+    colours: wp.array(dtype=wp.vec3)
+    corner_colours: wp.array(dtype=wp.int32)  # indices, three a triangle
+    end_colours: wp.array(dtype=wp.vec2i)
+    shares: wp.array(dtype=wp.float32)  # of light and shadow in the colour, by triangles and then tubes
+    backs: wp.array(dtype=wp.vec3)  # factor of the colour on the back of triangles
+
+
+@wp.struct
+class Viewer:
+    """Rays of a camera: origin + t (forward + x right + y up), with x and y the pixel's coordinates from the middle."""
+
+    origin: wp.vec3
+    forward: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    width: wp.int32
+    height: wp.int32
+    samples: wp.int32
+
+
+@wp.struct
+class Light:
+    """A sun, an even sky and a ground."""
+
+    up: wp.vec3
+    sun: wp.vec3  # towards it
+    sun_radius: wp.float32  # tangent of half the angle that it fills
+    sun_share: wp.float32  # of the light on a surface that faces it
+    sky_share: wp.float32
+    sky_tilt: wp.float32  # by which the sky is lighter above than below
+    sky_distance: wp.float32  # of rays towards the sky
+    has_ground: wp.int32
+    ground: wp.float32  # height
+    ground_colour: wp.vec3
+    ground_radius: wp.float32  # at which it has faded
+    background: wp.vec3
+
+
+@wp.struct
+class Layers:
+    """Parts of the colour of each pixel: base + sky visible_sky + sun visible_sun."""
+
+    base: wp.array(dtype=wp.vec3)
+    sky: wp.array(dtype=wp.vec3)
+    sun: wp.array(dtype=wp.vec3)
+    visible: wp.array(dtype=wp.vec2)
+    normal: wp.array(dtype=wp.vec3)
+    depth: wp.array(dtype=wp.float32)
+
+
+@wp.func
+def meet_ball(o: wp.vec3, d: wp.vec3, r: float):
+    """Distance along the unit vector d at which a line enters a ball about the origin, FAR if it does not."""
+    # From the point of the line nearest to the centre: squares of what is far would cancel (Haines et al. 2019).
+    b = -wp.dot(o, d)
+    q = o + b * d
+    h = r * r - wp.dot(q, q)
+    t = FAR
+    if h >= 0.0:
+        t = b - wp.sqrt(h)
+    return t
+
+
+@wp.func
+def meet_tube(o: wp.vec3, d: wp.vec3, a: wp.vec3, b: wp.vec3, r: float):
+    """(distance, parameter from a to b) at which a ray enters a cylinder with round ends from outside, FAR if it does not."""
+    start = wp.dot(0.5 * (a + b) - o, d)
+    oa = o + start * d - a
+    ba = b - a
+    t = meet_ball(oa, d, r)
+    s = wp.float32(0.0)
+    length_sq = wp.dot(ba, ba)
+    if length_sq > 0.0:
+        tb = meet_ball(oa - ba, d, r)
+        if tb < t:
+            t = tb
+            s = 1.0
+        # Across the axis
+        along_d = wp.dot(ba, d) / length_sq
+        along_o = wp.dot(ba, oa) / length_sq
+        dx = d - along_d * ba
+        ox = oa - along_o * ba
+        A = wp.dot(dx, dx)
+        if A > 0.0:
+            at = -wp.dot(ox, dx) / A
+            q = ox + at * dx
+            h = r * r - wp.dot(q, q)
+            if h >= 0.0:
+                tc = at - wp.sqrt(h / A)
+                sc = along_o + tc * along_d
+                if tc < t and sc >= 0.0 and sc <= 1.0:
+                    t = tc
+                    s = sc
+    t = t + start
+    if t < 0.0 or t > 0.5 * FAR:
+        t = FAR
+    return t, s
+
+
+@wp.func
+def nearest_tube(g: Geometry, o: wp.vec3, d: wp.vec3, most: float):
+    """(distance, tube, parameter along it) of the first tube nearer than ``most``; the tube is −1 if there is none."""
+    nearest = most
+    tube = wp.int32(-1)
+    s = wp.float32(0.0)
+    if g.tree != wp.uint64(0):
+        query = wp.bvh_query_ray(g.tree, o, d)
+        k = wp.int32(0)
+        while wp.bvh_query_next(query, k, nearest):
+            r = g.radii[k]
+            if r > 0.0:
+                t, at = meet_tube(o, d, g.points[g.ends[k][0]], g.points[g.ends[k][1]], r)
+                if t < nearest:
+                    nearest = t
+                    tube = k
+                    s = at
+    return nearest, tube, s
+
+
+@wp.func
+def is_hidden(g: Geometry, o: wp.vec3, d: wp.vec3, most: float):
+    """Whether a ray meets anything nearer than ``most``."""
+    hidden = wp.bool(False)
+    if g.mesh != wp.uint64(0):
+        hidden = wp.mesh_query_ray_anyhit(g.mesh, o, d, most)
+    if not hidden and g.tree != wp.uint64(0):
+        query = wp.bvh_query_ray(g.tree, o, d)
+        k = wp.int32(0)
+        while wp.bvh_query_next(query, k, most):
+            r = g.radii[k]
+            if r > 0.0 and not hidden:
+                t, _s = meet_tube(o, d, g.points[g.ends[k][0]], g.points[g.ends[k][1]], r)
+                if t < most:
+                    hidden = True
+    return hidden
+
+
+@wp.func
+def beside(n: wp.vec3):
+    """A unit vector across a unit vector (Duff et al. 2017)."""
+    sign = wp.where(n[2] < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + n[2])
+    return wp.vec3(1.0 + sign * n[0] * n[0] * a, sign * n[0] * n[1] * a, -sign * n[0])
+
+
+@wp.func
+def size_of(p: wp.vec3):
+    return wp.max(wp.abs(p[0]), wp.max(wp.abs(p[1]), wp.abs(p[2])))
+
+
+@wp.func
+def light_at(g: Geometry, light: Light, p: wp.vec3, n: wp.vec3, across: wp.vec3, offset: float, j: int):
+    """(light of the sky, of the sun, share of each that is seen) at a point with normal n, ``across`` the surface itself."""
+    sky = light.sky_share * (1.0 + light.sky_tilt * (wp.dot(n, light.up) - 1.0))
+    facing = wp.dot(n, light.sun)
+    sun = wp.float32(0.0)
+    start = p + offset * across
+    k = float(j)
+    seen_sun = wp.float32(0.0)
+    if facing > 0.0 and wp.dot(across, light.sun) > 0.0:
+        sun = light.sun_share * facing
+        radius = light.sun_radius * wp.sqrt(wp.frac(0.5 + PLASTIC_1 * k))
+        angle = 2.0 * wp.pi * wp.frac(0.5 + PLASTIC_2 * k)
+        x = beside(light.sun)
+        y = wp.cross(light.sun, x)
+        d = wp.normalize(light.sun + radius * (wp.cos(angle) * x + wp.sin(angle) * y))
+        if not is_hidden(g, start, d, FAR):
+            seen_sun = 1.0
+    # With the cosine as density: a disc lifted to the half sphere (Malley)
+    a = wp.frac(0.25 + PLASTIC_1 * k)
+    radius = wp.sqrt(a)
+    angle = 2.0 * wp.pi * wp.frac(0.75 + PLASTIC_2 * k)
+    x = beside(n)
+    y = wp.cross(n, x)
+    d = radius * (wp.cos(angle) * x + wp.sin(angle) * y) + wp.sqrt(1.0 - a) * n
+    below = wp.dot(d, across)
+    if below < 0.0:
+        d -= 2.0 * below * across
+    seen_sky = wp.float32(1.0)
+    if is_hidden(g, start, d, light.sky_distance):
+        seen_sky = 0.0
+    return sky, sun, seen_sky, seen_sun
+
+
+@cache
+def trace():
+    """Kernel over pixels, from ``first`` on: the layers of each, the mean of its samples."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def trace_pixel(
+        # elements
+        g: Geometry,
+        # parameters
+        viewer: Viewer,
+        light: Light,
+        first: int,
+        # out
+        out: Layers,
+    ):
+        pixel = first + wp.tid()
+        column = pixel % viewer.width
+        row = pixel // viewer.width
+        base = wp.vec3()
+        sky = wp.vec3()
+        sun = wp.vec3()
+        visible = wp.vec2()
+        weight = wp.float32(0.0)
+        mean_normal = wp.vec3()
+        depth = wp.float32(0.0)
+        # Neighbours take other parts of the sequence: 16 pixels of a square together have an even one.
+        shift = ((7 * (column % 4 + 4 * (row % 4))) % 16) * viewer.samples
+        for sample in range(viewer.samples):
+            j = shift + sample
+            s = float(sample)
+            x = float(column) + wp.frac(0.5 + PLASTIC_1 * s) - 0.5 * float(viewer.width)
+            y = 0.5 * float(viewer.height) - float(row) - wp.frac(0.5 + PLASTIC_2 * s)
+            o = viewer.origin
+            d = wp.normalize(viewer.forward + x * viewer.right + y * viewer.up)
+            nearest = FAR
+            face = wp.int32(-1)
+            u = wp.float32(0.0)
+            v = wp.float32(0.0)
+            if g.mesh != wp.uint64(0):
+                query = wp.mesh_query_ray(g.mesh, o, d, FAR)
+                if query.result:
+                    nearest = query.t
+                    face = query.face
+                    u = query.u
+                    v = query.v
+            nearest, tube, along = nearest_tube(g, o, d, nearest)
+            ground_share = wp.float32(0.0)
+            colour = wp.vec3()
+            share = wp.float32(1.0)
+            n = wp.vec3()
+            across = wp.vec3()
+            p = wp.vec3()
+            hit = wp.bool(False)
+            if tube >= 0:
+                a = g.points[g.ends[tube][0]]
+                b = g.points[g.ends[tube][1]]
+                p = o + nearest * d
+                n = wp.normalize(p - ((1.0 - along) * a + along * b))
+                p = (1.0 - along) * a + along * b + g.radii[tube] * n
+                across = n
+                colour = (1.0 - along) * g.colours[g.end_colours[tube][0]] + along * g.colours[g.end_colours[tube][1]]
+                share = g.shares[g.triangles.shape[0] // 3 + tube]
+                hit = True
+            elif face >= 0:
+                w = 1.0 - u - v
+                a = g.points[g.triangles[3 * face]]
+                b = g.points[g.triangles[3 * face + 1]]
+                c = g.points[g.triangles[3 * face + 2]]
+                na = g.normals[3 * face]
+                nb = g.normals[3 * face + 1]
+                nc = g.normals[3 * face + 2]
+                across = wp.normalize(wp.cross(b - a, c - a))
+                n = wp.normalize(u * na + v * nb + w * nc)
+                p = u * a + v * b + w * c
+                side = wp.float32(1.0)
+                colour = (
+                    u * g.colours[g.corner_colours[3 * face]]
+                    + v * g.colours[g.corner_colours[3 * face + 1]]
+                    + w * g.colours[g.corner_colours[3 * face + 2]]
+                )
+                if wp.dot(across, d) > 0.0:
+                    side = -1.0
+                    colour = wp.cw_mul(colour, g.backs[face])
+                across = side * across
+                n = side * n
+                # Onto the round surface that the normals tell of, so that no flat one hides it (Hanika 2021)
+                p += (
+                    (u * wp.max(0.0, side * wp.dot(a - p, na)) * side) * na
+                    + (v * wp.max(0.0, side * wp.dot(b - p, nb)) * side) * nb
+                    + (w * wp.max(0.0, side * wp.dot(c - p, nc)) * side) * nc
+                )
+                share = g.shares[face]
+                hit = True
+            elif light.has_ground != 0:
+                height = wp.dot(o, light.up) - light.ground
+                fall = -wp.dot(d, light.up)
+                if height > 0.0 and fall > 0.0:
+                    nearest = height / fall
+                    p = o + nearest * d
+                    r = wp.length(p) / light.ground_radius
+                    if r < 1.0:
+                        ground_share = (1.0 - r * r) * (1.0 - r * r)
+                        n = light.up
+                        across = n
+                        hit = True
+            if not hit:
+                base += light.background
+                continue
+            offset = OFFSET * (size_of(p) + size_of(o))
+            seen_sky, seen_sun = wp.float32(0.0), wp.float32(0.0)
+            sky_here, sun_here, seen_sky, seen_sun = light_at(g, light, p, n, across, offset, j)
+            if ground_share > 0.0:
+                lit = sky_here + sun_here
+                base += (1.0 - ground_share) * light.background
+                sky += (ground_share * sky_here / lit) * light.ground_colour
+                sun += (ground_share * sun_here / lit) * light.ground_colour
+            else:
+                base += (1.0 - share) * colour
+                sky += (share * sky_here) * colour
+                sun += (share * sun_here) * colour
+            weight += 1.0
+            visible += wp.vec2(seen_sky, seen_sun)
+            mean_normal += n
+            depth += nearest
+        per_sample = 1.0 / float(viewer.samples)
+        out.base[pixel] = per_sample * base
+        out.sky[pixel] = per_sample * sky
+        out.sun[pixel] = per_sample * sun
+        if weight > 0.0:
+            visible /= weight
+            depth /= weight
+        out.visible[pixel] = visible
+        out.normal[pixel] = mean_normal
+        out.depth[pixel] = depth
+
+    return trace_pixel
+
+
+@wp.func
+def to_srgb(x: float):
+    """Linear Rec. 709 to sRGB (IEC 61966-2-1), in 8 bits."""
+    x = wp.clamp(x, 0.0, 1.0)
+    y = 12.92 * x
+    if x > 0.0031308:
+        y = 1.055 * wp.pow(x, 1.0 / 2.4) - 0.055
+    return wp.uint8(255.0 * y + 0.5)
+
+
+@cache
+def develop():
+    """Kernel over pixels: the colour of each in sRGB."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def develop_pixel(
+        # state in
+        layers: Layers,
+        # out
+        out: wp.array2d(dtype=wp.uint8),
+    ):
+        pixel = wp.tid()
+        seen = layers.visible[pixel]
+        colour = layers.base[pixel] + seen[0] * layers.sky[pixel] + seen[1] * layers.sun[pixel]
+        for channel in range(3):
+            out[pixel, channel] = to_srgb(colour[channel])
+
+    return develop_pixel
+
+
+@cache
+def tube_bounds():
+    """Kernel over tubes: boxes about them."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def bound_tube(
+        # elements
+        ends: wp.array(dtype=wp.vec2i),
+        radii: wp.array(dtype=wp.float32),
+        # state in
+        points: wp.array(dtype=wp.vec3),
+        # out
+        low: wp.array(dtype=wp.vec3),
+        high: wp.array(dtype=wp.vec3),
+    ):
+        k = wp.tid()
+        a = points[ends[k][0]]
+        b = points[ends[k][1]]
+        r = wp.vec3(radii[k], radii[k], radii[k])
+        low[k] = wp.min(a, b) - r
+        high[k] = wp.max(a, b) + r
+
+    return bound_tube
+
+
+@cache
+def face_normals():
+    """Kernel over triangles: unit normals, 0 of those without area, and the angles at their corners."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_face_normal(
+        # elements
+        triangles: wp.array(dtype=wp.int32),
+        # state in
+        points: wp.array(dtype=wp.vec3),
+        # out
+        normals: wp.array(dtype=wp.vec3),
+        angles: wp.array(dtype=wp.float32),
+    ):
+        t = wp.tid()
+        a = points[triangles[3 * t]]
+        b = points[triangles[3 * t + 1]]
+        c = points[triangles[3 * t + 2]]
+        n = wp.cross(b - a, c - a)
+        area = wp.length(n)
+        normals[t] = wp.normalize(n)
+        angles[3 * t] = wp.atan2(area, wp.dot(b - a, c - a))
+        angles[3 * t + 1] = wp.atan2(area, wp.dot(c - b, a - b))
+        angles[3 * t + 2] = wp.atan2(area, wp.dot(a - c, b - c))
+
+    return find_face_normal
+
+
+@cache
+def corner_normals():
+    """Kernel over corners of triangles: the mean of the normals about a vertex, by their angles (Thürmer & Wüthrich 1998).
+
+    Normals count only where the surface bends by less than some 75°, whichever side they are on: boxes keep their edges,
+    and triangles may be wound either way.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_corner_normal(
+        # elements
+        triangles: wp.array(dtype=wp.int32),
+        smooth: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int32),
+        corners: wp.array(dtype=wp.int32),
+        # state in
+        face_normals: wp.array(dtype=wp.vec3),
+        angles: wp.array(dtype=wp.float32),
+        # out
+        normals: wp.array(dtype=wp.vec3),
+    ):
+        corner = wp.tid()
+        own = face_normals[corner // 3]
+        n = own
+        if smooth[corner // 3] != 0:
+            n = wp.vec3()
+            vertex = triangles[corner]
+            for k in range(starts[vertex], starts[vertex + 1]):
+                other = face_normals[corners[k] // 3]
+                along = wp.dot(own, other)
+                n += (wp.sign(along) * angles[corners[k]] * wp.smoothstep(0.25, 0.6, wp.abs(along))) * other
+            n = wp.normalize(n)
+        normals[corner] = n
+
+    return find_corner_normal

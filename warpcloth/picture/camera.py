@@ -1,0 +1,83 @@
+"""A camera with perspective, and one that shows all of a motion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..base.checks import array, number
+from .view import View
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera with perspective.
+
+    Attributes:
+        position: Of the eye [m].
+        target: What is in the middle of the picture [m]. Its distance also says how large the scene is: rays that find how
+            much of the sky a point sees are about as long as half the height of the picture there.
+        up: What is up in the picture, not along the view; of any length.
+        fov: Angle from the lower to the upper side of the picture [°], above 0 and below 180.
+
+    Raises:
+        ValueError: A number is not finite or beyond its range, the target is at the position, or up is along the view.
+    """
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    fov: float = 30.0
+
+    def __post_init__(self):
+        for name in ("position", "target", "up"):
+            object.__setattr__(self, name, tuple(array(name, getattr(self, name), (3,)).tolist()))
+        number("fov", self.fov, above=0.0)
+        if not self.fov < 180.0:
+            raise ValueError(f"fov is {self.fov:g}; it must be below 180")
+        view = np.subtract(self.target, self.position)
+        if not view.any():
+            raise ValueError(f"target is {self.target}, where position is; the camera must look somewhere")
+        up = np.asarray(self.up)
+        if not np.linalg.norm(np.cross(view, up)) > 1e-9 * np.linalg.norm(view) * np.linalg.norm(up):
+            raise ValueError(f"up is {self.up}, along the view; it must point to the side of it")
+
+    @classmethod
+    def framed(cls, frames, azimuth=-38.0, elevation=24.0, up_axis="Y", aspect=16 / 9, fov=30.0, margin=0.08):
+        """The nearest camera in a direction that sees all of some frames.
+
+        Args:
+            frames: Points (n, 3) of each [m], read once, one at a time; points that are not finite do not count.
+            azimuth: Angle of the viewer about the vertical [°], as in :class:`View`.
+            elevation: Angle of the viewer above the horizontal [°].
+            up_axis: "Y" or "Z".
+            aspect: Width of the picture by its height.
+            fov: Angle from the lower to the upper side [°].
+            margin: Part of the picture that stays empty on each side.
+
+        Raises:
+            ValueError: No point is finite, or a number is beyond its range.
+        """
+        number("aspect", aspect, above=0.0)
+        number("fov", fov, above=0.0)
+        number("margin", margin, least=0.0)
+        if not (fov < 180.0 and margin < 0.5):
+            raise ValueError(f"fov is {fov:g} and margin {margin:g}; they must be below 180 and 0.5")
+        view = View(azimuth, elevation, up_axis)
+        half = np.tan(np.radians(fov) / 2.0) * (1.0 - 2.0 * margin) * np.array([aspect, 1.0])
+        # A point (x, y, z) to the right, up and towards a viewer at (X, Y, Z) is in the picture if |x − X| ≤ half (Z − z):
+        # the largest of ± x + half z are all that must be known of the points.
+        most, low, high = np.full((2, 2), -np.inf), np.full(3, np.inf), np.full(3, -np.inf)
+        for points in frames:
+            seen = view.project(points).reshape(-1, 3)
+            seen = seen[np.isfinite(seen).all(axis=1)]
+            low, high = np.minimum(low, seen.min(axis=0, initial=np.inf)), np.maximum(high, seen.max(axis=0, initial=-np.inf))
+            sides = np.stack([seen[:, :2], -seen[:, :2]]) + half * seen[:, 2:]
+            most = np.maximum(most, sides.max(axis=1, initial=-np.inf))
+        if not (low <= high).all():
+            raise ValueError("no point of the frames is finite; a camera must have something to show")
+        size = (high - low).max() or 1.0
+        depth = max((most.sum(axis=0) / (2.0 * half)).max(), high[2] + 0.05 * size)
+        eye = np.append((most[0] - most[1]) / 2.0, depth)
+        middle = np.append(eye[:2], (low[2] + high[2]) / 2.0)
+        axes = view.project(np.eye(3))
+        return cls(axes @ eye, axes @ middle, axes[:, 1], fov)

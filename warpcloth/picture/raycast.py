@@ -1,0 +1,343 @@
+"""Pictures of surfaces and tubes in the light of a sun and the sky, by rays."""
+
+import os
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from ..base.checks import array, choice, number, whole
+from ..base.quiet import find_device
+from ..base.turns import in_turn
+from ..core.thread_pool import ThreadPool
+from ..kernels import render as kernels
+
+CLOTH = (0.20, 0.42, 0.68)
+BACK = (1.0, 0.86, 0.74)
+BACKGROUND = (0.90, 0.92, 0.94)
+GROUND = (0.86, 0.87, 0.88)
+_UP = {"Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
+# Of half the height of the picture: what a ray to the sky needs to be free, and where the ground has faded.
+_SKY_DISTANCE, _GROUND = 1.0, 6.0
+# How much of the light on a surface that faces the sun is the sky's, and by how much that is lighter above than below.
+_SKY, _TILT = 0.45, 0.3
+# Beyond, products of three coordinates of float32 overflow.
+_FARTHEST = 1e9
+# Rows that a thread of the CPU takes at a time.
+_ROWS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One thing in a picture: what it is made of, and its looks. Its positions come with each picture.
+
+    Attributes:
+        count: Number n of points.
+        triangles: Vertices of triangles (T, 3), which are seen from both sides.
+        lines: Vertices of tubes with round ends (E, 2).
+        radius: Of the tubes [m].
+        balls: Vertices that are balls (k,).
+        ball_radius: Of the balls [m].
+        colour: Linear Rec. 709 of what has no colours of its own.
+        ball_colour: Of the balls.
+        back: Factors of the colour on the back of triangles. Colours of a measure are the same on both sides.
+        smooth: Whether triangles are lit as a smooth surface. Where it bends by more than some 70° it keeps its edges.
+
+    Raises:
+        ValueError: An array has another shape, an index is of no point, or a radius is not above 0.
+    """
+
+    count: int
+    triangles: np.ndarray = field(default_factory=lambda: np.empty((0, 3), int))
+    lines: np.ndarray = field(default_factory=lambda: np.empty((0, 2), int))
+    radius: float = 0.0
+    balls: np.ndarray = field(default_factory=lambda: np.empty(0, int))
+    ball_radius: float = 0.0
+    colour: tuple[float, float, float] = CLOTH
+    ball_colour: tuple[float, float, float] = (0.60, 0.05, 0.03)
+    back: tuple[float, float, float] = BACK
+    smooth: bool = True
+
+    def __post_init__(self):
+        whole("count", self.count, 0)
+        for name, shape in (("triangles", (3,)), ("lines", (2,)), ("balls", ())):
+            found = np.asarray(getattr(self, name))
+            found = found.reshape(0, *shape) if found.size == 0 else found
+            if found.shape[1:] != shape or found.ndim != 1 + len(shape) or (found.size and found.dtype.kind not in "iu"):
+                wanted = ", ".join(map(str, ("k", *shape)))
+                raise ValueError(f"{name} has shape {found.shape} and type {found.dtype}; it must be ({wanted}), whole numbers")
+            if found.size and not 0 <= found.min() <= found.max() < self.count:
+                raise ValueError(f"{name} refers to vertices {found.min()} to {found.max()}; there are {self.count}")
+            object.__setattr__(self, name, found.astype(np.int32))
+        if len(self.lines):
+            number("radius", self.radius, above=0.0)
+        if len(self.balls):
+            number("ball_radius", self.ball_radius, above=0.0)
+        for name in ("colour", "ball_colour", "back"):
+            object.__setattr__(self, name, array(name, getattr(self, name), (3,)))
+
+
+class RayCaster:
+    """Makes pictures of shapes that move: allocates once, and takes positions, a camera and colours for each picture.
+
+    Light comes from a sun over the viewer's left shoulder and from the sky; a ray from each visible point finds whether it sees
+    the sun, one whether it sees the sky. The light on a surface that faces the sun and sees all of the sky is 1, nowhere more:
+    there the colour in the picture is the surface's. Rays are the same for each picture, so the same input gives the same bytes
+    on one device.
+
+    Args:
+        shapes: The :class:`Shape` list.
+        width: Of the picture [px].
+        height: Of the picture [px].
+        samples: Rays from the camera through each pixel.
+        ground: Height of a level ground that fades into the background [m], or None.
+        device: A Warp device.
+        up_axis: "Y" or "Z".
+        threads: Threads of the CPU; by default all of its cores.
+        sun_angle: Angle that the sun fills [°], which makes its shadows soft.
+        contrast: How much of the light and shadow is seen where an image has colours, from 0 to 1: 0 shows the colours alone.
+        background: Linear Rec. 709.
+        ground_colour: Linear Rec. 709, where the sun and all of the sky reach the ground.
+
+    Attributes:
+        left_out: After :meth:`image`, how many triangles, lines and balls it does not show: those with a point that is not
+            finite, or so far away that float32 does not hold it.
+
+    Raises:
+        ValueError: A number is beyond its range, or this machine has no such device.
+    """
+
+    def __init__(
+        self,
+        shapes,
+        width,
+        height,
+        samples=4,
+        ground=None,
+        device="cpu",
+        up_axis="Y",
+        threads=None,
+        sun_angle=5.0,
+        contrast=0.6,
+        background=BACKGROUND,
+        ground_colour=GROUND,
+    ):
+        for name, value in (("width", width), ("height", height), ("samples", samples)):
+            whole(name, value, 1, 16384)
+        if ground is not None:
+            number("ground", ground)
+        choice("up_axis", up_axis, tuple(_UP))
+        number("sun_angle", sun_angle, least=0.0)
+        number("contrast", contrast, least=0.0)
+        self.shapes, self.left_out = list(shapes), 0
+        self._size, self._samples = (int(width), int(height)), int(samples)
+        self._ground, self._up = ground, np.array(_UP[up_axis])
+        self._sun_angle, self._contrast = sun_angle, contrast
+        self._background, self._ground_colour = (
+            array("background", background, (3,)),
+            array("ground_colour", ground_colour, (3,)),
+        )
+        self._device = find_device(device)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._pool = ThreadPool(1 if not self._device.is_cpu else threads or cores)
+        self._allocate()
+
+    @in_turn
+    def _allocate(self):
+        shapes, offsets = self.shapes, np.cumsum([0, *(shape.count for shape in self.shapes)])
+        empty = np.empty((0, 3), np.int32)
+        self._points = np.zeros((max(1, offsets[-1]), 3))
+        self._triangles = np.concatenate(
+            [empty, *(s.triangles + o for s, o in zip(shapes, offsets, strict=False))], dtype=np.int32
+        )
+        tubes, radii = [empty[:, :2]], [np.empty(0)]
+        for shape, offset in zip(shapes, offsets, strict=False):
+            tubes += [shape.lines + offset, np.stack([shape.balls, shape.balls], axis=1) + offset]
+            radii += [np.full(len(shape.lines), shape.radius), np.full(len(shape.balls), shape.ball_radius)]
+        self._tubes, self._radii = np.concatenate(tubes, dtype=np.int32), np.concatenate(radii)
+        smooth = np.repeat([int(s.smooth) for s in shapes], [len(s.triangles) for s in shapes]).astype(np.int32)
+        flat = self._triangles.ravel()
+        starts = np.searchsorted(np.sort(flat), np.arange(len(self._points) + 1)).astype(np.int32)
+        corners = np.argsort(flat, kind="stable").astype(np.int32)
+        pixels = self._size[0] * self._size[1]
+        with wp.ScopedDevice(self._device):
+            g = self._geometry = kernels.Geometry()
+            g.points = wp.zeros(len(self._points), dtype=wp.vec3)
+            g.triangles = wp.array(flat, dtype=wp.int32)
+            g.normals = wp.zeros(len(flat), dtype=wp.vec3)
+            g.ends = wp.array(self._tubes, dtype=wp.vec2i)
+            g.radii = wp.zeros(len(self._radii), dtype=wp.float32)
+            self._smoothing = [wp.array(a, dtype=wp.int32) for a in (smooth, starts, corners)]
+            self._faces = [wp.zeros(len(self._triangles), dtype=wp.vec3), wp.zeros(len(flat), dtype=wp.float32)]
+            self._bounds = [wp.zeros(len(self._radii), dtype=wp.vec3) for _ in range(2)]
+            layers = self._layers = kernels.Layers()
+            layers.base, layers.sky, layers.sun, layers.normal = (wp.zeros(pixels, dtype=wp.vec3) for _ in range(4))
+            layers.visible, layers.depth = wp.zeros(pixels, dtype=wp.vec2), wp.zeros(pixels, dtype=wp.float32)
+            self._image = wp.zeros((pixels, 3), dtype=wp.uint8)
+
+    @in_turn
+    def image(self, points, camera, colours=None):
+        """Makes a picture.
+
+        Args:
+            points: Positions (n, 3) of each shape [m]. What has a point that is not finite is left out.
+            camera: A :class:`Camera`.
+            colours: Of each shape, linear Rec. 709 or None: (n, 3) of vertices, (T, 3, 3) of the corners of triangles, or
+                (E, 2, 3) of the ends of lines.
+
+        Returns:
+            np.ndarray: (height, width, 3) uint8 in sRGB.
+
+        Raises:
+            ValueError: An array has another shape.
+        """
+        if len(points) != len(self.shapes):
+            raise ValueError(f"points has {len(points)} arrays; there are {len(self.shapes)} shapes")
+        colours = [None] * len(self.shapes) if colours is None else colours
+        if len(colours) != len(self.shapes):
+            raise ValueError(f"colours has {len(colours)} entries; there are {len(self.shapes)} shapes")
+        unit, viewer = self._viewer(camera)
+        with wp.ScopedDevice(self._device):
+            self._set_positions(points, np.asarray(camera.target), unit)
+            self._colour(colours)
+            light = self._light(viewer, np.asarray(camera.target), unit)
+            self._trace(viewer, light)
+            width, height = self._size
+            wp.launch(kernels.develop(), width * height, inputs=[self._layers], outputs=[self._image])
+            return self._image.numpy().reshape(height, width, 3)
+
+    def _viewer(self, camera):
+        """Length of one in coordinates of the picture [m], a power of two, and the rays of the camera in them."""
+        width, height = self._size
+        position, target, up = (np.asarray(a) for a in (camera.position, camera.target, camera.up))
+        forward = target - position
+        distance = np.linalg.norm(forward)
+        tangent = np.tan(np.radians(camera.fov) / 2.0)
+        unit = 2.0 ** np.ceil(np.log2(distance * tangent))
+        forward /= distance
+        right = np.cross(forward, up / np.linalg.norm(up))
+        right /= np.linalg.norm(right)
+        pixel = 2.0 * tangent / height
+        viewer = kernels.Viewer()
+        viewer.origin, viewer.forward = wp.vec3(*((position - target) / unit)), wp.vec3(*forward)
+        viewer.right, viewer.up = wp.vec3(*(pixel * right)), wp.vec3(*(pixel * np.cross(right, forward)))
+        viewer.width, viewer.height, viewer.samples = width, height, self._samples
+        return unit, viewer
+
+    def _light(self, viewer, target, unit):
+        right = np.array(viewer.right) / np.linalg.norm(viewer.right)
+        back = np.cross(right, self._up)
+        if not np.linalg.norm(back) > 1e-6:  # a camera that lies on its side
+            back = -np.array(viewer.forward)
+        sun = -0.5 * right + 0.6 * back / np.linalg.norm(back) + 0.95 * self._up
+        sun /= np.linalg.norm(sun)
+        light = kernels.Light()
+        light.up, light.sun = wp.vec3(*self._up), wp.vec3(*sun)
+        light.sun_radius = float(np.tan(np.radians(self._sun_angle) / 2.0))
+        # light = sky (1 + tilt (n·up − 1)) + sun n·s is largest, and 1, for n along this vector
+        largest = _SKY * (1.0 - _TILT) + np.linalg.norm(_SKY * _TILT * self._up + (1.0 - _SKY) * sun)
+        light.sky_share, light.sun_share, light.sky_tilt = _SKY / largest, (1.0 - _SKY) / largest, _TILT
+        light.sky_distance = _SKY_DISTANCE
+        light.has_ground = int(self._ground is not None)
+        if self._ground is not None:
+            light.ground = float((self._ground - target @ self._up) / unit)
+        light.ground_colour, light.background = wp.vec3(*self._ground_colour), wp.vec3(*self._background)
+        light.ground_radius = _GROUND
+        return light
+
+    def _set_positions(self, points, target, unit):
+        """Copies the positions to the device, and fits the trees and the normals to them."""
+        first = 0
+        for k, (shape, found) in enumerate(zip(self.shapes, points, strict=True)):
+            found = np.asarray(found)
+            if found.shape != (shape.count, 3):
+                raise ValueError(f"points[{k}] has shape {found.shape}; it must be ({shape.count}, 3)")
+            self._points[first : first + shape.count] = found
+            first += shape.count
+        with np.errstate(over="ignore", invalid="ignore"):
+            local = (self._points - target) / unit
+            bad = ~(np.abs(local) < _FARTHEST).all(axis=1)
+        local[bad] = 0.0
+        flat, hollow = bad[self._triangles].any(axis=1), bad[self._tubes].any(axis=1)
+        self.left_out = int(flat.sum() + hollow.sum())
+        g = self._geometry
+        g.points.assign(local)
+        if len(self._triangles):
+            g.triangles.assign(np.where(flat[:, None], 0, self._triangles).ravel())
+            wp.launch(kernels.face_normals(), len(flat), inputs=[g.triangles, g.points], outputs=self._faces)
+            inputs = [g.triangles, *self._smoothing, *self._faces]
+            wp.launch(kernels.corner_normals(), 3 * len(flat), inputs=inputs, outputs=[g.normals])
+            self._mesh = wp.Mesh(g.points, g.triangles)
+            g.mesh = self._mesh.id
+        if len(self._tubes):
+            g.radii.assign(np.where(hollow, 0.0, self._radii / unit))
+            wp.launch(kernels.tube_bounds(), len(hollow), inputs=[g.ends, g.radii, g.points], outputs=self._bounds)
+            self._tree = wp.Bvh(*self._bounds)
+            g.tree = self._tree.id
+
+    def _colour(self, colours):
+        """Copies the colours to the device."""
+        values, corners, ends = [], [], []
+        shares, line_shares, backs = [], [], []
+        first = 0
+
+        def add(rows):
+            nonlocal first
+            values.append(rows)
+            first += len(rows)
+            return first - len(rows)
+
+        for k, (shape, found) in enumerate(zip(self.shapes, colours, strict=True)):
+            balls = np.full((len(shape.balls), 2), add(shape.ball_colour[None]))
+            plain = add(shape.colour[None])
+            corner, end = np.full(shape.triangles.shape, plain), np.full(shape.lines.shape, plain)
+            painted = [False, False]
+            if found is not None:
+                found = np.asarray(found, dtype=np.float64)
+                if found.shape == (shape.count, 3):
+                    start = add(found)
+                    corner, end, painted = shape.triangles + start, shape.lines + start, [True, True]
+                elif found.shape == (len(shape.triangles), 3, 3):
+                    corner, painted[0] = add(found.reshape(-1, 3)) + np.arange(corner.size).reshape(-1, 3), True
+                elif found.shape == (len(shape.lines), 2, 3):
+                    end, painted[1] = add(found.reshape(-1, 3)) + np.arange(end.size).reshape(-1, 2), True
+                else:
+                    raise ValueError(
+                        f"colours[{k}] has shape {found.shape}; it must be ({shape.count}, 3) of vertices, "
+                        f"({len(shape.triangles)}, 3, 3) of corners or ({len(shape.lines)}, 2, 3) of ends of lines"
+                    )
+            corners.append(corner)
+            ends += [end, balls]
+            shares.append(np.full(len(corner), self._contrast if painted[0] else 1.0))
+            line_shares += [np.full(len(end), self._contrast if painted[1] else 1.0), np.ones(len(balls))]
+            backs.append(np.tile((1.0, 1.0, 1.0) if painted[0] else shape.back, (len(corner), 1)))
+        g = self._geometry
+        none = np.empty((0, 3))
+        g.colours = wp.array(np.concatenate([none, *values]), dtype=wp.vec3)
+        g.corner_colours = wp.array(np.concatenate([none, *corners]).ravel(), dtype=wp.int32)
+        g.end_colours = wp.array(np.concatenate([none[:, :2], *ends]), dtype=wp.vec2i)
+        g.shares = wp.array(np.concatenate([none[:, 0], *shares, *line_shares]), dtype=wp.float32)
+        g.backs = wp.array(np.concatenate([none, *backs]), dtype=wp.vec3)
+
+    def _trace(self, viewer, light):
+        """Traces the pixels: on the CPU each thread takes some rows, then the next that nobody has taken."""
+        width, height = self._size
+        step = _ROWS if self._device.is_cpu else height
+        launches = iter(
+            [
+                wp.launch(
+                    kernels.trace(),
+                    min(step, height - row) * width,
+                    inputs=[self._geometry, viewer, light, row * width],
+                    outputs=[self._layers],
+                    record_cmd=True,
+                )
+                for row in range(0, height, step)
+            ]
+        )
+
+        def work():
+            for launch in launches:
+                launch.launch()
+
+        self._pool.run([work] * self._pool.threads)
