@@ -34,8 +34,9 @@ def inverse_edges(points, stencil):
     return np.stack([1.0 / length, -along / (length * height), 1.0 / height], axis=1)
 
 
-def material_state(points, stencil, poisson_ratio):
-    """:func:`inverse_edges` and, of Poisson's ratio ν (one or E), μ/k = 1/(2(1 + ν)) and λ/k = ν/(1 − ν²), (E, 5)."""
+def material_state(points, stencil, poisson_ratio=0.0):
+    """:func:`inverse_edges` of the triangles ``stencil`` (E, 3), and μ/k = 1/(2(1 + ν)) and λ/k = ν/(1 − ν²) [1] of Poisson's
+    ratio ν (one or E), as an array (E, 5)."""
     nu = np.broadcast_to(poisson_ratio, len(stencil))
     return np.column_stack([inverse_edges(points, stencil), 0.5 / (1.0 + nu), nu / (1.0 - nu**2)])
 

@@ -205,24 +205,8 @@ def add_block_forces(parts: tuple[TermFacts, ...], dtype, corrected: bool = Fals
     """As :func:`add_block`, of all terms."""
     vec3, _ = types(dtype)
     chain_type = chain_of(parts, dtype)
-
-    if not parts:
-
-        @wp.func
-        def add_nothing(
-            chain: chain_type,
-            block: int,
-            x: wp.array(dtype=vec3),
-            v: wp.array(dtype=vec3),
-            h: dtype,
-            y: wp.array(dtype=dtype),
-            dy: wp.array(dtype=dtype),
-            out: wp.array(dtype=vec3),
-        ):
-            return
-
-        return add_nothing
-    first, others = add_block(parts[0], dtype, corrected), add_block_forces(parts[1:], dtype, corrected)
+    key = dtype, corrected
+    first, others = (add_block(parts[0], *key), add_block_forces(parts[1:], *key)) if parts else (None, None)
 
     @wp.func
     def add(
@@ -235,7 +219,8 @@ def add_block_forces(parts: tuple[TermFacts, ...], dtype, corrected: bool = Fals
         dy: wp.array(dtype=dtype),
         out: wp.array(dtype=vec3),
     ):
-        first(chain.first, block, x, v, h, y, dy, out)
-        others(chain.others, block, x, v, h, y, dy, out)
+        if wp.static(first is not None):
+            first(chain.first, block, x, v, h, y, dy, out)
+            others(chain.others, block, x, v, h, y, dy, out)
 
     return add

@@ -265,23 +265,7 @@ def correct_terms(parts: tuple[Projected, ...], dtype):
     """As :func:`correct_elements`, of all terms."""
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     chain_type = chain_of(parts, dtype, constraints_of)
-
-    if not parts:
-
-        @wp.func
-        def total_of_nothing(
-            chain: chain_type,
-            i: int,
-            count: int,
-            rows: wp.array(dtype=vec4),
-            d: wp.array(dtype=vec3),
-            h: dtype,
-            sweeps: int,
-        ):
-            return vec3()
-
-        return total_of_nothing
-    first, others = correct_elements(parts[0], dtype), correct_terms(parts[1:], dtype)
+    first, others = (correct_elements(parts[0], dtype), correct_terms(parts[1:], dtype)) if parts else (None, None)
 
     @wp.func
     def total_of(
@@ -293,8 +277,10 @@ def correct_terms(parts: tuple[Projected, ...], dtype):
         h: dtype,
         sweeps: int,
     ):
-        total = first(chain.first, i, count, rows, d, h, sweeps)
-        return total + others(chain.others, i, count, rows, d, h, sweeps)
+        if wp.static(first is None):
+            return vec3()
+        else:
+            return first(chain.first, i, count, rows, d, h, sweeps) + others(chain.others, i, count, rows, d, h, sweeps)
 
     return total_of
 

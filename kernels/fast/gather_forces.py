@@ -237,23 +237,17 @@ def gather_terms(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     chain_type = chain_of(parts, dtype)
-
-    if not parts:
-
-        @wp.func
-        def total_of_nothing(
-            chain: chain_type, i: int, lane: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=v_type), h: dtype
-        ):
-            return vec3()
-
-        return total_of_nothing
-    first, others = gather_term(parts[0], dtype, ahead, lanes), gather_terms(parts[1:], dtype, ahead, lanes)
+    key = dtype, ahead, lanes
+    first, others = (gather_term(parts[0], *key), gather_terms(parts[1:], *key)) if parts else (None, None)
 
     @wp.func
     def total_of(
         chain: chain_type, i: int, lane: int, count: int, x: wp.array(dtype=vec3), v: wp.array(dtype=v_type), h: dtype
     ):
-        return first(chain.first, i, lane, count, x, v, h) + others(chain.others, i, lane, count, x, v, h)
+        if wp.static(first is None):
+            return vec3()
+        else:
+            return first(chain.first, i, lane, count, x, v, h) + others(chain.others, i, lane, count, x, v, h)
 
     return total_of
 

@@ -19,11 +19,6 @@ from ..term import Term
 from .membrane_damping import DISSIPATION
 
 
-def rest_state(points, stencil, poisson_ratio=0.0):
-    """Inverse rest edges [1/m] of the triangles ``stencil`` (E, 3), μ/k and λ/k [1] of ν (one or E), as an array (E, 5)."""
-    return material_state(points, stencil, poisson_ratio)
-
-
 @wp.func
 def crushed(y: Any, J: Any):
     return J <= y.dtype(4.0) * epsilon(J) * wp.ddot(y, y)
@@ -89,7 +84,7 @@ NEO_HOOKEAN_MEMBRANE = Term(
     vertices=3,
     rows=2,
     parameters=5,
-    rest_state=rest_state,
+    rest_state=material_state,
     weight=weight,
     measure=measure,
     energy=energy,

@@ -16,18 +16,12 @@ import numpy as np
 import warp as wp
 
 from ..term import Term
+from .attachment import hessian, weight
 
 
 def rest_state(points, stencil, masses=1.0):
     """t = 0 [m] and the masses (one or E) [kg] of the vertices ``stencil`` (E, 1), as an array (E, 4)."""
     return np.column_stack([np.zeros((len(stencil), 3)), np.broadcast_to(masses, len(stencil))])
-
-
-@wp.func
-def weight(rest: Any, i: int):
-    w = wp.vector(length=1, dtype=rest.dtype)
-    w[0] = rest.dtype(1.0)
-    return w
 
 
 @wp.func
@@ -58,11 +52,6 @@ def gradient(y: Any, rest: Any):
 def energy(y: Any, rest: Any):
     t = target(rest)
     return y.dtype(0.5) * wp.ddot(t, t)
-
-
-@wp.func
-def hessian(y: Any, rest: Any, policy: int):
-    return wp.identity(n=3, dtype=y.dtype)
 
 
 RIGID_CLUSTER = Term(

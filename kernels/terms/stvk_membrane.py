@@ -16,11 +16,6 @@ from ..term import Term
 from .membrane_damping import DISSIPATION
 
 
-def rest_state(points, stencil, poisson_ratio=0.0):
-    """Inverse rest edges [1/m] of the triangles ``stencil`` (E, 3), μ/k and λ/k [1] of ν (one or E), as an array (E, 5)."""
-    return material_state(points, stencil, poisson_ratio)
-
-
 @wp.func
 def energy(y: Any, rest: Any):
     E = green_strain(y)
@@ -64,7 +59,7 @@ STVK_MEMBRANE = Term(
     vertices=3,
     rows=2,
     parameters=5,
-    rest_state=rest_state,
+    rest_state=material_state,
     weight=weight,
     measure=measure,
     energy=energy,

@@ -1,10 +1,11 @@
 """Jacobi sweeps that scatter the corrections of constraints to their vertices, for the CPU, where nothing need be atomic."""
 
+from ..core.jacobi_sweeps import JacobiSweeps
 from ..kernels.fast import scatter_corrections as kernels
 from ..terms.refresh import EVALUATION, Moment
 
 
-class ScatterSweeps:
+class ScatterSweeps(JacobiSweeps):
     """Sweeps of one launch a term, over elements that add to the moves of their vertices in order, and one that moves these.
 
     Arguments are those of :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`.
@@ -17,12 +18,6 @@ class ScatterSweeps:
         self._apply, self._total = model.kernel(kernels.apply_correction, model.dtype), model.vectors()
         self._given, self._factors, self._scale = [h, spread or 1], factors, scale
 
-    def launch_start(self):
-        """Launches d = 0, λ = 0."""
-        for array in (self.correction, self._total, *self.multipliers):
-            if array is not None:
-                array.zero_()
-
     def launch(self, sweeps=1):
         """Launches so many sweeps."""
         model, d = self.model, self.correction
@@ -34,7 +29,3 @@ class ScatterSweeps:
                 given = [*elements.arguments, model.inverse_mass, factor, self.x, d, *self._given]
                 model.launch(kernel, elements.count, given, [lambdas, self._total])
             model.launch(self._apply, model.count, [self._scale], [self._total, d])
-
-    def parts(self, sweeps):
-        """Returns pairs of a function that launches and of how many times it runs, for so many sweeps."""
-        return [(self.launch, sweeps)]
