@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # the table below, as type checkers read it
     from .numerics.rotation import kabsch as kabsch
     from .numerics.rotation import polar as polar
     from .numerics.rotation import svd as svd
+    from .picture.render import render as render
     from .run.equilibrium import Equilibrium as Equilibrium
     from .run.equilibrium import equilibrium as equilibrium
     from .run.simulate import Animation as Animation
@@ -58,6 +59,7 @@ _MODULES = {
     "kabsch": "numerics.rotation",
     "polar": "numerics.rotation",
     "svd": "numerics.rotation",
+    "render": "picture.render",
     "Equilibrium": "run.equilibrium",
     "equilibrium": "run.equilibrium",
     "Animation": "run.simulate",

@@ -16,7 +16,7 @@ from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.numerics.constraints import Constraints
-from warpcloth.run.lines import lines_of
+from warpcloth.scene.lines import lines_of
 from warpcloth.scenes import bar_twist, chain, hanging, mobile
 from warpcloth.solvers.explicit import step_limits
 from warpcloth.usd import FrameSequence

@@ -1,5 +1,5 @@
-"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures and compares
-animations, charts and benchmarks methods.
+"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures, compares
+and draws animations, charts and benchmarks methods.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
 saved), 2 wrong use (one line on stderr), 130 interrupted by Ctrl-C and 143 by SIGTERM, as in shells (a line says what is
@@ -19,7 +19,7 @@ import warnings
 import numpy as np
 
 from ..base.interrupts import Interrupts
-from . import analyze, bench, chart, choose, compare, deform, info, options, run, scenes
+from . import analyze, bench, chart, choose, compare, deform, info, options, render, run, scenes
 from .terminal import DTYPES, Printable, say, show_warning
 
 
@@ -114,6 +114,8 @@ def _parser():
     analyze.add_arguments(analyzes)
     compares = add("compare", compare.compare, "Measure the distance between two animations.", epilog=compare.EPILOG)
     compare.add_arguments(compares)
+    renders = add("render", render.render, "Draw a picture or a film of an animation.", epilog=render.EPILOG)
+    render.add_arguments(renders)
     charts = commands.add_parser("chart", help=chart.TEXT, description=chart.TEXT, allow_abbrev=False)
     chart.add_arguments(charts)
     chooses = add("choose", choose.choose, "Choose the cheapest solver and settings for a scene.", epilog=choose.EPILOG)
@@ -126,10 +128,7 @@ def _parser():
             metavar="SCENE",
             help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
         )
-        of_info = "also show the step and the kernels of this solver (default with -s or --advise: newton)"
-        sub.add_argument(
-            "--solver", choices=options.solvers(), help=of_info if sub is infos else "the solver (default: newton)"
-        )
+        sub.add_argument("--solver", choices=options.solvers(), help="the solver (default: newton)")
         for option, of, text in (("-s", "option", "options of the solver"), ("-p", "parameter", "parameters of the scene")):
             text = f"{text}; '{option} help' lists them"
             sub.add_argument(option, nargs="+", action="extend", default=[], metavar=f"{of}=value", help=text)
@@ -155,7 +154,7 @@ def _parser():
     runs.add_argument(
         "--frames", type=int, metavar="N", help="number of frames after the start (default: the scene's duration)"
     )
-    for sub in (runs, infos, deforms, analyzes, compares, chooses, benches):
+    for sub in (runs, infos, deforms, analyzes, compares, renders, chooses, benches):
         sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     for sub in (runs, benches):

@@ -32,14 +32,7 @@ def add_arguments(parser):
         nargs="?",
         help="the animation: a USD stage, a folder or pattern of mesh files, a .npz or a .npy file",
     )
-    add("--prim", help="path or name of the mesh, if the file has several")
-    add("--fps", type=float, help="frames per second (default: that of the input); rates need it")
-    add(
-        "--rest",
-        metavar="MESH",
-        help="mesh file or stage with the rest shape (default: the rest shape in INPUT, else its first frame)",
-    )
-    add("--rest-prim", metavar="PRIM", help="path or name of the mesh in the file of --rest")
+    add_measuring(parser)
     add(
         "--measure",
         nargs="+",
@@ -47,29 +40,8 @@ def add_arguments(parser):
         metavar="NAME",
         help="measures to compute, or all; '--measure help' lists them (default: stretch)",
     )
-    add(
-        "--neighbourhood",
-        metavar="N",
-        help="measure vertices instead of triangles: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%",
-    )
-    add("--reference", metavar="R", help="compare each frame with rest (default), first, previous, or a frame number")
     add("--pairs", metavar="A:B,…", help="compare these pairs of reference and frame instead, such as 1:2,1:3,72:75")
-    add("--lag", type=int, metavar="K", help="compare each frame with the one K frames earlier instead")
     add("--every", type=int, default=1, metavar="K", help="measure only every K-th frame")
-    add(
-        "--rates",
-        choices=("midpoint", "forward", "logarithm"),
-        default="midpoint",
-        help="formula of rates, see docs/measuring.md",
-    )
-    add("--directions", metavar="D", help="direction of the warp: st for texture coordinates, or a vector such as 1,0,0")
-    add(
-        "--material",
-        metavar="M",
-        help="membrane for energy and stress: neo-hookean (default with --stiffness), stvk or corotated",
-    )
-    add("--stiffness", type=float, metavar="K", help="stiffness of the material, Young's modulus times thickness [N/m]")
-    add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material (default: 0)")
     add(
         "-o",
         "--output",
@@ -104,6 +76,40 @@ def add_arguments(parser):
         help="a colour map of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
     )
     add("--still-frames", type=float, nargs="+", metavar="FRAME", help="frames to show with --still (default: the last)")
+
+
+def add_measuring(parser):
+    """Adds the options that say what an animation is measured against, and how."""
+    add = parser.add_argument
+    add("--prim", help="path or name of the mesh, if the file has several")
+    add("--fps", type=float, help="frames per second (default: that of the input); rates need it")
+    add(
+        "--rest",
+        metavar="MESH",
+        help="mesh file or stage with the rest shape (default: the rest shape in INPUT, else its first frame)",
+    )
+    add("--rest-prim", metavar="PRIM", help="path or name of the mesh in the file of --rest")
+    add(
+        "--neighbourhood",
+        metavar="N",
+        help="measure vertices instead of triangles: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%",
+    )
+    add("--reference", metavar="R", help="compare each frame with rest (default), first, previous, or a frame number")
+    add("--lag", type=int, metavar="K", help="compare each frame with the one K frames earlier instead")
+    add(
+        "--rates",
+        choices=("midpoint", "forward", "logarithm"),
+        default="midpoint",
+        help="formula of rates, see docs/measuring.md",
+    )
+    add("--directions", metavar="D", help="direction of the warp: st for texture coordinates, or a vector such as 1,0,0")
+    add(
+        "--material",
+        metavar="M",
+        help="membrane for energy and stress: neo-hookean (default with --stiffness), stvk or corotated",
+    )
+    add("--stiffness", type=float, metavar="K", help="stiffness of the material, Young's modulus times thickness [N/m]")
+    add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material (default: 0)")
 
 
 def analyze(arguments):
@@ -181,24 +187,25 @@ def _analyzer(arguments):
         raise ValueError("INPUT is missing, what is to be measured; see warpcloth analyze --help")
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
     sequence = open_sequence(arguments.input, arguments.prim, arguments.fps, rest)
-    directions = arguments.directions
-    if directions is not None and directions != "st":
-        directions = [convert("--directions", number, (float,)) for number in directions.split(",")]
     return Analyzer(
         sequence,
         rest,
         measures="all" if arguments.measure == ["all"] else arguments.measure,
-        reference=arguments.reference,
         pairs=arguments.pairs,
-        lag=arguments.lag,
         every=arguments.every,
-        neighbourhood=arguments.neighbourhood,
-        rates=arguments.rates,
-        directions=directions,
-        material=_material(arguments),
         device=find_device(arguments.device),
         dtype=arguments.dtype,
+        **measuring_of(arguments),
     )
+
+
+def measuring_of(arguments):
+    """The options of `add_measuring`, but for the rest shape, as :class:`warpcloth.Analyzer` takes them."""
+    directions = arguments.directions
+    if directions is not None and directions != "st":
+        directions = [convert("--directions", number, (float,)) for number in directions.split(",")]
+    given = {name: getattr(arguments, name) for name in ("reference", "lag", "neighbourhood", "rates")}
+    return {**given, "directions": directions, "material": _material(arguments)}
 
 
 def _material(arguments):

@@ -33,6 +33,8 @@ class Deformation:
         times: (F,) [s].
         timings: ``factorise`` and ``frames`` (a list) [s].
         output: Path of the USD file, or None.
+        mesh: The :class:`warpcloth.Mesh` at rest, or None.
+        pins: Vertices of the handles, or None.
     """
 
     points: np.ndarray | FrameSequence
@@ -44,6 +46,8 @@ class Deformation:
     times: np.ndarray
     timings: dict[str, Any]
     output: FilePath | None = None
+    mesh: Mesh | None = None
+    pins: np.ndarray | None = None
 
     def __repr__(self) -> str:
         frames, vertices, _ = self.points.shape
@@ -145,7 +149,8 @@ def deform(
                 progress(frame, frames - 1)
     energies, iterations, converged, largest = (np.array(values) for values in zip(*results, strict=True))
     points, angles = recorder.read()
-    return Deformation(points, angles, largest, energies, iterations, converged, np.arange(frames) / fps, timings, output)
+    times = np.arange(frames) / fps
+    return Deformation(points, angles, largest, energies, iterations, converged, times, timings, output, mesh, pins.vertices)
 
 
 def _refuse_beyond_float32(keyframes, fps):

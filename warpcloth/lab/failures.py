@@ -4,10 +4,12 @@ A chart is a module with a `TITLE`, `PANELS`, what is drawn, and `tasks`, what m
 dictionaries with ``panel``, ``series``, ``x``, ``value`` (None where there is none) and ``reason``.
 """
 
+import csv
+
 from ..base.checks import choice
-from ..base.outputs import write_table
+from ..base.outputs import TEXT, Output
 from . import cotangents, isometry, locking, rank, slivers
-from .campaign import collect
+from .campaign import kept_store, sweep
 from .machine import machine
 
 FAILURES = {"locking": locking, "isometry": isometry, "slivers": slivers, "cotangents": cotangents, "rank": rank}
@@ -30,14 +32,15 @@ def failure_chart(name, device="cpu", **run):
     """
     choice("failure", name, tuple(FAILURES))
     tasks = FAILURES[name].tasks(str(device))
+    run = run if "store" in run else {"store": kept_store("failures", run.get("executor")), **run}
+    results = {task.key: points for task, points in sweep(tasks, **run)}
     panels = {panel.key: panel for panel in FAILURES[name].PANELS}
     rows = []
-    for points, where in collect(tasks, "failures", **run):
-        for point in points:
-            panel = panels[point["panel"]]
-            law = panel.follows.get(point["series"])
-            expected = float(panel.laws[law](point["x"])) if law else None
-            rows.append({**point, "law": law, "expected": expected, "machine": where})
+    for done, point in [(task, point) for task in tasks for point in results[task.key]]:
+        panel = panels[point["panel"]]
+        law = panel.follows.get(point["series"])
+        expected = float(panel.laws[law](point["x"])) if law else None
+        rows.append({**point, "law": law, "expected": expected, "machine": run["store"].machine(done)})
     facts = {"failure": name, "title": FAILURES[name].TITLE, "device": str(device), "seed": 0, "machine": machine(device)}
     shown = {key: {"title": panel.title, "x": panel.x, "y": panel.y} for key, panel in panels.items()}
     return {**facts, "panels": shown, "rows": rows}
@@ -49,4 +52,7 @@ def write_csv(path, found):
     Raises:
         FileNotFoundError: The folder does not exist.
     """
-    write_table(path, COLUMNS, ([row[name] for name in COLUMNS] for row in found["rows"]))
+    with Output(path, "x", **TEXT) as output:
+        table = csv.DictWriter(output.file, COLUMNS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(found["rows"])

@@ -4,13 +4,14 @@ Each diagram is a function of a :class:`warpcloth.lab.measurements.SceneRef` tha
 dictionary for each setting in ``rows``; :mod:`warpcloth.chart.pareto` draws it.
 """
 
+import csv
 import json
 import math
 
 from ..base.digest import scene_digest
-from ..base.outputs import write_table
+from ..base.outputs import TEXT, Output
 from . import convergence, physics, spectrum, trajectory
-from .campaign import collect
+from .campaign import kept_store, sweep
 from .machine import machine
 from .measurements import task
 from .reference import reference
@@ -26,8 +27,21 @@ WITHIN = 0.01  # the error of which the cheapest setting is named
 _KNOWN, _TIMES, _SECONDS = 1e-4, 6.0, 120.0
 # What a CSV has of a setting, in this order; what it does not know is empty.
 COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
-COLUMNS += ("h", "stiffness", "ms_per_second", "iterations", "gap", "predicted", "floor", "compile_s", "factorise_s")
-COLUMNS += ("residual", "frames", "message", "machine")
+COLUMNS += (
+    "h",
+    "stiffness",
+    "ms_per_second",
+    "iterations",
+    "gap",
+    "predicted",
+    "floor",
+    "compile_s",
+    "factorise_s",
+    "residual",
+    "frames",
+    "message",
+    "machine",
+)
 # And of all settings alike, in every line.
 FACTS = ("scene", "dtype", "seed", "processor", "cores", "device", "system", "python", "numpy", "scipy", "warp", "warpcloth")
 FACTS += ("source",)
@@ -249,20 +263,24 @@ def write_csv(path, found):
     Raises:
         FileNotFoundError: The folder does not exist.
     """
-
-    def lines():
+    with Output(path, "x", **TEXT) as output:
+        table = csv.DictWriter(output.file, COLUMNS + FACTS, lineterminator="\n", extrasaction="ignore")
+        table.writeheader()
         for row in found["rows"]:
-            facts = {**found, **found["machine"], **row}
+            facts = {**found, **found["machine"], **row, "options": json.dumps(row["options"])}
             for point in row.get("points") or [row]:
                 low, high = point.get("spread") or (None, None)
-                line = {**facts, **point, "options": json.dumps(row["options"]), "ms_low": low, "ms_high": high}
-                yield map(line.get, COLUMNS + FACTS)
-
-    write_table(path, COLUMNS + FACTS, lines())
+                table.writerow({**facts, **point, "options": facts["options"], "ms_low": low, "ms_high": high})
 
 
 def _facts(kind, scene, device, dtype):
-    return {"diagram": kind, "scene": str(scene), "device": str(device), "dtype": dtype, "machine": machine(device)}
+    return {
+        "diagram": kind,
+        "scene": str(scene),
+        "device": str(device),
+        "dtype": dtype,
+        "machine": machine(device),
+    }
 
 
 def _has_error(row):
@@ -280,4 +298,6 @@ def _measured(function, scene, setups, given, run):
 
 def _results(tasks, run):
     """The result of each task and the machine that measured it, in their order."""
-    return [{**result, "machine": where} for result, where in collect(tasks, "work-precision", **run)]
+    run = run if "store" in run else {"store": kept_store("work-precision", run.get("executor")), **run}
+    results = {each.key: result for each, result in sweep(tasks, **run)}
+    return [{**results[each.key], "machine": run["store"].machine(each)} for each in tasks]

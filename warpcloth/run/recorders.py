@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from ..scene.lines import lines_of
 from ..usd import AnimationWriter, FrameSequence
 from .checkpoint import NAME, Checkpoint
-from .lines import lines_of
 
 
 class Memory:

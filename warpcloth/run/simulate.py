@@ -47,6 +47,7 @@ class Animation:
         worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame; with B > 1 copies one value per copy, (B,), over
             its good frames.
         output: Path of the USD file, or None.
+        scene: The :class:`warpcloth.Scene` of the run, or None.
     """
 
     points: np.ndarray | FrameSequence
@@ -56,6 +57,7 @@ class Animation:
     timings: dict[str, Any]
     worst_strain: float | np.ndarray
     output: FilePath | None = None
+    scene: Scene | None = None
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
@@ -159,7 +161,7 @@ def simulate(
     status = watch.status(solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
-    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), output)
+    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), output, scene)
 
 
 @in_turn

@@ -83,7 +83,7 @@ def _stage_mesh(stage, path, prim, kind, time):
         if time is None:
             _refuse_moving_topology(found)
         if found.IsA(UsdGeom.Mesh):
-            corners, triangles = _corners(found, len(points))
+            corners, triangles = face_corners(found, len(points))
             if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # only the sign, because the determinant may overflow
                 triangles = triangles[:, ::-1]
             at_vertices, at_corners = _texture_coordinates(found, len(points), corners)
@@ -91,10 +91,10 @@ def _stage_mesh(stage, path, prim, kind, time):
             mesh = kind(points, corners[triangles], texture_coordinates=at_vertices, up_axis=up_axis)
         else:
             point_vertices = curve_vertices(found, len(points))
-            edges = point_vertices[_curve_edges(found, len(points))]
+            edges = point_vertices[curve_edges(found, len(points))]
             edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
             mesh = kind(points[first_points(point_vertices)], edges=edges, up_axis=up_axis)
-        pins = _pins(found, point_vertices, len(points))
+        pins = pins_of(found, point_vertices, len(points))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     layer = stage.GetRootLayer()
@@ -345,7 +345,7 @@ def _refuse_moving_topology(prim):
             refuse_change(attribute.GetName(), topology(attribute, code), fixed, code)
 
 
-def _corners(prim, count):
+def face_corners(prim, count):
     """Vertices (C,) int32 of the corners of a Mesh prim's faces, and the three corners of each triangle (T, 3), which run
     counter-clockwise seen from the front in the prim's own space."""
     mesh = UsdGeom.Mesh(prim)
@@ -381,7 +381,7 @@ def triangles_of_faces(prim):
     return triangles
 
 
-def _curve_edges(prim, count):
+def curve_edges(prim, count):
     """Pairs of points (E, 2) that the segments of linear curves join."""
     curves = UsdGeom.BasisCurves(prim)
     counts = topology(curves.GetCurveVertexCountsAttr())
@@ -416,7 +416,7 @@ def _texture_coordinates(prim, count, corners):
     return (at_vertices, None) if np.array_equal(at_vertices[corners], st) else (None, st)
 
 
-def _pins(prim, point_vertices, count):
+def pins_of(prim, point_vertices, count):
     """Sorted vertices (p,) int32 of every GeomSubset of points, by name."""
     pins = {}
     for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):

@@ -1,0 +1,164 @@
+"""The command ``render``: draws pictures and films of animations, without a display."""
+
+import argparse
+import time
+from pathlib import Path
+
+from ..base.limits import shown_bytes
+from ..base.quiet import find_device
+from .analyze import add_measuring, measuring_of
+from .terminal import check_writable, json_text, open_bar
+
+EPILOG = """\
+FILE is a USD stage, all of whose meshes and linear curves are drawn, a mesh file, a folder or pattern of mesh files, or arrays
+in .npz or .npy. Two of them are drawn side by side. The ending of -o says what is made: .png is one frame, .gif and .mp4 are
+films in real time (.mp4 needs PyAV: pip install -e '.[video]' in the checkout). Colours need matplotlib.
+
+  warpcloth render hanging.usdc -o hanging.mp4
+  warpcloth render hanging.usdc -o last.png --size 1920x1080 --samples 16
+  warpcloth render hanging.usdc -o strain.gif --colour stretch_1 --range 0.9 1.1 --time --size 640x360 --every 2
+  warpcloth render coarse.usdc fine.usdc -o both.mp4 --frames 10:60 --speed 0.5 --azimuth 20
+"""
+
+
+def add_arguments(parser):
+    """Adds what the command takes but for what all commands do."""
+    add = parser.add_argument
+    add("files", metavar="FILE", nargs="+", help="what is drawn; two are drawn side by side")
+    add("-o", "--output", metavar="FILE", required=True, help="the file to write: .png, .gif or .mp4")
+    add("--frame", type=float, metavar="N", help="the frame of a .png, as FILE numbers them (default: the last)")
+    add("--frames", type=frames, metavar="A:B", help="the first and the last frame of a film (default: all)")
+    add("--every", type=int, default=1, metavar="K", help="draw only every K-th frame")
+    add("--speed", type=float, default=1.0, metavar="FACTOR", help="0.5 plays at half speed (default: 1, real time)")
+    add("--size", type=size, default=(1280, 720), metavar="WxH", help="width and height in pixels (default: 1280x720)")
+    add("--samples", type=int, default=4, metavar="N", help="rays through each pixel (default: 4)")
+    add("--colour", metavar="NAME", help="show a measured value as colour, such as stretch_1 (default: one colour of cloth)")
+    add(
+        "--range",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="values at the ends of the colour scale (default: from the 1st to the 99th percentile of all frames)",
+    )
+    add(
+        "--colormap",
+        metavar="NAME",
+        help="a colour map of matplotlib (default: viridis, or coolwarm around the undeformed value)",
+    )
+    add("--azimuth", type=float, default=-38.0, metavar="DEGREES", help="angle of the camera about the vertical (default: -38)")
+    add(
+        "--elevation",
+        type=float,
+        default=24.0,
+        metavar="DEGREES",
+        help="angle of the camera above the horizontal (default: 24)",
+    )
+    add("--zoom", type=float, default=1.0, metavar="FACTOR", help="go nearer by this factor (default: 1, all of the motion)")
+    add("--ground", type=float, metavar="HEIGHT", help="height of the ground [m] (default: the lowest point of the motion)")
+    add("--no-ground", action="store_true", help="draw no ground")
+    add("--time", action="store_true", help="write the time into a corner")
+    add("--up-axis", choices=("Y", "Z"), help="up axis, if FILE does not say (default: Y)")
+    add_measuring(parser)
+
+
+def size(text):
+    """Width and height of a text such as 640x360."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r} is no size; it must be a width and a height, such as 1280x720")
+    return tuple(map(int, parts))
+
+
+def frames(text):
+    """The ends of a text such as 10:50, None for one that is left out."""
+    parts = text.split(":")
+    try:
+        first, last = (float(part) if part else None for part in parts)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no range; it must be the first and the last frame, such as 10:50"
+        ) from None
+    return first, last
+
+
+def render(arguments):
+    from ..mesh.mesh import Surface
+    from ..picture.render import render as draw
+
+    if len(arguments.files) > 2:
+        raise ValueError(f"{len(arguments.files)} files are given; one is drawn, or two side by side")
+    if arguments.no_ground and arguments.ground is not None:
+        raise ValueError("--ground and --no-ground are given; give one of them")
+    measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
+    if arguments.colour is None:
+        for name in (*measuring, *(["range"] if arguments.range else []), *(["colormap"] if arguments.colormap else [])):
+            raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    check_writable(arguments.output)
+    device = find_device(arguments.device)
+    rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
+    started, progress = time.perf_counter(), Drawing()
+    try:
+        draw(
+            arguments.files,
+            arguments.output,
+            mesh=rest,
+            prim=arguments.prim,
+            fps=arguments.fps,
+            up_axis=arguments.up_axis,
+            frame=arguments.frame,
+            frames=arguments.frames,
+            every=arguments.every,
+            speed=arguments.speed,
+            size=arguments.size,
+            samples=arguments.samples,
+            colour=arguments.colour,
+            colour_range=arguments.range,
+            colormap=arguments.colormap,
+            measuring=measuring,
+            azimuth=arguments.azimuth,
+            elevation=arguments.elevation,
+            zoom=arguments.zoom,
+            ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
+            time=arguments.time,
+            device=device.alias,
+            progress=progress,
+        )
+    finally:
+        progress.close()
+    facts = {
+        "input": arguments.files,
+        "file": arguments.output,
+        "pictures": progress.pictures,
+        "width": arguments.size[0],
+        "height": arguments.size[1],
+        "bytes": Path(arguments.output).stat().st_size,
+        "seconds": time.perf_counter() - started,
+        "device": device.alias,
+    }
+    print(json_text(facts) if arguments.json else _summary(facts))
+    return 0
+
+
+class Drawing:
+    """Counts the pictures of a film, and shows them on a terminal."""
+
+    def __init__(self):
+        self.pictures, self._bar = 0, open_bar(None, "reading", "")
+
+    def __call__(self, done, total):
+        self.pictures = done
+        if done == 0:
+            self.close()
+            self._bar = open_bar(total, "drawing", "{n_fmt} of {total_fmt} pictures, {remaining} left")
+        elif self._bar is not None:
+            self._bar.update()
+
+    def close(self):
+        if self._bar is not None:
+            self._bar.close()
+
+
+def _summary(facts):
+    count, seconds = facts["pictures"], facts["seconds"]
+    each = f"{count} picture{'s' if count > 1 else ''} of {facts['width']} x {facts['height']} in {seconds:.3g} s"
+    return f"{facts['file']}: {each}, {shown_bytes(facts['bytes'])}"

@@ -1,0 +1,164 @@
+"""Writes pictures, one after another, as a still, a GIF or a film in real time, the same bytes each time."""
+
+import importlib.util
+import io
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ..base.outputs import Output
+
+STILL, FILMS = ".png", (".gif", ".mp4")
+# Browsers show a GIF's frame that is to last less for 0.1 s.
+SHORTEST = 0.02
+# Of H.264: threads of folded cloth and the edges of letters stay clean; 23 is the encoder's own.
+_QUALITY = {"crf": "16", "preset": "slow"}
+# IEC 61966-2-1 (sRGB) on the primaries of Rec. 709, with the matrix of Rec. 709, 16 to 235.
+_PRIMARIES, _TRANSFER, _MATRIX, _RANGE = 1, 13, 1, 1
+# Pixels that the colours of a GIF are chosen from.
+_SAMPLE = 4_000_000
+
+
+def check_film(path, size):
+    """Refuses a picture or film that cannot be written, before anything is read or drawn.
+
+    Args:
+        path: The file.
+        size: Width and height [px].
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: PyAV, which writes films, is not installed.
+        ValueError: The ending is none of the three, or the size does not suit it.
+    """
+    path, (width, height) = Path(path), size
+    if path.suffix.lower() not in (STILL, *FILMS):
+        raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {', '.join((STILL, *FILMS[:-1]))} or {FILMS[-1]}")
+    if not path.absolute().parent.is_dir():
+        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
+    if path.suffix.lower() == ".mp4":
+        if width % 2 or height % 2:
+            even = f"{width + width % 2}x{height + height % 2}"
+            raise ValueError(f"size is {width}x{height}; a film in .mp4 must have even numbers, such as {even}")
+        if not importlib.util.find_spec("av"):
+            raise ImportError("films in .mp4 need PyAV: pip install -e '.[video]' in the checkout; .gif and .png need nothing")
+
+
+def open_film(path, size, times):
+    """Opens the file that pictures are to be added to.
+
+    Args:
+        path: Ends with .png, .gif or .mp4.
+        size: Width and height [px].
+        times: When each picture is shown [s], rising (F,). The last is shown as long as the one before it.
+
+    Returns:
+        Output: With a method ``add``, which takes an image of Pillow.
+    """
+    kind = {".png": _Still, ".gif": _Gif, ".mp4": _Video}[Path(path).suffix.lower()]
+    return kind(path, size, np.asarray(times, dtype=float))
+
+
+class _Still(Output):
+    """One picture, as PNG."""
+
+    def __init__(self, path, size, times):
+        super().__init__(path, "xb")
+        self.frames = 0
+
+    def add(self, image):
+        image.save(self.file, "PNG")
+        self.frames += 1
+
+
+class _Gif(Output):
+    """A GIF that repeats, with one palette for all frames, so that what stands still is stored once.
+
+    The palette is known at the end only; until then frames are held as PNG, which takes about the memory of the GIF.
+    """
+
+    def __init__(self, path, size, times):
+        super().__init__(path, "xb")
+        self._times, self._held = times, []
+
+    @property
+    def frames(self):
+        return len(self._held)
+
+    def add(self, image):
+        held = io.BytesIO()
+        image.save(held, "PNG", compress_level=1)
+        self._held.append(held.getvalue())
+
+    def finish(self):
+        count = len(self._held)
+        if not count:
+            return
+        palette = self._palette()
+        images = (self._image(k).quantize(palette=palette, dither=Image.Dither.NONE) for k in range(count))
+        first = next(images)
+        shown = durations(self._times[:count])
+        first.save(self.file, "GIF", save_all=True, append_images=images, duration=shown, loop=0, optimize=False)
+
+    def _image(self, k):
+        return Image.open(io.BytesIO(self._held[k])).convert("RGB")
+
+    def _palette(self):
+        """An image with the 256 colours that suit all frames."""
+        chosen = np.unique(np.linspace(0, len(self._held) - 1, 16).round().astype(int))
+        pixels = [np.asarray(self._image(k)).reshape(-1, 3) for k in chosen]
+        step = max(1, sum(map(len, pixels)) // _SAMPLE)
+        rows = np.concatenate([each[::step] for each in pixels])
+        rows = rows[: len(rows) // 64 * 64] if len(rows) >= 64 else rows
+        sample = Image.fromarray(rows.reshape(-1, 64 if len(rows) >= 64 else len(rows), 3))
+        palette = Image.new("P", (1, 1))
+        palette.putpalette(sample.quantize(256, Image.Quantize.MEDIANCUT).getpalette())
+        return palette
+
+
+def durations(times):
+    """How long a GIF shows each of its frames [ms], in whole hundredths of a second that add up to the times."""
+    last = times[-1] - times[-2] if len(times) > 1 else 1.0
+    ends = np.floor(100.0 * (np.append(times, times[-1] + last) - times[0]) + 0.5).astype(int)
+    return (10 * np.diff(ends)).tolist()
+
+
+class _Video(Output):
+    """A film in H.264 by one thread, so that the same pictures make the same bytes."""
+
+    def __init__(self, path, size, times):
+        import av
+
+        super().__init__(path, "xb")
+        self.frames = 0
+        intervals = np.diff(times)
+        rate = Fraction(1.0 / float(intervals.min()) if len(intervals) else 24.0).limit_denominator(1001)
+        # Frames that are missing leave a gap; the one before is shown longer.
+        self._counts = [math.floor(float(time - times[0]) * rate + 0.5) for time in times]
+        self._av, self._tick = av, 1 / rate
+        # By its name: at the end it is opened again, to move the table of frames to the front.
+        self._container = av.open(self.file.name, "w", format="mp4", options={"movflags": "+faststart"})
+        self._stream = self._container.add_stream("libx264", rate=rate, options=_QUALITY)
+        self._stream.width, self._stream.height = size
+        self._stream.pix_fmt = "yuv420p"
+        context = self._stream.codec_context
+        context.thread_count, context.time_base = 1, self._tick
+        context.color_primaries, context.color_trc, context.colorspace = _PRIMARIES, _TRANSFER, _MATRIX
+        context.color_range = _RANGE
+
+    def add(self, image):
+        frame = self._av.VideoFrame.from_ndarray(np.asarray(image), format="rgb24")
+        frame = frame.reformat(format="yuv420p", dst_colorspace=_MATRIX, dst_color_range=_RANGE)
+        frame.pts, frame.time_base = self._counts[self.frames], self._tick
+        self._container.mux(self._stream.encode(frame))
+        self.frames += 1
+
+    def finish(self):
+        self._container.mux(self._stream.encode())
+        self._container.close()
+
+    def parts(self):
+        return (self._container,)

@@ -1,0 +1,149 @@
+"""Colours of a cloth by what is measured on it, on one scale for all frames."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from ..analysis.analysis import Analyzer
+from ..analysis.measures import MEASURES, scalars
+from ..analysis.summaries import summarise
+from ..base.checks import shown
+from .colour import Scale, range_over
+
+
+def scalar_names(measure):
+    """Names of the scalars of a measure."""
+    return list(scalars(measure, np.zeros((1, *measure.shape))))
+
+
+def neutral_of(measure):
+    """Where the scale of a scalar of a measure has its middle; norms begin at 0."""
+    return measure.neutral if len(measure.shape) < 2 else None
+
+
+def measure_of(scalar, on="triangle"):
+    """Name of the measure that a scalar belongs to, such as stretch of stretch_1.
+
+    Raises:
+        ValueError: There is none.
+    """
+    listed = {name: measure.name for measure in MEASURES[on].values() for name in scalar_names(measure)}
+    if scalar not in listed:
+        raise ValueError(f"colour is {shown(scalar)}; it must be one of {', '.join(listed)}")
+    return listed[scalar]
+
+
+def summaries_of(analyzer, name, measure):
+    """Yields the summary of a scalar in each row of an analysis."""
+    for sample in analyzer.of(measure.name):
+        numbers = scalars(measure, sample.values[measure.name])[name]
+        positions = np.zeros((len(numbers), 3))
+        about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
+        yield summarise(name, measure.unit, numbers, positions, analyzer.areas, **about)
+
+
+def scale_of(analyzers, name, measure, given=None, colormap=None):
+    """One scale for all rows of some analyses.
+
+    Args:
+        analyzers: List of :class:`warpcloth.Analyzer`.
+        name: The scalar.
+        measure: The :class:`warpcloth.analysis.measures.Measure` that has it.
+        given: (low, high), or None for those of :func:`range_over`.
+        colormap: Of matplotlib, or None.
+
+    Returns:
+        Scale: About the value of what is undeformed, where there is one.
+    """
+    neutral = neutral_of(measure)
+    if given is None:
+        given = range_over((row for each in analyzers for row in summaries_of(each, name, measure)), neutral)
+    return Scale(*given, neutral, colormap)
+
+
+class MeasuredScalar:
+    """The values of a scalar on the cloths of a subject.
+
+    Args:
+        analyzers: A :class:`warpcloth.Analyzer` for each cloth.
+        name: The scalar.
+
+    Raises:
+        ValueError: None of the measures of an analyzer has it.
+    """
+
+    def __init__(self, analyzers, name):
+        listed = {scalar: measure for measure in analyzers[0].measures for scalar in scalar_names(measure)}
+        if name not in listed:
+            raise ValueError(f"colour is {shown(name)}; it must be one of {', '.join(listed)}")
+        self.name, self.measure = name, listed[name]
+        self.analyzers = [each.of(self.measure.name) for each in analyzers]
+        self.unit = self.measure.unit
+
+    def scale(self, others, given, colormap):
+        """The scale for these values and those of others."""
+        analyzers = [each for one in (self, *others) for each in one.analyzers]
+        return scale_of(analyzers, self.name, self.measure, given, colormap)
+
+    def rows(self, frames):
+        """Yields the values (E,) of rising indices of frames; NaN in a frame that is not measured."""
+        rows = [_Rows(each, self.name, self.measure) for each in self.analyzers]
+        for frame in frames:
+            yield np.concatenate([each.at(frame) for each in rows])
+
+
+class _Rows:
+    """The rows of an analysis, one after another."""
+
+    def __init__(self, analyzer, name, measure):
+        self._rows, self._name, self._measure = iter(analyzer), name, measure
+        self._sample, self._none = next(self._rows, None), np.full(analyzer.count, np.nan)
+
+    def at(self, frame):
+        while self._sample is not None and self._sample.index < frame:
+            self._sample = next(self._rows, None)
+        if self._sample is None or self._sample.index != frame:
+            return self._none
+        return np.array(scalars(self._measure, self._sample.values[self._measure.name])[self._name])
+
+
+class GivenScalar:
+    """Values that the user gives, (F, n) of vertices or (F, T) of triangles."""
+
+    unit = "1"
+
+    def __init__(self, values, subject):
+        shape = subject.shapes[subject.coloured]
+        self.values = values if hasattr(values, "shape") else np.asarray(values)
+        counts = (shape.count, len(shape.triangles))
+        if self.values.ndim != 2 or len(self.values) != len(subject) or self.values.shape[1] not in counts:
+            rule = f"({len(subject)}, {counts[0]}) of vertices or ({len(subject)}, {counts[1]}) of triangles"
+            raise ValueError(f"colour has shape {self.values.shape}; it must be {rule} in all frames")
+        self.name = ""
+
+    def scale(self, others, given, colormap):
+        if given is None:
+            ends = [np.nanpercentile(row, [0, 1, 5, 25, 50, 75, 95, 99, 100]) for one in (self, *others) for row in one.values]
+            given = range_over([SimpleNamespace(percentiles=each) for each in ends])
+        return Scale(*given, None, colormap)
+
+    def rows(self, frames):
+        for frame in frames:
+            yield np.asarray(self.values[frame], dtype=np.float64)
+
+
+def analyzers_of(subject, scalar, rest, device, options):
+    """An analyzer of a scalar for each cloth of a subject.
+
+    Args:
+        subject: The :class:`Subject`.
+        scalar: Name, such as "stretch_1".
+        rest: The rest shape, or None for that of the subject.
+        device: A Warp device.
+        options: More of :class:`warpcloth.Analyzer`, by name.
+
+    Raises:
+        ValueError: There is no such scalar, it cannot be measured, or the cloth has no triangles.
+    """
+    measure = measure_of(scalar, "triangle" if options.get("neighbourhood") is None else "vertex")
+    return [Analyzer(each, rest, measures=measure, device=device, **options) for each in subject.sequences()]

@@ -1,0 +1,153 @@
+"""Draws the bar of the colours, names and the time on pictures, as large as the picture asks."""
+
+from functools import cached_property
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from .colour import EXCLUDED
+
+INK = (64, 64, 68)
+# Height of letters by that of the picture, or of 9/16 of its width; below so many pixels they cannot be read.
+_LETTERS, _LEAST = 0.03, 10
+# Of the height of a picture, the bar; of its width, at most all that is about the bar.
+_BAR, _WIDEST = 0.56, 0.4
+
+
+class Overlay:
+    """Draws on pictures of one size.
+
+    Args:
+        size: Width and height [px].
+        scale: The :class:`Scale` of the bar, or None for none.
+        title: Name of what is coloured.
+        unit: Its unit, "1" of what has none.
+        names: Of each panel, panels being side by side; none of a single one.
+        background: sRGB of the background, from 0 to 255.
+    """
+
+    def __init__(self, size, scale=None, title="", unit="1", names=(), background=(255, 255, 255)):
+        self.width, self.height = size
+        self.scale, self.title, self.unit = scale, title, unit
+        self.names, self.background = names, tuple(background)
+        self.letters = max(_LEAST, round(_LETTERS * min(self.height, self.width * 9 / 16)))
+        self._font = ImageFont.load_default(self.letters)
+
+    @cached_property
+    def beside(self):
+        """Width that the bar takes, to the right of the picture [px]."""
+        if self.scale is None:
+            return 0
+        em, labels = self.letters, [self._length(text) for _, text in self._ticks]
+        bar = 0.5 * em + 0.9 * em + 0.4 * em + max(labels, default=0) + 0.6 * em
+        head = max((self._length(line) for line in self._head), default=0) + 1.1 * em
+        return int(min(np.ceil(max(bar, head)), _WIDEST * self.width))
+
+    @cached_property
+    def _ticks(self):
+        """Values and texts beside the bar."""
+        room = _BAR * self.height / (2.4 * self.letters)
+        values = round_numbers(self.scale.low, self.scale.high, max(2, min(6, int(room))))
+        factor = 10.0**self._exponent
+        step = float(np.diff(values).min()) / factor if len(values) > 1 else abs(values[0] / factor) or 1.0
+        digits = int(max(0, -np.floor(np.log10(step) + 1e-9), -np.floor(np.log10(step * 10) + 1e-9)))
+        while digits and all(f"{value / factor:.{digits}f}".endswith("0") for value in values):
+            digits -= 1
+        return [(value, f"{value / factor:.{digits}f}".replace("-", "−")) for value in values]
+
+    @cached_property
+    def _exponent(self):
+        """Of ten, by which the numbers beside the bar are divided."""
+        most = max(abs(self.scale.low), abs(self.scale.high))
+        exponent = 3 * int(np.floor(np.log10(most) / 3.0)) if most > 0.0 else 0
+        return exponent if not -3 < exponent < 6 else 0
+
+    @cached_property
+    def _head(self):
+        """Lines above the bar: the name, broken after _ where it is wide, and the unit."""
+        lines, widest = [""], max(8 * self.letters, 0.16 * self.width)
+        for part in self.title.replace("_", "_\n").split("\n"):
+            if lines[-1] and self._length(lines[-1] + part) > widest:
+                lines.append("")
+            lines[-1] += part
+        factor = f"1e{self._exponent}" if self._exponent else ""
+        unit = " ".join(filter(None, (factor, "" if self.unit == "1" else self.unit)))
+        return [*lines, f"[{unit}]"] if unit else lines
+
+    def _length(self, text):
+        return self._font.getlength(text)
+
+    def draw(self, panels, time=None, excluded=False):
+        """Puts panels side by side and draws what belongs to them.
+
+        Args:
+            panels: Images (height, width, 3) uint8.
+            time: Text in the lower left corner, or None.
+            excluded: Whether a colour of the picture means that there is no value.
+
+        Returns:
+            PIL.Image.Image: Of the whole size.
+        """
+        canvas = Image.new("RGB", (self.width, self.height), self.background)
+        pen = ImageDraw.Draw(canvas)
+        left, em = 0, self.letters
+        for k, panel in enumerate(panels):
+            canvas.paste(Image.fromarray(panel), (left, 0))
+            if k:
+                pen.line([(left, 0), (left, self.height)], (205, 207, 210), max(1, em // 12))
+            if k < len(self.names):
+                self._write(pen, (left + 0.6 * em, 0.5 * em), self._short(self.names[k], panel.shape[1] - 1.2 * em), "la")
+            left += panel.shape[1]
+        if time is not None:
+            self._write(pen, (0.6 * em, self.height - 0.5 * em), time, "ld")
+        if self.scale is not None:
+            self._draw_bar(pen, excluded)
+        return canvas
+
+    def _write(self, pen, position, text, anchor="lm"):
+        """Text with a rim of the background, which keeps it apart from what it is drawn on."""
+        rim = max(1, self.letters // 8)
+        pen.text(position, text, INK, self._font, anchor, stroke_width=rim, stroke_fill=self.background)
+
+    def _short(self, text, room):
+        while len(text) > 1 and self._length(text) > room:
+            text = text[:-2].rstrip("…") + "…"
+        return text
+
+    def _draw_bar(self, pen, excluded):
+        em, left = self.letters, self.width - self.beside
+        tall = max(2, round(_BAR * self.height))
+        top = (self.height - tall) // 2
+        bottom, start, end = top + tall, left + round(0.5 * em), left + round(1.4 * em)
+        colours = self.scale.srgb(np.linspace(self.scale.high, self.scale.low, tall))
+        colours = np.round(255.0 * colours).astype(int)
+        for row, colour in enumerate(colours):
+            pen.line([(start, top + row), (end - 1, top + row)], tuple(colour.tolist()))
+        tip = round(0.55 * em)  # values beyond the ends have their colours
+        for at, beyond, colour in ((top - 1, top - tip, colours[0]), (bottom, bottom + tip, colours[-1])):
+            pen.polygon([(start, at), (end - 1, at), ((start + end - 1) / 2, beyond)], tuple(colour.tolist()))
+        for value, text in self._ticks:
+            y = bottom - (value - self.scale.low) / (self.scale.high - self.scale.low) * tall
+            pen.line([(end, y), (end + 0.2 * em, y)], INK, max(1, em // 14))
+            pen.text((end + 0.4 * em, y), text, INK, self._font, "lm")
+        y = top - tip - 0.7 * em
+        for line in self._head[::-1]:
+            pen.text((start, y), line, INK, self._font, "ls")
+            y -= 1.25 * em
+        if excluded:
+            y = bottom + tip + 1.2 * em
+            pen.rectangle([start, y - 0.4 * em, start + 0.8 * em, y + 0.4 * em], tuple(round(255 * c) for c in EXCLUDED))
+            pen.text((start + 1.2 * em, y), "no value", INK, self._font, "lm")
+
+
+def round_numbers(low, high, most):
+    """Multiples of 1, 2 or 5 times a power of ten from low to high, at most so many, or at least low and high."""
+    rough = (high - low) / most
+    power = 10.0 ** np.floor(np.log10(rough))
+    for factor in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0):
+        step = factor * power
+        first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
+        if last - first + 1 <= most:
+            break
+    found = step * np.arange(first, last + 1)
+    return found if len(found) > 1 else np.array([low, high])

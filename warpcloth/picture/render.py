@@ -1,0 +1,365 @@
+"""Pictures and films of what moves: sources in, a file out."""
+
+import os
+import warnings
+from collections.abc import Mapping
+from collections.abc import Sequence as Several
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.checks import array, number, shown, whole
+from ..base.interrupts import Interrupted
+from ..base.outputs import check_apart
+from ..base.types import FilePath, Progress, UpAxis
+from ..mesh.mesh import Mesh
+from .camera import Camera
+from .colour import check_colormap
+from .films import SHORTEST, STILL, check_film, open_film
+from .measured import GivenScalar, MeasuredScalar, analyzers_of
+from .overlay import Overlay
+from .raycast import BACKGROUND, RayCaster
+from .subjects import subject_of
+
+# Surroundings that are so many times as large as the cloth are not fitted into the picture.
+_LARGE = 1.5
+# By the size of the motion: how far the ground is below it, so that a cloth that lies on it is above.
+_BELOW = 1e-3
+
+
+def render(
+    source: Any,
+    output: FilePath,
+    *,
+    mesh: Mesh | None = None,
+    prim: str | None = None,
+    fps: float | None = None,
+    up_axis: UpAxis | None = None,
+    copy: int | None = None,
+    frame: float | None = None,
+    frames: tuple[float | None, float | None] | None = None,
+    every: int = 1,
+    speed: float = 1.0,
+    size: tuple[int, int] = (1280, 720),
+    samples: int = 4,
+    colour: str | ArrayLike | None = None,
+    colour_range: tuple[float, float] | None = None,
+    colormap: str | None = None,
+    measuring: Mapping[str, Any] | None = None,
+    azimuth: float = -38.0,
+    elevation: float = 24.0,
+    zoom: float = 1.0,
+    ground: bool | float = True,
+    time: bool = False,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> str:
+    """Draws a picture or a film by casting rays, on the CPU or a GPU, without a display.
+
+    Frames are read and drawn one at a time, so memory stays flat. The camera shows all of the motion, seen from one direction.
+    A film plays in real time. The same input makes the same bytes on one device.
+
+    Args:
+        source: A path: a stage, all of whose meshes and linear curves are drawn; a mesh file; a folder or pattern of mesh
+            files; .npz or .npy. Or an :class:`warpcloth.Animation`, whose pins, strings and bars are drawn too,
+            :class:`warpcloth.Deformation`, :class:`warpcloth.Scene`, :class:`warpcloth.Mesh`, :class:`warpcloth.Sequence`,
+            or frames (F, n, 3) [m]. Two of them in a list are drawn side by side, by one camera.
+        output: File to write: .png, .gif or, with PyAV, .mp4.
+        mesh: The :class:`warpcloth.Mesh` of frames that have none; of other sources the rest shape, against which they are
+            measured.
+        prim: Path or name of the cloth in a stage; without it the prims that move are cloths. Name of the geometry in a file.
+        fps: Frames a second of the source, where it does not say it or says it wrong.
+        up_axis: "Y" or "Z", where the source does not say it.
+        copy: Index of the cloth of a batch; None draws all of them side by side.
+        frame: Number of the frame of a .png, as the source counts them; by default the last.
+        frames: Numbers of the first and the last frame of a film; None is an end of the source.
+        every: Only every k-th frame.
+        speed: 0.5 plays at half speed.
+        size: Width and height [px].
+        samples: Rays through each pixel.
+        colour: A number that ``warpcloth analyze`` measures, such as "stretch_1", shown with a bar; or values (F, n) of
+            vertices or (F, T) of triangles; None is the plain colour of cloth.
+        colour_range: Low and high of the colours; by default of all frames of the source, as `analyze` takes them.
+        colormap: Name of a colour map of matplotlib.
+        measuring: Options of :class:`warpcloth.Analyzer` for the colour, by name, such as ``{"neighbourhood": "1-ring"}``.
+        azimuth: Angle of the viewer about the vertical [°], from +z of a y-up world, from −y of a z-up one.
+        elevation: Angle of the viewer above the horizontal [°].
+        zoom: 2 shows half of what the camera would show.
+        ground: Whether there is a ground at the lowest point of the motion, or its height [m]. None is seen from below.
+        time: Whether the time stands in a corner, or the number of the frame if the source has no times.
+        device: A Warp device.
+        progress: Function called with (pictures drawn, pictures), from 0; or None.
+
+    Returns:
+        str: The path of the file.
+
+    Raises:
+        FileNotFoundError: There is no such file or folder.
+        ImportError: Colours need matplotlib, .mp4 needs PyAV.
+        Interrupted: A KeyboardInterrupt, if the user interrupts; the message says what is in the file.
+        ValueError: An argument breaks a rule, a source cannot be drawn, or a frame of it cannot be read.
+
+    Examples:
+        >>> import os, tempfile
+        >>> import warpcloth as wc
+        >>> path = os.path.join(tempfile.mkdtemp(), "sheet.png")
+        >>> os.path.basename(wc.render(wc.Mesh.grid(4, 4), path, size=(64, 36), samples=1))
+        'sheet.png'
+    """
+    size, output = _checked_size(size), os.fspath(output)
+    check_film(output, size)
+    for name, value in (("azimuth", azimuth), ("elevation", elevation)):
+        number(name, value)
+    for name, value in (("speed", speed), ("zoom", zoom)):
+        number(name, value, above=0.0)
+    if fps is not None:
+        number("fps", fps, above=0.0)
+    whole("every", every, 1)
+    if not isinstance(ground, bool | np.bool_):
+        number("ground", ground)
+    if colour_range is not None:
+        array("colour_range", colour_range, (2,))
+    if colormap is not None:
+        check_colormap(colormap)
+    sources = list(source) if _are_several(source) else [source]
+    subjects = [subject_of(each, mesh, prim, fps, copy, azimuth) for each in sources]
+    subjects = [replace(each, up_axis=each.up_axis or up_axis or "Y") for each in subjects]
+    if len({each.up_axis for each in subjects}) > 1:
+        raise ValueError("source: one is Y up and the other Z up; two that are drawn side by side must have one up axis")
+    check_apart([output], [path for each in subjects for path in each.files])
+    shots = _shots(subjects, Path(output).suffix.lower(), frame, frames, every, speed)
+    values, scale = _colours(subjects, colour, colour_range, colormap, mesh, device, measuring)
+    picture = _Picture(subjects, shots, size, samples, (azimuth, elevation, zoom), ground, values, scale, device)
+    times = [shot.time for shot in shots]
+    film = open_film(output, size, times)
+    try:
+        with film:
+            if progress is not None:
+                progress(0, len(shots))
+            for image in picture.images(time):
+                film.add(image)
+                if progress is not None:
+                    progress(film.frames, len(shots))
+    except KeyboardInterrupt:
+        if not film.frames:
+            raise Interrupted("interrupted before the first picture; nothing was saved") from None
+        raise Interrupted(f"interrupted after {film.frames} of {len(shots)} pictures, which are in {output}") from None
+    if picture.left_out:
+        warnings.warn(
+            f"{picture.left_out} triangles, lines or pins without a finite position are not drawn, in all pictures together",
+            stacklevel=2,
+        )
+    return output
+
+
+def _checked_size(size):
+    found = tuple(size) if np.ndim(size) == 1 and len(size) == 2 else ()
+    if not found:
+        raise ValueError(f"size is {shown(size)}; it must be a width and a height [px]")
+    for name, value in zip(("width", "height"), found, strict=True):
+        whole(f"size: {name}", value, 8, 16384)
+    return int(found[0]), int(found[1])
+
+
+def _are_several(source):
+    """Whether it is a list of two sources, and not a list of frames."""
+    if not isinstance(source, (list, tuple)) or not len(source):
+        return False
+    frames = [isinstance(each, np.ndarray | list | tuple) for each in source]
+    if any(frames):
+        return False
+    if len(source) > 2:
+        raise ValueError(f"source is a list of {len(source)}; it must be one, or two that are drawn side by side")
+    return True
+
+
+class _Shot:
+    """One picture of a film: when it is shown [s], the frame of each subject, and the text of its time."""
+
+    def __init__(self, time, frames, text):
+        self.time, self.frames, self.text = time, frames, text
+
+
+def _shots(subjects, ending, frame, frames, every, speed):
+    """The pictures to be drawn.
+
+    The frames of the first subject lead; of the second that is shown which is nearest in time, up to its end.
+    """
+    first = subjects[0]
+    if ending == STILL:
+        for name, value in (("frames", frames), ("every", None if every == 1 else every)):
+            if value is not None:
+                raise ValueError(f"{name} is given, and a {STILL} has one picture; give frame, or a film")
+        chosen = [len(first) - 1 if frame is None else _index(first, frame)]
+    elif frame is not None:
+        raise ValueError(f"frame is given, and a {ending} has many; give frames, or a {STILL}")
+    else:
+        chosen = _between(first, frames)[::every]
+    times = [each.labels - each.labels[0] if each.times is None else each.times for each in subjects]
+    times = [np.asarray(t) * (each.interval if each.times is None else 1.0) for t, each in zip(times, subjects, strict=True)]
+    shots = [_Shot(times[0][k], [int(k)], _text(first, k)) for k in chosen]
+    for other, own in zip(subjects[1:], times[1:], strict=True):
+        for shot in shots:
+            shot.frames.append(int(np.abs(own - shot.time).argmin()))
+        if ending != STILL and frames is None:
+            late = np.flatnonzero(own > times[0][-1] + 0.5 * other.interval)[every - 1 :: every]
+            shots += [_Shot(own[k], [len(first) - 1, int(k)], _text(other, k)) for k in late]
+    start, kept = shots[0].time, []
+    least = SHORTEST if ending == ".gif" else 0.0
+    for shot in shots:
+        at = (shot.time - start) / speed
+        if not kept or at - kept[-1].time >= least - 1e-9:
+            kept.append(_Shot(at, shot.frames, shot.text))
+    return kept
+
+
+def _text(subject, k):
+    """The time of a frame, or its number."""
+    if subject.times is None:
+        return f"{subject.labels[k]:g}"
+    digits = 2 if subject.interval < 10.0 else 0
+    return f"{subject.times[k]:.{digits}f} s"
+
+
+def _index(subject, label):
+    number("frame", label)
+    apart = np.abs(subject.labels - label)
+    if not apart.min() <= 1e-6:
+        raise ValueError(f"frame is {label:g}; it must be one of the {len(subject)} from {_ends(subject)}")
+    return int(apart.argmin())
+
+
+def _ends(subject):
+    return f"{subject.labels[0]:g} to {subject.labels[-1]:g}"
+
+
+def _between(subject, frames):
+    """Indices of the frames from one number to another."""
+    if frames is None:
+        return np.arange(len(subject))
+    if not isinstance(frames, Several) or isinstance(frames, str) or len(frames) != 2:
+        raise ValueError(f"frames is {shown(frames)}; it must be the numbers of the first and the last frame")
+    low, high = (end if given is None else given for given, end in zip(frames, subject.labels[[0, -1]].tolist(), strict=True))
+    for value in (low, high):
+        number("frames", value)
+    found = np.flatnonzero((subject.labels >= low - 1e-6) & (subject.labels <= high + 1e-6))
+    if not len(found):
+        raise ValueError(f"frames is {low:g} to {high:g}, where there are none; they are {len(subject)}, from {_ends(subject)}")
+    return found
+
+
+def _colours(subjects, colour, given, colormap, rest, device, measuring):
+    """The values of each subject, and their one scale; None without colours."""
+    if not isinstance(colour, str):
+        options = {"measuring": measuring or None}
+        options |= {"colour_range": given, "colormap": colormap} if colour is None else {}
+        for name, value in options.items():
+            if value is not None:
+                raise ValueError(f"{name} is given without colour, the name of what is measured")
+    if colour is None:
+        return None, None
+    if isinstance(colour, str):
+        options = dict(measuring or {})
+        values = [MeasuredScalar(analyzers_of(each, colour, rest, device, options), colour) for each in subjects]
+    else:
+        arrays = [colour] if len(subjects) == 1 else list(colour)
+        values = [GivenScalar(array, each) for array, each in zip(arrays, subjects, strict=True)]
+    return values, values[0].scale(values[1:], given, colormap)
+
+
+class _Picture:
+    """All pictures of a film, in one size and by one camera."""
+
+    def __init__(self, subjects, shots, size, samples, view, ground, values, scale, device):
+        self._subjects, self._shots, self._values, self._scale, self.left_out = subjects, shots, values, scale, 0
+        self._up = subjects[0].up_axis
+        named = [each.name for each in subjects] if len(subjects) > 1 else []
+        title, unit = (values[0].name, values[0].unit) if values else ("", "1")
+        background = _srgb(BACKGROUND)
+        self._overlay = Overlay(size, scale, title, unit, named, background)
+        width, height = size
+        room = width - self._overlay.beside
+        widths = [room // len(subjects)] * len(subjects)
+        widths[0] += room - sum(widths)
+        low = self._frame(view, min(widths) / height)
+        below = self._camera.position["YZ".index(self._up) + 1] < low
+        if isinstance(ground, bool | np.bool_):
+            ground = low if ground and not below else None
+        options = {"samples": samples, "ground": ground, "device": device, "up_axis": self._up}
+        self._casters = [RayCaster(each.shapes, wide, height, **options) for each, wide in zip(subjects, widths, strict=True)]
+
+    def _frame(self, view, aspect):
+        """Sets the camera; returns the height of the ground."""
+        azimuth, elevation, zoom = view
+        up = "YZ".index(self._up) + 1
+        lowest, span = np.inf, [np.full(3, np.inf), np.full(3, -np.inf)]
+        fitted = [_fitted(each) for each in self._subjects]
+
+        def frames():
+            nonlocal lowest
+            for shot in self._shots:
+                for subject, k, chosen in zip(self._subjects, shot.frames, fitted, strict=True):
+                    points = subject.read(k)
+                    for index, (shape, found) in enumerate(zip(subject.shapes, points, strict=True)):
+                        finite = found[np.isfinite(found).all(axis=1)]
+                        if not len(finite):
+                            continue
+                        lowest = min(lowest, finite[:, up].min() - (shape.radius if len(shape.lines) else 0.0))
+                        if index in chosen:
+                            span[0], span[1] = np.minimum(span[0], finite.min(axis=0)), np.maximum(span[1], finite.max(axis=0))
+                            yield finite
+
+        camera = Camera.framed(frames(), azimuth, elevation, self._up, aspect)
+        position, target = np.array(camera.position), np.array(camera.target)
+        self._camera = replace(camera, position=tuple(target + (position - target) / zoom))
+        return float(lowest - _BELOW * np.linalg.norm(span[1] - span[0]))
+
+    def images(self, with_time):
+        """Yields the pictures, images of Pillow."""
+        rows = None
+        if self._values:
+            columns = zip(*(shot.frames for shot in self._shots), strict=True)
+            rows = [_held(each.rows, column) for each, column in zip(self._values, columns, strict=True)]
+        for shot in self._shots:
+            panels, excluded = [], False
+            for k, (subject, caster) in enumerate(zip(self._subjects, self._casters, strict=True)):
+                colours = [None] * len(subject.shapes)
+                if rows:
+                    values = next(rows[k])
+                    excluded = excluded or bool(np.isnan(values).any())
+                    colours[subject.coloured] = self._painted(subject.shapes[subject.coloured], values)
+                panels.append(caster.image(subject.read(shot.frames[k]), self._camera, colours))
+                self.left_out += caster.left_out
+            yield self._overlay.draw(panels, shot.text if with_time else None, excluded)
+
+    def _painted(self, shape, values):
+        """Colours of vertices (n, 3), or of the corners of triangles (T, 3, 3)."""
+        colours = self._scale.linear(values)
+        return colours if len(values) == shape.count else np.repeat(colours[:, None], 3, axis=1)
+
+
+def _held(rows, frames):
+    """Yields the row of each frame, also where a frame is shown again."""
+    found = rows(dict.fromkeys(frames))
+    last = values = None
+    for frame in frames:
+        if frame != last:
+            last, values = frame, next(found)
+        yield values
+
+
+def _fitted(subject):
+    """Indices of the shapes that the camera shows all of: the cloth, and surroundings that are not much larger."""
+    finite = [each[np.isfinite(each).all(axis=1)] for each in subject.read(0)]
+    sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]
+    return [k for k, size in enumerate(sizes) if k == subject.coloured or size <= _LARGE * sizes[subject.coloured]]
+
+
+def _srgb(linear):
+    """Linear Rec. 709 as sRGB from 0 to 255."""
+    c = np.asarray(linear)
+    coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
+    return tuple(np.round(255.0 * coded).astype(int).tolist())

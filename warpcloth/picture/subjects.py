@@ -1,0 +1,276 @@
+"""Shows what there is to draw, whatever it comes from: shapes whose positions are read one frame at a time."""
+
+import glob
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..base.checks import shown, whole
+from ..base.outputs import STAGE_ENDINGS
+from ..deformation.deform import Deformation
+from ..mesh.loading import ENDINGS
+from ..mesh.mesh import Mesh, Surface
+from ..mesh.sequences import Sequence, as_sequence, open_sequence
+from ..run.simulate import Animation
+from ..scene.lines import lines_of
+from ..scene.scene import Scene
+from ..usd.drawn import read_drawn
+from ..usd.layers import CURVE_WIDTH
+from .raycast import CLOTH, Shape
+
+# Linear Rec. 709 of meshes beside the cloth, and of strings and bars.
+SURROUNDINGS, LINES = (0.42, 0.41, 0.39), (0.06, 0.06, 0.065)
+# Radius of pins, by the size of the cloth and, of coarse ones, by the mean edge.
+_PIN, _PIN_EDGE = 0.009, 0.35
+# Radius of the tubes of a net or chain that says none, by its size: thinner ones are hardly seen.
+_THINNEST = 0.002
+# From the middle of one cloth of a batch to that of the next, by their size.
+_APART = 1.12
+_SOURCES = "a path, an Animation, a Deformation, a Scene, a Mesh, a Sequence, or an array of frames with its mesh"
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """All that is drawn of a source.
+
+    Attributes:
+        name: Of the source, for a picture with two.
+        shapes: List of :class:`Shape`.
+        labels: Numbers of the frames (F,), as the source has them.
+        times: Of the frames (F,) [s], or None.
+        read: Function that gives the positions (n, 3) [m] of each shape from the index of a frame.
+        up_axis: "Y" or "Z"; None where the source does not say.
+        coloured: Index of the shape that is coloured by a measure.
+        sequences: Function that gives the :class:`Sequence` to be measured of each cloth of the coloured shape.
+        files: Paths that the source is read from.
+    """
+
+    name: str
+    shapes: list
+    labels: np.ndarray
+    times: np.ndarray | None
+    read: Callable
+    up_axis: str | None
+    sequences: Callable
+    coloured: int = 0
+    files: tuple = ()
+
+    def __len__(self):
+        return len(self.labels)
+
+    @property
+    def interval(self):
+        """Seconds between frames, 1/24 where nobody says it."""
+        if self.times is None or len(self.times) < 2:
+            return 1.0 / 24.0
+        return float(np.median(np.diff(self.times)))
+
+
+def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0):
+    """The :class:`Subject` of a source.
+
+    Args:
+        source: Any of those that :func:`warpcloth.render` takes.
+        mesh: The :class:`warpcloth.Mesh` of frames that have none.
+        prim: Path or name of the cloth in a stage, or of the geometry in a file.
+        fps: Frames a second, where the source does not say it or says it wrong.
+        copy: Index of the cloth of a batch, or None for all, side by side.
+        azimuth: From where they are side by side [°].
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The source is none, or has nothing to draw.
+    """
+    if isinstance(source, (str, os.PathLike)):
+        found = _of_path(os.fspath(source), mesh, prim, fps)
+    elif isinstance(source, Sequence):
+        found = _of_sequence(source, source.mesh)
+    elif isinstance(source, Scene):
+        found = _of_frames(source.name, source.mesh, source.positions[None], None, source.pins.vertices, lines_of(source))
+    elif isinstance(source, Animation) and source.scene is not None:
+        scene = source.scene
+        found = _of_animation(source, scene, copy, azimuth)
+        copy = None
+    elif isinstance(source, Deformation) and source.mesh is not None:
+        found = _of_frames("deformation", source.mesh, source.points, source.times, source.pins)
+    elif isinstance(source, Mesh):
+        found = _of_frames("mesh", source, source.points[None], None)
+    else:
+        points = getattr(source, "points", source)
+        if mesh is None or not (hasattr(points, "__getitem__") or hasattr(points, "__array__")):
+            given = shown(source) if isinstance(source, (str, int, float, type(None))) else type(source).__name__
+            rule = "arrays need their mesh" if hasattr(points, "__getitem__") else f"it must be {_SOURCES}"
+            raise ValueError(f"source is {given}; {rule}")
+        found = _of_frames("frames", mesh, points, getattr(source, "times", None))
+    if copy is not None:
+        raise ValueError(f"copy is {shown(copy)}; the source is one cloth and no batch, so that it must be None")
+    if fps is not None and not isinstance(source, (str, os.PathLike)):
+        found = replace(found, times=(found.labels - found.labels[0]) / fps)
+    return found
+
+
+def _of_path(path, mesh, prim, fps):
+    name = Path(path).name or path
+    ending = Path(path).suffix.lower()
+    if ending in STAGE_ENDINGS and not glob.has_magic(path):
+        return _of_stage(path, name, prim, fps)
+    if ending in ENDINGS and os.path.isfile(path):
+        one = Surface.load(path, prim)
+        return replace(_of_frames(name, one, one.points[None], None), files=(path,))
+    sequence = open_sequence(path, prim, fps, mesh)
+    return replace(_of_sequence(sequence, sequence.mesh), name=name)
+
+
+def _of_stage(path, name, prim, fps):
+    """All meshes and curves of a stage."""
+    stage = read_drawn(path, prim)
+    codes = stage.codes
+    first = np.concatenate([each.points(codes[0]) for each in stage.prims if each.cloth])
+    size = _size(first)
+    shapes = []
+    for each in stage.prims:
+        edge = np.linalg.norm(np.diff(each.points(codes[0])[each.edges], axis=1), axis=-1).mean() if len(each.edges) else 0.0
+        radius = max(each.radius, min(_THINNEST * size, 0.2 * edge)) if each.cloth else each.radius
+        colour = CLOTH if each.cloth else LINES if len(each.edges) else SURROUNDINGS
+        shapes.append(_shape(each.count, each.triangles, each.edges, radius or 0.2 * edge, each.pins, size, edge, colour))
+    labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
+    times = (codes - codes[0]) / (stage.rate if fps is None else fps)
+
+    def read(frame):
+        return [each.points(codes[frame]) for each in stage.prims]
+
+    def sequences():
+        return [open_sequence(path, prim, fps)]
+
+    cloth = next(k for k, each in enumerate(stage.prims) if each.cloth)
+    files = tuple(layer.realPath for layer in stage.stage.GetUsedLayers() if layer.realPath)
+    return Subject(name, shapes, labels, times, read, stage.up_axis, sequences, cloth, files)
+
+
+def _of_sequence(sequence, mesh):
+    if sequence.stage is not None:
+        found = _of_stage(os.fspath(sequence.path), Path(sequence.path).name, sequence.stage.prim, None)
+        return replace(found, times=sequence.times, sequences=lambda: [sequence])
+    shape = _cloth(mesh, sequence[0])
+    name = "frames" if sequence.path is None else Path(sequence.path).name
+    up_axis = sequence.up_axis or mesh.up_axis
+    files = tuple(sequence.files)
+    return Subject(
+        name, [shape], sequence.labels, sequence.times, lambda k: [sequence[k]], up_axis, lambda: [sequence], 0, files
+    )
+
+
+def _of_frames(name, mesh, frames, times, pins=(), lines=None):
+    """Frames (F, n, 3) of a mesh."""
+    read, count = _reader(frames, mesh)
+    shapes = [_cloth(mesh, read(0), pins), *_strings(mesh, lines)]
+    times = None if times is None else np.asarray(times, dtype=float)
+
+    def sequences():
+        return [as_sequence(mesh, frames, times=times)]
+
+    return Subject(name, shapes, np.arange(count), times, lambda frame: [read(frame)] * len(shapes), mesh.up_axis, sequences)
+
+
+def _reader(frames, mesh):
+    """Function that gives a frame (n, 3) from its index, and the number of frames."""
+    if not hasattr(frames, "exact"):
+        frames = frames if isinstance(frames, (list, tuple)) else np.asarray(frames)
+    shape = np.shape(frames[0]) if len(frames) else None
+    if shape != mesh.points.shape:
+        raise ValueError(f"frames have shape {shape}; they must be {mesh.points.shape}, as the points of the mesh")
+    return (lambda frame: np.asarray(frames[frame], dtype=np.float64)), len(frames)
+
+
+def _of_animation(animation, scene, copy, azimuth):
+    """The frames of a run; of a batch all cloths side by side, or one."""
+    points, lines = animation.points, lines_of(scene)
+    if points.ndim == 3:
+        if copy is not None:
+            raise ValueError(f"copy is {shown(copy)}; the animation is of one cloth, so that it must be None")
+        return replace(
+            _of_frames(scene.name, scene.mesh, points, animation.times, scene.pins.vertices, lines), up_axis=scene.up_axis
+        )
+    batch = points.shape[1]
+    if copy is not None:
+        whole("copy", copy, 0, batch - 1)
+        return replace(
+            _of_frames(scene.name, scene.mesh, points[:, copy], animation.times, scene.pins.vertices, lines),
+            up_axis=scene.up_axis,
+        )
+    offsets = _side_by_side(points, azimuth, scene.up_axis)
+    count = len(scene.mesh.points)
+    shapes = [_cloth(scene.mesh, scene.positions, scene.pins.vertices), *_strings(scene.mesh, lines)]
+    shapes = [_repeated(shape, batch) for shape in shapes]
+
+    def read(frame):
+        return [(np.asarray(points[frame], dtype=np.float64) + offsets).reshape(batch * count, 3)] * len(shapes)
+
+    def sequences():
+        return [as_sequence(scene.mesh, points[:, k], times=animation.times) for k in range(batch)]
+
+    return Subject(scene.name, shapes, np.arange(len(points)), np.asarray(animation.times), read, scene.up_axis, sequences)
+
+
+def _side_by_side(points, azimuth, up_axis):
+    """Offsets (B, 1, 3) [m] by which the cloths of a batch stand in rows, seen from an azimuth."""
+    batch = points.shape[1]
+    a = np.radians(azimuth)
+    right, back = np.array([np.cos(a), 0.0, -np.sin(a)]), np.array([-np.sin(a), 0.0, -np.cos(a)])
+    if up_axis == "Z":
+        right, back = (np.array([x, -z, y]) for x, y, z in (right, back))
+    sizes = []
+    for axis in (right, back):
+        extents = [np.asarray(frame, dtype=np.float64) @ axis for frame in points]
+        finite = [each[np.isfinite(each)] for each in extents]
+        sizes.append(max(each.max() for each in finite if each.size) - min(each.min() for each in finite if each.size))
+    columns = batch if batch <= 5 else int(np.ceil(np.sqrt(1.6 * batch)))
+    k = np.arange(batch)
+    across, depth = (k % columns) - (min(batch, columns) - 1) / 2.0, k // columns
+    gap = _APART * max(sizes[0], 0.3 * sizes[1])
+    return (np.outer(across * gap, right) + np.outer(depth * max(_APART * sizes[1], 0.5 * gap), back))[:, None]
+
+
+def _repeated(shape, batch):
+    """The shape of all cloths of a batch, one after another."""
+    offsets = shape.count * np.arange(batch)
+
+    def tiled(rows):
+        return np.concatenate([rows + offset for offset in offsets])
+
+    return replace(
+        shape,
+        count=shape.count * batch,
+        triangles=tiled(shape.triangles),
+        lines=tiled(shape.lines),
+        balls=tiled(shape.balls),
+    )
+
+
+def _strings(mesh, lines):
+    """Shapes of strings and bars, pairs and a thickness by name."""
+    count = len(mesh.points)
+    return [Shape(count, lines=pairs, radius=width / 2.0, colour=LINES) for pairs, width in (lines or {}).values()]
+
+
+def _cloth(mesh, points, pins=()):
+    """The shape of a cloth: its triangles, or the tubes of a mesh of edges, and its pins as balls."""
+    edge = float(np.nanmean(mesh.edge_lengths)) if len(mesh.edges) else 0.0
+    edges = np.empty((0, 2), int) if len(mesh.triangles) else mesh.edges
+    size = _size(points)
+    radius = max(0.5 * CURVE_WIDTH * edge, min(_THINNEST * size, 0.2 * edge))
+    return _shape(len(mesh.points), mesh.triangles, edges, radius, pins, size, edge, CLOTH)
+
+
+def _shape(count, triangles, edges, radius, pins, size, edge, colour):
+    ball = max(min(_PIN * size, _PIN_EDGE * edge or np.inf), 1.6 * radius) or 1.0
+    return Shape(count, triangles, edges, radius, np.asarray(pins, dtype=int), ball, colour)
+
+
+def _size(points):
+    """Diagonal of the box of points that are finite [m]."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    return float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 1.0

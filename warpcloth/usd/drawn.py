@@ -1,0 +1,192 @@
+"""All that a stage shows: its meshes and linear curves, read at one time code after another."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from .layers import CURVE_WIDTH
+from .modules import Usd, UsdGeom
+from .stage import (
+    METADATA_KEY,
+    curve_edges,
+    face_corners,
+    find_prim,
+    local_to_metres,
+    moving_space,
+    open_stage,
+    pins_of,
+    placed,
+)
+from .values import array_of, check_composed, sentences, time_codes_of
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnPrim:
+    """A Mesh prim or linear BasisCurves as it is drawn.
+
+    Attributes:
+        path: Path of the prim.
+        cloth: Whether it is the cloth, and not part of its surroundings.
+        count: Number of its points n.
+        triangles: (T, 3) int32; empty for curves.
+        edges: (E, 2) int32, the segments of curves; empty for a mesh.
+        radius: Of the curves [m].
+        pins: Points in GeomSubsets of the family "pins" (p,) int32.
+        points: Function that gives the points (n, 3) [m] in world space at a time code.
+        codes: Time codes of the samples of its points or, of points that stand still, of its space.
+    """
+
+    path: str
+    cloth: bool
+    count: int
+    triangles: np.ndarray
+    edges: np.ndarray
+    radius: float
+    pins: np.ndarray
+    points: Callable[[float], np.ndarray]
+    codes: list[float]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnStage:
+    """The prims of a stage that are drawn, and its time codes.
+
+    Attributes:
+        prims: List of `DrawnPrim`.
+        codes: Time codes of the frames (F,): those of the cloth, or else of its surroundings; one where nothing moves.
+        rate: Time codes a second.
+        up_axis: "Y" or "Z".
+        stage: The stage, whose prims are invalid once it is gone.
+    """
+
+    prims: list[DrawnPrim]
+    codes: np.ndarray
+    rate: float
+    up_axis: str
+    stage: Any
+
+
+def read_drawn(path, prim=None):
+    """Reads all meshes and linear curves that a stage shows.
+
+    The cloth is the prim that is named or that an earlier run animated, or else each prim whose points move, or else all of
+    them. Prims that are invisible, guides or proxies, and prototypes of point instancers are left out.
+
+    Args:
+        path: A .usd, .usda, .usdc or .usdz file.
+        prim: Path or name of the cloth, or None.
+
+    Returns:
+        DrawnStage: It keeps the stage open, and has read the first frame only.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no stage or shows neither a mesh nor linear curves; there is no such prim; a prim is broken.
+    """
+    with sentences(path):
+        stage = open_stage(path)
+        own = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY)
+        named = prim is not None or (isinstance(own, dict) and "prim" in own)
+        chosen = find_prim(stage, path, prim) if named else None
+        found = [each for each in _shown(stage) if chosen is None or each != chosen]
+        found = ([chosen] if chosen else []) + found
+        codes = {each: _codes(each) for each in found}
+        moving = [each for each in found if len(codes[each]) > 1]
+        cloths = [chosen] if chosen else moving or found
+        prims = [_drawn(each, path, each in cloths, codes[each]) for each in found]
+        prims = [each for each in prims if each is not None]
+        if not prims:
+            raise ValueError(f"{path}: has no Mesh prim and no linear curves with points; there is nothing to draw")
+        times = sorted({code for each in prims if each.cloth for code in each.codes})
+        times = times or sorted({code for each in prims for code in each.codes}) or [0.0]
+        return DrawnStage(prims, np.array(times), stage.GetTimeCodesPerSecond(), str(UsdGeom.GetStageUpAxis(stage)), stage)
+
+
+def _shown(stage):
+    """The meshes and linear curves of a stage that a viewer shows."""
+    walk = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+    for prim in walk:
+        if prim.IsA(UsdGeom.PointInstancer):
+            walk.PruneChildren()
+            continue
+        linear = prim.IsA(UsdGeom.BasisCurves) and UsdGeom.BasisCurves(prim).GetTypeAttr().Get() == UsdGeom.Tokens.linear
+        if not (linear or prim.IsA(UsdGeom.Mesh)):
+            continue
+        seen = UsdGeom.Imageable(prim)
+        hidden = seen.ComputeVisibility(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.invisible
+        if not hidden and seen.ComputePurpose() not in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+            yield prim
+
+
+def _codes(prim):
+    """Time codes of the samples of a prim's points, or else of its space."""
+    codes = time_codes_of(UsdGeom.PointBased(prim).GetPointsAttr())
+    ancestor = prim
+    while not codes and ancestor and not ancestor.IsPseudoRoot():
+        codes = UsdGeom.Xformable(ancestor).GetTimeSamples() if ancestor.IsA(UsdGeom.Xformable) else []
+        ancestor = ancestor.GetParent()
+    return list(codes)
+
+
+def _drawn(prim, path, cloth, codes):
+    """The `DrawnPrim` of a prim, None of surroundings without points."""
+    check_composed(prim, path)
+    where = f"{path}, prim {prim.GetPath()}"
+    first = codes[0] if codes else Usd.TimeCode.Default()
+    moving = moving_space(prim) is not None
+    transform = None if moving else local_to_metres(prim, where)
+    attribute = UsdGeom.PointBased(prim).GetPointsAttr()
+
+    def points(code, count=None):
+        try:
+            found = array_of(attribute, (3,), time=code)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        number = 0 if found is None else len(found)
+        if count is not None and number != count:
+            raise ValueError(f"{where}: {number} points at time code {code}, must be {count} as at the first")
+        if not number:
+            return np.empty((0, 3))
+        return placed(found.astype(np.float64), local_to_metres(prim, where, code) if moving else transform)
+
+    start = points(first)
+    if not len(start):
+        if cloth:
+            raise ValueError(f"{where}: has no points")
+        return None
+    try:
+        if prim.IsA(UsdGeom.Mesh):
+            corners, triangles = face_corners(prim, len(start))
+            triangles, edges, radius = corners[triangles], np.empty((0, 2), np.int32), 0.0
+            linear = local_to_metres(prim, where, first)[:3, :3]
+            if np.linalg.slogdet(linear)[0] < 0:  # as the mesh is read elsewhere, with its front outside
+                triangles = triangles[:, ::-1]
+        else:
+            triangles, edges = np.empty((0, 3), np.int32), curve_edges(prim, len(start)).astype(np.int32)
+            radius = _radius(prim, start, edges, local_to_metres(prim, where, first))
+        pins = _pinned(prim, len(start))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    return DrawnPrim(
+        str(prim.GetPath()), cloth, len(start), triangles, edges, radius, pins, partial(points, count=len(start)), codes
+    )
+
+
+def _radius(prim, points, edges, transform):
+    """Half the mean width of curves [m], in part of their mean segment where they say none."""
+    widths = array_of(UsdGeom.Curves(prim).GetWidthsAttr())
+    if widths is not None and len(widths) and np.isfinite(widths).all() and widths.mean() > 0.0:
+        return 0.5 * float(widths.mean()) * abs(np.linalg.det(transform[:3, :3])) ** (1 / 3)
+    lengths = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
+    return 0.5 * CURVE_WIDTH * float(lengths.mean()) if len(lengths) else 0.0
+
+
+def _pinned(prim, count):
+    """Points in the GeomSubsets of the family "pins" (p,)."""
+    subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.point, "pins")
+    names = {subset.GetPrim().GetName() for subset in subsets}
+    found = [points for name, points in pins_of(prim, None, count).items() if name in names]
+    return np.unique(np.concatenate([np.empty(0, np.int32), *found]))
