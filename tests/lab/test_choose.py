@@ -187,7 +187,7 @@ def test_an_interruption_says_what_is_kept(tmp_path, monkeypatch, capsys):
         yield
 
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
-    monkeypatch.setattr("warpcloth.lab.choosing.sweep", interrupted)
+    monkeypatch.setattr("warpcloth.lab.campaign.sweep", interrupted)
     assert main("choose chain -p links=3 --frames 3 --tolerance 5% --solvers pbd".split()) == 130
     assert "settings that are measured are kept" in capsys.readouterr().err
 

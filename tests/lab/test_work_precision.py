@@ -14,7 +14,7 @@ import warpcloth as wc
 from warpcloth.base.digest import scene_digest
 from warpcloth.chart import pareto
 from warpcloth.cli import main
-from warpcloth.lab import convergence, machine, spectrum, work_precision
+from warpcloth.lab import campaign, convergence, machine, spectrum, work_precision
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.convergence import OneStep
 from warpcloth.lab.measurements import SceneRef, Setup
@@ -460,7 +460,7 @@ def test_command(tmp_path, monkeypatch, capsys):
     """Interrupted after two settings it says so and keeps them; the same command goes on."""
     monkeypatch.chdir(tmp_path)
     command = ["chart", "work-precision", "hanging", "-p", "n=4", "--frames", "2", "--solvers", "pbd", "--workers", "1"]
-    real = work_precision.sweep
+    real = campaign.sweep
 
     def interrupted(*given, **options):
         for done, each in enumerate(real(*given, **options), 1):
@@ -468,11 +468,11 @@ def test_command(tmp_path, monkeypatch, capsys):
             if done == 2:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(work_precision, "sweep", interrupted)
+    monkeypatch.setattr(campaign, "sweep", interrupted)
     assert main(command) == 130
     assert "interrupted after 2 of 4 settings, which are kept" in capsys.readouterr().err
     assert len(Store(tmp_path / "cache" / "work-precision.jsonl")) >= 2  # and what was finished meanwhile
-    monkeypatch.setattr(work_precision, "sweep", real)
+    monkeypatch.setattr(campaign, "sweep", real)
     assert main([*command, "-o", "chart.png", "--csv", "chart.csv"]) == 0
     said = capsys.readouterr().out
     assert "hanging(n=4): 4 settings, 4 ok" in said and "nothing beats" in said and "known to" in said

@@ -1,6 +1,7 @@
 """Files that are there whole or not at all."""
 
 import contextlib
+import csv
 import errno
 import os
 import secrets
@@ -96,6 +97,18 @@ class Output:
     def parts(self):
         """Further files that are open."""
         return ()
+
+
+def write_table(path, columns, rows):
+    """Writes a table of comma-separated values: the names of its columns, and rows of as many values; None is an empty cell.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+    """
+    with Output(path, "x", **TEXT) as output:
+        table = csv.writer(output.file, lineterminator="\n")
+        table.writerow(columns)
+        table.writerows(rows)
 
 
 class Lock:

@@ -128,7 +128,10 @@ def _parser():
             metavar="SCENE",
             help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
         )
-        sub.add_argument("--solver", choices=options.solvers(), help="the solver (default: newton)")
+        of_info = "also show the step and the kernels of this solver (default with -s or --advise: newton)"
+        sub.add_argument(
+            "--solver", choices=options.solvers(), help=of_info if sub is infos else "the solver (default: newton)"
+        )
         for option, of, text in (("-s", "option", "options of the solver"), ("-p", "parameter", "parameters of the scene")):
             text = f"{text}; '{option} help' lists them"
             sub.add_argument(option, nargs="+", action="extend", default=[], metavar=f"{of}=value", help=text)

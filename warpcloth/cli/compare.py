@@ -1,11 +1,9 @@
 """The command ``compare``: how far two animations are apart."""
 
-import csv
-
 import numpy as np
 
 from ..base.checks import whole
-from ..base.outputs import TEXT, Output, check_apart
+from ..base.outputs import check_apart, write_table
 from ..base.quiet import find_device
 from ..picture.figures import PICTURES, check_path
 from .terminal import Progress, check_writable, json_text
@@ -99,11 +97,8 @@ def _columns(found):
 
 
 def _write_csv(path, columns):
-    with Output(path, "x", **TEXT) as output:
-        table = csv.writer(output.file, lineterminator="\n")
-        table.writerow(columns)
-        for row in zip(*(column.tolist() for column in columns.values()), strict=True):
-            table.writerow("" if value != value else value for value in row)
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    write_table(path, columns, ([None if value != value else value for value in row] for row in rows))
 
 
 def _facts(arguments, found, sequences):

@@ -49,7 +49,7 @@ def add_arguments(parser):
             f"--{of}-range",
             nargs=3,
             metavar=("LOW", "HIGH", "N"),
-            help="lowest value, highest value and number of values, spaced logarithmically",
+            help="lowest value, highest value and number of values, spaced logarithmically (compression: evenly)",
         )
     parser.add_argument(
         "--at",

@@ -1,15 +1,13 @@
 """Benchmarks as data, and their rows: each in a fresh process, one after another."""
 
-import os
-import tempfile
 import time
-from contextlib import contextmanager
 from dataclasses import dataclass
+from tempfile import TemporaryDirectory
 
 from ..base.quiet import initialise_warp
 from ..solvers import SOLVERS
 from . import bandwidth
-from .campaign import sweep
+from .campaign import environment, sweep
 from .cells import refined
 from .measurements import SceneRef, Setup, task
 from .setups import label, setups_of_runs
@@ -95,7 +93,8 @@ class Run:
         device = self.benchmarks[0].device
         self.bandwidth = _alone(task(bandwidth.measure, device=device))
         for index, benchmark in enumerate(self.benchmarks):
-            with _kernel_cache():
+            # An empty folder for the kernels that are compiled meanwhile.
+            with TemporaryDirectory(prefix="warpcloth-kernels-") as folder, environment({"WARP_CACHE_PATH": folder}):
                 for i, scene in enumerate(benchmark.scenes()):
                     self.rows.append({**self._row(benchmark, scene, cold=i == 0), "benchmark": index})
                     progress(len(self.rows), self.total)
@@ -119,18 +118,3 @@ def _alone(asked):
     """The result of a task in a fresh process."""
     ((_, result),) = sweep([asked], workers=1)
     return result
-
-
-@contextmanager
-def _kernel_cache():
-    """An empty folder for the kernels that are compiled meanwhile, by processes that are started."""
-    before = os.environ.get("WARP_CACHE_PATH")
-    with tempfile.TemporaryDirectory(prefix="warpcloth-kernels-") as folder:
-        os.environ["WARP_CACHE_PATH"] = folder
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ["WARP_CACHE_PATH"]
-            else:
-                os.environ["WARP_CACHE_PATH"] = before

@@ -137,24 +137,45 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
                     store.keep(task, *future.result())  # finished, and not looked at
 
 
+def collect(tasks, name, **run):
+    """Measures all tasks and returns the (result, machine) of each in their order; ``run`` is that of :func:`sweep`.
+
+    Args:
+        tasks: As of :func:`sweep`.
+        name: Of the :func:`kept_store` where ``run`` has no ``store``.
+        **run: Arguments of :func:`sweep`.
+    """
+    if "store" not in run:
+        run["store"] = kept_store(name, run.get("executor"))
+    results = {task.key: result for task, result in sweep(tasks, **run)}
+    return [(results[task.key], run["store"].machine(task)) for task in tasks]
+
+
 @contextlib.contextmanager
-def _processes(workers):
-    """Fresh processes, each with one thread for arithmetic; they read these settings when they start."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)
+def environment(values):
+    """Sets variables of the environment meanwhile, which processes read when they start."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin, initargs=(_own(),)) as pool:
-            try:
-                yield pool
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
+        yield
     finally:
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _processes(workers):
+    """Fresh processes, each with one thread for arithmetic."""
+    context = multiprocessing.get_context("spawn")
+    with environment(_ONE_THREAD), ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(_own(),)) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
 
 
 def _own():

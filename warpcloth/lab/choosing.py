@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from ..base.checks import number
 from ..solvers import SOLVERS
 from . import trajectory
-from .campaign import kept_store, sweep
+from .campaign import collect, kept_store
 from .measurements import Setup, task
 from .reference import reference
 from .setups import setups_of_runs
@@ -162,9 +162,7 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
                  dtype=dtype, limit=limit)
             for setup in setups
         ]  # fmt: skip
-        found = {one.key: result for one, result in sweep(tasks, **run)}
-        machine = run["store"].machine
-        return [_measured(setup, found[one.key], machine(one)) for setup, one in zip(setups, tasks, strict=True)]
+        return [_measured(setup, *found) for setup, found in zip(setups, collect(tasks, "trajectories", **run), strict=True)]
 
     choice, found = climb(rungs, measure, tolerance, budget, exact.error)
     return choice, found, exact

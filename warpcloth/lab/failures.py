@@ -4,12 +4,10 @@ A chart is a module with a `TITLE`, `PANELS`, what is drawn, and `tasks`, what m
 dictionaries with ``panel``, ``series``, ``x``, ``value`` (None where there is none) and ``reason``.
 """
 
-import csv
-
 from ..base.checks import choice
-from ..base.outputs import TEXT, Output
+from ..base.outputs import write_table
 from . import cotangents, isometry, locking, rank, slivers
-from .campaign import kept_store, sweep
+from .campaign import collect
 from .machine import machine
 
 FAILURES = {"locking": locking, "isometry": isometry, "slivers": slivers, "cotangents": cotangents, "rank": rank}
@@ -32,15 +30,14 @@ def failure_chart(name, device="cpu", **run):
     """
     choice("failure", name, tuple(FAILURES))
     tasks = FAILURES[name].tasks(str(device))
-    run = run if "store" in run else {"store": kept_store("failures", run.get("executor")), **run}
-    results = {task.key: points for task, points in sweep(tasks, **run)}
     panels = {panel.key: panel for panel in FAILURES[name].PANELS}
     rows = []
-    for done, point in [(task, point) for task in tasks for point in results[task.key]]:
-        panel = panels[point["panel"]]
-        law = panel.follows.get(point["series"])
-        expected = float(panel.laws[law](point["x"])) if law else None
-        rows.append({**point, "law": law, "expected": expected, "machine": run["store"].machine(done)})
+    for points, where in collect(tasks, "failures", **run):
+        for point in points:
+            panel = panels[point["panel"]]
+            law = panel.follows.get(point["series"])
+            expected = float(panel.laws[law](point["x"])) if law else None
+            rows.append({**point, "law": law, "expected": expected, "machine": where})
     facts = {"failure": name, "title": FAILURES[name].TITLE, "device": str(device), "seed": 0, "machine": machine(device)}
     shown = {key: {"title": panel.title, "x": panel.x, "y": panel.y} for key, panel in panels.items()}
     return {**facts, "panels": shown, "rows": rows}
@@ -52,7 +49,4 @@ def write_csv(path, found):
     Raises:
         FileNotFoundError: The folder does not exist.
     """
-    with Output(path, "x", **TEXT) as output:
-        table = csv.DictWriter(output.file, COLUMNS, lineterminator="\n")
-        table.writeheader()
-        table.writerows(found["rows"])
+    write_table(path, COLUMNS, ([row[name] for name in COLUMNS] for row in found["rows"]))

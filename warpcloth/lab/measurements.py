@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import platform
 import threading
 from dataclasses import asdict, dataclass, field
@@ -113,6 +114,11 @@ def task(function, **arguments):
     """
     plain = {name: asdict(value) if hasattr(value, "__dataclass_fields__") else value for name, value in arguments.items()}
     return Task(f"{function.__module__}:{function.__qualname__}", plain)
+
+
+def finite(value):
+    """A number as JSON has it, None for what is not finite."""
+    return float(value) if math.isfinite(value) else None
 
 
 def run(task, source):

@@ -33,10 +33,5 @@ class Panel:
 
 def point(panel, series, x, value, reason=""):
     """A measured point as JSON; ``value`` None where there is none, and then the reason."""
-    return {
-        "panel": panel,
-        "series": series,
-        "x": float(x),
-        "value": None if value is None else float(value),
-        "reason": reason,
-    }
+    value = None if value is None else float(value)
+    return {"panel": panel, "series": series, "x": float(x), "value": value, "reason": reason}

@@ -15,7 +15,7 @@ from ..run.watch import Watch, watched_frames
 from ..solvers import Newton
 from .axes import ACCURACY, AXES, FIXED, OPTIONS
 from .cells import record_at, refined, scene_at, steps_in, together, vary
-from .measurements import SceneRef, Setup, task
+from .measurements import SceneRef, Setup, finite, task
 from .stability_limits import KNOWN, limit_ratios
 
 VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
@@ -141,7 +141,7 @@ def measure(
                 if cell["status"] != "refused":
                     of_cell = scene_at(ref, {**fixed, axis: value}, *length)
                     run_for = of_cell.frames * record.per_frame(of_cell.fps)
-                    known = {name: _finite(ratio) for name, ratio in limit_ratios(of_cell, record, run_for).items()}
+                    known = {name: finite(ratio) for name, ratio in limit_ratios(of_cell, record, run_for).items()}
                     cell = cell | {"steps": run_for, "rules": known}
                     if cell["floor"] is not None and accuracy > 0.0:
                         cell["rules"][KNOWN] = cell["floor"] / accuracy
@@ -188,12 +188,12 @@ def _apart(first, other, copy):
     if min(each.good[copy] for each in (first, other)) < frames - 1:
         return None
     squares = ((first.points[:frames, copy] - other.points[:, copy]) ** 2).sum(axis=-1)
-    return _finite(math.sqrt(squares.mean()) / np.ptp(other.points[0, copy], axis=0).max())
+    return finite(math.sqrt(squares.mean()) / np.ptp(other.points[0, copy], axis=0).max())
 
 
 def _judge(trial, copy, answer, accuracy):
     """The cell of one copy; ``answer`` as of :func:`_reference`."""
-    growth, reason = _finite(trial.growth[copy]), trial.reasons[copy]
+    growth, reason = finite(trial.growth[copy]), trial.reasons[copy]
     floor = _apart(*answer, copy) if isinstance(answer, list) else None
     if trial.good[copy] < len(trial.points) - 1:
         step = int(trial.good[copy] + 1) * trial.steps_per_frame
@@ -214,21 +214,8 @@ def _judge(trial, copy, answer, accuracy):
 
 def _cell(verdict, reason, **more):
     status = "ok" if verdict in VERDICTS[:4] else verdict
-    return {
-        "verdict": verdict,
-        "status": status,
-        "reason": reason,
-        "step": None,
-        "steps": None,
-        "growth": None,
-        "error": None,
-        "floor": None,
-        "rules": {},
-    } | more
-
-
-def _finite(value):
-    return float(value) if math.isfinite(value) else None
+    unknown = dict.fromkeys(("step", "steps", "growth", "error", "floor"))
+    return {"verdict": verdict, "status": status, "reason": reason, **unknown, "rules": {}} | more
 
 
 @dataclass(frozen=True)

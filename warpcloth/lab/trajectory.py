@@ -1,6 +1,5 @@
 """How far a setup strays from the reference solution of a scene, and what a frame costs it."""
 
-import math
 import warnings
 
 import numpy as np
@@ -9,7 +8,7 @@ from ..base.checks import number, whole
 from ..base.digest import scene_digest
 from ..run.simulate import simulate
 from .clock import Clock, TooSlow
-from .measurements import SceneRef, Setup
+from .measurements import SceneRef, Setup, finite
 from .reference import Reference, position_error, strain_error
 
 
@@ -75,7 +74,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         return found
     first = runs[0]
     status, timings = first.status, first.timings
-    found |= {"frames": min(int(status.frame), frames), "residual": _plain(status.residual)}
+    found |= {"frames": min(int(status.frame), frames), "residual": finite(status.residual)}
     found["message"] = "; ".join(dict.fromkeys([status.message, *(str(warning.message) for warning in warned)]))
     found |= _times([run.timings["frames"] for run in runs], declared.fps)
     warm_up = timings["frames"][0] - 1e-3 * found["ms"]
@@ -85,7 +84,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
     if exact is not None:
         points, others = first.points[1 : frames + 1].astype(np.float64), exact.points[1 : frames + 1]
         for name, error in (("error", position_error), ("strain_error", strain_error)):
-            found[name] = _plain(error(points, others, declared.mesh))
+            found[name] = finite(error(points, others, declared.mesh))
     return found
 
 
@@ -114,8 +113,3 @@ def _times(runs, fps):
     warm = np.concatenate([run[1:] if len(run) > 1 else run for run in runs])
     low, median, high = (1e3 * np.percentile(warm, [25, 50, 75])).tolist()
     return {"ms": median, "spread": [low, high], "ms_per_second": median * fps}
-
-
-def _plain(value):
-    """A number as JSON has it, None for what is not finite."""
-    return float(value) if math.isfinite(value) else None

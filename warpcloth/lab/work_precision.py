@@ -4,14 +4,13 @@ Each diagram is a function of a :class:`warpcloth.lab.measurements.SceneRef` tha
 dictionary for each setting in ``rows``; :mod:`warpcloth.chart.pareto` draws it.
 """
 
-import csv
 import json
 import math
 
 from ..base.digest import scene_digest
-from ..base.outputs import TEXT, Output
+from ..base.outputs import write_table
 from . import convergence, physics, spectrum, trajectory
-from .campaign import kept_store, sweep
+from .campaign import collect
 from .machine import machine
 from .measurements import task
 from .reference import reference
@@ -27,21 +26,8 @@ WITHIN = 0.01  # the error of which the cheapest setting is named
 _KNOWN, _TIMES, _SECONDS = 1e-4, 6.0, 120.0
 # What a CSV has of a setting, in this order; what it does not know is empty.
 COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
-COLUMNS += (
-    "h",
-    "stiffness",
-    "ms_per_second",
-    "iterations",
-    "gap",
-    "predicted",
-    "floor",
-    "compile_s",
-    "factorise_s",
-    "residual",
-    "frames",
-    "message",
-    "machine",
-)
+COLUMNS += ("h", "stiffness", "ms_per_second", "iterations", "gap", "predicted", "floor", "compile_s", "factorise_s")
+COLUMNS += ("residual", "frames", "message", "machine")
 # And of all settings alike, in every line.
 FACTS = ("scene", "dtype", "seed", "processor", "cores", "device", "system", "python", "numpy", "scipy", "warp", "warpcloth")
 FACTS += ("source",)
@@ -263,24 +249,20 @@ def write_csv(path, found):
     Raises:
         FileNotFoundError: The folder does not exist.
     """
-    with Output(path, "x", **TEXT) as output:
-        table = csv.DictWriter(output.file, COLUMNS + FACTS, lineterminator="\n", extrasaction="ignore")
-        table.writeheader()
+
+    def lines():
         for row in found["rows"]:
-            facts = {**found, **found["machine"], **row, "options": json.dumps(row["options"])}
+            facts = {**found, **found["machine"], **row}
             for point in row.get("points") or [row]:
                 low, high = point.get("spread") or (None, None)
-                table.writerow({**facts, **point, "options": facts["options"], "ms_low": low, "ms_high": high})
+                line = {**facts, **point, "options": json.dumps(row["options"]), "ms_low": low, "ms_high": high}
+                yield map(line.get, COLUMNS + FACTS)
+
+    write_table(path, COLUMNS + FACTS, lines())
 
 
 def _facts(kind, scene, device, dtype):
-    return {
-        "diagram": kind,
-        "scene": str(scene),
-        "device": str(device),
-        "dtype": dtype,
-        "machine": machine(device),
-    }
+    return {"diagram": kind, "scene": str(scene), "device": str(device), "dtype": dtype, "machine": machine(device)}
 
 
 def _has_error(row):
@@ -298,6 +280,4 @@ def _measured(function, scene, setups, given, run):
 
 def _results(tasks, run):
     """The result of each task and the machine that measured it, in their order."""
-    run = run if "store" in run else {"store": kept_store("work-precision", run.get("executor")), **run}
-    results = {each.key: result for each, result in sweep(tasks, **run)}
-    return [{**results[each.key], "machine": run["store"].machine(each)} for each in tasks]
+    return [{**result, "machine": where} for result, where in collect(tasks, "work-precision", **run)]
