@@ -10,6 +10,7 @@ from ..analysis.measures import scalars
 from ..analysis.summaries import CsvWriter, JsonWriter, Summary, summarise
 from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart
+from ..picture.measured import neutral_of, scalar_names, scale_of
 
 # Length of a principal direction of stretch 1 beside the square root of the median area of a triangle.
 _SEGMENT = 0.7
@@ -112,7 +113,8 @@ def write_report(
     check_apart([usd, csv, json, npz, plot, *(stills or {}).values()], analyzer.sequence.files)
     if (usd or stills) and colour != "none" and (stills or colour or _can_colour()):
         report.coloured = colour or next(iter(listed))
-        report.scale = _range(analyzer, report.coloured, listed[report.coloured], colour_range)
+        scale = scale_of([analyzer], report.coloured, listed[report.coloured], colour_range)
+        report.scale = scale.low, scale.high
     kept, opened = [], []
     with _interruptible(report, len(analyzer), opened), ExitStack() as stack:
         writers = [stack.enter_context(CsvWriter(csv))] if csv else []
@@ -181,11 +183,6 @@ def _interruptible(report, rows, opened):
         raise Interrupted(f"interrupted after {report.rows} of {rows} frames; {saved}") from None
 
 
-def scalar_names(measure):
-    """Names of the scalars of a measure."""
-    return list(scalars(measure, np.zeros((1, *measure.shape))))
-
-
 def camel(name):
     """A name as USD has it: ``stretch_1`` is ``stretch1``, ``area_ratio`` is ``areaRatio``."""
     first, *others = name.split("_")
@@ -234,22 +231,6 @@ def _check_pictures(plot, stills):
             check_path(path, PICTURES[:1])
 
 
-def _range(analyzer, name, measure, given):
-    """(low, high) of the colours of a scalar."""
-    from ..chart import Scale, range_over
-
-    if given is None:
-        summaries = []
-        for sample in analyzer.of(measure.name):
-            numbers = scalars(measure, sample.values[measure.name])[name]
-            positions = np.zeros((len(numbers), 3))
-            about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
-            summaries.append(summarise(name, measure.unit, numbers, positions, analyzer.areas, **about))
-        given = range_over(summaries, _neutral(measure))
-    scale = Scale(*given, _neutral(measure))
-    return scale.low, scale.high
-
-
 def _count(analyzer, name):
     """How many numbers an element has of a measure."""
     return next(measure.shape[0] for measure in analyzer.measures if measure.name == name)
@@ -260,11 +241,6 @@ def _rate(sequence):
     if sequence.times is None or len(sequence) < 2:
         return 24.0
     return float((sequence.labels[-1] - sequence.labels[0]) / (sequence.times[-1] - sequence.times[0]))
-
-
-def _neutral(measure):
-    """Where the scale of a scalar of a measure has its middle; norms begin at 0."""
-    return measure.neutral if len(measure.shape) < 2 else None
 
 
 def _input(analyzer):
@@ -292,7 +268,7 @@ class _Shown:
             from ..chart import Scale
 
             self.unit = listed[self.name].unit
-            self.scale = Scale(*report.scale, _neutral(listed[self.name]), colormap)
+            self.scale = Scale(*report.scale, neutral_of(listed[self.name]), colormap)
             metadata["legend"] = self.scale.legend(self.name, self.unit)
         areas = analyzer.mesh.triangle_areas
         areas = areas[np.isfinite(areas) & (areas > 0.0)]  # others have no segments
