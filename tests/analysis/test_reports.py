@@ -16,8 +16,8 @@ from warpcloth.analysis.measures import scalars
 from warpcloth.chart import Scale
 from warpcloth.cli import main
 from warpcloth.cli.reports import camel, write_report
-from warpcloth.picture.measured import scalar_names
 from warpcloth.picture.colour import table
+from warpcloth.picture.measured import scalar_names
 from warpcloth.scenes import hanging
 from warpcloth.usd import AnimationWriter, FrameSequence
 

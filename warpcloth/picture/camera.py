@@ -18,6 +18,7 @@ class Camera:
             much of the sky a point sees are about as long as half the height of the picture there.
         up: What is up in the picture, not along the view; of any length.
         fov: Angle from the lower to the upper side of the picture [°], above 0 and below 180.
+        shift: By how many heights of the picture its middle is to the right of the target, as by a shifted lens.
 
     Raises:
         ValueError: A number is not finite or beyond its range, the target is at the position, or up is along the view.
@@ -27,11 +28,13 @@ class Camera:
     target: tuple[float, float, float]
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     fov: float = 30.0
+    shift: float = 0.0
 
     def __post_init__(self):
         for name in ("position", "target", "up"):
             object.__setattr__(self, name, tuple(array(name, getattr(self, name), (3,)).tolist()))
         number("fov", self.fov, above=0.0)
+        number("shift", self.shift)
         if not self.fov < 180.0:
             raise ValueError(f"fov is {self.fov:g}; it must be below 180")
         view = np.subtract(self.target, self.position)

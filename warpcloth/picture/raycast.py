@@ -218,8 +218,9 @@ class RayCaster:
         right = np.cross(forward, up / np.linalg.norm(up))
         right /= np.linalg.norm(right)
         pixel = 2.0 * tangent / height
+        shift = 2.0 * tangent * camera.shift * right
         viewer = kernels.Viewer()
-        viewer.origin, viewer.forward = wp.vec3(*((position - target) / unit)), wp.vec3(*forward)
+        viewer.origin, viewer.forward = wp.vec3(*((position - target) / unit)), wp.vec3(*(forward + shift))
         viewer.right, viewer.up = wp.vec3(*(pixel * right)), wp.vec3(*(pixel * np.cross(right, forward)))
         viewer.width, viewer.height, viewer.samples = width, height, self._samples
         return unit, viewer

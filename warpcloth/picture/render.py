@@ -284,11 +284,15 @@ class _Picture:
         room = width - self._overlay.beside
         widths = [room // len(subjects)] * len(subjects)
         widths[0] += room - sum(widths)
+        # The bar is on the last panel, whose motion stays to the left of it.
+        shifts = [0.0] * (len(subjects) - 1) + [0.5 * self._overlay.beside / height]
         low = self._frame(view, min(widths) / height)
         below = self._camera.position["YZ".index(self._up) + 1] < low
         if isinstance(ground, bool | np.bool_):
             ground = low if ground and not below else None
         options = {"samples": samples, "ground": ground, "device": device, "up_axis": self._up}
+        self._cameras = [replace(self._camera, shift=shift) for shift in shifts]
+        widths[-1] += self._overlay.beside
         self._casters = [RayCaster(each.shapes, wide, height, **options) for each, wide in zip(subjects, widths, strict=True)]
 
     def _frame(self, view, aspect):
@@ -331,7 +335,7 @@ class _Picture:
                     values = next(rows[k])
                     excluded = excluded or bool(np.isnan(values).any())
                     colours[subject.coloured] = self._painted(subject.shapes[subject.coloured], values)
-                panels.append(caster.image(subject.read(shot.frames[k]), self._camera, colours))
+                panels.append(caster.image(subject.read(shot.frames[k]), self._cameras[k], colours))
                 self.left_out += caster.left_out
             yield self._overlay.draw(panels, shot.text if with_time else None, excluded)
 
