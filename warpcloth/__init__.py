@@ -39,6 +39,9 @@ if TYPE_CHECKING:  # the table below, as type checkers read it
     from .scene.scene import Scene as Scene
     from .solvers import *  # noqa: F403
     from .terms import *  # noqa: F403
+    from .terms.loads import Force as Force
+    from .terms.loads import Pressure as Pressure
+    from .terms.loads import Traction as Traction
 
 # The module of each public name; those of the two catalogues are added to them.
 _MODULES = {
@@ -66,6 +69,9 @@ _MODULES = {
     "simulate": "run.simulate",
     "Pins": "scene.scene",
     "Scene": "scene.scene",
+    "Force": "terms.loads",
+    "Pressure": "terms.loads",
+    "Traction": "terms.loads",
 }
 _CATALOGUES = ("solvers", "terms")
 

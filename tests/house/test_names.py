@@ -18,6 +18,7 @@ MODULES = {
     "failures": "the pictures of warpcloth.lab.failures",
     "panels": "the pictures of warpcloth.lab.panels",
     "measures": "what writes warpcloth.analysis.measures into a stage",
+    "loads": "the arrays on a device of what warpcloth.terms.loads declares",
     "scene": "what reads and writes warpcloth.scene.scene as a stage",
 }
 # Classes and functions that mean one thing in several modules, and why.

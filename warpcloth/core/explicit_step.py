@@ -35,12 +35,13 @@ class ExplicitStep:
         self._move_ahead = model.kernel(kernels.move_ahead, model.dtype)
         self._step = model.kernel(kernels.explicit_step, model.dtype, symplectic, compensated)
         self._given = [model.inverse_mass, *model.free_gravity, h]
+        self._per_frame = round(1.0 / (model.scene.fps * h))
 
     def launch(self, steps, move_pins):
         """Launches this number of steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
-            model.refresh(STEP, Moment(x))
+            model.refresh(STEP, Moment(x, steps=self._pins[-1], per_frame=self._per_frame))
             model.refresh(STEP, Moment(x), self._damped)
             self._elastic.add(x, self._gradient, self.residual)
             if self._damped:

@@ -58,7 +58,7 @@ class Plan:
             ValueError: If threads cannot share the steps; it names the term.
         """
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
-        if self.model.mobility is not None and pool.threads == 1:
+        if not self.model.uniform and pool.threads == 1:
             return ExplicitStep(*given)
         if pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
@@ -108,6 +108,11 @@ def _refuse_undivided(model, backend, threads):
         raise ValueError(
             f"threads is {threads} with one copy, whose vertices that are locked along some axes Explicit cannot divide; "
             "threads=1 can, and copies are shared out with every solver"
+        )
+    if model.loads is not None:
+        raise ValueError(
+            f"threads is {threads} with one copy that has loads, whose steps Explicit cannot divide; threads=1 can, or PBD and "
+            "XPBD, and copies are shared out with every solver"
         )
     for elements in model.terms:
         if elements.refresh:

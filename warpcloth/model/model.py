@@ -13,8 +13,10 @@ from ..kernels.step import lock
 from ..kernels.term import Term
 from ..kernels.vectors import types
 from ..mesh.selection import distinct_vertices
+from ..terms.refresh import STEP, Moment
 from .elements import elements_on
 from .host_values import keep, repeat
+from .loads import loads_on
 from .precision import DTYPES, cast, refuse_coarse
 from .report import report
 from .threads import threads_on
@@ -31,7 +33,8 @@ class Model:
         copies: B.
         vary: What differs between the copies, by name, each with B entries: ``"gravity"`` (B, 3), ``"density"`` (B,),
             ``"masses"`` (B, n), ``"positions"`` and ``"velocities"`` (B, n, 3), and any numeric field of a term, by its name or
-            class, such as ``"Spring.stiffness"`` and ``"Spring.rest_lengths"``, (B,) or (B, E).
+            class, such as ``"Spring.stiffness"`` and ``"Spring.rest_lengths"``, (B,) or (B, E), or of a load, such as
+            ``"Force.force"``, (B, 3) or (B, p, 3).
         order: The scene's vertices in the order that the model has them in, (n,), such as
             :func:`warpcloth.mesh.ordering.near_order` gives; elements are then in the order of their lowest vertices there. All
             arguments here, and what is said of them, have the scene's own order, and all attributes and what solvers make of
@@ -46,6 +49,7 @@ class Model:
         gravity: (B,) vectors [m/s²].
         pins, keyframes: Moved pins (p,) and their positions (F, p) [m], or None.
         pin_axes: 1 along axes that each moved pin holds and 0 along others, (p,) vectors; None where all hold all axes.
+        loads: The :class:`warpcloth.model.loads.DeviceLoads`, or None.
         terms: One :class:`warpcloth.model.elements.DeviceElements` for each declared term.
         rest_points: Rest shape of one copy, (n, 3) [m].
         order: As given, int32, or None.
@@ -114,6 +118,12 @@ class Model:
             self.keyframes = self.array(keyframes, self.vec3)
             if not scene.pins.held.all():
                 self.pin_axes = self.array(scene.pins.held, self.vec3)
+        self.loads = None
+        if scene.loads:
+            if self._vertex_gravity is None:
+                self._vertex_gravity = self._put("gravity", "m/s²", np.repeat(gravity, self.per_copy, axis=1), self.vec3)
+            self.loads = loads_on(self, scene.loads, vary, self._vertex_gravity)
+            self.loads.set(self, Moment(self.positions))
         self.terms = tuple(elements_on(self, term, positions, vary) for term in scene.terms)
         vary.refuse_rest()
 
@@ -136,8 +146,13 @@ class Model:
 
     @property
     def free_gravity(self):
-        """Gravity along free axes, (G,) vectors [m/s²], and how many vertices in a row share an entry."""
-        return (self.gravity, self.per_copy) if self.mobility is None else (self._vertex_gravity, 1)
+        """Gravity and loads along free axes, (G,) vectors [m/s²], and how many vertices in a row share an entry."""
+        return (self.gravity, self.per_copy) if self.uniform else (self._vertex_gravity, 1)
+
+    @property
+    def uniform(self):
+        """Whether gravity acts on all vertices of a copy alike, and along every axis: no load, no locked coordinate."""
+        return self._vertex_gravity is None
 
     @property
     def local_mobility(self):
@@ -162,13 +177,15 @@ class Model:
         return other
 
     def refresh(self, when, moment, terms=None):
-        """Launches what its terms, or the ``terms`` given, have set anew.
+        """Launches what its loads and terms, or only the ``terms`` given, have set anew.
 
         Args:
             when: :data:`warpcloth.terms.refresh.STEP` or :data:`warpcloth.terms.refresh.EVALUATION`.
             moment: The :class:`warpcloth.terms.refresh.Moment`.
             terms: :class:`warpcloth.model.elements.DeviceElements`.
         """
+        if self.loads is not None and terms is None and when == STEP:
+            self.loads.launch(self, moment)
         for elements in self.terms if terms is None else terms:
             if elements.refresh and elements.refresh.when == when:
                 elements.refresh.launch(self, elements, moment)
@@ -186,6 +203,8 @@ class Model:
             if getattr(self, name) is not None:
                 setattr(other, name, getattr(self, name)[of_vertices])
         other.gravity = self.gravity[of_copies]
+        if self.loads is not None:
+            other.loads = self.loads.part(self, first, count)
         other.terms = tuple(elements.part(first, count) for elements in self.terms)
         return other
 

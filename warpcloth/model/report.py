@@ -14,6 +14,7 @@ def report(model):
     arrays = [model.positions, model.velocities, model.mass, model.inverse_mass, model.gravity]
     arrays += [array for array in (model.pins, model.keyframes, model.pin_axes, model.mobility) if array is not None]
     arrays += [model.free_gravity[0]] * (model.mobility is not None)
+    arrays += [] if model.loads is None else model.loads.arrays
     terms = [
         {
             "term": elements.label + (f" {count + 1}" if count else ""),

@@ -109,6 +109,24 @@ class Vary:
                 return values
         return None
 
+    def load(self, load):
+        """A load as each copy has it, B records."""
+        found = [load] * self.copies
+        for field in (load.quantity, "keyframes"):
+            self.fields.append(f"{type(load).__name__}.{field}")
+            name = next((f"{of}.{field}" for of in (load.label, type(load).__name__) if f"{of}.{field}" in self.values), None)
+            if name is None:
+                continue
+            self.taken.add(name)
+            values = numeric(f"vary[{name!r}]", self.values[name], "have an entry for each copy")
+            if len(np.atleast_1d(values)) != self.copies:
+                raise ValueError(
+                    f"vary[{name!r}] has shape {values.shape}; it must have {self.copies} entries, one for each copy"
+                )
+            other = "keyframes" if field == load.quantity else load.quantity
+            found = [replace(one, **{field: values[copy], other: None}) for copy, one in enumerate(found)]
+        return found
+
     def refuse_rest(self):
         """Refuses names that nobody took."""
         rest = sorted(set(self.values) - self.taken, key=str)

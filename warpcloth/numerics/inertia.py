@@ -23,8 +23,9 @@ class Inertia:
         self._kernel = model.kernel(add_inertia, model.dtype)
 
     def add(self, d, gradient):
-        """gradient (N,) += s M d − load·M g, and 0 for what does not move; sets ``work``."""
+        """gradient (N,) += s M d − load·M g, g with loads, and 0 for what does not move; sets ``work``."""
         model = self.model
-        given = [model.mass, model.inverse_mass, model.gravity, d, model.per_copy, self.s, self.load]
+        gravity, each = model.free_gravity
+        given = [model.mass, model.inverse_mass, gravity, d, each, self.s, self.load]
         model.launch(self._kernel, model.count, given, [gradient, self.work])
         model.lock(gradient)

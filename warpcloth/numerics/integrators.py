@@ -33,7 +33,11 @@ class Euler:
     @property
     def moment(self):
         """The :class:`warpcloth.terms.refresh.Moment` where a step begins, by which (s − s̃)/hₑ is the rate of a damped s."""
-        return Moment(self.stepper.state.x)
+        return Moment(self.stepper.state.x, **self._time(parts=1))
+
+    def _time(self, parts):
+        """When loads are taken that follow keyframes: one step of these ahead, of which a step of h has ``parts``."""
+        return {"steps": self.stepper.count, "per_frame": parts * self.stepper.steps_per_frame, "ahead": 1}
 
     def launch_prediction(self):
         """Sets x = x̃ and v = (x̃ − x₀)/hₑ, and moves the pins to the end of the step."""
@@ -57,7 +61,7 @@ class Midpoint(Euler):
     @property
     def moment(self):
         x, v = self.stepper.state
-        return Moment(x, integrator="midpoint", move=v, scale=self.he)
+        return Moment(x, integrator="midpoint", move=v, scale=self.he, **self._time(parts=2))
 
     def launch_finish(self, correction):
         gravity, each = self.stepper.model.free_gravity
@@ -110,7 +114,7 @@ class BDF2(Euler):
 
     @property
     def moment(self):
-        return Moment(self.stepper.state.x, integrator="bdf2", move=self.move)
+        return Moment(self.stepper.state.x, integrator="bdf2", move=self.move, **self._time(parts=1))
 
     def launch_prediction(self):
         given = [*self.stepper.model.free_gravity, self.he]

@@ -103,8 +103,10 @@ class Balance:
 
     Attributes:
         mass, total: Masses of the free vertices (B, n) and their sum (B,) [kg].
+        free: Whether no pin, attachment or rail holds it.
         elastic: :class:`Elastic` of the model.
         sources: The sources of the scene.
+        points: Those of the frame that is checked (B·n, 3) [m].
         has, given: Energy that each copy has, and that it can have been given, in the last frame that was checked, (B,) [J].
     """
 
@@ -120,8 +122,11 @@ class Balance:
         self.total = self.mass.sum(axis=1)
         # A term of one vertex that is in no cell holds it where it is in space.
         held = any(elements.term.vertices == 1 and not elements.cells for elements in model.terms)
-        self._free = not (held or len(model.scene.fixed) or model.mobility is not None)
+        self.free = not (held or len(model.scene.fixed) or model.mobility is not None)
         self._gravity = model.gravity.numpy().astype(np.float64)
+        constant = None if model.loads is None or self.free else model.loads.constant
+        self._pull = None if constant is None else model.in_scene_order(constant.reshape(-1, 3)).reshape(constant.shape)
+        self._start = points.reshape(model.copies, -1, 3)
         self._moment, self._fastest = self._moments(points), np.zeros(model.copies)
         self._rounding = np.zeros(model.copies)
         self.elastic = Elastic(model)
@@ -134,7 +139,7 @@ class Balance:
     def kinetic(self, velocities):
         """½Σ m v² of each copy [J], of a free cloth relative to its centre of mass."""
         velocities = velocities.reshape(*self.mass.shape, 3)
-        if self._free:
+        if self.free:
             velocities = velocities - (self._moments(velocities) / self.total[:, None])[:, None]
         return 0.5 * (self.mass * np.einsum("bij,bij->bi", velocities, velocities)).sum(axis=1)
 
@@ -149,8 +154,9 @@ class Balance:
         with np.errstate(all="ignore"):
             points, velocities = points.astype(np.float64, copy=False), velocities.astype(np.float64, copy=False)
             kinetic, height = self.kinetic(velocities), self._height(points)
-            if self._free:
+            if self.free:
                 self._note_farthest(points)
+            self.points = points
             self._lowest = np.fmin(self._lowest, height)
             per_frame = 1.0 / self.model.scene.fps
             speed = self._fastest + np.linalg.norm(self._gravity, axis=1) * per_frame
@@ -178,7 +184,7 @@ class Balance:
 
     def sentence(self, copy):
         """Says how much energy a copy has gained by the last frame."""
-        names = [source.name for source in self.sources] + ["falling"] * bool(self.weighs[copy] and not self._free)
+        names = [source.name for source in self.sources] + ["falling"] * bool(self.weighs[copy] and not self.free)
         names = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
         return (
             f"it has gained energy, {self.has[copy]:.3g} J of motion and height, of which {names} can have put in no more "
@@ -208,15 +214,20 @@ class Balance:
         return np.einsum("bi,bij->bj", self.mass, points.reshape(*self.mass.shape, 3))
 
     def _height(self, points):
-        """Potential energy of gravity since the start [J], without which a free cloth is judged."""
-        if self._free:
+        """Potential energy of gravity and constant loads since the start [J], without which a free cloth is judged."""
+        if self.free:
             return np.zeros(self.model.copies)
-        return -((self._moments(points) - self._moment) * self._gravity).sum(axis=1)
+        height = -((self._moments(points) - self._moment) * self._gravity).sum(axis=1)
+        if self._pull is not None:
+            height = height - (self._pull * (points.reshape(self._pull.shape) - self._start)).sum(axis=(1, 2))
+        return height
 
     def _at_positions(self, points, velocities):
         """Velocities at the time of the positions, half a kick later."""
         mass, shape = self.mass[..., None], (*self.mass.shape, 3)
         forces = mass * self._gravity[:, None] - self.elastic.gradient(self.elastic.put(points)).reshape(shape)
+        if self.model.loads is not None:
+            forces = forces + self.model.in_scene_order(self.model.loads.force.numpy()).reshape(shape)
         kicks = np.divide(forces, mass, out=np.zeros(shape), where=mass > 0.0)
         if self.model.mobility is not None:
             kicks[:, self.model.scene.locked] = 0.0

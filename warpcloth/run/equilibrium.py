@@ -6,12 +6,14 @@ import numpy as np
 import warp as wp
 
 from ..base.checks import choice, number, whole
+from ..base.limits import MOST_FRAMES
 from ..base.turns import in_turn
 from ..base.types import Precision
 from ..core.status import Residual, Result, Status, digits, sentence
 from ..numerics.minimise import Minimiser
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
+from ..terms.refresh import Moment
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
@@ -53,7 +55,9 @@ def equilibrium(
 ) -> Equilibrium:
     """Finds the shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins in their final positions.
 
-    Pins with keyframes end at the last keyframe; all others stay where they start.
+    Pins with keyframes end at the last keyframe; all others stay where they start. Loads have the values of their last
+    keyframes, and pressure, which follows the cloth, is that of the shape found: its forces are kept while the cloth settles
+    and taken anew until they balance; ``stable`` and ``lowest_eigenvalue`` are of these forces.
 
     Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
     the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
@@ -67,7 +71,8 @@ def equilibrium(
             (without any, over the largest at the start). Where rounding leaves more at a vertex, the descent ends when nothing
             is left to gain, and the residual decides; with half the weight or more unbalanced it does not pass for a rest
             shape. Without gravity there is no load to hide.
-        load_steps: Number of steps in which gravity grows and pins move along their keyframes. Pins that turn far need several.
+        load_steps: Number of steps in which gravity and loads grow and pins move along their keyframes. Pins that turn far need
+            several.
         iterations: The most Newton iterations in all.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
@@ -99,7 +104,7 @@ def equilibrium(
     descent = _Descent(minimiser, base, tolerance, iterations)
     for part in range(1, load_steps + 1):
         _move_pins(scene.pins, base, part / load_steps)
-        result = descent.run(part / load_steps, _frequency_scale(model))
+        result = _settle_loads(model, base, descent, part / load_steps)
     # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
     if result in SETTLED and minimiser.curves_down(tolerance):
         base.assign(base.numpy() + _nudge(model))
@@ -154,6 +159,13 @@ class _Descent:
             s /= 16.0
             self.used += 1  # so that a round which finds no direction at all ends too
 
+    def balanced(self):
+        """Whether the loads as they are now leave no more unbalanced than the tolerance, or than rounding did before."""
+        before = self.unbalanced
+        self.minimiser.clear()
+        self.unbalanced = float(self.minimiser.unbalanced()[0])
+        return self.unbalanced <= max(self.tolerance * self.load, 2.0 * before)
+
     @property
     def residual(self):
         """The fraction of the load that is unbalanced after the last descent."""
@@ -172,6 +184,21 @@ class _Descent:
         self.moved = np.abs(correction).max(initial=0.0) / self.size
         self.base.assign(self.base.numpy() + correction)
         return result
+
+
+def _settle_loads(model, base, descent, part):
+    """Descends under the fraction ``part`` of all loads, again where these follow the cloth until they no longer change it."""
+    while True:
+        if model.loads is not None:
+            # Of keyframes the last, whatever their number.
+            model.loads.set(model, Moment(base, ahead=MOST_FRAMES))
+        result = descent.run(part, _frequency_scale(model))
+        if model.loads is None or not model.loads.follows or result not in SETTLED or descent.used >= descent.iterations:
+            return result
+        model.loads.set(model, Moment(base, ahead=MOST_FRAMES))
+        if descent.balanced():
+            return result
+        descent.used += 1
 
 
 def _halved(found, least):

@@ -11,6 +11,7 @@ import numpy as np
 from ..numerics.rotation import kabsch
 from ..scene.scene import Pins
 from ..solvers.solver import Stepper
+from ..terms.loads import Loads
 
 # More patches of pins than this are treated as one patch, whose pins move within it.
 _PATCHES = 32
@@ -174,6 +175,58 @@ class MovingPins(Source):
             x = elastic.put(np.tile(points, (self._balance.model.copies, 1)))
             self._stored = np.maximum(self._stored, elastic.energy(x))
         return self._stored
+
+
+class DrivenLoads(Source):
+    """Loads that change or follow the cloth, and any on a cloth that nothing holds; others count with the height.
+
+    Forces f on masses m give the power Σ f·v ≤ (Σ f²/m · Σ m v²)^½. With the acceleration a² = Σ f²/m / Σ m they add the speed
+    δ = a/fps to the cloth in a frame, and so at most ½δ² + δ·speed per unit mass.
+    """
+
+    name = "loads"
+    carried = ("_given",)
+
+    def __init__(self, balance):
+        model, loads = balance.model, balance.model.loads
+        self._balance, self._given = balance, np.zeros(model.copies)
+        vertices = loads.dead.vertices.numpy()
+        vertices = vertices if model.order is None else model.order[vertices]
+        self._dead = np.linalg.norm(loads.dead.keyframes.numpy().astype(np.float64), axis=-1)
+        self._vertices, mass = vertices, balance.mass[:, vertices]
+        self._inverse = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0.0)
+        self._triangles = self._pressure = None
+        if loads.follows:
+            triangles = loads.pressed.triangles.numpy()
+            self._triangles = triangles if model.order is None else model.order[triangles]
+            self._pressure = np.abs(loads.pressed.keyframes.numpy().astype(np.float64))
+
+    def energy(self, frame, speed):
+        balance = self._balance
+        force = self._during(self._dead, frame)
+        if self._triangles is not None:
+            a, b, c = np.moveaxis(balance.points.reshape(*balance.mass.shape, 3)[:, self._triangles], 2, 0)
+            pull = self._during(self._pressure, frame) * np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 6.0
+            at = np.zeros(balance.mass.shape)
+            for corner in self._triangles.T:
+                np.add.at(at, (slice(None), corner), pull)
+            force = force + at[:, self._vertices]
+        total = np.where(balance.total > 0.0, balance.total, 1.0)
+        kick = np.sqrt((force**2 * self._inverse).sum(axis=1) / total) / balance.model.scene.fps
+        self._given = self._given + balance.total * kick * (speed + 0.5 * kick)
+        return self._given
+
+    @staticmethod
+    def _during(values, frame):
+        """The larger of the values at the two ends of a frame; they are linear between them."""
+        last = len(values) - 1
+        return np.maximum(values[min(frame - 1, last)], values[min(frame, last)])
+
+
+@source_of.register
+def _loaded(loads: Loads, balance, _stepper):
+    held = loads and balance.model.loads.constant is not None and not balance.free
+    return DrivenLoads(balance) if loads and not held else None
 
 
 @source_of.register

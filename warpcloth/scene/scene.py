@@ -15,6 +15,7 @@ from ..mesh.selection import distinct_vertices
 from ..mesh.stage_mesh import StageMesh
 from ..model.model import Model
 from ..terms.declared import Declared
+from ..terms.loads import Load, Loads, checked_loads
 
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
@@ -95,6 +96,7 @@ class Scene:
         free_axes: The axes of space along which each vertex may move, (n, 3) truth values; by default all. A locked coordinate
             keeps its value, and its velocity is 0, which makes planes of symmetry and rails. A vertex without a free axis is
             a pin that stands still. Values of pinned vertices are ignored.
+        loads: Forces, tractions and pressures on the cloth: :class:`Force`, :class:`Traction`, :class:`Pressure`.
 
     Raises:
         ValueError: If a value breaks a rule; the sentence names it.
@@ -120,11 +122,12 @@ class Scene:
     name: str = "scene"
     stage: StageMesh | None = None
     free_axes: Converted[ArrayLike | None, np.ndarray | None] = default(None)
+    loads: Converted[Load | Iterable[Load], Loads] = default(())
 
     @property
     def declared(self) -> tuple[object, ...]:
         """All that it declares besides the cloth itself; any of it may put energy into the cloth."""
-        return (self.pins, *self.terms)
+        return (self.pins, *self.terms, self.loads)
 
     def __post_init__(self) -> None:
         if not isinstance(self.mesh, Mesh):
@@ -147,6 +150,7 @@ class Scene:
         keep("positions", self.mesh.points if self.positions is None else array("positions", self.positions, (n, 3)))
         keep("velocities", np.zeros((n, 3)) if self.velocities is None else array("velocities", self.velocities, (n, 3)))
         keep("pins", checked_pins(self.pins, self.mesh))
+        keep("loads", checked_loads(self.loads, self.mesh))
         keep("free_axes", _checked_axes(self.free_axes, n))
         self.pins.refuse_far(self.positions)
         if (self.density is None) == (self.masses is None):
@@ -252,7 +256,7 @@ class Scene:
         if self.locked is not None:
             counts = ", ".join(f"{count} {axis}" for axis, count in zip("xyz", self.locked.sum(axis=0), strict=True))
             lines.append(f"  locked coordinates: {counts}")
-        return "\n".join(lines + [f"  {_described(term)}" for term in self.terms])
+        return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
 
 
 def _checked_axes(free_axes, n):

@@ -50,7 +50,8 @@ class Stepper:
         self.h = 1.0 / (fps * self.steps_per_frame)
         motion = self._motion or (wp.clone(model.positions), wp.clone(model.velocities))
         self.state = State(*motion, model.copies)
-        self.count = None if model.pins is None else model.scalars(wp.int32)
+        timed = model.pins is not None or (model.loads is not None and model.loads.timed)
+        self.count = model.scalars(wp.int32) if timed else None
         self.state.add("steps of keyframes", self.count)
         self._reset = None
         self.integrator, self.he = None, self.h
@@ -90,14 +91,16 @@ class Stepper:
         self.launch_pins_of(self.model.pins, self.model.keyframes, self.count, x, v, parts)
 
     def launch_pins_of(self, pins, keyframes, count, x, v, parts=1):
-        """Moves these pins, or none, on in x and v (N,) as `launch_pins` does; ``count`` counts their steps."""
-        if pins is None:
-            return
+        """Moves these pins, or none, on in x and v (N,) as `launch_pins` does; ``count`` counts steps of pins and loads."""
         model = self.model
+        add_one = model.kernel(kernels.count_step) if count is not None else None
+        if pins is None:
+            if model.loads is not None and model.loads.timed:
+                model.launch(add_one, model.copies, [], [count])
+            return
         dim = (model.copies, len(pins))
         partly = model.pin_axes is not None  # then they are those of the model, for its steps are not divided
         move = model.kernel(kernels.guide_pins if partly else kernels.move_pins, model.dtype)
-        add_one = model.kernel(kernels.count_step)
         given = [pins, keyframes, *[model.pin_axes] * partly, count, parts * self.steps_per_frame, model.per_copy]
         model.launch(move, dim, [*given, self.h / parts], [x, v])
         model.launch(add_one, model.copies, [], [count])

@@ -25,6 +25,9 @@ class Moment(NamedTuple):
         move: Array (N,) whose ``scale``-fold is, where a step begins, the last move of BDF2 or hₑ v of midpoint [m]; None for
             Euler.
         scale: 1 if ``move`` is in metres, or the time [s] by which velocities are multiplied.
+        steps: Number of steps of keyframes that each copy has made, (B,) int32, or None where nothing follows keyframes.
+        per_frame: Number of these steps in a frame.
+        ahead: Number of these steps from where a step begins to where it takes forces.
     """
 
     x: wp.array
@@ -32,6 +35,9 @@ class Moment(NamedTuple):
     integrator: str = "euler"
     move: wp.array | None = None
     scale: float = 1.0
+    steps: wp.array | None = None
+    per_frame: int = 1
+    ahead: int = 0
 
 
 @dataclass(frozen=True, eq=False)

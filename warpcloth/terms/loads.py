@@ -1,0 +1,186 @@
+"""Loads: forces on vertices, tractions on edges and pressures on triangles, constant or led by keyframes."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..base.checks import numeric, refuse, shown
+from ..mesh.mesh import Mesh
+from ..mesh.selection import distinct_vertices
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Load:
+    """The base of all loads. Give its value, which stays, or keyframes of it.
+
+    Attributes:
+        quantity: Name of the field of the value.
+        shape: Shape of one value.
+        acts_on: Its elements, in words.
+        vertices: Indices (p,), or a selection of the mesh such as ``"x == 1"``, as of pins.
+        keyframes: The value at frames 0 … F−1 of the scene, (F, …); linear between them, and constant after the last.
+        name: To tell two loads of one kind apart.
+
+    Raises:
+        ValueError: If a value breaks a rule; a scene checks vertices and the lengths of arrays.
+    """
+
+    quantity: ClassVar[str]
+    shape: ClassVar[tuple[int, ...]]
+    acts_on: ClassVar[str]
+
+    vertices: str | Sequence[int] | np.ndarray
+    keyframes: Sequence | np.ndarray | None = None
+    name: str | None = None
+
+    def __post_init__(self):
+        if (getattr(self, self.quantity) is None) == (self.keyframes is None):
+            raise ValueError(f"{self.label}: exactly one of {self.quantity} and keyframes must be given")
+        if not (self.name is None or isinstance(self.name, str)):
+            raise ValueError(f"{type(self).__name__}.name is {shown(self.name)}; it must be a text or None")
+        self._values()
+
+    @property
+    def label(self) -> str:
+        """The name, or else that of the class."""
+        return self.name or type(self).__name__
+
+    def elements(self, mesh: Mesh) -> np.ndarray:
+        """Indices of what it acts on, which has one value each: vertices (p,), edges (E, 2) or triangles (T, 3)."""
+        raise NotImplementedError  # every load has its own
+
+    def of_elements(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+        """Finds the elements and the keyframes of each of them.
+
+        Returns:
+            (elements, values): As of :meth:`elements`, and (F, count, …), with F = 1 of a constant load.
+
+        Raises:
+            ValueError: If it acts on nothing, or has another number of values.
+        """
+        found, values = self.elements(mesh), self._values()
+        if not len(found):
+            raise ValueError(f"{self.label} acts on nothing, for the mesh has no {self.acts_on}; leave the load out")
+        count, each = values.shape[: self.keyframes is not None], (len(found), *self.shape)
+        if values.shape not in ((*count, *self.shape), (*count, *each)) or count == (0,):
+            given, many = values.shape, ("F",) * len(count)
+            shapes = [str((*many, *shape)).replace("'F'", "F") for shape in (self.shape, each)]
+            raise ValueError(
+                f"{self._field} has shape {given}; it must be {' or '.join(shapes)} for {len(found)} {self.acts_on}"
+            )
+        values = values if count else values[None]
+        values = values if values.shape[1:] == each else values[:, None]
+        return found, np.broadcast_to(values, (len(values), *each))
+
+    @property
+    def _field(self):
+        return f"{self.label}.{self.quantity if self.keyframes is None else 'keyframes'}"
+
+    def _values(self):
+        given = getattr(self, self.quantity) if self.keyframes is None else self.keyframes
+        values = numeric(self._field, given, "be a number or an array of numbers")
+        refuse(self._field, values, ~np.isfinite(values), "must be finite")
+        return values
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Force(Load):
+    """Forces on vertices, which keep their direction.
+
+    Attributes:
+        force: [N] on each vertex, (3,), or (p, 3).
+        keyframes: (F, 3) or (F, p, 3) [N].
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> chain, spring = wc.Mesh.chain(2), wc.Spring(stiffness=1e3)
+        >>> pull = wc.Force(vertices=[1], force=(0, -10, 0))
+        >>> scene = wc.Scene(chain, masses=[1, 1], terms=[spring], pins=[0], gravity=(0, 0, 0), loads=[pull])
+        >>> round(float(-1 - wc.equilibrium(scene).points[1, 1]), 6)  # the force over the stiffness
+        0.01
+    """
+
+    quantity: ClassVar[str] = "force"
+    shape: ClassVar[tuple[int, ...]] = (3,)
+    acts_on: ClassVar[str] = "such vertices"
+
+    force: Sequence | np.ndarray | None = None
+
+    def elements(self, mesh: Mesh) -> np.ndarray:
+        return distinct_vertices(f"{self.label}.vertices", self.vertices, mesh)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Traction(Load):
+    """Tractions on the edges between vertices, which keep their direction; half of t L acts at each end, L the rest length.
+
+    Attributes:
+        vertices: An edge of the mesh is pulled if both of its ends are among these.
+        traction: t [N/m] of rest length, (3,), or (E, 3) in the order of ``mesh.edges``.
+        keyframes: (F, 3) or (F, E, 3) [N/m].
+    """
+
+    quantity: ClassVar[str] = "traction"
+    shape: ClassVar[tuple[int, ...]] = (3,)
+    acts_on: ClassVar[str] = "edges between such vertices"
+
+    traction: Sequence | np.ndarray | None = None
+
+    def elements(self, mesh: Mesh) -> np.ndarray:
+        return mesh.edges[_within(self, mesh, mesh.edges)]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pressure(Load):
+    """Pressure on triangles, along their normals as they turn: p A n/3 at each corner, A and n those of the moving triangle.
+
+    The normal is that of the corners in their order, right-handed. Pressure on cloth with free edges has no energy, so steps
+    take its force where they begin: explicit steps at x, implicit ones of Euler at x too, of midpoint at x + ½h v, and of BDF2
+    at 2xₙ − xₙ₋₁, which keeps the order of each of them.
+
+    Attributes:
+        vertices: A triangle is pressed if all of its corners are among these.
+        pressure: p [Pa], a number, or (T,) in the order of ``mesh.triangles``.
+        keyframes: (F,) or (F, T) [Pa].
+    """
+
+    quantity: ClassVar[str] = "pressure"
+    shape: ClassVar[tuple[int, ...]] = ()
+    acts_on: ClassVar[str] = "triangles of such vertices"
+
+    pressure: float | Sequence[float] | np.ndarray | None = None
+
+    def elements(self, mesh: Mesh) -> np.ndarray:
+        return mesh.triangles[_within(self, mesh, mesh.triangles)]
+
+
+class Loads(tuple[Load, ...]):
+    """All loads of a scene."""
+
+
+LOADS = {kind.__name__: kind for kind in (Force, Traction, Pressure)}
+
+
+def checked_loads(loads: Any, mesh: Mesh) -> Loads:
+    """Returns the loads of a scene on a mesh.
+
+    Raises:
+        ValueError: One is no load, or does not fit the mesh.
+    """
+    if not isinstance(loads, Iterable):
+        loads = (loads,)
+    loads = Loads(loads)
+    for k, load in enumerate(loads):
+        if not isinstance(load, Load):
+            raise ValueError(f"loads[{k}] is {shown(load)}; it must be a Force, Traction or Pressure")
+        load.of_elements(mesh)
+    return loads
+
+
+def _within(load, mesh, elements):
+    """Which edges or triangles have all of their vertices among those of a load, (count,) truth values."""
+    chosen = np.zeros(len(mesh.points), dtype=bool)
+    chosen[distinct_vertices(f"{load.label}.vertices", load.vertices, mesh)] = True
+    return chosen[elements].all(axis=1)
