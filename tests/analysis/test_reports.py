@@ -13,9 +13,10 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 import warpcloth as wc
 from support.usd_validation import validate
 from warpcloth.analysis.measures import scalars
+from warpcloth.base.texts import camel_case
 from warpcloth.chart import Scale
 from warpcloth.cli import main
-from warpcloth.cli.reports import camel, write_report
+from warpcloth.cli.reports import write_report
 from warpcloth.picture.colour import table
 from warpcloth.picture.measured import scalar_names
 from warpcloth.scenes import hanging
@@ -67,7 +68,7 @@ def test_every_file_says_what_the_arrays_say(cloth, tmp_path, neighbourhood):
         for measure in measures:
             assert np.array_equal(archive[measure], expected[measure], equal_nan=True)
     for name, values in fields.items():
-        read = FrameSequence(str(tmp_path / "out.usdc"), attribute=f"primvars:{camel(name)}")
+        read = FrameSequence(str(tmp_path / "out.usdc"), attribute=f"primvars:{camel_case(name)}")
         assert np.array_equal(np.asarray(read), values.astype(np.float32), equal_nan=True), name
     scale = Scale(*report.scale, 1.0)
     ends = [np.percentile(values, [1, 99]) for values in fields["stretch_2"]]

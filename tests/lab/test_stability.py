@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.chart.maps import _PLAIN, plot_maps, write_table
+from warpcloth.chart.maps import _PLAIN, plot_maps, write_csv
 from warpcloth.cli import _parser, main
 from warpcloth.cli.stability import _survey
 from warpcloth.lab import machine, stability
@@ -672,7 +672,7 @@ def test_a_map_is_drawn(tmp_path, monkeypatch):
 
 def test_a_table_has_a_line_for_each_cell(tmp_path):
     survey, cells = made_up()
-    write_table(tmp_path / "map.csv", survey, cells)
+    write_csv(tmp_path / "map.csv", survey, cells)
     with open(tmp_path / "map.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 8 and rows[4]["verdict"] == "diverged" and rows[4]["step"] == "1" and rows[0]["step"] == ""

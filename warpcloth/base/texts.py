@@ -28,6 +28,12 @@ def words_of(record):
     return {name: typing.get_args(hint) for name, hint in hints.items() if typing.get_origin(hint) is typing.Literal}
 
 
+def camel_case(name):
+    """A name as USD has it: ``stretch_1`` is ``stretch1``, ``area_ratio`` is ``areaRatio``."""
+    first, *others = name.split("_")
+    return first + "".join(word.capitalize() for word in others)
+
+
 def assignments(texts):
     """A dict from texts of the form ``name=value``.
 

@@ -1,11 +1,10 @@
 """Maps of stability: a panel for each method, with the limits that theory gives, and the same as a table."""
 
-import csv
 import math
 
 import numpy as np
 
-from ..base.outputs import TEXT, Output
+from ..base.outputs import write_table
 from ..lab.axes import AXES
 from ..lab.cells import FRAMES
 from ..lab.stability_limits import DIVERGES, KNOWN
@@ -175,7 +174,7 @@ def _legend(figure, shown, verdicts, accuracy):
     figure.legend(handles=entries, loc="outside lower center", ncols=columns, frameon=False, fontsize=_SMALL, labelcolor=GREY)
 
 
-def write_table(path, survey, cells):
+def write_csv(path, survey, cells):
     """Writes a line for each cell of the maps.
 
     Its columns are method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules and reason, and
@@ -186,12 +185,12 @@ def write_table(path, survey, cells):
     """
     names = list(dict.fromkeys(name for rows in cells for row in rows for cell in row for name in cell["rules"]))
     plain = ("verdict", "step", "steps", "growth", "error", "floor")
-    with Output(path, "x", **TEXT) as output:
-        table = csv.writer(output.file, lineterminator="\n")
-        table.writerow(["method", survey.x, survey.y, *plain, *names, "reason", "machine"])
+
+    def lines():
         for setup, rows in zip(survey.setups, cells, strict=True):
             for y, row in zip(survey.ys, rows, strict=True):
                 for x, cell in zip(survey.xs, row, strict=True):
-                    values = [cell[name] for name in plain] + [cell["rules"].get(name) for name in names]
-                    ends = cell["reason"], cell.get("machine", "")
-                    table.writerow([str(setup), x, y, *("" if v is None else v for v in values), *ends])
+                    ratios = [cell["rules"].get(name) for name in names]
+                    yield [str(setup), x, y, *(cell[name] for name in plain), *ratios, cell["reason"], cell.get("machine")]
+
+    write_table(path, ["method", survey.x, survey.y, *plain, *names, "reason", "machine"], lines())

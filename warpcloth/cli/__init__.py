@@ -19,6 +19,7 @@ import warnings
 import numpy as np
 
 from ..base.interrupts import Interrupts
+from ..base.version import installed_version
 from . import analyze, bench, chart, choose, compare, deform, info, options, render, run, scenes
 from .terminal import DTYPES, Printable, say, show_warning
 
@@ -94,7 +95,8 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser():
     parser = _Parser(prog="warpcloth", description="Simulate cloth and write it as USD.", allow_abbrev=False)
-    parser.add_argument("--version", action="version", version=f"warpcloth {_version()}")
+    version = installed_version() or "(a checkout that is not installed)"
+    parser.add_argument("--version", action="version", version=f"warpcloth {version}")
     parser.set_defaults(command=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
 
@@ -123,18 +125,12 @@ def _parser():
     benches = add("bench", bench.bench, "Measure the time and memory of frames, or compare two results.", epilog=bench.EPILOG)
     bench.add_arguments(benches)
     for sub in (runs, infos):
-        sub.add_argument(
-            "scene",
-            metavar="SCENE",
-            help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
-        )
+        options.add_scene(sub)
         of_info = "also show the step and the kernels of this solver (default with -s or --advise: newton)"
         sub.add_argument(
             "--solver", choices=options.solvers(), help=of_info if sub is infos else "the solver (default: newton)"
         )
-        for option, of, text in (("-s", "option", "options of the solver"), ("-p", "parameter", "parameters of the scene")):
-            text = f"{text}; '{option} help' lists them"
-            sub.add_argument(option, nargs="+", action="extend", default=[], metavar=f"{of}=value", help=text)
+        options.add_values(sub, "-s", "option", "options of the solver")
         sub.add_argument("--prim", help="path or name of the cloth's prim, if the stage has several meshes")
         sub.add_argument(
             "--pins", metavar="SELECTION", help="pin these vertices in place of the scene's pins, such as 'x < 0.1'"
@@ -181,12 +177,3 @@ def _parser():
         "folder", metavar="FOLDER", nargs="?", help="a folder of scene files (default: ./scenes and the included scenes)"
     )
     return parser
-
-
-def _version():
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("warpcloth")
-    except PackageNotFoundError:
-        return "(a checkout that is not installed)"

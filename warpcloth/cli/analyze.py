@@ -1,13 +1,14 @@
 """The command ``analyze``: measures an animation, and writes what it found as a stage, tables, arrays and pictures."""
 
 import time
+from contextlib import closing
 from pathlib import Path
 
 from ..base.checks import choice
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import convert
-from .terminal import Progress, check_writable, frames_folder_of, json_text, location
+from .terminal import Progress, aligned, check_writable, frames_folder_of, json_text, location
 
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays in .npz or .npy.
@@ -128,8 +129,8 @@ def analyze(arguments):
     started = time.perf_counter()
     view = _view(arguments)
     analyzer = _analyzer(arguments)
-    stills, progress = _stills(arguments, analyzer), Progress(len(analyzer), first="measuring")
-    try:
+    stills = _stills(arguments, analyzer)
+    with closing(Progress(len(analyzer), first="measuring")) as progress:
         found = write_report(
             analyzer,
             usd=arguments.output,
@@ -148,8 +149,6 @@ def analyze(arguments):
             both_sides=arguments.both_sides,
             colormap=arguments.colormap,
         )
-    finally:
-        progress.close()
     facts = {
         "input": arguments.input,
         "vertices": len(analyzer.mesh.points),
@@ -276,8 +275,7 @@ def _summary(facts):
             continue
         cells = [(f"{end['value']:.5g}", f"{end['frame']:g}", str(end["element"])) for end in ends.values()]
         rows.append((name, *cells[0], *cells[1], ends["largest"]["unit"]))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    table = ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    table = [f"  {line}" for line in aligned(rows)]
     frames = f"{facts['rows']} from {facts['first_frame']:g} to {facts['last_frame']:g}"
     of = f"{facts['triangles']} triangles" if facts["measured"] == "triangle" else f"{facts['vertices']} vertices"
     around = f", {facts['neighbourhood']}" if facts["neighbourhood"] else ""

@@ -6,9 +6,9 @@ from ..base.checks import whole
 from ..base.outputs import Output, check_apart
 from ..base.quiet import find_device
 from ..base.texts import assignments, options
-from .options import DEFAULT, solvers
+from .options import DEFAULT, add_scene, add_values, solvers
 from .setup import named_scene, solver_setup
-from .terminal import Interrupted, check_writable, json_text, open_bar, say
+from .terminal import Interrupted, aligned, check_writable, json_text, open_bar, say
 
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
@@ -42,24 +42,9 @@ _OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": 
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
-    add(
-        "scene",
-        nargs="?",
-        metavar="SCENE",
-        help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
-    )
-    add(
-        "-p",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="parameter=value",
-        help="parameters of the scene; '-p help' lists them",
-    )
+    add_scene(parser, nargs="?")
     add("--solver", choices=solvers(), help="the solver (default: newton)")
-    add(
-        "-s", nargs="+", action="extend", default=[], metavar="option=value", help="options of the solver; '-s help' lists them"
-    )
+    add_values(parser, "-s", "option", "options of the solver")
     add(
         "--sizes",
         nargs="+",
@@ -201,7 +186,10 @@ def _text(facts):
     machine, copied = facts["machine"], " and ".join(f"{1e-9 * each:.3g}" for each in facts["bandwidth"].values())
     name = machine["processor"] if machine["device"] == "cpu" else machine["device"]
     table = [("", "", *_HEAD), *(_cells(row) for row in facts["rows"])]
-    lines = [f"{name}, warp {machine['warp']}; a copy and a kernel that copies move {copied} GB/s", *_aligned(table)]
+    lines = [
+        f"{name}, warp {machine['warp']}; a copy and a kernel that copies move {copied} GB/s",
+        *_aligned(table),
+    ]
     for each in facts["growth"]:
         words = [each["solver"], *(f"{name}={value}" for name, value in each["options"].items())]
         powers = [f"{p:.2f}" + ("" if error is None else f" ± {error:.2f}") for p, error in (each["frame"], each["iteration"])]
@@ -241,10 +229,8 @@ def _number(value):
 
 
 def _aligned(table):
-    """Rows of texts as lines: two columns to the left, numbers to the right, and a remark."""
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    pads = (str.ljust, str.ljust, *[str.rjust] * (len(widths) - 3), str.ljust)
-    return ["  ".join(pad(text, width) for pad, text, width in zip(pads, row, widths, strict=True)).rstrip() for row in table]
+    """Lines of two columns to the left, numbers to the right, and a remark."""
+    return aligned(table, range(2, len(table[0]) - 1))
 
 
 def _compare(arguments):

@@ -10,7 +10,7 @@ from ..base.texts import assignments
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
-from .options import add_import, solvers
+from .options import add_import, add_scene, solvers
 from .setup import named_scene
 from .terminal import DTYPES, add_dask, check_outputs, json_text, measuring
 
@@ -76,19 +76,7 @@ def add(charts, name, command, text, epilog):
 
 def _add_work_precision(charts):
     sub = add(charts, "work-precision", work_precision, "Chart the error of solvers against their compute time.", EPILOG)
-    sub.add_argument(
-        "scene",
-        metavar="SCENE",
-        help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
-    )
-    sub.add_argument(
-        "-p",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="parameter=value",
-        help="parameters of the scene; '-p help' lists them",
-    )
+    add_scene(sub)
     sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="diagram to measure")
     sub.add_argument(
         "--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure only these solvers (default: all)"

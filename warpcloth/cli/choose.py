@@ -5,6 +5,7 @@ import sys
 
 from ..base.quiet import find_device
 from ..base.texts import assignments, fraction, milliseconds
+from .options import add_scene
 from .setup import named_scene
 from .terminal import Interrupted, Settings, add_dask, executing, json_text
 
@@ -21,19 +22,7 @@ Measurements are stored and reused.
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
-    add(
-        "scene",
-        metavar="SCENE",
-        help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
-    )
-    add(
-        "-p",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="parameter=value",
-        help="parameters of the scene; '-p help' lists them",
-    )
+    add_scene(parser)
     add("--tolerance", metavar="SHARE", help="largest error allowed, such as 1%% of the size of the cloth")
     add("--budget", metavar="TIME", help="longest time per frame allowed, such as 16ms")
     add("--solvers", nargs="+", metavar="NAME", help="solvers to choose among (default: all)")

@@ -1,5 +1,7 @@
 """The command ``compare``: how far two animations are apart."""
 
+from contextlib import closing
+
 import numpy as np
 
 from ..base.checks import whole
@@ -46,12 +48,9 @@ def compare(arguments):
     device = find_device(arguments.device)
     a, b = (_open(arguments, name, opened) for name in ("a", "b"))
     check_apart([arguments.csv, arguments.plot], [*a.files, *b.files, arguments.rest_a, arguments.rest_b])
-    progress = Progress()
-    try:
+    with closing(Progress()) as progress:
         axes = {name: getattr(arguments, name) for name in ("up_axis", "up_axis_a", "up_axis_b")}
         found = compare(a, b, frames=arguments.frames, device=device, progress=progress, **axes)
-    finally:
-        progress.close()
     columns = _columns(found)
     if arguments.csv:
         _write_csv(arguments.csv, columns)

@@ -92,8 +92,7 @@ def advise_on(arguments, source, values, scene, device):
     tolerance = 0.01 if arguments.tolerance is None else fraction("tolerance", arguments.tolerance)
     solver = solver_setup(arguments, scene, device).checked
     resolutions = _resolutions(source, values, len(scene.mesh.points))
-    progress = Progress(None, first="trying")
-    try:
+    with contextlib.closing(Progress(None, first="trying")) as progress:
         found = advise(
             scene,
             solver,
@@ -104,8 +103,6 @@ def advise_on(arguments, source, values, scene, device):
             dtype=arguments.dtype,
             progress=progress,
         )
-    finally:
-        progress.close()
     facts = {
         "scene": scene.name,
         "parameters": values,

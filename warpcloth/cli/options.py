@@ -16,7 +16,7 @@ from ..base.extensions import load_extension, load_installed
 from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import WORDS, kinds_of_parameter, parameters_of, words_of
 from ..run.listing import folders, list_scenes, list_solvers
-from .terminal import json_text
+from .terminal import aligned, json_text
 
 _HELP = "help"
 DEFAULT = "newton"  # solver
@@ -79,8 +79,7 @@ def _text(found):
     rows = [(row["name"], _default(row), _values(row)) for row in found["rows"]]
     if not rows:
         return "\n".join([*lines, "  it has none"])
-    widths = [max(map(len, columns)) for columns in zip(*rows, strict=True)]
-    lines += [f"  {name:<{widths[0]}}  {default:<{widths[1]}}  {allowed}" for name, default, allowed in rows]
+    lines += [f"  {line}" for line in aligned(rows)]
     return "\n".join([*lines, *([found["note"]] if "note" in found else [])])
 
 
@@ -113,6 +112,19 @@ def _allowed(call, name, parameter):
     else:
         rule = " or ".join(words for kind, words in WORDS.items() if kind in kinds) or "nothing written as text"
     return rule.replace("'", "") + (", or none" if type(None) in kinds else "")
+
+
+def add_scene(parser, **more):
+    """Adds the scene and its parameters."""
+    text = "a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage"
+    parser.add_argument("scene", metavar="SCENE", help=text, **more)
+    add_values(parser, "-p", "parameter", "parameters of the scene")
+
+
+def add_values(parser, option, of, text):
+    """Adds an option that takes assignments, such as ``-s substeps=4``."""
+    text = f"{text}; '{option} help' lists them"
+    parser.add_argument(option, nargs="+", action="extend", default=[], metavar=f"{of}=value", help=text)
 
 
 def add_import(parser):

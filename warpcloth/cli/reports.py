@@ -10,6 +10,7 @@ from ..analysis.measures import scalars
 from ..analysis.summaries import CsvWriter, JsonWriter, Summary, summarise
 from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart
+from ..base.texts import camel_case
 from ..picture.measured import neutral_of, scalar_names, scale_of
 
 # Length of a principal direction of stretch 1 beside the square root of the median area of a triangle.
@@ -183,12 +184,6 @@ def _interruptible(report, rows, opened):
         raise Interrupted(f"interrupted after {report.rows} of {rows} frames; {saved}") from None
 
 
-def camel(name):
-    """A name as USD has it: ``stretch_1`` is ``stretch1``, ``area_ratio`` is ``areaRatio``."""
-    first, *others = name.split("_")
-    return first + "".join(part[:1].upper() + part[1:] for part in others)
-
-
 def _check(analyzer, listed, usd, stills, colour, curves):
     if (usd or stills) and not listed:
         raise ValueError(f"colour: {analyzer.measures[0].name} has no number to be coloured; measure something else too")
@@ -298,8 +293,8 @@ class _Shown:
             self.writer = MeasureWriter(
                 usd,
                 analyzer.mesh if sequence.stage is None else sequence.mesh,
-                {camel(name): kind for name in listed},
-                coloured=camel(self.name) if self.name else None,
+                {camel_case(name): kind for name in listed},
+                coloured=camel_case(self.name) if self.name else None,
                 directions=dict.fromkeys(names, kind),
                 source=sequence.stage,
                 fps=self.rate,
@@ -313,7 +308,7 @@ class _Shown:
         segments = self._segments(sample, positions) if self.curves else None
         finite = np.isfinite(sample.points).all()
         if self.writer and (self.over or finite):  # without a stage below it a frame needs points
-            primvars = {camel(name): _single(numbers) for name, numbers in values.items()}
+            primvars = {camel_case(name): _single(numbers) for name, numbers in values.items()}
             colours = self.scale.linear(values[self.name]) if self.scale else None
             self.writer.append(self._time_code(sample), primvars, colours, segments, None if self.over else sample.points)
         if sample.frame in self.stills:

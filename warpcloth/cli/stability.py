@@ -6,6 +6,7 @@ from ..base.checks import number, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, options
 from ..lab.axes import ACCURACY, AXES, FIXED, SEED
+from .options import add_scene
 from .terminal import DTYPES, check_outputs, json_text, measuring
 
 _COUNT = 9
@@ -30,19 +31,7 @@ The reference is Newton's method with BDF2 and a quarter of the step, in float64
 
 def add_arguments(parser):
     """Adds what the command takes but for what all charts do."""
-    parser.add_argument(
-        "scene",
-        metavar="SCENE",
-        help="a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage",
-    )
-    parser.add_argument(
-        "-p",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="parameter=value",
-        help="parameters of the scene; '-p help' lists them",
-    )
+    add_scene(parser)
     for of in "xy":
         parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"quantity on the {of} axis")
         parser.add_argument(
@@ -95,10 +84,10 @@ def chart(arguments):
         store = kept_store("stability", run.get("executor"))
         cells = survey.table(sweep(tasks, store=store, **run), store)
     if arguments.output or arguments.csv:
-        from ..chart.maps import plot_maps, write_table
+        from ..chart.maps import plot_maps, write_csv
 
         if arguments.csv:
-            write_table(arguments.csv, survey, cells)
+            write_csv(arguments.csv, survey, cells)
         if arguments.output:
             plot_maps(arguments.output, survey, cells, arguments.accuracy)
     methods = [str(setup) for setup in survey.setups]

@@ -211,6 +211,13 @@ class Progress:
             self.close()
 
 
+def aligned(rows, right=()):
+    """Rows of texts as lines in columns, of which those with the numbers ``right`` are aligned to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    pads = [str.rjust if column in right else str.ljust for column in range(len(widths))]
+    return ["  ".join(pad(text, width) for pad, text, width in zip(pads, row, widths, strict=True)).rstrip() for row in rows]
+
+
 def json_text(facts):
     return json.dumps(_plain(facts), allow_nan=False)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ..base.digest import source_digest
 from ..base.quiet import find_device
+from ..base.version import installed_version
 
 
 def machine(device="cpu"):
@@ -29,7 +30,7 @@ def machine(device="cpu"):
         "numpy": numpy.__version__,
         "scipy": scipy.__version__,
         "warp": wp.__version__,
-        "warpcloth": _version(),
+        "warpcloth": installed_version() or "checkout",
         "source": source_digest(),
     }
 
@@ -55,12 +56,3 @@ def processor():
         lines = []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
-
-
-def _version():
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("warpcloth")
-    except PackageNotFoundError:
-        return "checkout"

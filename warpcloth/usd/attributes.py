@@ -27,6 +27,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ..base.texts import camel_case
 from ..terms import TERMS
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from .values import refuse_unknown, value_of
@@ -125,15 +126,10 @@ def attributes():
                 continue
             rows[field.name] = tuple(dict.fromkeys((*rows.get(field.name, ()), *types)))
     of_terms = [
-        Attribute(f"terms.{name}", f"{TERMS_NAMESPACE}:<name>:{_in_camel_case(name)}", "cloth", types)
+        Attribute(f"terms.{name}", f"{TERMS_NAMESPACE}:<name>:{camel_case(name)}", "cloth", types)
         for name, types in rows.items()
     ]
     return *of_terms, *ATTRIBUTES
-
-
-def _in_camel_case(name):
-    first, *others = name.split("_")
-    return first + "".join(word.capitalize() for word in others)
 
 
 class Values:
