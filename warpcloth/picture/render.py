@@ -134,19 +134,19 @@ def render(
     values, scale = _colours(subjects, colour, colour_range, colormap, mesh, device, measuring)
     picture = _Picture(subjects, shots, size, samples, (azimuth, elevation, zoom), ground, values, scale, device)
     times = [shot.time for shot in shots]
-    film = open_film(output, size, times)
-    try:
-        with film:
+    with open_film(output, size, times) as film:
+        try:
             if progress is not None:
                 progress(0, len(shots))
             for image in picture.images(time):
                 film.add(image)
                 if progress is not None:
                     progress(film.frames, len(shots))
-    except KeyboardInterrupt:
-        if not film.frames:
-            raise Interrupted("interrupted before the first picture; nothing was saved") from None
-        raise Interrupted(f"interrupted after {film.frames} of {len(shots)} pictures, which are in {output}") from None
+        except KeyboardInterrupt:
+            if not film.frames:
+                film.discard()
+                raise Interrupted("interrupted before the first picture; nothing was saved") from None
+            raise Interrupted(f"interrupted after {film.frames} of {len(shots)} pictures, which are in {output}") from None
     if picture.left_out:
         warnings.warn(
             f"{picture.left_out} triangles, lines or pins without a finite position are not drawn, in all pictures together",

@@ -1,0 +1,466 @@
+"""Pictures and films: every source and ending, what films hold, and what is refused."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+import warpcloth as wc
+from support.command_line import refused, run
+from warpcloth.picture import render as rendering
+from warpcloth.picture.colour import Scale
+from warpcloth.picture.films import durations
+from warpcloth.picture.measured import scale_of
+from warpcloth.picture.overlay import Overlay, round_numbers
+from warpcloth.picture.subjects import subject_of
+from warpcloth.usd import AnimationWriter
+
+SMALL = {"size": (64, 36), "samples": 1}
+SIZE = ("--size", "64x36", "--samples", "1")
+FPS, FRAMES = 24.0, 6
+MESH = wc.Mesh.grid(4, 4)
+STAGE = """#usda 1.0
+(
+    metersPerUnit = 0.01
+    upAxis = "Z"
+    timeCodesPerSecond = 30
+)
+def Mesh "Sheet"
+{
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points = [(0, 0, 0), (100, 0, 0), (100, 100, 0), (0, 100, 0)]
+    point3f[] points.timeSamples = {
+        1: [(0, 0, 50), (100, 0, 50), (100, 100, 50), (0, 100, 50)],
+        3: [(0, 0, 20), (100, 0, 20), (100, 100, 20), (0, 100, 20)],
+    }
+}
+def Mesh "Table"
+{
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    point3f[] points = [(0, 0, 0), (100, 0, 0), (0, 100, 0)]
+    double3 xformOp:translate = (0, 0, -10)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+def BasisCurves "Rope"
+{
+    uniform token type = "linear"
+    int[] curveVertexCounts = [3]
+    point3f[] points = [(0, 0, 50), (50, 50, 90), (100, 100, 50)]
+    float[] widths = [4]
+}
+def Mesh "Guide"
+{
+    uniform token purpose = "guide"
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+}
+def Mesh "Hidden"
+{
+    token visibility = "invisible"
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+}
+"""
+
+
+def moved(frame):
+    """A sheet that is lifted, and stretched along x."""
+    return MESH.points * [1.0 + 0.05 * frame, 1.0, 1.0] + [0.0, 0.1 * frame, 0.0]
+
+
+MOTION = np.array([moved(frame) for frame in range(FRAMES)])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Files of every kind with the motion."""
+    found = tmp_path_factory.mktemp("sources")
+    with AnimationWriter(found / "cloth.usdc", MESH, FPS, pins={"pins": [0, 3]}) as writer:
+        for points in MOTION:
+            writer.append(points, np.zeros_like(points))
+    (found / "scene.usda").write_text(STAGE)
+    np.savez(found / "cloth.npz", points=MOTION, triangles=MESH.triangles, times=np.arange(FRAMES) / FPS)
+    np.save(found / "cloth.npy", MOTION)
+    (found / "frames").mkdir()
+    for k, points in enumerate(MOTION):
+        rows = [f"v {x} {y} {z}\n" for x, y, z in points] + [f"f {a} {b} {c}\n" for a, b, c in MESH.triangles + 1]
+        (found / "frames" / f"cloth_{10 + 2 * k}.obj").write_text("".join(rows))
+    shutil.copy(found / "frames" / "cloth_10.obj", found / "one.obj")
+    chain = wc.Mesh.chain(4)
+    with AnimationWriter(found / "chain.usdc", chain, FPS) as writer:
+        for k in range(3):
+            writer.append(chain.points + np.array([0.0, 0.1 * k, 0.0]), np.zeros_like(chain.points))
+    return found
+
+
+@pytest.fixture(scope="module")
+def animation():
+    scene = wc.Scene(MESH, density=0.1, terms=[wc.Spring(stiffness=100.0)], pins=[0, 3], duration=0.1)
+    return wc.simulate(scene, wc.PBD(substeps=2), copies=2, dtype="float64")
+
+
+def picture(path):
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+@pytest.mark.parametrize(
+    ("name", "shapes", "labels", "interval"),
+    [
+        ("cloth.usdc", 1, list(range(FRAMES)), 1 / 24),
+        ("scene.usda", 3, [1, 3], 2 / 30),
+        ("chain.usdc", 1, [0, 1, 2], 1 / 24),
+        ("cloth.npz", 1, list(range(FRAMES)), 1 / 24),
+        ("frames", 1, [10, 12, 14, 16, 18, 20], None),
+        ("frames/*.obj", 1, [10, 12, 14, 16, 18, 20], None),
+        ("one.obj", 1, [0], None),
+    ],
+)
+def test_every_file_is_drawn(folder, name, shapes, labels, interval, tmp_path):
+    source, path = folder / name, tmp_path / "out.png"
+    subject = subject_of(source)
+    assert len(subject.shapes) == shapes and subject.labels.tolist() == labels
+    assert subject.times is None if interval is None else np.diff(subject.times)[0] == pytest.approx(interval)
+    assert wc.render(source, path, **SMALL) == str(path)
+    image = picture(path)
+    assert image.shape == (36, 64, 3)
+    blue = image[..., 2] - image[..., 0]
+    assert "chain" in name or (blue > 40).mean() > 0.05, "the cloth is blue"
+
+
+def test_a_stage_shows_its_surroundings_in_metres_and_nothing_hidden(folder):
+    subject = subject_of(folder / "scene.usda")
+    sheet, table, rope = subject.shapes
+    assert subject.up_axis == "Z" and subject.coloured == 0 and len(sheet.triangles) == 2
+    assert len(rope.lines) == 2 and rope.radius == pytest.approx(0.02)
+    assert len({tuple(shape.colour) for shape in subject.shapes}) == 3
+    points = subject.read(1)
+    assert points[0][:, 2] == pytest.approx([0.2] * 4) and points[1][:, 2] == pytest.approx([-0.1] * 3)
+    chosen = subject_of(folder / "scene.usda", prim="Table")
+    assert chosen.shapes[0].count == table.count and tuple(chosen.shapes[0].colour) == tuple(sheet.colour)
+    pinned = subject_of(folder / "cloth.usdc").shapes[0]
+    assert pinned.balls.tolist() == [0, 3] and pinned.ball_radius > 0.0
+
+
+def test_every_result_of_python_is_drawn(animation, tmp_path):
+    scene = animation.scene
+    deformed = wc.deform(MESH, wc.Pins([0, 3], [MESH.points[[0, 3]]] * 2))
+    sequence = wc.as_sequence(MESH, MOTION, dt=1 / FPS)
+    for source, options in (
+        (scene, {}),
+        (MESH, {}),
+        (wc.Mesh.chain(5), {}),
+        (deformed, {}),
+        (sequence, {}),
+        (MOTION, {"mesh": MESH}),
+        (list(MOTION), {"mesh": MESH}),
+        (animation, {"copy": 1}),
+        ([MESH, sequence], {}),
+    ):
+        path = tmp_path / "out.png"
+        wc.render(source, path, **SMALL, **options)
+        image = picture(path)
+        assert np.ptp(image) > 50
+        path.unlink()
+
+
+def test_cloths_of_a_batch_stand_side_by_side(animation):
+    both, one = subject_of(animation, azimuth=0.0), subject_of(animation, copy=0)
+    n = len(MESH.points)
+    assert both.shapes[0].count == 2 * n and one.shapes[0].count == n and len(both.shapes[0].balls) == 4
+    points = both.read(2)[0]
+    width = np.ptp(np.asarray(animation.points)[..., 0])
+    assert points[n:] - points[:n] == pytest.approx(np.tile([1.12 * width, 0.0, 0.0], (n, 1)), abs=1e-6 + 0.12 * width)
+    assert points[n:, 0].min() > points[:n, 0].max()
+
+
+def test_strings_and_bars_of_a_scene_are_drawn():
+    from warpcloth.scenes import mobile
+
+    scene = mobile.scene(n=3)
+    subject = subject_of(scene)
+    lines = [shape for shape in subject.shapes if len(shape.lines)]
+    assert len(lines) == 2 and all(shape.count == len(scene.mesh.points) for shape in subject.shapes)
+
+
+@pytest.mark.parametrize("ending", [".png", ".gif", ".mp4"])
+def test_the_same_bytes_come_twice(folder, ending, tmp_path):
+    if ending == ".mp4":
+        pytest.importorskip("av")
+    paths = [tmp_path / f"{name}{ending}" for name in "ab"]
+    for path in paths:
+        wc.render(folder / "cloth.usdc", path, **SMALL, time=True)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [path.name for path in paths]
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "count", "rate"),
+    [
+        ("cloth.usdc", {}, 6, 24),
+        ("cloth.usdc", {"every": 2}, 3, 12),
+        ("cloth.usdc", {"frames": (1, 3)}, 3, 24),
+        ("cloth.usdc", {"frames": (None, 3), "speed": 0.5}, 4, 12),
+        ("scene.usda", {}, 2, 15),
+        ("frames", {"fps": 60.0}, 6, 30),
+        ("frames", {}, 6, 12),
+    ],
+)
+def test_a_film_plays_in_real_time(folder, source, options, count, rate, tmp_path):
+    av = pytest.importorskip("av")
+    path = tmp_path / "out.mp4"
+    wc.render(folder / source, path, **SMALL, **options)
+    with av.open(path) as film:
+        stream = film.streams.video[0]
+        assert (stream.width, stream.height, stream.frames, stream.codec_context.pix_fmt) == (64, 36, count, "yuv420p")
+        assert stream.average_rate == rate and stream.codec_context.name == "h264"
+        found = [frame for frame in film.decode(stream)]
+        assert [float(frame.time) for frame in found] == pytest.approx(np.arange(count) / rate, abs=1e-6)
+        assert (found[0].colorspace, found[0].color_range) == (1, 1)
+    data = path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat"), "a browser plays it while it loads"
+
+
+def test_a_film_has_the_colours_of_its_pictures(folder, tmp_path):
+    """H.264 keeps 8 bits of luma in 219 steps, and a quarter of the pixels' chroma."""
+    av = pytest.importorskip("av")
+    wc.render(folder / "cloth.usdc", tmp_path / "a.mp4", **SMALL)
+    wc.render(folder / "cloth.usdc", tmp_path / "a.png", **SMALL)
+    with av.open(tmp_path / "a.mp4") as film:
+        *_, last = film.decode(film.streams.video[0])
+        found = last.reformat(format="rgb24", src_colorspace=1).to_ndarray().astype(int)
+    wanted = rendered_last(folder, tmp_path)
+    assert np.abs(found.mean(axis=(0, 1)) - wanted.mean(axis=(0, 1))).max() < 2.0
+    assert np.abs(found[2:6, 2:6] - wanted[2:6, 2:6]).max() <= 3
+
+
+def rendered_last(folder, tmp_path):
+    """The last frame as the camera of the whole film sees it."""
+    path = tmp_path / "last.gif"
+    wc.render(folder / "cloth.usdc", path, **SMALL)
+    with Image.open(path) as film:
+        *_, last = (np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(film))
+    return last
+
+
+@pytest.mark.parametrize(
+    ("rate", "wanted"),
+    [
+        (24.0, [40, 40, 50, 40, 40, 40]),
+        (60.0, [30, 40, 30]),
+        (1000.0, [1000]),
+    ],
+    ids=["24", "60, every second frame", "1000, too short for more than one"],
+)
+def test_a_gif_plays_in_real_time(rate, wanted, tmp_path):
+    """Hundredths of a second are spread; no frame is shorter than what browsers show."""
+    path = tmp_path / "out.gif"
+    wc.render(MOTION, path, mesh=MESH, fps=rate, **SMALL, time=True)
+    with Image.open(path) as film:
+        assert film.n_frames == len(wanted) and film.info.get("loop", 0) == 0
+        assert [frame.info["duration"] for frame in ImageSequence.Iterator(film)] == wanted if len(wanted) > 1 else True
+    assert sum(durations(np.arange(100) / 30.0)) == 3330
+
+
+def test_every_frame_of_a_gif_has_one_palette(folder, tmp_path):
+    wc.render(folder / "cloth.usdc", tmp_path / "out.gif", **SMALL)
+    data = (tmp_path / "out.gif").read_bytes()
+    assert data[10] & 0x80, "a global palette"
+    with Image.open(tmp_path / "out.gif") as film:
+        for frame in ImageSequence.Iterator(film):
+            assert not frame.tile or len(frame.tile) == 1
+
+
+def test_the_range_of_the_bar_is_that_of_analyze(folder, tmp_path, capfd):
+    code, out, _ = run(capfd, "analyze", folder / "cloth.usdc", "-o", tmp_path / "measured.usdc", "--json")
+    low, high = json.loads(out)["colour_range"]
+    analyzer = wc.Analyzer(folder / "cloth.usdc")
+    scale = scale_of([analyzer], "stretch_1", analyzer.measures[0])
+    assert code == 0 and (scale.low, scale.high) == (low, high)
+    assert high == pytest.approx(1.25) and low == pytest.approx(0.75)
+
+
+def test_colours_are_those_of_the_scale(folder, tmp_path, monkeypatch):
+    """Of a single frame, of part of a film and of two films the scale is that of all frames."""
+    scales = []
+    real = rendering.Overlay
+
+    def overlay(size, scale, *more):
+        scales.append((scale.low, scale.high, scale.neutral, scale.map))
+        return real(size, scale, *more)
+
+    monkeypatch.setattr(rendering, "Overlay", overlay)
+    cloth, path = folder / "cloth.usdc", tmp_path / "out.png"
+    for source, options in (
+        (cloth, {"frame": 2}),
+        (cloth, {"frame": 5}),
+        ([cloth, folder / "cloth.npz"], {}),
+        (cloth, {"colour_range": (0.9, 1.1), "colormap": "RdBu"}),
+    ):
+        wc.render(source, path, **SMALL, colour="stretch_1", **options)
+    assert scales[0] == scales[1] == scales[2] == pytest.approx(scales[0])
+    assert scales[0][2:] == (1.0, "coolwarm") and scales[3] == (pytest.approx(0.9), pytest.approx(1.1), 1.0, "RdBu")
+    red = picture(path)
+    wc.render(cloth, path, size=(128, 72), samples=1, colour="stretch_1", colour_range=(0.75, 1.25), frame=5, ground=False)
+    top, wanted = picture(path)[:, :90], 255 * Scale(0.75, 1.25, 1.0).srgb(1.25)
+    coloured = top[np.abs(top - top[0, 0]).max(axis=-1) > 60]
+    assert len(coloured) > 100 and np.abs(np.median(coloured, axis=0) - wanted).max() < 10, "in light that is nearly full"
+    assert np.ptp(red) > 0
+
+
+def test_values_of_ones_own_and_of_vertices_are_colours(folder, tmp_path):
+    path, values = tmp_path / "out.png", np.linspace(0.0, 1.0, len(MESH.points))
+    wc.render(MOTION, path, mesh=MESH, colour=np.tile(values, (FRAMES, 1)), **SMALL)
+    wc.render(folder / "cloth.usdc", path, colour="rotation_angle", measuring={"neighbourhood": "1-ring"}, **SMALL)
+    wc.render(folder / "one.obj", path, mesh=MESH, colour="area_ratio", **SMALL)
+    wc.render(folder / "cloth.npy", path, mesh=MESH, colour="stretch_2", **SMALL)
+    with pytest.raises(ValueError, match=r"colour has shape \(2, 3\); it must be \(6, 16\) of vertices or \(6, 18\)"):
+        wc.render(MOTION, path, mesh=MESH, colour=np.zeros((2, 3)), **SMALL)
+
+
+def test_the_bar_has_round_numbers_and_fits(folder):
+    assert round_numbers(0.93, 1.07, 6).tolist() == pytest.approx([0.95, 1.0, 1.05])
+    assert round_numbers(0.0, 1.0, 6).tolist() == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
+    for size in ((64, 36), (320, 180), (1280, 720), (3840, 2160)):
+        for low, high in ((0.0, 1.0), (1 - 1e-6, 1 + 1e-6), (-3e7, 2e7), (1e-9, 4e-9)):
+            overlay = Overlay(size, Scale(low, high), "velocity_gradient_norm", "1/s")
+            texts = [text for _, text in overlay._ticks]
+            assert len(set(texts)) == len(texts) > 1 and overlay.beside <= 0.4 * size[0]
+            image = np.asarray(overlay.draw([np.full((size[1], size[0], 3), 255, np.uint8)], "1.00 s", True))
+            assert image.shape == (size[1], size[0], 3) and (image != 255).any()
+
+
+def test_what_is_not_finite_is_left_out_and_said(tmp_path):
+    broken = MOTION.copy()
+    broken[3, 0] = np.nan
+    with pytest.warns(UserWarning, match="without a finite position are not drawn"):
+        wc.render(broken, tmp_path / "out.gif", mesh=MESH, **SMALL)
+
+
+def test_the_second_of_two_goes_on_to_its_end(folder, tmp_path):
+    path = tmp_path / "out.gif"
+    wc.render([wc.as_sequence(MESH, MOTION[:2], dt=1 / FPS), folder / "cloth.usdc"], path, **SMALL)
+    with Image.open(path) as film:
+        assert film.n_frames == FRAMES
+
+
+def test_an_interrupt_leaves_the_good_pictures_or_nothing(folder, tmp_path):
+    av = pytest.importorskip("av")
+
+    def stop(after):
+        def progress(done, total):
+            if done == after:
+                raise KeyboardInterrupt
+
+        return progress
+
+    path = tmp_path / "out.mp4"
+    with pytest.raises(KeyboardInterrupt, match="interrupted before the first picture; nothing was saved"):
+        wc.render(folder / "cloth.usdc", path, **SMALL, progress=stop(0))
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(KeyboardInterrupt, match="interrupted after 4 of 6 pictures, which are in "):
+        wc.render(folder / "cloth.usdc", path, **SMALL, progress=stop(4))
+    with av.open(path) as film:
+        assert len(list(film.decode(film.streams.video[0]))) == 4
+    with pytest.raises(KeyboardInterrupt, match="after 2 of 6"):
+        wc.render(folder / "cloth.usdc", tmp_path / "out.gif", **SMALL, progress=stop(2))
+    with Image.open(tmp_path / "out.gif") as film:
+        assert film.n_frames == 2
+    assert sorted(os.listdir(tmp_path)) == ["out.gif", "out.mp4"]
+
+
+def test_the_command_draws(folder, tmp_path, capfd):
+    path = tmp_path / "out.gif"
+    code, out, err = run(capfd, "render", folder / "cloth.usdc", folder / "cloth.npz", "-o", path, *SIZE, "--json", "--time")
+    facts = json.loads(out)
+    assert (code, err) == (0, "") and facts["pictures"] == FRAMES and facts["bytes"] == path.stat().st_size
+    code, out, err = run(capfd, "render", folder / "cloth.npy", "--rest", folder / "one.obj", "-o", tmp_path / "a.png", *SIZE)
+    assert code == 0 and "1 picture of 64 x 36 in " in out
+    options = ("--colour", "energy_density", "--stiffness", "100", "--range", "0", "2", "--azimuth", "10", "--zoom", "1.5")
+    code, _, err = run(capfd, "render", folder / "cloth.usdc", "-o", tmp_path / "a.png", *SIZE, *options, "--no-ground")
+    assert (code, err) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("argv", "fragment"),
+    [
+        (("none.usdc", "-o", "a.png"), "none.usdc: there is no such file"),
+        (("CLOTH", "-o", "a.jpg"), "a.jpg: the ending is '.jpg'; it must be .png, .gif or .mp4"),
+        (("CLOTH", "-o", "nowhere/a.png"), "nowhere"),
+        (("CLOTH", "-o", "a.mp4", "--size", "65x36"), "size is 65x36; a film in .mp4 must have even numbers, such as 66x36"),
+        (("CLOTH", "-o", "a.png", "--size", "65"), "'65' is no size"),
+        (("CLOTH", "-o", "a.png", "--size", "2x2"), "size: width is 2; it must be a whole number of 8 or more"),
+        (("CLOTH", "-o", "a.png", "--frame", "99"), "frame is 99; it must be one of the 6 from 0 to 5"),
+        (("CLOTH", "-o", "a.gif", "--frame", "1"), "frame is given, and a .gif has many"),
+        (("CLOTH", "-o", "a.png", "--frames", "1:2"), "frames is given, and a .png has one picture"),
+        (("CLOTH", "-o", "a.gif", "--frames", "9:12"), "frames is 9 to 12, where there are none; they are 6, from 0 to 5"),
+        (("CLOTH", "-o", "a.gif", "--frames", "1-2"), "'1-2' is no range"),
+        (("CLOTH", "-o", "a.gif", "--every", "0"), "every is 0"),
+        (("CLOTH", "-o", "a.gif", "--speed", "0"), "speed is 0.0"),
+        (("CLOTH", "-o", "a.png", "--zoom", "-1"), "zoom is -1.0"),
+        (("CLOTH", "-o", "a.png", "--samples", "0"), "samples is 0"),
+        (("CLOTH", "-o", "a.png", "--colour", "strech_1"), "colour is 'strech_1'; it must be one of"),
+        (("CLOTH", "-o", "a.png", "--range", "0", "1"), "--range is given without --colour"),
+        (("CLOTH", "-o", "a.png", "--neighbourhood", "1-ring"), "--neighbourhood is given without --colour"),
+        (("CLOTH", "-o", "a.png", "--colour", "stretch_1", "--range", "2", "1"), "low must be below high"),
+        (("CLOTH", "-o", "a.png", "--colour", "stretch_1", "--colormap", "virdis"), "it must be a colour map"),
+        (("CLOTH", "-o", "a.png", "--prim", "Other"), "there is no such prim"),
+        (("CLOTH", "-o", "a.png", "--ground", "0", "--no-ground"), "give one of them"),
+        (("CLOTH", "-o", "a.png", "--device", "cuda:99"), "device is 'cuda:99'"),
+        (("CLOTH", "CLOTH", "CLOTH", "-o", "a.png"), "3 files are given"),
+        (("CHAIN", "-o", "a.png", "--colour", "stretch_1"), "must have triangles"),
+        (("NPY", "-o", "a.png"), "has no triangles; give a rest mesh that has them (--rest)"),
+        (("EMPTY", "-o", "a.png"), "no mesh files there"),
+        (("BARE", "-o", "a.png"), "there is nothing to draw"),
+        (("PNG", "-o", "b.png"), "must be a folder or pattern of mesh files"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_in_a_sentence(argv, fragment, folder, tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bare.usda").write_text('#usda 1.0\ndef Xform "World"\n{\n}\n')
+    (tmp_path / "text.png").write_text("no picture")
+    files = {"CLOTH": folder / "cloth.usdc", "CHAIN": folder / "chain.usdc", "NPY": folder / "cloth.npy"}
+    files |= {"EMPTY": "empty", "BARE": "bare.usda", "PNG": "text.png"}
+    refused(capfd, ["render", *(files.get(word, word) for word in argv)], fragment)
+    assert sorted(os.listdir(tmp_path)) == ["bare.usda", "empty", "text.png"]
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "message"),
+    [
+        (MESH, {"output": "a.png", "copy": 1}, "copy is 1; the source is one cloth"),
+        (3, {"output": "a.png"}, "source is 3; it must be a path, an Animation"),
+        (MOTION, {"output": "a.png"}, "source is ndarray; arrays need their mesh"),
+        (MOTION[:, :3], {"output": "a.png", "mesh": MESH}, r"frames have shape \(3, 3\); they must be \(16, 3\)"),
+        (MESH, {"output": "a.png", "size": 64}, "size is 64; it must be a width and a height"),
+        (MESH, {"output": "a.png", "measuring": {"lag": 1}}, "measuring is given without colour"),
+        ([MESH] * 3, {"output": "a.png"}, "source is a list of 3"),
+        (MESH, {"output": "a.png", "ground": "low"}, "ground is 'low'"),
+        (MESH, {"output": "a.gif", "frames": "1:2"}, "frames is '1:2'; it must be the numbers of the first and the last"),
+    ],
+)
+def test_wrong_arguments_are_refused(source, options, message, tmp_path):
+    output = tmp_path / options.pop("output")
+    with pytest.raises(ValueError, match=message):
+        wc.render(source, output, **{**SMALL, **options})
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_installed_is_said(folder, tmp_path, capfd, monkeypatch):
+    real = rendering.check_film.__globals__["importlib"].util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *more: None if name == "av" else real(name, *more))
+    refused(capfd, ["render", folder / "cloth.usdc", "-o", tmp_path / "a.mp4"], "films in .mp4 need PyAV: pip install")
+
+
+def test_a_source_is_not_written_over(folder, tmp_path, capfd):
+    shutil.copy(folder / "one.obj", tmp_path / "a.obj")
+    (tmp_path / "a.png").symlink_to(tmp_path / "a.obj")
+    refused(capfd, ["render", tmp_path / "a.obj", "-o", tmp_path / "a.png", *SIZE], "is a file of the input")
