@@ -103,13 +103,32 @@ def predict_bdf2(dtype):
 
 
 @cache
+def keyframed_position(dtype):
+    """The device function (keyframes, pin, step, steps a keyframe) → the position; linear between keyframes, then at rest."""
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def position(keyframes: wp.array2d(dtype=vec3), p: int, step: int, steps_per_frame: int):
+        last = keyframes.shape[0] - 1
+        frame = wp.min(step // steps_per_frame, last)
+        found = keyframes[frame, p]
+        if frame < last:
+            part = dtype(step - frame * steps_per_frame) / dtype(steps_per_frame)
+            found = (dtype(1.0) - part) * found + part * keyframes[frame + 1, p]
+        return found
+
+    return position
+
+
+@cache
 def move_pins(dtype):
     """Kernel over (copies, pins): puts the pinned vertices where the keyframes say they are h later.
 
-    Counted in whole steps of this h, in each copy by itself, ``steps_per_frame`` of them to a keyframe; between keyframes
-    linear, after the last at rest. x is set, v = (x − x before)/h.
+    Counted in whole steps of this h, in each copy by itself, ``steps_per_frame`` of them to a keyframe. x is set,
+    v = (x − x before)/h.
     """
     vec3, _ = types(dtype)
+    position = keyframed_position(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def move(
@@ -129,15 +148,9 @@ def move_pins(dtype):
     ):
         copy, p = wp.tid()
         i = copy * per_copy + pins[p]
-        after = step[copy] + 1
-        last = keyframes.shape[0] - 1
-        frame = wp.min(after // steps_per_frame, last)
-        part = dtype(after - frame * steps_per_frame) / dtype(steps_per_frame)
-        position = keyframes[frame, p]
-        if frame < last:
-            position = (dtype(1.0) - part) * position + part * keyframes[frame + 1, p]
-        v[i] = (position - x[i]) / h
-        x[i] = position
+        after = position(keyframes, p, step[copy] + 1, steps_per_frame)
+        v[i] = (after - x[i]) / h
+        x[i] = after
 
     return move
 
@@ -149,16 +162,7 @@ def guide_pins(dtype):
     Both positions are those of the keyframes, because a step may have moved x from where it was.
     """
     vec3, _ = types(dtype)
-
-    @wp.func
-    def position(keyframes: wp.array2d(dtype=vec3), p: int, step: int, steps_per_frame: int):
-        last = keyframes.shape[0] - 1
-        frame = wp.min(step // steps_per_frame, last)
-        found = keyframes[frame, p]
-        if frame < last:
-            part = dtype(step - frame * steps_per_frame) / dtype(steps_per_frame)
-            found = (dtype(1.0) - part) * found + part * keyframes[frame + 1, p]
-        return found
+    position = keyframed_position(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def guide(

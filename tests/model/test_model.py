@@ -13,8 +13,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from support.energies import DECLARED
-from warpcloth.core.energy import Energy
+from support.energies import DECLARED, energy_and_gradient
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import RowSums, Sums
 from warpcloth.model.host_values import host_values
@@ -609,12 +608,10 @@ def all_terms(spring=100.0, bend=1e-3, hold=10.0):
     ]
 
 
-def energy_and_gradient(model):
-    energy, gradient = wp.zeros(model.copies, dtype=wp.float64, device=model.device), model.vectors()
-    x = model.array(model.positions.numpy() * 1.05, model.vec3)
-    Energy(model, Sums(model)).add(x, energy)
-    Gradient(model).add(x, gradient)
-    return energy.numpy(), gradient.numpy().reshape(model.copies, -1, 3)
+def stretched(model):
+    """U (B,) and ∂U/∂x (B, n, 3) of copies that are a little larger than where they start."""
+    energy, gradient = energy_and_gradient(model, model.positions.numpy() * 1.05)
+    return energy, gradient.reshape(model.copies, -1, 3)
 
 
 def test_a_sum_replaces_what_an_overflow_left(device):
@@ -677,7 +674,7 @@ def test_a_copy_is_a_scene_of_its_own(names, dtype, device):
     fields = {"terms": all_terms(), "pins": [0], "positions": STARTS[0]}
     vary = {name: VARIED[name][0] for name in names}
     batch = scene(**fields).build(device=device, dtype=dtype, copies=COPIES, vary=vary)
-    energy, gradient = energy_and_gradient(batch)
+    energy, gradient = stretched(batch)
     differs = []
     for b in range(COPIES):
         changed = dict(fields)
@@ -690,7 +687,7 @@ def test_a_copy_is_a_scene_of_its_own(names, dtype, device):
         for field in ("positions", "velocities", "mass", "inverse_mass", "gravity"):
             whole = getattr(batch, field).numpy()
             assert (np.split(whole, COPIES)[b] == getattr(single, field).numpy()).all()
-        energy_alone, gradient_alone = energy_and_gradient(single)
+        energy_alone, gradient_alone = stretched(single)
         assert energy[b] == energy_alone[0] > 0.0 and (gradient[b] == gradient_alone[0]).all()
         differs.append([energy_alone[0], *single.mass.numpy(), *single.velocities.numpy().ravel(), *single.gravity.numpy()[0]])
     assert (np.ptp(differs, axis=0) > 0.0).any(), "the copies are not alike"
@@ -718,7 +715,7 @@ def test_any_number_of_a_term_varies(kind, field, by_element):
 
 def test_copies_without_differences_are_alike(device):
     batch = scene(terms=all_terms()).build(device=device, copies=COPIES)
-    energy, gradient = energy_and_gradient(batch)
+    energy, gradient = stretched(batch)
     assert (energy == energy[0]).all() and (gradient == gradient[0]).all()
     assert [elements.stiffness.strides for elements in batch.terms] == [(0,)] * 4
 

@@ -79,6 +79,15 @@ def model_of(mesh, positions, names=DECLARED, dtype="float64", device="cpu", pin
     return scene.build(device=device, dtype=dtype, **build)
 
 
+def energy_and_gradient(model, x=None):
+    """U (B,) and ∂U/∂x (N, 3) at x (N, 3), where the model starts if None."""
+    energy, gradient = model.scalars(), model.vectors()
+    x = model.positions if x is None else model.array(x, model.vec3)
+    Energy(model, Sums(model)).add(x, energy)
+    Gradient(model).add(x, gradient)
+    return energy.numpy(), gradient.numpy()
+
+
 CELL = 0.05
 
 

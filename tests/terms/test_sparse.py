@@ -9,12 +9,9 @@ import warp as wp
 from scipy.sparse import coo_array, diags_array
 
 import warpcloth as wc
-from support.energies import FEW, eps, every_dtype
+from support.energies import FEW, energy_and_gradient, eps, every_dtype
 from support.steps import after_one_step, newton_step
-from warpcloth.core.energy import Energy
-from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
-from warpcloth.core.sums import Sums
 from warpcloth.kernels.term import Term
 from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
@@ -79,14 +76,6 @@ def sheet(terms=None, **fields):
     terms = [wc.Spring(stiffness=50.0), Laplacian(stiffness=20.0)] if terms is None else terms
     start = mesh.points + random.normal(scale=0.03, size=mesh.points.shape)
     return wc.Scene(mesh, **{"density": 0.3, "terms": terms, "positions": start, "pins": [0, 3]} | fields)
-
-
-def energy_and_gradient(model, x=None):
-    energy_, gradient_ = wp.zeros(model.copies, dtype=wp.float64, device=model.device), model.vectors()
-    x = model.positions if x is None else model.array(x, model.vec3)
-    Energy(model, Sums(model)).add(x, energy_)
-    Gradient(model).add(x, gradient_)
-    return energy_.numpy(), gradient_.numpy()
 
 
 @every_dtype

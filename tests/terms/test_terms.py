@@ -20,6 +20,7 @@ from support.energies import (
     HALF,
     MATERIALS,
     bending_density,
+    energy_and_gradient,
     eps,
     every_dtype,
     material_of,
@@ -27,10 +28,8 @@ from support.energies import (
     random_rotation,
 )
 from support.outside import Plane
-from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
-from warpcloth.core.sums import Sums
 from warpcloth.fast import quadratic_pairs as quadratic
 from warpcloth.fast.gather_layout import gathered
 from warpcloth.fast.structs import chained
@@ -1028,13 +1027,6 @@ def test_nan_is_never_swallowed(term, dtype, device):
 
 
 # --- sums over a mesh
-
-
-def energy_and_gradient(model):
-    energy, gradient = wp.zeros(model.copies, dtype=wp.float64, device=model.device), model.vectors()
-    Energy(model, Sums(model)).add(model.positions, energy)
-    Gradient(model).add(model.positions, gradient)
-    return energy.numpy(), gradient.numpy()
 
 
 def row_sums(model):

@@ -14,6 +14,7 @@ from ..base.limits import refuse_memory
 from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
 from ..base.texts import convert
+from .options import add_values
 from .setup import named_scene
 from .terminal import Progress, check_writable, frames_folder_of, json_text, location
 
@@ -68,14 +69,7 @@ def add_arguments(parser):
     )
     parser.add_argument("--fps", type=float, help=f"frames per second (default: that of the stage, else {_FPS:g})")
     parser.add_argument("--prim", help="path or name of the mesh, if the file has several")
-    parser.add_argument(
-        "-p",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="parameter=value",
-        help="parameters of the scene; '-p help' lists them",
-    )
+    add_values(parser, "-p", "parameter", "parameters of the scene")
     parser.add_argument(
         "--weights",
         choices=("cotangent", "intrinsic", "uniform", "clamped"),
