@@ -11,14 +11,14 @@ class Inertia:
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         s: Weight of the inertia, 1/h² [1/s²].
-        load: Part of gravity that acts as a force.
 
     Attributes:
+        s, load: s as given; the part of gravity that acts as a force, 0 until it is set.
         work: The sum by vertices, (N,) [J].
     """
 
-    def __init__(self, model, s, load=0.0):
-        self.model, self.s, self.load = model, s, load
+    def __init__(self, model, s):
+        self.model, self.s, self.load = model, s, 0.0
         self.work = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         self._kernel = model.kernel(add_inertia, model.dtype)
 

@@ -37,7 +37,6 @@ class Minimiser:
             ``"clamp"`` or ``"absolute"``.
         linear: ``"cg"`` or ``"factorised"``.
         s: Weight of the inertia, 1/h² [1/s²].
-        load: Part of gravity that acts as a force.
         linear_iterations: The most iterations of a conjugate gradient solve.
 
     Attributes:
@@ -47,11 +46,11 @@ class Minimiser:
         iterations: Newton iterations of the last :meth:`minimise`.
     """
 
-    def __init__(self, model, base, hessian, linear, s, load=0.0, linear_iterations=10_000):
+    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000):
         self.model, self.base = model, base
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
-        self.search = Search(model, base, self.sums, s, load)
+        self.search = Search(model, base, self.sums, s)
         self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
         if linear == "cg":

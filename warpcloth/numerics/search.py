@@ -20,7 +20,7 @@ class Search:
         model: The :class:`warpcloth.model.model.Model`.
         base: The positions of d = 0, (N,) vectors [m]; the caller's array, read only.
         sums: :class:`warpcloth.core.sums.Sums`.
-        s, load: See :class:`warpcloth.numerics.inertia.Inertia`.
+        s: See :class:`warpcloth.numerics.inertia.Inertia`.
 
     Attributes:
         correction: d (N,) [m].
@@ -30,8 +30,8 @@ class Search:
             found.
     """
 
-    def __init__(self, model, base, sums, s, load=0.0):
-        self.model, self.base, self.sums, self.inertia = model, base, sums, Inertia(model, s, load)
+    def __init__(self, model, base, sums, s):
+        self.model, self.base, self.sums, self.inertia = model, base, sums, Inertia(model, s)
         self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), Energy(model, sums, corrected=True)
         self.correction, self.trial, self.gradient, self.direction = (model.vectors() for _ in range(4))
 

@@ -85,10 +85,9 @@ class Stepper:
     def residual(self, residual):
         self.state.residual = residual
 
-    def launch_pins(self, parts=1, x=None, v=None):
-        """Moves the pins that have keyframes on by h/``parts``, the same in all calls, in x and v if not in the state."""
-        x, v = self.state.x if x is None else x, self.state.v if v is None else v
-        self.launch_pins_of(self.model.pins, self.model.keyframes, self.count, x, v, parts)
+    def launch_pins(self, parts=1):
+        """Moves the pins that have keyframes on by h/``parts``, the same in all calls."""
+        self.launch_pins_of(self.model.pins, self.model.keyframes, self.count, *self.state, parts)
 
     def launch_pins_of(self, pins, keyframes, count, x, v, parts=1):
         """Moves these pins, or none, on in x and v (N,) as `launch_pins` does; ``count`` counts steps of pins and loads."""
