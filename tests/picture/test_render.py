@@ -1,8 +1,10 @@
 """Pictures and films: every source and ending, what films hold, and what is refused."""
 
+import importlib
 import json
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +12,17 @@ from PIL import Image, ImageSequence
 
 import warpcloth as wc
 from support.command_line import refused, run
+from warpcloth.cli import render as drawing
 from warpcloth.picture import render as rendering
 from warpcloth.picture.colour import Scale
 from warpcloth.picture.films import durations
 from warpcloth.picture.measured import scale_of
 from warpcloth.picture.overlay import Overlay, round_numbers
 from warpcloth.picture.subjects import subject_of
+from warpcloth.run import recorders
 from warpcloth.usd import AnimationWriter
+
+ROOT = Path(__file__).parents[2]
 
 SMALL = {"size": (64, 36), "samples": 1}
 SIZE = ("--size", "64x36", "--samples", "1")
@@ -464,3 +470,59 @@ def test_a_source_is_not_written_over(folder, tmp_path, capfd):
     shutil.copy(folder / "one.obj", tmp_path / "a.obj")
     (tmp_path / "a.png").symlink_to(tmp_path / "a.obj")
     refused(capfd, ["render", tmp_path / "a.obj", "-o", tmp_path / "a.png", *SIZE], "is a file of the input")
+
+
+@pytest.fixture
+def small_films(tmp_path, monkeypatch):
+    """Makes the films of runs small, in a folder of their own."""
+    real = drawing.draw
+    monkeypatch.setattr("warpcloth.cli.run.draw", lambda *given, **more: real(*given, **more, **SMALL))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_run_draws_its_film(small_films, capfd):
+    command = ["run", "hanging", "-p", "n=4", "--frames", "4", "--film", "a.gif"]
+    code, out, err = run(capfd, *command, "-o", "a.usdc", "--json")
+    assert (code, err, json.loads(out)["film"]) == (0, "", "a.gif")
+    wc.render("a.usdc", "b.gif", **SMALL)
+    assert (small_films / "a.gif").read_bytes() == (small_films / "b.gif").read_bytes()
+    for film, fragment in (("a.avi", "the ending is '.avi'"), ("none/a.gif", "folder none does not exist")):
+        refused(capfd, ["run", "hanging", "-p", "n=4", "-o", "c.usdc", "--film", film], fragment)
+    assert not (small_films / "c.usdc").exists()
+
+
+def test_a_run_that_diverges_has_a_film_of_its_good_frames(small_films, capfd):
+    options = ("--solver", "pbd", "-s", "sweep=jacobi", "relaxation=1.9", "iterations=1")
+    code, out, _ = run(capfd, "run", "hanging", "-p", "n=8", *options, "-o", "a.usdc", "--film", "a.gif", "--json")
+    good = json.loads(out)["frames"]
+    assert code == 1 and good > 0
+    with Image.open("a.gif") as film:
+        assert film.n_frames == good // 2 + 1, "60 frames a second are more than a GIF shows"
+
+
+def test_a_resumed_run_draws_all_of_it(small_films, capfd, monkeypatch):
+    """The film of the whole run, though part of it was computed by another process."""
+    command = ["run", "hanging", "-p", "n=4", "--frames", "24", "-o", "a.usdc", "--film", "a.gif"]
+    append, calls = recorders.File.append, []
+
+    def stop(self, *given):
+        calls.append(given)
+        if len(calls) == 14:
+            raise KeyboardInterrupt
+        append(self, *given)
+
+    monkeypatch.setattr(recorders.File, "append", stop)
+    code, _, err = run(capfd, *command)
+    assert code == 130 and "interrupted after frame 12" in err and not (small_films / "a.gif").exists()
+    code, _, err = run(capfd, *command, "--resume")
+    assert (code, err) == (0, "")
+    with Image.open("a.gif") as film:
+        assert film.n_frames == 13
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "scenes").glob("[!_]*.py")))
+def test_every_scene_is_drawn(name, tmp_path):
+    path = tmp_path / "out.png"
+    wc.render(importlib.import_module(f"warpcloth.scenes.{name}").scene(), path, **SMALL)
+    assert np.ptp(picture(path)) > 20

@@ -165,6 +165,7 @@ def _parser():
         text = "the .usd, .usda, .usdc or .usdz file to write"
         text += "" if sub is deforms else " (default: the scene's name and .usdc; an existing file is then not replaced)"
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
+    runs.add_argument("--film", metavar="FILE", help="also draw the run as a film, .mp4 or .gif; see 'warpcloth render'")
     runs.add_argument(
         "--resume",
         action="store_true",

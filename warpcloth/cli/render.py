@@ -5,10 +5,12 @@ import time
 from pathlib import Path
 
 from ..base.limits import shown_bytes
+from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from .analyze import add_measuring, measuring_of
 from .terminal import check_writable, json_text, open_bar
 
+SIZE = (1280, 720)
 EPILOG = """\
 FILE is a USD stage, all of whose meshes and linear curves are drawn, a mesh file, a folder or pattern of mesh files, or arrays
 in .npz or .npy. Two of them are drawn side by side. The ending of -o says what is made: .png is one frame, .gif and .mp4 are
@@ -30,7 +32,7 @@ def add_arguments(parser):
     add("--frames", type=frames, metavar="A:B", help="the first and the last frame of a film (default: all)")
     add("--every", type=int, default=1, metavar="K", help="draw only every K-th frame")
     add("--speed", type=float, default=1.0, metavar="FACTOR", help="0.5 plays at half speed (default: 1, real time)")
-    add("--size", type=size, default=(1280, 720), metavar="WxH", help="width and height in pixels (default: 1280x720)")
+    add("--size", type=size, default=SIZE, metavar="WxH", help="width and height in pixels (default: 1280x720)")
     add("--samples", type=int, default=4, metavar="N", help="rays through each pixel (default: 4)")
     add("--colour", metavar="NAME", help="show a measured value as colour, such as stretch_1 (default: one colour of cloth)")
     add(
@@ -83,7 +85,6 @@ def frames(text):
 
 def render(arguments):
     from ..mesh.mesh import Surface
-    from ..picture.render import render as draw
 
     if len(arguments.files) > 2:
         raise ValueError(f"{len(arguments.files)} files are given; one is drawn, or two side by side")
@@ -93,42 +94,38 @@ def render(arguments):
     if arguments.colour is None:
         for name in (*measuring, *(["range"] if arguments.range else []), *(["colormap"] if arguments.colormap else [])):
             raise ValueError(f"--{name} is given without --colour, the name of what is measured")
-    check_writable(arguments.output)
+    check_drawing(arguments.output, arguments.files, arguments.size)
     device = find_device(arguments.device)
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
-    started, progress = time.perf_counter(), Drawing()
-    try:
-        draw(
-            arguments.files,
-            arguments.output,
-            mesh=rest,
-            prim=arguments.prim,
-            fps=arguments.fps,
-            up_axis=arguments.up_axis,
-            frame=arguments.frame,
-            frames=arguments.frames,
-            every=arguments.every,
-            speed=arguments.speed,
-            size=arguments.size,
-            samples=arguments.samples,
-            colour=arguments.colour,
-            colour_range=arguments.range,
-            colormap=arguments.colormap,
-            measuring=measuring,
-            azimuth=arguments.azimuth,
-            elevation=arguments.elevation,
-            zoom=arguments.zoom,
-            ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
-            time=arguments.time,
-            device=device.alias,
-            progress=progress,
-        )
-    finally:
-        progress.close()
+    started = time.perf_counter()
+    pictures = draw(
+        arguments.files,
+        arguments.output,
+        mesh=rest,
+        prim=arguments.prim,
+        fps=arguments.fps,
+        up_axis=arguments.up_axis,
+        frame=arguments.frame,
+        frames=arguments.frames,
+        every=arguments.every,
+        speed=arguments.speed,
+        size=arguments.size,
+        samples=arguments.samples,
+        colour=arguments.colour,
+        colour_range=arguments.range,
+        colormap=arguments.colormap,
+        measuring=measuring,
+        azimuth=arguments.azimuth,
+        elevation=arguments.elevation,
+        zoom=arguments.zoom,
+        ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
+        time=arguments.time,
+        device=device.alias,
+    )
     facts = {
         "input": arguments.files,
         "file": arguments.output,
-        "pictures": progress.pictures,
+        "pictures": pictures,
         "width": arguments.size[0],
         "height": arguments.size[1],
         "bytes": Path(arguments.output).stat().st_size,
@@ -139,7 +136,29 @@ def render(arguments):
     return 0
 
 
-class Drawing:
+def check_drawing(path, others=(), size=SIZE):
+    """Finds out before anything is read or runs that a picture or film, or None, cannot be written."""
+    from ..picture.films import check_film
+
+    if path is not None:
+        check_film(path, size)
+        check_apart([path], others)
+        check_writable(path)
+
+
+def draw(source, output, **options):
+    """Draws by :func:`warpcloth.render`, counting the pictures on a terminal; returns how many they are."""
+    from ..picture.render import render
+
+    progress = _Drawing()
+    try:
+        render(source, output, progress=progress, **options)
+    finally:
+        progress.close()
+    return progress.pictures
+
+
+class _Drawing:
     """Counts the pictures of a film, and shows them on a terminal."""
 
     def __init__(self):

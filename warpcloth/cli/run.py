@@ -4,6 +4,7 @@ import os
 import statistics
 
 from ..base.quiet import find_device
+from .render import check_drawing, draw
 from .setup import EPILOG as EPILOG
 from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
 from .terminal import Progress, check_writable, frames_folder_of, json_text, location, say
@@ -16,6 +17,7 @@ def run(arguments):
     frames = scene.frames if arguments.frames is None else arguments.frames
     arguments.output = _own_output(scene, arguments.resume) if arguments.output is None else arguments.output
     check_writable(arguments.output)
+    check_drawing(arguments.film, [arguments.output])
     device = find_device(arguments.device)
     if arguments.tolerance is not None or arguments.budget is not None:
         from .choose import take_choice
@@ -38,6 +40,8 @@ def run(arguments):
         )
         progress.close()
         status = animation.status
+        if arguments.film:
+            draw([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
         facts = {
             "scene": scene.name,
             "source": str(source.path),
@@ -58,6 +62,7 @@ def run(arguments):
             "threads": arguments.threads,
             "file": arguments.output,
             "frames_folder": frames_folder_of(arguments),
+            "film": arguments.film,
         }
         print(json_text(facts) if arguments.json else _summary(facts))
         if status.ok:
@@ -94,5 +99,6 @@ def _summary(facts):
             f"  solver        {solver_line(facts)}",
             f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),
             f"  file          {location(facts)}",
+            *([f"  film          {facts['film']}"] if facts["film"] else []),
         ]
     )

@@ -26,7 +26,7 @@ SURROUNDINGS, LINES = (0.42, 0.41, 0.39), (0.06, 0.06, 0.065)
 # Radius of pins, by the size of the cloth and, of coarse ones, by the mean edge.
 _PIN, _PIN_EDGE = 0.009, 0.35
 # Radius of the tubes of a net or chain that says none, by its size: thinner ones are hardly seen.
-_THINNEST = 0.002
+_THINNEST = 0.003
 # From the middle of one cloth of a batch to that of the next, by their size.
 _APART = 1.12
 _SOURCES = "a path, an Animation, a Deformation, a Scene, a Mesh, a Sequence, or an array of frames with its mesh"
