@@ -475,8 +475,8 @@ def test_a_source_is_not_written_over(folder, tmp_path, capfd):
 @pytest.fixture
 def small_films(tmp_path, monkeypatch):
     """Makes the films of runs small, in a folder of their own."""
-    real = drawing.draw
-    monkeypatch.setattr("warpcloth.cli.run.draw", lambda *given, **more: real(*given, **more, **SMALL))
+    real = drawing.draw_film
+    monkeypatch.setattr("warpcloth.cli.run.draw_film", lambda *given, **more: real(*given, **more, **SMALL))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -98,7 +98,7 @@ def render(arguments):
     device = find_device(arguments.device)
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
     started = time.perf_counter()
-    pictures = draw(
+    pictures = draw_film(
         arguments.files,
         arguments.output,
         mesh=rest,
@@ -146,7 +146,7 @@ def check_drawing(path, others=(), size=SIZE):
         check_writable(path)
 
 
-def draw(source, output, **options):
+def draw_film(source, output, **options):
     """Draws by :func:`warpcloth.render`, counting the pictures on a terminal; returns how many they are."""
     from ..picture.render import render
 

@@ -4,7 +4,7 @@ import os
 import statistics
 
 from ..base.quiet import find_device
-from .render import check_drawing, draw
+from .render import check_drawing, draw_film
 from .setup import EPILOG as EPILOG
 from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
 from .terminal import Progress, check_writable, frames_folder_of, json_text, location, say
@@ -41,7 +41,7 @@ def run(arguments):
         progress.close()
         status = animation.status
         if arguments.film:
-            draw([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
+            draw_film([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
         facts = {
             "scene": scene.name,
             "source": str(source.path),
