@@ -11,6 +11,11 @@ FAR = wp.constant(wp.float32(1e30))
 PLASTIC_1 = wp.constant(wp.float32(0.7548776662))
 PLASTIC_2 = wp.constant(wp.float32(0.5698402910))
 
+# Of the light of the sky: what a ray brings that meets a surface instead.
+BOUNCE = wp.constant(wp.float32(0.3))
+# Of the shares of the sky that two points see: a difference that may be noise.
+SIMILAR = wp.constant(wp.float32(0.08))
+
 
 @wp.struct
 class Geometry:
@@ -40,7 +45,7 @@ class Viewer:
     up: wp.vec3
     width: wp.int32
     height: wp.int32
-    samples: wp.int32
+    samples: wp.array(dtype=wp.vec2)  # positions in the pixel, from 0 to 1
 
 
 @wp.struct
@@ -69,8 +74,9 @@ class Layers:
     sky: wp.array(dtype=wp.vec3)
     sun: wp.array(dtype=wp.vec3)
     visible: wp.array(dtype=wp.vec2)
+    # Normal and position of the one surface in the pixel; the normal is 0 where there is none, or several
     normal: wp.array(dtype=wp.vec3)
-    depth: wp.array(dtype=wp.float32)
+    point: wp.array(dtype=wp.vec3)
 
 
 @wp.func
@@ -174,13 +180,15 @@ def size_of(p: wp.vec3):
 
 
 @wp.func
-def light_at(g: Geometry, light: Light, p: wp.vec3, n: wp.vec3, across: wp.vec3, offset: float, j: int):
+def light_at(
+    g: Geometry, light: Light, p: wp.vec3, n: wp.vec3, across: wp.vec3, offset: float, sun_sample: int, sky_sample: int
+):
     """(light of the sky, of the sun, share of each that is seen) at a point with normal n, ``across`` the surface itself."""
     sky = light.sky_share * (1.0 + light.sky_tilt * (wp.dot(n, light.up) - 1.0))
     facing = wp.dot(n, light.sun)
     sun = wp.float32(0.0)
     start = p + offset * across
-    k = float(j)
+    k = float(sun_sample)
     seen_sun = wp.float32(0.0)
     if facing > 0.0 and wp.dot(across, light.sun) > 0.0:
         sun = light.sun_share * facing
@@ -191,6 +199,7 @@ def light_at(g: Geometry, light: Light, p: wp.vec3, n: wp.vec3, across: wp.vec3,
         d = wp.normalize(light.sun + radius * (wp.cos(angle) * x + wp.sin(angle) * y))
         if not is_hidden(g, start, d, FAR):
             seen_sun = 1.0
+    k = float(sky_sample)
     # With the cosine as density: a disc lifted to the half sphere (Malley)
     a = wp.frac(0.25 + PLASTIC_1 * k)
     radius = wp.sqrt(a)
@@ -228,17 +237,20 @@ def trace():
         base = wp.vec3()
         sky = wp.vec3()
         sun = wp.vec3()
+        # Sums of the layers' brightness, of all samples and of those that see the light
+        lit = wp.vec2()
         visible = wp.vec2()
-        weight = wp.float32(0.0)
-        mean_normal = wp.vec3()
-        depth = wp.float32(0.0)
-        # Neighbours take other parts of the sequence: 16 pixels of a square together have an even one.
-        shift = ((7 * (column % 4 + 4 * (row % 4))) % 16) * viewer.samples
-        for sample in range(viewer.samples):
-            j = shift + sample
-            s = float(sample)
-            x = float(column) + wp.frac(0.5 + PLASTIC_1 * s) - 0.5 * float(viewer.width)
-            y = 0.5 * float(viewer.height) - float(row) - wp.frac(0.5 + PLASTIC_2 * s)
+        normal = wp.vec3()
+        point = wp.vec3()
+        hits = wp.int32(0)
+        mixed = wp.bool(False)
+        # Pixels of a square of 4×4 take parts of one sequence; 4×4 squares take parts of a longer one.
+        count = viewer.samples.shape[0]
+        in_square = ((7 * (column % 4 + 4 * (row % 4))) % 16) * count
+        square = ((7 * ((column // 4) % 4 + 4 * ((row // 4) % 4))) % 16) * 16 * count
+        for sample in range(count):
+            x = float(column) + viewer.samples[sample][0] - 0.5 * float(viewer.width)
+            y = 0.5 * float(viewer.height) - float(row) - viewer.samples[sample][1]
             o = viewer.origin
             d = wp.normalize(viewer.forward + x * viewer.right + y * viewer.up)
             nearest = FAR
@@ -316,33 +328,99 @@ def trace():
                 base += light.background
                 continue
             offset = OFFSET * (size_of(p) + size_of(o))
-            seen_sky, seen_sun = wp.float32(0.0), wp.float32(0.0)
-            sky_here, sun_here, seen_sky, seen_sun = light_at(g, light, p, n, across, offset, j)
+            sky_here, sun_here, seen_sky, seen_sun = light_at(
+                g, light, p, n, across, offset, in_square + sample, square + in_square + sample
+            )
             if ground_share > 0.0:
-                lit = sky_here + sun_here
                 base += (1.0 - ground_share) * light.background
-                sky += (ground_share * sky_here / lit) * light.ground_colour
-                sun += (ground_share * sun_here / lit) * light.ground_colour
+                share = ground_share / (sky_here + sun_here)
+                colour = light.ground_colour
             else:
                 base += (1.0 - share) * colour
-                sky += (share * sky_here) * colour
-                sun += (share * sun_here) * colour
-            weight += 1.0
-            visible += wp.vec2(seen_sky, seen_sun)
-            mean_normal += n
-            depth += nearest
-        per_sample = 1.0 / float(viewer.samples)
+            brightness = wp.vec2(sky_here, sun_here) * (share * (colour[0] + colour[1] + colour[2]))
+            lit += brightness
+            visible += wp.cw_mul(brightness, wp.vec2(seen_sky, seen_sun))
+            base += (BOUNCE * share * sky_here) * colour
+            sky += ((1.0 - BOUNCE) * share * sky_here) * colour
+            sun += (share * sun_here) * colour
+            if hits == 0:
+                normal = n
+                point = p
+            elif wp.dot(n, normal) < 0.5 or wp.abs(wp.dot(normal, p - point)) > 4.0 * nearest * wp.length(viewer.up):
+                mixed = True
+            hits += 1
+        per_sample = 1.0 / float(count)
         out.base[pixel] = per_sample * base
         out.sky[pixel] = per_sample * sky
         out.sun[pixel] = per_sample * sun
-        if weight > 0.0:
-            visible /= weight
-            depth /= weight
-        out.visible[pixel] = visible
-        out.normal[pixel] = mean_normal
-        out.depth[pixel] = depth
+        # Where no light would come, seen or not, it says nothing.
+        out.visible[pixel] = wp.vec2(
+            wp.where(lit[0] > 0.0, visible[0] / lit[0], -1.0), wp.where(lit[1] > 0.0, visible[1] / lit[1], -1.0)
+        )
+        out.normal[pixel] = wp.where(mixed, wp.vec3(), normal)
+        out.point[pixel] = point
 
     return trace_pixel
+
+
+@cache
+def smooth():
+    """Kernel over pixels, from ``first`` on: means of ``visible`` along a row or a column over what belongs to one surface.
+
+    Weights 1, 2, 3, 4, 3, 2, 1 sum to the same for each of four neighbours in turn, whose samples are parts of one even
+    sequence. They fall where the normal turns and where a point is off the plane of the middle one. With steps of four pixels,
+    from square to square, only the sky's share is smoothed, and only where it is nearly the same.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def smooth_pixel(
+        # state in
+        layers: Layers,
+        visible: wp.array(dtype=wp.vec2),
+        # parameters
+        viewer: Viewer,
+        vertical: int,
+        step: int,
+        first: int,
+        # out
+        out: wp.array(dtype=wp.vec2),
+    ):
+        pixel = first + wp.tid()
+        n = layers.normal[pixel]
+        own = visible[pixel]
+        if wp.dot(n, n) == 0.0:
+            out[pixel] = own
+            return
+        p = layers.point[pixel]
+        # Of a pixel, there
+        width = wp.length(p - viewer.origin) * wp.length(viewer.up)
+        sky = wp.vec2()  # sums of weights, and of weights times what is visible
+        sun = wp.vec2()
+        at = wp.where(vertical != 0, pixel // viewer.width, pixel % viewer.width)
+        count = wp.where(vertical != 0, viewer.height, viewer.width)
+        stride = wp.where(vertical != 0, viewer.width, 1)
+        for k in range(-3, 4):
+            if at + step * k >= 0 and at + step * k < count:
+                other = pixel + step * k * stride
+                turn = wp.dot(n, layers.normal[other])
+                if turn > 0.0:
+                    off = wp.dot(n, layers.point[other] - p) / width
+                    turn = turn * turn
+                    turn = turn * turn
+                    w = (4.0 - wp.abs(float(k))) * turn * turn / (1.0 + off * off * off * off)
+                    seen = visible[other]
+                    if seen[0] >= 0.0:
+                        change = wp.where(step > 1, (seen[0] - own[0]) / SIMILAR, 0.0)
+                        sky += w / (1.0 + change * change * change * change) * wp.vec2(1.0, seen[0])
+                    if seen[1] >= 0.0:
+                        sun += w * wp.vec2(1.0, seen[1])
+        if sky[0] > 0.0:
+            own[0] = sky[1] / sky[0]
+        if sun[0] > 0.0 and step == 1:
+            own[1] = sun[1] / sun[0]
+        out[pixel] = own
+
+    return smooth_pixel
 
 
 @wp.func

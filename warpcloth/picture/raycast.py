@@ -130,7 +130,7 @@ class RayCaster:
         number("sun_angle", sun_angle, least=0.0)
         number("contrast", contrast, least=0.0)
         self.shapes, self.left_out = list(shapes), 0
-        self._size, self._samples = (int(width), int(height)), int(samples)
+        self._size = int(width), int(height)
         self._ground, self._up = ground, np.array(_UP[up_axis])
         self._sun_angle, self._contrast = sun_angle, contrast
         self._background, self._ground_colour = (
@@ -140,10 +140,10 @@ class RayCaster:
         self._device = find_device(device)
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._pool = ThreadPool(1 if not self._device.is_cpu else threads or cores)
-        self._allocate()
+        self._allocate(samples)
 
     @in_turn
-    def _allocate(self):
+    def _allocate(self, samples):
         shapes, offsets = self.shapes, np.cumsum([0, *(shape.count for shape in self.shapes)])
         empty = np.empty((0, 3), np.int32)
         self._points = np.zeros((max(1, offsets[-1]), 3))
@@ -171,8 +171,13 @@ class RayCaster:
             self._faces = [wp.zeros(len(self._triangles), dtype=wp.vec3), wp.zeros(len(flat), dtype=wp.float32)]
             self._bounds = [wp.zeros(len(self._radii), dtype=wp.vec3) for _ in range(2)]
             layers = self._layers = kernels.Layers()
-            layers.base, layers.sky, layers.sun, layers.normal = (wp.zeros(pixels, dtype=wp.vec3) for _ in range(4))
-            layers.visible, layers.depth = wp.zeros(pixels, dtype=wp.vec2), wp.zeros(pixels, dtype=wp.float32)
+            layers.base, layers.sky, layers.sun, layers.normal, layers.point = (
+                wp.zeros(pixels, dtype=wp.vec3) for _ in range(5)
+            )
+            layers.visible = wp.zeros(pixels, dtype=wp.vec2)
+            self._samples = wp.array(pixel_samples(samples), dtype=wp.vec2)
+            self._visible = wp.zeros_like(layers.visible)
+            self._smooth = True
             self._image = wp.zeros((pixels, 3), dtype=wp.uint8)
 
     @in_turn
@@ -201,7 +206,12 @@ class RayCaster:
             self._set_positions(points, np.asarray(camera.target), unit)
             self._colour(colours)
             light = self._light(viewer, np.asarray(camera.target), unit)
-            self._trace(viewer, light)
+            self._launch_rows(kernels.trace(), [self._geometry, viewer, light], [self._layers])
+            if self._smooth:
+                for step, vertical in ((1, 0), (1, 1), (4, 0), (4, 1)):
+                    visible, other = self._layers.visible, self._visible
+                    self._launch_rows(kernels.smooth(), [self._layers, visible, viewer, vertical, step], [other])
+                    self._layers.visible, self._visible = other, visible
             width, height = self._size
             wp.launch(kernels.develop(), width * height, inputs=[self._layers], outputs=[self._image])
             return self._image.numpy().reshape(height, width, 3)
@@ -230,7 +240,7 @@ class RayCaster:
         back = np.cross(right, self._up)
         if not np.linalg.norm(back) > 1e-6:  # a camera that lies on its side
             back = -np.array(viewer.forward)
-        sun = -0.5 * right + 0.6 * back / np.linalg.norm(back) + 0.95 * self._up
+        sun = -0.55 * right + 0.8 * back / np.linalg.norm(back) + 0.85 * self._up
         sun /= np.linalg.norm(sun)
         light = kernels.Light()
         light.up, light.sun = wp.vec3(*self._up), wp.vec3(*sun)
@@ -320,19 +330,13 @@ class RayCaster:
         g.shares = wp.array(np.concatenate([none[:, 0], *shares, *line_shares]), dtype=wp.float32)
         g.backs = wp.array(np.concatenate([none, *backs]), dtype=wp.vec3)
 
-    def _trace(self, viewer, light):
-        """Traces the pixels: on the CPU each thread takes some rows, then the next that nobody has taken."""
+    def _launch_rows(self, kernel, inputs, outputs):
+        """Launches over the pixels: on the CPU each thread takes some rows, then the next that nobody has taken."""
         width, height = self._size
         step = _ROWS if self._device.is_cpu else height
         launches = iter(
             [
-                wp.launch(
-                    kernels.trace(),
-                    min(step, height - row) * width,
-                    inputs=[self._geometry, viewer, light, row * width],
-                    outputs=[self._layers],
-                    record_cmd=True,
-                )
+                wp.launch(kernel, min(step, height - row) * width, [*inputs, row * width], outputs, record_cmd=True)
                 for row in range(0, height, step)
             ]
         )
@@ -342,3 +346,21 @@ class RayCaster:
                 launch.launch()
 
         self._pool.run([work] * self._pool.threads)
+
+
+def pixel_samples(count):
+    """Positions (count, 2) in a pixel from 0 to 1, as even as they can be in each direction.
+
+    Four are the corners of a square that is turned by atan ½; others are the lattice (k + ½, gk + ½)/count with the g that
+    keeps them farthest apart.
+    """
+    if count == 4:
+        return np.array([(0.125, 0.625), (0.375, 0.125), (0.625, 0.875), (0.875, 0.375)])
+    k = np.arange(count)
+
+    def gap(g):
+        apart = np.stack([k[1:], g * k[1:] % count])
+        return (np.minimum(apart, count - apart) ** 2).sum(axis=0).min(initial=2 * count**2)
+
+    best = max((g for g in range(1, count + 1) if np.gcd(g, count) == 1), key=gap)
+    return np.stack([k + 0.5, best * k % count + 0.5], axis=1) / count
