@@ -29,6 +29,8 @@ _PIN, _PIN_EDGE = 0.009, 0.35
 _THINNEST = 0.003
 # From the middle of one cloth of a batch to that of the next, by their size.
 _APART = 1.12
+# Of the height of a cloth, how much farther behind it the next row of a batch is, so that it is seen.
+_HIDES = 1.0
 _SOURCES = "a path, an Animation, a Deformation, a Scene, a Mesh, a Sequence, or an array of frames with its mesh"
 
 
@@ -223,15 +225,17 @@ def _side_by_side(points, azimuth, up_axis):
     if up_axis == "Z":
         right, back = (np.array([x, -z, y]) for x, y, z in (right, back))
     sizes = []
-    for axis in (right, back):
+    for axis in (right, back, np.eye(3)["YZ".index(up_axis) + 1]):
         extents = [np.asarray(frame, dtype=np.float64) @ axis for frame in points]
         finite = [each[np.isfinite(each)] for each in extents]
         sizes.append(max(each.max() for each in finite if each.size) - min(each.min() for each in finite if each.size))
-    columns = batch if batch <= 5 else int(np.ceil(np.sqrt(1.6 * batch)))
-    k = np.arange(batch)
-    across, depth = (k % columns) - (min(batch, columns) - 1) / 2.0, k // columns
-    gap = _APART * max(sizes[0], 0.3 * sizes[1])
-    return (np.outer(across * gap, right) + np.outer(depth * max(_APART * sizes[1], 0.5 * gap), back))[:, None]
+    width, depth, height = sizes
+    rows = max(1, round(np.sqrt(batch / 2.5)))
+    columns = -(-batch // rows)
+    row, column = np.divmod(np.arange(batch), columns)
+    across = _APART * max(width, 0.3 * depth) * (column - (columns - 1) / 2.0)
+    behind = (_APART * depth + _HIDES * height) * row
+    return (np.outer(across, right) + np.outer(behind, back))[:, None]
 
 
 def _repeated(shape, batch):
