@@ -41,8 +41,8 @@ class Reset:
         stepper, model = self.stepper, self.model
         if stepper.state.starts and not (positions is None and velocities is None):
             raise ValueError(
-                "reset takes no positions or velocities with integrator='bdf2', which knows what was before the start of the "
-                "model alone; 'euler' and 'midpoint' take them"
+                f"reset takes no positions or velocities with integrator={stepper.options.integrator!r}, which knows what was "
+                "before the start of the model alone; an integrator of one step, such as 'euler', takes them"
             )
         mask, x, v = self.on_device(mask, positions, velocities)
         x, v = model.positions if x is None else x, model.velocities if v is None else v

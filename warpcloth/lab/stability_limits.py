@@ -20,15 +20,6 @@ KNOWN = "error of the reference = accuracy"
 # Growth in energy of the fastest mode of a net when the whole net, which starts as noise, has grown enough to count as diverged
 # (:data:`warpcloth.run.balance.GAIN`). Measured in runs of 40 to 400 steps it is 7 to 16 times.
 GROWTH = 10.0
-# Factors z of a step, complex, where sweeps multiply x̃ by q: Euler z² − 2qz + q = 0, midpoint z² − 2(2q − 1)z + 1 = 0, BDF2
-# z² = r(4z − 1)/3 with r = q ± √(q² − q).
-_STEPS = {
-    "euler": lambda q: _roots(q, q),
-    "midpoint": lambda q: _roots(2.0 * q - 1.0, 1.0),
-    "bdf2": lambda q: np.concatenate([_roots(2.0 * r / 3.0, r / 3.0) for r in _roots(q, q)]),
-}
-# Smallest real q for which |z| ≤ 1.
-_LEAST = {"euler": -1.0 / 3.0, "midpoint": 0.0, "bdf2": -9.0 / 55.0}
 # Most springs for which the eigenvalues of a sweep are computed, by a dense solver.
 _MOST = 1000
 
@@ -59,7 +50,7 @@ class _Cell:
     def __init__(self, scene, record, steps):
         self.scene, self.record, self.steps = scene, record, steps
         self.h = 1.0 / (scene.fps * record.per_frame(scene.fps))
-        self.he = INTEGRATORS[getattr(record, "integrator", "euler")].part * self.h
+        self.he = _integrator(record).part * self.h
         self.damped = any(getattr(term, "damping", None) is not None for term in scene.terms)
         self.springs = not self.damped and all(isinstance(term, Spring) for term in scene.terms)
 
@@ -182,8 +173,8 @@ def largest_relaxation(scene, he, record):
     A sweep multiplies what is wrong by 1 − ωλ, λ the eigenvalues of C(D + α̃)⁻¹JVWJᵀ, D the diagonal of JWJᵀ, α̃ = 1/(khₑ²) and
     C and V what constraints and vertices are averaged by; of XPBD, whose multipliers count, C(D + α̃)⁻¹(JWJᵀ + α̃). It settles
     iff ωλ_max < 2. Velocities are differences of positions, so that what n sweeps multiply x̃ by, q = 1 − ρ(1 − (1 − ωλ)ⁿ)
-    with ρ the part of JWJᵀ in λ, must be below 1, and above :data:`_LEAST`: of an even n that is the same, of an odd one
-    (ωλ_max − 1)ⁿ < (1 − q_min)/ρ − 1.
+    with ρ the part of JWJᵀ in λ, must be below 1, and above the ``least_factor`` of the integrator: of an even n
+    that is the same, of an odd one (ωλ_max − 1)ⁿ < (1 − q_min)/ρ − 1.
 
     Args:
         scene: Of springs alone, without damping.
@@ -208,7 +199,7 @@ def largest_relaxation(scene, he, record):
     # Of the first sweep λ is 0 before it.
     largest, v = _largest(moved + diags_array(factor * compliance) if record.multipliers and n > 1 else moved)
     part = float(v @ (moved @ v)) / largest
-    least = _LEAST[getattr(record, "integrator", "euler")]
+    least = _integrator(record).least_factor
     return float(1.0 + (((1.0 - least) / part - 1.0) ** (1.0 / n) if n % 2 else 1.0)) / largest
 
 
@@ -218,8 +209,9 @@ def largest_ordered(scene, he, record, steps):
     A sweep solves (D/ω + L)Δλ = −(Jx̃ + Aλ). A is JWJᵀ + α̃ for XPBD and JWJᵀ for PBD, D is the diagonal of JWJᵀ + α̃,
     α̃ = 1/(khₑ²), and L is the part of JWJᵀ that comes before an element in the order of the sweep; x = x̃ + WJᵀλ. The matrix by
     which n sweeps multiply x̃ has complex eigenvalues q, because the order makes it unsymmetric. Steps multiply by z, see
-    :data:`_STEPS`. A run is stable while no |z| makes the energy grow by :data:`GROWTH` in all steps. In a net of structural
-    springs the smallest q is (1 − ω)ⁿ, which is −1/3 for ω = 1 + 3^(−1/n); with more springs complex q grow before that.
+    ``growth`` of the integrator. A run is stable while no |z| makes the energy grow by :data:`GROWTH` in all steps. In a net of
+    structural springs the smallest q is (1 − ω)ⁿ, which is −1/3 for ω = 1 + 3^(−1/n); with more springs complex q grow before
+    that.
 
     Args:
         scene: A scene of springs alone, without damping.
@@ -237,15 +229,12 @@ def largest_ordered(scene, he, record, steps):
     J = (_directions(scene, pairs) * np.repeat(np.sqrt(_inverse_masses(scene)), 3)).toarray()
     share = _share(mobility, compliance, record)
     kept = compliance if record.multipliers else np.zeros_like(compliance)
-    integrator = getattr(record, "integrator", "euler")
-    to_and_fro = integrator == "midpoint"
-    return _largest_ordered(
-        J.tobytes(), len(pairs), (mobility / share).tobytes(), kept.tobytes(), record.iterations, integrator, to_and_fro, steps
-    )
+    given = J.tobytes(), len(pairs), (mobility / share).tobytes(), kept.tobytes()
+    return _largest_ordered(*given, record.iterations, _integrator(record), steps)
 
 
 @lru_cache(256)  # cells that differ in relaxation share a limit, and so do those of a hard net at all steps
-def _largest_ordered(J, count, diagonal, compliance, n, integrator, to_and_fro, steps):
+def _largest_ordered(J, count, diagonal, compliance, n, integrator, steps):
     """Implements :func:`largest_ordered` with JW^½ (E, 3N), D (E,) and α̃ (E,), each as bytes."""
     from scipy.linalg import solve_triangular
 
@@ -256,11 +245,11 @@ def _largest_ordered(J, count, diagonal, compliance, n, integrator, to_and_fro, 
     def grows(omega):
         moves = np.zeros_like(B)
         for sweep in range(n):
-            back = to_and_fro and sweep % 2
+            back = integrator.to_and_fro and sweep % 2
             factor = np.diag(diagonal / omega) + (after if back else before)
             moves -= solve_triangular(factor, B + A @ moves, lower=not back, check_finite=False)
         q = np.linalg.eigvals(np.eye(B.shape[1]) + B.T @ moves).astype(complex)
-        return abs(_STEPS[integrator](q)).max() > GROWTH ** (0.5 / steps)
+        return abs(integrator.growth(q)).max() > GROWTH ** (0.5 / steps)
 
     # Beyond the first unstable ω there may be stable ones again.
     trials = np.linspace(0.0, 2.0 * (1.0 + 3.0 ** (-1.0 / n)), 41)[1:] * (diagonal / np.diag(J @ J.T)).min()
@@ -314,10 +303,9 @@ def _range(J):
     return vectors[values > 1e-9 * values[0]].T
 
 
-def _roots(half, product):
-    """Solves z² − 2·half·z + product = 0 for both z, complex."""
-    root = np.sqrt(half * half - product + 0j)
-    return np.stack([half + root, half - root])
+def _integrator(record):
+    """The class of the integrator of a record; solvers without a choice have the velocities of Euler."""
+    return INTEGRATORS[getattr(record, "integrator", "euler")]
 
 
 def _share(mobility, compliance, record):

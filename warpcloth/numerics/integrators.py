@@ -3,8 +3,13 @@
 Each step of each of them minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x); they differ in the effective step hₑ, in x̃ and in how the new
 state follows from the minimiser (Hairer and Wanner 1996, *Solving ordinary differential equations II*). As solvers minimise
 over the correction d = x − x̃, velocities follow from d/hₑ = hₑ a with a = −∇U/m at the minimiser.
+
+A class also says what solvers and step limits ask of its integrator, so that these need not know it by name.
 """
 
+from typing import ClassVar
+
+import numpy as np
 import warp as wp
 
 from ..kernels import step as kernels
@@ -19,10 +24,26 @@ class Euler:
 
     Attributes:
         he: hₑ [s].
+        part: hₑ/h.
+        pin_parts: In which the pins make the way of a step.
+        hard: Whether it takes constraints of infinite stiffness.
+        to_and_fro: Whether Gauss–Seidel sweeps must change their direction, because it does not damp what one order adds.
+        least_weight: Number of iterations times the least automatic weight of ADMM. A small weight needs many iterations, and
+            what a step leaves unfinished becomes a velocity in the next one, which midpoint keeps and Euler damps.
+        least_factor: The smallest real q for which no |z| of `growth` is above 1.
     """
 
-    part = 1.0  # hₑ/h
-    pin_parts = 1  # in which the pins make the way of a step
+    part: ClassVar[float] = 1.0
+    pin_parts: ClassVar[int] = 1
+    hard: ClassVar[bool] = True
+    to_and_fro: ClassVar[bool] = False
+    least_weight: ClassVar[float] = 2.0
+    least_factor: ClassVar[float] = -1.0 / 3.0
+
+    @staticmethod
+    def growth(q):
+        """The factors z of a step, complex, where iterations multiply x̃ by q (n,): z² − 2qz + q = 0."""
+        return _roots(q, q)
 
     def __init__(self, stepper):
         self.stepper, self.he = stepper, self.part * stepper.h
@@ -56,7 +77,12 @@ class Euler:
 class Midpoint(Euler):
     """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Second order. At xₘ pins are where they are at t + h/2."""
 
-    part, pin_parts = 0.5, 2
+    part, pin_parts, hard, to_and_fro, least_weight, least_factor = 0.5, 2, False, True, 20.0, 0.0
+
+    @staticmethod
+    def growth(q):
+        """As of Euler, z² − 2(2q − 1)z + 1 = 0."""
+        return _roots(2.0 * q - 1.0, 1.0)
 
     @property
     def moment(self):
@@ -87,7 +113,12 @@ class BDF2(Euler):
         v_before: v₋₁ (N,) [m/s]; not used for pins.
     """
 
-    part = 2.0 / 3.0
+    part, hard, least_weight, least_factor = 2.0 / 3.0, False, 4.0, -9.0 / 55.0
+
+    @staticmethod
+    def growth(q):
+        """As of Euler, z² = r(4z − 1)/3 with r = q ± √(q² − q)."""
+        return np.concatenate([_roots(2.0 * r / 3.0, r / 3.0) for r in _roots(q, q)])
 
     def __init__(self, stepper):
         super().__init__(stepper)
@@ -129,6 +160,12 @@ class BDF2(Euler):
             given = [model.pins, model.pin_axes, stepper.state.v, model.per_copy, stepper.h]
             note = model.kernel(kernels.note_guided, model.dtype)
             model.launch(note, (model.copies, len(model.pins)), given, [self.move])
+
+
+def _roots(half, product):
+    """Solves z² − 2·half·z + product = 0 for both z, complex."""
+    root = np.sqrt(half * half - product + 0j)
+    return np.stack([half + root, half - root])
 
 
 INTEGRATORS = {"euler": Euler, "midpoint": Midpoint, "bdf2": BDF2}

@@ -26,10 +26,6 @@ from .implicit import ImplicitStepper
 from .solver import Stepper
 from .step import ImplicitStep
 
-# n times the smallest r for n iterations. A small weight needs many iterations, and what a step leaves unfinished becomes a
-# velocity in the next one, which midpoint keeps and Euler damps.
-_FLOORS = {"euler": 2.0, "bdf2": 4.0, "midpoint": 20.0}
-
 
 @dataclass(frozen=True)
 class ADMM(ImplicitStep):
@@ -194,7 +190,7 @@ class ADMMStepper(ImplicitStepper):
         model, weight = self.model, self.options.weight
         if weight != "auto":
             return np.full(elements.count, weight, dtype=model.numpy_dtype)
-        least = min(_FLOORS[self.options.integrator] / self.options.iterations, 1.0)
+        least = min(self.integrator.least_weight / self.options.iterations, 1.0)
         return np.maximum(best_weights(model, elements, self.he, scale), least).astype(model.numpy_dtype)
 
     def _split_of(self, elements, ratio, scale):

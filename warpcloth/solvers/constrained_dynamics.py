@@ -106,8 +106,7 @@ class ConstrainedDynamics(ImplicitStep):
             ValueError: If a term has no constraint, or infinite stiffness where that is not allowed.
         """
         self.refuse(model)
-        if self.integrator != "euler":
-            self.refuse(model, (FINITE,), f"integrator={self.integrator!r}", "integrator='euler'")
+        self.refuse_hard(model)
         if self.stabilisation == "line-search":
             self.refuse(model, (FINITE,), "stabilisation='line-search'", "stabilisation='geometric-stiffness'")
         return self._on(ConstrainedDynamicsStepper, model)

@@ -11,8 +11,9 @@ from ..base.texts import words_of
 from ..base.turns import methods_in_turn
 from ..core.status import Residual
 from ..model.model import Model
+from ..numerics.integrators import INTEGRATORS
 from ..scene.scene import Scene
-from ..terms.needs import Need, listed, refuse_unmet
+from ..terms.needs import FINITE, Need, listed, refuse_unmet
 from .facts import Facts
 from .solver import Stepper
 from .threaded import ThreadedStepper
@@ -203,6 +204,12 @@ class ImplicitStep(Step):
     """
 
     integrator: Literal["euler", "midpoint", "bdf2"] = "euler"
+
+    def refuse_hard(self, model):
+        """Refuses infinite stiffness with an integrator that cannot take it."""
+        if not INTEGRATORS[self.integrator].hard:
+            able = " or ".join(repr(name) for name, integrator in INTEGRATORS.items() if integrator.hard)
+            self.refuse(model, (FINITE,), f"integrator={self.integrator!r}", f"integrator={able}")
 
 
 def fewest_substeps(fps, rest, motion):

@@ -13,9 +13,10 @@ from ..fast.plan import plan
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..model.model import Model
+from ..numerics.integrators import INTEGRATORS
 from ..numerics.iterate import GravityScale
 from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
-from ..terms.needs import FINITE, LOCAL_STEP, MERGED_DAMPING
+from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
 from .step import ImplicitStep
@@ -92,9 +93,9 @@ class XPBD(ImplicitStep):
         super().__post_init__()
         whole("iterations", self.iterations, 1)
         number("relaxation", self.relaxation, above=0.0)
-        if self.integrator == "midpoint" and self.sweep != "constraint-averaged" and self.iterations % 2:
+        if INTEGRATORS[self.integrator].to_and_fro and self.ordered and self.iterations % 2:
             raise ValueError(
-                f'iterations is {self.iterations}; with integrator="midpoint" sweeps go forward and backward in turn, '
+                f'iterations is {self.iterations}; with integrator="{self.integrator}" sweeps go forward and backward in turn, '
                 "so that it must be even"
             )
 
@@ -119,8 +120,7 @@ class XPBD(ImplicitStep):
                 other than Euler.
         """
         self.refuse(model)
-        if self.integrator != "euler":
-            self.refuse(model, (FINITE,), f"integrator={self.integrator!r}", "integrator='euler'")
+        self.refuse_hard(model)
         return self._on(XPBDStepper, model)
 
 
@@ -148,7 +148,7 @@ class XPBDStepper(LaunchedStepper):
         self._keep_largest = model.kernel(keep_largest)
         self._scale = GravityScale(model).or_else(1.0)
         sweeps = self.sweep.parts(options.iterations - (not soft))
-        if options.integrator == "midpoint" and options.ordered:
+        if self.integrator.to_and_fro and options.ordered:
             sweeps = [(self._launch_to_and_fro, options.iterations // 2)]
         self.record((self._launch_start, 1), *sweeps, (self._launch_last, 1))
         self.integrator.start()
