@@ -277,10 +277,25 @@ def measure_triangles(dtype):
 
 
 @cache
+def stress_measures(dtype):
+    """The struct of the outputs of :func:`measure_stress`, (T,) each, by the names of measures."""
+    _, mat33 = types(dtype)
+    mat32 = wp.types.matrix((3, 2), dtype)
+
+    @wp.struct
+    class StressMeasures:
+        energy_density: wp.array(dtype=dtype)
+        first_piola_stress: wp.array(dtype=mat32)
+        cauchy_stress: wp.array(dtype=mat33)
+
+    return StressMeasures
+
+
+@cache
 def measure_stress(dtype, term):
     """Kernel over triangles: ku, P = k∂u/∂F (3×2) and σ = P Fᵀ/J (3×3) of a membrane :class:`..term.Term`, J = ‖f₁×f₂‖."""
     _, mat33 = types(dtype)
-    mat32 = wp.types.matrix((3, 2), dtype)
+    outputs = stress_measures(dtype)
     parameters = wp.types.vector(term.parameters, dtype)
     energy_of, gradient_of = term.energy, term.gradient
 
@@ -292,25 +307,23 @@ def measure_stress(dtype, term):
         # state in
         gradients: wp.array(dtype=mat33),
         # out
-        energy_density: wp.array(dtype=dtype),
-        first_piola_stress: wp.array(dtype=mat32),
-        cauchy_stress: wp.array(dtype=mat33),
+        out: outputs,
     ):
         t = wp.tid()
         F = surface_part(gradients[t])
         y = wp.transpose(F)
         k = stiffness[t]
-        if energy_density:
-            energy_density[t] = k * energy_of(y, rest[t])
+        if out.energy_density:
+            out.energy_density[t] = k * energy_of(y, rest[t])
         P = k * wp.transpose(gradient_of(y, rest[t]))
-        if first_piola_stress:
-            first_piola_stress[t] = P
-        if cauchy_stress:
+        if out.first_piola_stress:
+            out.first_piola_stress[t] = P
+        if out.cauchy_stress:
             n = wp.cross(column(F, 0), column(F, 1))
             J = wp.length(n)
             if not (J > dtype(4.0) * epsilon(J) * wp.ddot(F, F)):
                 J = dtype(wp.NAN)
             sigma = (dtype(1.0) / J) * (P * y)
-            cauchy_stress[t] = dtype(0.5) * sigma + dtype(0.5) * wp.transpose(sigma)
+            out.cauchy_stress[t] = dtype(0.5) * sigma + dtype(0.5) * wp.transpose(sigma)
 
     return measure

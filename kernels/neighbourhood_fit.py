@@ -140,10 +140,26 @@ def neighbourhood_gradients(dtype):
 
 
 @cache
+def neighbourhood_measures(dtype):
+    """The struct of the outputs of :func:`measure_neighbourhoods`, (N,) each, by the names of measures."""
+    vec3, mat33 = types(dtype)
+
+    @wp.struct
+    class NeighbourhoodMeasures:
+        deformation_gradient: wp.array(dtype=mat33)
+        stretch: wp.array(dtype=vec3)
+        directions: wp.array(dtype=mat33)
+        rotation_angle: wp.array(dtype=dtype)
+
+    return NeighbourhoodMeasures
+
+
+@cache
 def measure_neighbourhoods(dtype):
     """Kernel over vertices: F = F̂ Tᵀ (3×3), its singular values, those directions as rows (3×3) in the current frame, and the
     angle of R."""
-    vec3, mat33 = types(dtype)
+    _, mat33 = types(dtype)
+    outputs = neighbourhood_measures(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def measure(
@@ -152,21 +168,18 @@ def measure_neighbourhoods(dtype):
         frames: wp.array(dtype=mat33),
         rotations: wp.array(dtype=mat33),
         # out
-        gradient: wp.array(dtype=mat33),
-        stretch: wp.array(dtype=vec3),
-        directions: wp.array(dtype=mat33),
-        rotation_angle: wp.array(dtype=dtype),
+        out: outputs,
     ):
         i = wp.tid()
-        if gradient:
-            gradient[i] = gradients[i] * wp.transpose(frames[i])
-        if stretch or directions:
+        if out.deformation_gradient:
+            out.deformation_gradient[i] = gradients[i] * wp.transpose(frames[i])
+        if out.stretch or out.directions:
             U, S, _V = svd3(gradients[i])
-            if stretch:
-                stretch[i] = S
-            if directions:
-                directions[i] = wp.transpose(U)
-        if rotation_angle:
-            rotation_angle[i] = angle_of(rotations[i])
+            if out.stretch:
+                out.stretch[i] = S
+            if out.directions:
+                out.directions[i] = wp.transpose(U)
+        if out.rotation_angle:
+            out.rotation_angle[i] = angle_of(rotations[i])
 
     return measure

@@ -27,6 +27,7 @@ from support.continuum import (
     turn,
     turned,
 )
+from warpcloth.analysis.measures import MEASURES
 
 STATIC = ("deformation_gradient", "rotation", "right_stretch", "right_cauchy_green", "green_strain", "stretch",
           "rest_directions", "directions", "rotation_angle", "area_ratio")  # fmt: skip
@@ -142,6 +143,19 @@ def test_affine_maps_of_neighbourhoods(neighbourhood, dtype, device):
         gap = -np.diff(S).max()
         bounded(gap * np.abs(np.einsum("eij,ji->ei", d, W)), gap, 4.0 * bound)
     assert not found.excluded
+
+
+@pytest.mark.parametrize("neighbourhood", [None, "1-ring"])
+def test_a_measure_alone_is_that_among_all(neighbourhood, device):
+    """To the bit, for every measure that there is: each finds by itself what it follows from."""
+    mesh, rng, names = flat(), np.random.default_rng(5), MEASURES["triangle" if neighbourhood is None else "vertex"]
+    positions = [mesh.points @ G.T + b for G, b in (random_map(rng) for _ in range(2))]
+    given = {"dt": 10.0, "neighbourhood": neighbourhood, "rates": "forward", "device": device}
+    if neighbourhood is None:
+        given |= {"directions": (1.0, 0.2, 0.1), "material": wc.StVKMembrane(stiffness=2.0)}
+    together = wc.analyze(positions, mesh, measures="all", **given)
+    for name in names:
+        np.testing.assert_array_equal(wc.analyze(positions, mesh, measures=name, **given)[name], together[name], name)
 
 
 @every_dtype

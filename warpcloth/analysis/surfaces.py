@@ -12,6 +12,8 @@ from ..terms import TERMS
 from ..terms.membrane import Membrane
 from .neighbourhoods import neighbourhoods
 
+# Measures of vertices that do not follow from F, which is found where any other is measured.
+_WITHOUT_GRADIENT = ("rotation", "rotation_angle", "residual", "cross_covariance")
 RATES = {"midpoint": rates.MIDPOINT, "forward": rates.FORWARD, "logarithm": rates.LOGARITHM}
 
 
@@ -132,10 +134,10 @@ class Triangles(_Elements):
         if self.wanted(*outputs.vars):
             inputs = [self.frames, self.materials, self.gradients]
             self.launch(deformation.measure_triangles(self.scalar), inputs, [self.chosen(outputs)])
-        names = ("energy_density", "first_piola_stress", "cauchy_stress")
-        if self.wanted(*names):
+        outputs = deformation.stress_measures(self.scalar)
+        if self.wanted(*outputs.vars):
             kernel = deformation.measure_stress(self.scalar, self.term)
-            self.launch(kernel, [self.stiffness, self.rest, self.gradients], names)
+            self.launch(kernel, [self.stiffness, self.rest, self.gradients], [self.chosen(outputs)])
 
     def _find_gradients(self, x, out):
         inputs = [self.triangles, self.inverse_edges, self.centred(x)]
@@ -176,8 +178,7 @@ class Neighbourhoods(_Elements):
         self.rotations = self.results.get("rotation")
         if self.rotations is None and self.wanted("rotation_angle"):
             self.rotations = self.empty(self.mat33)
-        self.fitted = self.wanted(*(measure.name for measure in measures if measure.rate))
-        self.fitted |= self.wanted("deformation_gradient", "stretch", "directions")
+        self.fitted = any(name not in _WITHOUT_GRADIENT for name in self.results)
         self.sizes = self.upload(np.sqrt(mesh.vertex_areas), self.scalar)
 
     def refer(self, X, rounding):
@@ -198,10 +199,10 @@ class Neighbourhoods(_Elements):
         """Measures the frame x (n, 3), all but rates."""
         gradients = self.gradients if self.fitted else None
         self._fit(x, [gradients, self.frames, self.rotations, "residual", "cross_covariance"])
-        names = ("deformation_gradient", "stretch", "directions", "rotation_angle")
-        if self.wanted(*names):
+        outputs = neighbourhood_fit.neighbourhood_measures(self.scalar)
+        if self.wanted(*outputs.vars):
             inputs = [self.gradients, self.frames, self.rotations]
-            self.launch(neighbourhood_fit.measure_neighbourhoods(self.scalar), inputs, names)
+            self.launch(neighbourhood_fit.measure_neighbourhoods(self.scalar), inputs, [self.chosen(outputs)])
 
     def touched(self, vertices):
         """Which neighbourhoods have one of some vertices (n,) bool."""
