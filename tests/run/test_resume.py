@@ -84,6 +84,23 @@ def test_a_resumed_run_is_the_same_to_the_bit(name, offset, dtype, tmp_path, dev
     assert not list(tmp_path.rglob("checkpoint*"))
 
 
+@pytest.mark.parametrize("name", ["explicit", "newton bdf2", "xpbd"])
+def test_books_of_a_resumed_run_are_the_same_to_the_bit(name, tmp_path, device):
+    """Works of pins and of a pressure too, which are summed from the start; another record is another run."""
+    wind = wc.Pressure(vertices="all", keyframes=np.linspace(0.0, 5.0, LAST))
+    scene, solver, record = replace(moved(), loads=[wind]), SOLVERS[name], ("reactions", "energies")
+    whole = wc.simulate(scene, solver, device=device, record=record)
+    interrupted(scene, solver, tmp_path / "a.usdc", STOP, device=device, record=record)
+    with pytest.raises(ValueError, match="interrupted had record energies, reactions, and this one has record energies; run"):
+        wc.simulate(scene, solver, output=str(tmp_path / "a.usdc"), resume=True, device=device, record="energies")
+    resumed = wc.simulate(scene, solver, output=str(tmp_path / "a.usdc"), resume=True, device=device, record=record)
+    assert whole.reactions.shape == (LAST + 1, 2, 3) and whole.reactions.tobytes() == resumed.reactions.tobytes()
+    assert "work of pins" in whole.energies and "work of loads" in whole.energies
+    assert list(whole.energies) == list(resumed.energies)
+    for values, found in zip(whole.energies.values(), resumed.energies.values(), strict=True):
+        assert values.tobytes() == found.tobytes()
+
+
 @pytest.mark.parametrize("stops", [(STOP,), (20, 21), (10, 10, 23)])
 @pytest.mark.parametrize(("ending", "single"), [("usdc", False), ("usda", True), ("usdz", False)])
 def test_frames_go_on_in_the_same_file(ending, single, stops, tmp_path, device):

@@ -78,6 +78,10 @@ class _Sweep:
             for elements, key in zip(model.terms, self._keys, strict=True)
         ]
 
+    def with_multipliers(self):
+        """Triples of the elements of each term, their multipliers, and the term, dtype and whether these are numbers."""
+        return zip(self.elements, self.multipliers, self._keys, strict=True)
+
 
 class JacobiSweep(_Sweep):
     """Jacobi sweeps, in which each constraint sees where its vertices were before.

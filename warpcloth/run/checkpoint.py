@@ -26,10 +26,11 @@ _CALLED = {
     "device": "the device {}",
     "dtype": "dtype {}",
     "threads": "threads {}",
+    "record": "record {}",
 }
 
 
-def facts_of(scene, solver, device, dtype, vary, threads):
+def facts_of(scene, solver, device, dtype, vary, threads, record=()):
     """All that the bits of a run depend on, by name.
 
     Raises:
@@ -44,6 +45,7 @@ def facts_of(scene, solver, device, dtype, vary, threads):
         "device": device.name if device.is_cuda else "cpu",
         "dtype": dtype,
         "threads": int(threads),
+        "record": ", ".join(record) or "nothing",
     }
 
 

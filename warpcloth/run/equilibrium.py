@@ -1,5 +1,6 @@
 """Rest shapes: where the energy of a scene and of its weight is least, without inertia."""
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..numerics.minimise import Minimiser
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
 from ..terms.refresh import Moment
+from .ledger import Books, checked_record
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
@@ -34,6 +36,9 @@ class Equilibrium(NamedTuple):
         stable: Whether the descent ended in balance and no eigenvalue is negative by more than rounding and the tolerance
             explain. Then no small move lowers the energy to second order. Moves that cost nothing, such as those of a body
             that nothing holds, have the eigenvalue 0 and count as stable.
+        energies: With ``record="energies"``, by name [J]: of each term, ``"gravity"`` since the start, and the ``"work of
+            loads"`` that are constant.
+        reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (p, 3) [N].
     """
 
     points: np.ndarray
@@ -41,6 +46,8 @@ class Equilibrium(NamedTuple):
     iterations: int
     lowest_eigenvalue: float = np.nan
     stable: bool = False
+    energies: dict[str, float] | None = None
+    reactions: np.ndarray | None = None
 
 
 @in_turn
@@ -52,6 +59,7 @@ def equilibrium(
     device: str = "cpu",
     dtype: Precision = "float64",
     linear: Literal["factorised", "cg"] = "factorised",
+    record: str | Sequence[str] = (),
 ) -> Equilibrium:
     """Finds the shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins in their final positions.
 
@@ -77,6 +85,7 @@ def equilibrium(
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
         linear: ``"factorised"``, which stiff and slender cloth needs, or ``"cg"``.
+        record: ``"energies"``, ``"reactions"`` or both, to have them in the result.
 
     Returns:
         :class:`Equilibrium`.
@@ -97,6 +106,7 @@ def equilibrium(
     whole("load_steps", load_steps, 1)
     whole("iterations", iterations, 1)
     choice("linear", linear, ("factorised", "cg"))
+    record = checked_record(record)
     model = scene.build(device=device, dtype=dtype)
     refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
     base = wp.clone(model.positions)
@@ -126,7 +136,15 @@ def equilibrium(
     if result is Result.STALLED:
         message = message.replace(result.value, began)
     status = Status(result, residual=residual, message=message, measure=RESIDUAL.measure, unit=unit)
-    return Equilibrium(np.array(base.numpy()), status, descent.used, lowest, result in SETTLED)
+    energies = reactions = None
+    if record:
+        books = Books(model, forces="reactions" in record)
+        if "energies" in record:
+            energies = {name: float(value[0]) for name, value in books.energies(base).items()}
+        if "reactions" in record:
+            books.launch(base)
+            reactions = books.reactions()[0]
+    return Equilibrium(np.array(base.numpy()), status, descent.used, lowest, result in SETTLED, energies, reactions)
 
 
 class _Descent:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +24,7 @@ from ..solvers.step import Step
 from ..usd import FrameSequence
 from .checkpoint import facts_of
 from .frames_ahead import state_of
+from .ledger import Ledger, checked_record
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
 
@@ -48,6 +49,11 @@ class Animation:
             its good frames.
         output: Path of the USD file, or None.
         scene: The :class:`warpcloth.Scene` of the run, or None.
+        energies: With ``record="energies"``, by name and (frames+1,) or (frames+1, B) [J]: of each term under its label,
+            ``"kinetic"``, ``"gravity"`` (0 at the start), and where there are any ``"work of pins"`` that move and ``"work of
+            loads"``. A copy that diverged is NaN from then on.
+        reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (frames+1, p,
+            3) or (frames+1, B, p, 3) [N], in the order of ``scene.pins.vertices``.
     """
 
     points: np.ndarray | FrameSequence
@@ -58,6 +64,8 @@ class Animation:
     worst_strain: float | np.ndarray
     output: FilePath | None = None
     scene: Scene | None = None
+    energies: dict[str, np.ndarray] | None = None
+    reactions: np.ndarray | None = None
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
@@ -79,6 +87,7 @@ def simulate(
     progress: Progress | None = None,
     threads: int = 1,
     resume: bool = False,
+    record: str | Sequence[str] = (),
 ) -> Animation:
     """Runs a scene with a solver.
 
@@ -101,6 +110,8 @@ def simulate(
         threads: See :class:`warpcloth.model.model.Model`.
         resume: Whether to continue the interrupted run to ``output`` after its last finished chunk of frames. The result equals
             that of an uninterrupted run bit for bit. All arguments but ``frames`` and ``single_file`` must be the same.
+        record: ``"energies"``, ``"reactions"`` or both, to have them in every frame of the :class:`Animation`. The motion is
+            the same to the bit. Work of moving pins and of loads that change is summed in every step, which takes more time.
 
     Returns:
         :class:`Animation`. A run that diverges ends with its last good frame, and ``status`` says so. With several copies the
@@ -126,13 +137,14 @@ def simulate(
     whole("frames", frames, 1, MOST_FRAMES)
     whole("copies", copies, 1)
     choice("dtype", dtype, tuple(DTYPES))
+    record = checked_record(record)
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
     if resume and output is None:
         raise ValueError("resume is given without output, the file of the run to go on with")
 
     def facts():
-        return facts_of(scene, solver, device, dtype, vary, threads)
+        return facts_of(scene, solver, device, dtype, vary, threads, record)
 
     # First, for it refuses a wrong output before anything compiles.
     recorder = Memory(frames, copies) if output is None else File(scene, output, single_file, facts, resume)
@@ -145,15 +157,21 @@ def simulate(
         stepper = solver.bind(model)
         timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds}
         watch, first = Watch(model, stepper), 0
+        ledger = watch.ledger = Ledger(stepper, model, record) if record else None
         if resume:
             first = _resume(recorder.checkpoint, frames, stepper, watch)
         else:
             recorder.append(*state_of(stepper))
+            if ledger:
+                ledger.keep(watch.alive)
         timings["frames"] = watch.seconds
         if progress is not None:
             progress(first, frames)
-        with closing(watched_frames(stepper, watch, frames, _ahead(model, output), first, recorder.keeps)) as found:
+        given = ledger or stepper, watch, frames, _ahead(model, output), first, recorder.keeps
+        with closing(watched_frames(*given)) as found:
             for number, frame in found:
+                if ledger:
+                    ledger.keep(watch.alive)
                 recorder.append(frame.points, frame.velocities, frame.state, watch)
                 if progress is not None:
                     progress(number, frames)
@@ -161,7 +179,8 @@ def simulate(
     status = watch.status(solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
-    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), output, scene)
+    recorded = ledger.by_name() if ledger else (None, None)
+    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), output, scene, *recorded)
 
 
 @in_turn
@@ -171,6 +190,8 @@ def _resume(checkpoint, frames, stepper, watch):
         raise ValueError(f"frames is {frames}; the run to be resumed has {checkpoint.frame} already, and this must be no less")
     stepper.state.from_host(checkpoint.state)
     watch.from_host(checkpoint.watch, stepper.state)
+    if watch.ledger:
+        watch.ledger.go_on()
     return checkpoint.frame
 
 

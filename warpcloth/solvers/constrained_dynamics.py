@@ -11,6 +11,7 @@ from ..core.capture import Mirror, Segment
 from ..core.status import Residual, Result
 from ..core.sums import RowSums, Sums
 from ..kernels import elementwise as kernels
+from ..kernels.ledger import add_scaled
 from ..model.model import Model
 from ..numerics.constraints import Constraints
 from ..numerics.iterate import GravityScale
@@ -170,6 +171,20 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._solve()
         self._move()
         self._stuck = self._stepped.read() == 0.0
+
+    def constraint_forces(self):
+        """Of M(x − x̃) = Jᵀλ: −Jᵀλ/hₑ²."""
+        model, constraints = self.model, self.constraints
+        hard = [part for part in constraints.parts if part.elements.hard]
+        add, pulls = model.kernel(add_scaled, model.dtype), model.vectors()
+
+        def launch(out):
+            pulls.zero_()
+            for part in hard:
+                part.launch_transpose(constraints.multipliers, pulls)
+            model.launch(add, model.count, [pulls, -1.0 / self.he**2], [out])
+
+        return launch
 
     def note(self, results, residual):
         """Records how a step ended; hard constraints that keep a gap contradict one another."""

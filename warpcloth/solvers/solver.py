@@ -104,6 +104,25 @@ class Stepper:
         model.launch(move, dim, [*given, self.h / parts], [x, v])
         model.launch(add_one, model.copies, [], [count])
 
+    @property
+    def loads_at_end(self):
+        """Whether steps take the forces of loads at their end, not in the middle or where they begin."""
+        return self.integrator is not None and self.integrator.part != 0.5
+
+    def constraint_forces(self):
+        """Makes what adds −f, f the forces of all hard terms by their multipliers in the last step, to an array (N,) [N].
+
+        Returns:
+            A function of the array, which launches it.
+
+        Raises:
+            ValueError: If the method has no multipliers.
+        """
+        raise ValueError(
+            f"{type(self.options).__name__} has no multipliers, so that the forces of terms with infinite stiffness are not "
+            "known, nor what pins bear; XPBD and ConstrainedDynamics have, and a finite stiffness gives them with every solver"
+        )
+
     def launch_prediction(self):
         """Updates what changes where a step begins, then sets x = x̃ and moves the pins to the end of the step."""
         self.model.refresh(STEP, self.integrator.moment)

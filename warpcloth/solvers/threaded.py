@@ -43,6 +43,19 @@ class ThreadedStepper(Stepper):
     def iterations(self):
         return max(part.iterations for part in self.parts)
 
+    @property
+    def loads_at_end(self):
+        return self.parts[0].loads_at_end
+
+    def constraint_forces(self):
+        n, launches = self.model.per_copy, [part.constraint_forces() for part in self.parts]
+
+        def launch(out):
+            for of_part, (first, end) in zip(launches, self._copies, strict=True):
+                of_part(out[first * n : end * n])
+
+        return launch
+
     def step(self):
         self.pool.run([part.step for part in self.parts])
 

@@ -9,7 +9,9 @@ from ..base.checks import number, whole
 from ..core.capture import Mirror
 from ..core.status import UNBALANCED, Residual, Result
 from ..core.sums import Sums
+from ..core.transpose import Transpose
 from ..fast.plan import plan
+from ..kernels import ledger
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..model.model import Model
@@ -183,6 +185,28 @@ class XPBDStepper(LaunchedStepper):
     def _launch_momentum(self, sign):
         given = [self.model.mass, self.sweep.correction, sign / self.he**2]
         self.model.launch(self._add_momentum, self.model.count, given, [self._force])
+
+    def constraint_forces(self):
+        """Of M(x − x̃) = Gᵀλ: −Gᵀλ/hₑ², which is right at any number of sweeps."""
+        model, pulls = self.model, []
+        for elements, values, key in self.sweep.with_multipliers():
+            if not elements.hard:
+                continue
+            if elements.cells:
+                raise ValueError(
+                    f"XPBD has no multipliers of {elements.label} at pinned vertices, so that what pins bear is not known; "
+                    "ConstrainedDynamics has them"
+                )
+            data = ledger.multiplier_pull(*key).data()
+            data.stencil, data.values, data.x, data.factor = elements.stencil, values, self.state.x, -1.0 / self.he**2
+            factories = ledger.scatter_multipliers, ledger.gather_multipliers
+            pulls.append((Transpose(model, elements, *factories, *key), data))
+
+        def launch(out):
+            for transpose, data in pulls:
+                transpose.add(data, out)
+
+        return launch
 
     def note(self):
         self.residual = self._largest.read() / self._scale

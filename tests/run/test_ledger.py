@@ -1,0 +1,288 @@
+"""Tests energies, works and reactions against closed forms, balances of momentum and of energy, and the run without them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import warpcloth as wc
+from support import setups
+from support.setups import square
+
+BOTH = ("energies", "reactions")
+NONE = (0.0, 0.0, 0.0)
+SOLVERS = {name: replace(solver, substeps=8) for name, solver in setups.SOLVERS.items()}
+
+
+def lifted(frames=12, **given):
+    """A cloth whose corners rise faster and faster."""
+    cloth = square(pins="corners", **given)
+    start = cloth.positions[cloth.pins.vertices]
+    keyframes = start + 0.01 * np.arange(frames)[:, None, None] ** 1.5 * np.array([0.2, 1.0, 0.0])
+    return replace(cloth, pins=wc.Pins("corners", keyframes))
+
+
+def total(energies):
+    """Of a closed system the sum of all energies, less the work that was done on it; constant."""
+    return sum(-values if name.startswith("work") else values for name, values in energies.items())
+
+
+def test_what_hangs_at_rest_pulls_by_its_weight(device):
+    """And has no moment about any point; along y alone, to rounding."""
+    cloth = square(pins="corners")
+    rest = wc.equilibrium(cloth, device=device, tolerance=1e-12, record=BOTH)
+    weights = cloth.vertex_masses[:, None] * cloth.gravity
+    mg = 9.81 * cloth.vertex_masses.sum()
+    np.testing.assert_allclose(rest.reactions.sum(axis=0), [0.0, mg, 0.0], rtol=1e-9, atol=1e-9 * mg)
+    moments = np.cross(rest.points[cloth.pins.vertices], rest.reactions).sum(axis=0) + np.cross(rest.points, weights).sum(
+        axis=0
+    )
+    np.testing.assert_allclose(moments, 0.0, atol=1e-9 * mg)
+    still = wc.simulate(
+        replace(cloth, positions=rest.points), SOLVERS["newton"], device=device, dtype="float64", frames=3, record="reactions"
+    )
+    np.testing.assert_allclose(still.reactions, np.tile(rest.reactions, (4, 1, 1)), atol=1e-9 * mg)
+    assert rest.energies["gravity"] == pytest.approx(-(weights * (rest.points - cloth.positions)).sum(), rel=1e-12)
+
+
+def test_pins_of_a_chain_bear_the_tension_of_the_discrete_catenary(device):
+    """Link i bears V_i = (i − (N−2)/2) m g upward and H along x, and is L + √(H² + V_i²)/k long; H closes the span."""
+    count, span, m, k = 12, 0.8, 0.05, 500.0
+    chain = wc.Mesh.chain(count, length=1.0)
+    x = np.linspace(0.0, span, count)
+    positions = np.stack([x, -np.sin(np.pi * x / span), 0.0 * x], axis=1)
+    scene = wc.Scene(chain, masses=np.full(count, m), positions=positions, terms=[wc.Spring(stiffness=k)], pins=[0, count - 1])
+    rest = wc.equilibrium(scene, device=device, tolerance=1e-12, record="reactions")
+    vertical = (np.arange(count - 1) - 0.5 * (count - 2)) * m * 9.81
+
+    def gap(horizontal):
+        tension = np.hypot(horizontal, vertical)
+        return ((1.0 / (count - 1) + tension / k) * horizontal / tension).sum() - span
+
+    horizontal = brentq(gap, 1e-3, 10.0, xtol=1e-14)
+    half = 0.5 * count * m * 9.81
+    np.testing.assert_allclose(rest.reactions, [[-horizontal, half, 0.0], [horizontal, half, 0.0]], rtol=1e-8, atol=1e-9)
+
+
+def test_pins_bear_pressure_traction_and_forces(device):
+    """Pressure on what is pinned all round pulls by p A, A the flat area, whatever its shape."""
+    cloth = replace(square(pins="boundary"), gravity=NONE, loads=[wc.Pressure(vertices="all", pressure=50.0)])
+    rest = wc.equilibrium(cloth, device=device, tolerance=1e-11, record=BOTH)
+    up = np.sign(rest.points[:, 1].sum())
+    np.testing.assert_allclose(rest.reactions.sum(axis=0), [0.0, -50.0 * up, 0.0], atol=1e-7)
+    assert "work of loads" not in rest.energies  # it depends on the path
+    loads = [wc.Traction(vertices="x == 1", traction=(3.0, 0.0, 0.0)), wc.Force(vertices=[0], force=(0.0, 2.0, 0.0))]
+    cloth = replace(square(pins="x == 0"), gravity=NONE, loads=loads)
+    rest = wc.equilibrium(cloth, device=device, tolerance=1e-11, record=BOTH)
+    np.testing.assert_allclose(rest.reactions.sum(axis=0), [-3.0, -2.0, 0.0], atol=1e-8)
+    moved = rest.points - cloth.positions
+    assert rest.energies["work of loads"] == pytest.approx((3.0 * moved[cloth.mesh.points[:, 0] > 0.99, 0]).mean(), rel=0.05)
+
+
+def test_rollers_bear_along_the_axes_that_they_hold(device):
+    cloth = square(pins=wc.Pins([0, 5, 30], axes=["xyz", "y", "xy"]))
+    rest = wc.equilibrium(cloth, device=device, record="reactions")
+    assert (rest.reactions[~cloth.pins.held] == 0.0).all()
+    assert rest.reactions[:, 1].sum() == pytest.approx(9.81 * cloth.vertex_masses.sum(), rel=1e-7)
+
+
+# The factor by which the error of the balance falls with half the step.
+ORDERS = {"explicit": 2, "newton": 2, "newton midpoint": 4, "newton bdf2": 4, "xpbd": 2, "constrained dynamics": 2}
+
+
+@pytest.mark.parametrize("name", ORDERS)
+@pytest.mark.parametrize("driven", ["pins", "loads"])
+def test_energies_and_works_balance_to_the_order_of_the_scheme(name, driven, device):
+    """Moved pins, or a pressure and a force that change; the motion is the same to the bit as without the books."""
+    if driven == "pins":
+        cloth = lifted()
+    else:
+        push = np.zeros((12, 3))
+        push[:, 1] = 0.02 * np.sin(0.8 * np.arange(12))
+        loads = [wc.Pressure(vertices="all", keyframes=np.arange(12.0)), wc.Force(vertices=[14, 15], keyframes=push)]
+        cloth = square(pins="corners", loads=loads)
+    if name == "explicit":
+        cloth = replace(cloth, terms=cloth.terms[:2])
+    gaps = []
+    for substeps in (16, 32):
+        solver = replace(SOLVERS[name], substeps=substeps)
+        if name in ("xpbd", "constrained dynamics"):
+            solver = replace(solver, iterations=40)
+        run = {"device": device, "dtype": "float64", "frames": 11}
+        recorded = wc.simulate(cloth, solver, record=BOTH, **run)
+        gaps.append(np.abs(total(recorded.energies)).max())
+        assert f"work of {driven}" in recorded.energies
+    assert (wc.simulate(cloth, solver, **run).points == recorded.points).all()
+    assert gaps[1] < gaps[0] / (0.85 * ORDERS[name])
+    assert gaps[1] < 0.05 * np.abs(recorded.energies[f"work of {driven}"]).max()
+
+
+def quadratic():
+    """Springs without length and attachments, whose energies are quadratic, with pins that move and forces that change."""
+    mesh = wc.Mesh.grid(4, 4)
+    terms = [
+        wc.Spring(stiffness=3.0, rest_lengths=0.0),
+        wc.Spring(pairs="shear", stiffness=2.0, rest_lengths=0.0),
+        wc.Attachment(vertices="corners", stiffness=4.0),
+        wc.QuadraticBending(stiffness=1e-3),
+    ]
+    start = mesh.points[[5, 9]]
+    keyframes = start + 0.05 * np.array([[0, 0, 0], [1, 2, 0], [0, 3, 1], [2, 1, 1]])[:, None]
+    loads = [wc.Force(vertices="x > 0.5", keyframes=0.1 * np.array([[0, 0, 0], [1, 0, 2], [-1, 1, 0]]))]
+    velocities = np.random.default_rng(3).normal(size=mesh.points.shape)
+    return wc.Scene(mesh, density=0.5, terms=terms, velocities=velocities, pins=wc.Pins([5, 9], keyframes), loads=loads)
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+def test_midpoint_balances_quadratic_energies_to_rounding(loaded, device):
+    scene = quadratic() if loaded else replace(quadratic(), loads=())
+    solver = wc.Newton(substeps=2, integrator="midpoint", tolerance=1e-12, linear="factorised")
+    run = wc.simulate(scene, solver, device=device, dtype="float64", frames=8, record="energies")
+    sums = total(run.energies)
+    np.testing.assert_allclose(sums, sums[0], rtol=0.0, atol=1e-11 * np.abs(run.energies["kinetic"]).max())
+    assert np.abs(run.energies["work of pins"]).max() > 0.1
+
+
+def test_implicit_euler_loses_half_the_squares_of_its_changes(device):
+    """Of quadratic energies exactly ½‖Δv‖²_M + ½‖Δx‖²_K, with nothing moved."""
+    scene = replace(quadratic(), loads=(), pins=[5, 9])
+    solver = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised")
+    run = wc.simulate(scene, solver, device=device, dtype="float64", frames=8, record="energies")
+    dv, dx = np.diff(run.velocities, axis=0), np.diff(run.points, axis=0)
+    kinetic = 0.5 * (scene.vertex_masses[:, None] * dv**2).sum(axis=(1, 2))
+    # K of a quadratic energy without a linear part about 0 gives U of the change itself; attachments at 0 then.
+    about_0 = replace(scene, terms=[*scene.terms[:2], replace(scene.terms[2], targets=NONE), scene.terms[3]])
+    elastic = []
+    for change in dx:
+        still = replace(about_0, positions=change, pins=None, gravity=NONE, velocities=0.0 * change)
+        found = wc.simulate(
+            still, wc.Explicit(substeps=8), device=device, dtype="float64", frames=1, record="energies"
+        ).energies
+        elastic.append(sum(found[term][0] for term in ("Spring", "Spring 2", "Attachment", "QuadraticBending")))
+    np.testing.assert_allclose(-np.diff(total(run.energies)), kinetic + elastic, rtol=1e-9)
+
+
+def test_symplectic_euler_swings_about_its_energy(device):
+    """On x″ = −ω²x it keeps ½m(v² + ω²x² − hω²xv), so that the energy is within ½mhω²|xv| of it at each frame."""
+    k, m, h = 40.0, 0.5, 1.0 / 240.0
+    bead = wc.Scene(
+        wc.Mesh.chain(2),
+        masses=[1.0, m],
+        positions=[[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]],
+        terms=[wc.Attachment(vertices=[1], targets=NONE, stiffness=k), wc.Spring(stiffness=0.0)],
+        pins=[0],
+        gravity=NONE,
+    )
+    run = wc.simulate(bead, wc.Explicit(substeps=4), device=device, dtype="float64", frames=40, record="energies")
+    xv = (run.points[:, 1] * run.velocities[:, 1]).sum(axis=1)
+    np.testing.assert_allclose(total(run.energies) - 0.5 * h * k * xv, 0.5 * k * 0.3**2, rtol=1e-12)
+
+
+def test_pins_that_lift_slowly_do_the_work_of_the_weight(device):
+    cloth = square(pins="corners", damping=0.01)
+    cloth = replace(cloth, positions=wc.equilibrium(cloth, device=device).points)
+    start = cloth.positions[cloth.pins.vertices]
+    rise = 0.5 * (1.0 - np.cos(np.pi * np.linspace(0.0, 1.0, 61)))
+    cloth = replace(cloth, pins=wc.Pins("corners", start + 0.4 * rise[:, None, None] * np.array([0.0, 1.0, 0.0])))
+    run = wc.simulate(cloth, SOLVERS["newton"], device=device, dtype="float64", frames=75, record="energies")
+    assert 0.0 < run.energies["work of pins"][-1] / (0.4 * 9.81 * cloth.vertex_masses.sum()) - 1.0 < 1e-2  # some is damped
+
+
+HARD = {
+    "xpbd": wc.XPBD(substeps=1, iterations=50),
+    "xpbd averaged by constraint": wc.XPBD(substeps=1, iterations=5, sweep="constraint-averaged"),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=1, iterations=100, tolerance=1e-12),
+}
+
+
+def pendulum():
+    """A chain of hard and soft links that swings from a pin that stands and one that moves."""
+    chain = wc.Mesh.chain(8, length=1.4)
+    edges = chain.edges
+    terms = [wc.Spring(pairs=edges[::2], stiffness=np.inf), wc.Spring(pairs=edges[1::2], stiffness=1e3)]
+    x = np.linspace(0.0, 1.4, 8)
+    positions = np.stack([x, 0.0 * x, 0.0 * x], axis=1)
+    keyframes = positions[[0, 7]] + np.arange(9)[:, None, None] * np.array([[0.0, 0.0, 0.0], [-0.02, 0.0, 0.01]])
+    return wc.Scene(chain, masses=np.full(8, 0.1), positions=positions, terms=terms, pins=wc.Pins([0, 7], keyframes))
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_reactions_of_hard_terms_balance_the_momentum(name, device):
+    """Σ R = Σ m Δv/h − Σ m g over vertices that move, and the pins' own weight; XPBD leaves soft springs out of balance."""
+    scene = pendulum()
+    if "xpbd" in name:
+        scene = replace(scene, terms=[wc.Spring(stiffness=np.inf)])
+    run = wc.simulate(scene, HARD[name], device=device, dtype="float64", frames=7, record=BOTH)
+    assert np.isnan(run.reactions[0]).all()
+    rates = np.diff(run.velocities, axis=0)[:, 1:-1].sum(axis=1) * 0.1 * scene.fps
+    weight = np.array([0.0, 0.8 * 9.81, 0.0])
+    np.testing.assert_allclose(run.reactions[1:].sum(axis=1), rates + weight, atol=1e-8 if "xpbd" in name else 1e-6)
+    assert np.abs(run.reactions[1:]).max() > 1.0
+    assert (run.energies["Spring"] == 0.0).all()
+
+
+@pytest.mark.parametrize("name", [*HARD, "xpbd scalar"])
+def test_the_upper_of_hard_links_bears_all_weight(name, device):
+    solver = {**HARD, "xpbd scalar": wc.XPBD(substeps=1, form="scalar")}[name]
+    chain = wc.Mesh.chain(4)
+    scene = wc.Scene(chain, masses=[0.1, 0.2, 0.3, 0.4], terms=[wc.Spring(stiffness=np.inf)], pins=[0])
+    run = wc.simulate(scene, replace(solver, iterations=1000), device=device, dtype="float64", frames=2, record="reactions")
+    np.testing.assert_allclose(run.reactions[1:, 0], [[0.0, 9.81, 0.0]] * 2, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["newton", "newton factorised", "projective dynamics", "admm", "constrained dynamics"])
+def test_reactions_of_an_implicit_step_balance_its_momentum(name, device):
+    """With damping, which is of the same step."""
+    cloth = replace(square(damping=1e-2), pins=[0, 5])
+    cloth = replace(cloth, terms=cloth.terms[:1])
+    solver = replace(SOLVERS[name], substeps=1, iterations=3000, tolerance=1e-11)
+    run = wc.simulate(cloth, solver, device=device, dtype="float64", frames=5, record="reactions")
+    momentum = (cloth.vertex_masses[:, None] * run.velocities).sum(axis=1)
+    expected = np.diff(momentum, axis=0) * cloth.fps - cloth.vertex_masses.sum() * cloth.gravity
+    np.testing.assert_allclose(run.reactions[1:].sum(axis=1), expected, atol=1e-8)
+
+
+def test_copies_have_books_of_their_own(device):
+    """To the bit those of a thread each; a copy that diverges has none from then on."""
+    cloth, solver = replace(lifted(), terms=lifted().terms[:1]), wc.Explicit(substeps=8, above_limit="allow")
+    run = {"device": device, "dtype": "float64", "frames": 6, "record": BOTH}
+    vary = {"Spring.stiffness": [50.0, 100.0, 1e6]}
+    batch = wc.simulate(cloth, solver, copies=3, vary=vary, **run)
+    alone = wc.simulate(replace(cloth, terms=[replace(cloth.terms[0], stiffness=50.0)]), solver, **run)
+    assert batch.reactions.shape == (7, 3, 4, 3)
+    np.testing.assert_allclose(batch.reactions[:, 0], alone.reactions, rtol=0.0, atol=1e-10)
+    for name, values in batch.energies.items():
+        assert values.shape == (7, 3) and alone.energies[name].shape == (7,)
+        np.testing.assert_allclose(values[:, 0], alone.energies[name], rtol=0.0, atol=1e-10)
+        assert np.isnan(values[-1, 2]) and np.isfinite(values[:, :2]).all()
+    assert np.isnan(batch.reactions[-1, 2]).all()
+    if device == "cpu":
+        shared = wc.simulate(cloth, solver, copies=3, vary=vary, threads=2, **run)
+        assert np.array_equal(shared.reactions, batch.reactions, equal_nan=True)
+        assert all(np.array_equal(shared.energies[name], batch.energies[name], equal_nan=True) for name in batch.energies)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_books_leave_the_motion_as_it_is(name, device):
+    """In float32, and without them nothing is launched for them."""
+    cloth = square(solver=SOLVERS[name], pins="corners")
+    plain, recorded = (wc.simulate(cloth, SOLVERS[name], device=device, frames=3, record=record) for record in ((), BOTH))
+    assert (plain.points == recorded.points).all() and (plain.velocities == recorded.velocities).all()
+    assert plain.energies is None and plain.reactions is None
+    assert list(recorded.energies) == [*(type(term).__name__ for term in cloth.terms), "kinetic", "gravity"]
+
+
+@pytest.mark.host
+def test_wrong_records_and_hidden_forces_are_refused():
+    with pytest.raises(ValueError, match=r"^record is 'forces'; it must be some of 'energies', 'reactions'$"):
+        wc.simulate(square(), SOLVERS["newton"], record="forces")
+    with pytest.raises(ValueError, match=r"^record is 3; it must be"):
+        wc.equilibrium(square(), record=3)
+    hard = wc.Scene(wc.Mesh.chain(3), masses=np.ones(3), terms=[wc.Spring(stiffness=np.inf)], pins=[0])
+    with pytest.raises(ValueError, match=r"^PBD has no multipliers, .*; XPBD and ConstrainedDynamics have, and a finite"):
+        wc.simulate(hard, SOLVERS["pbd"], record="reactions")
+    assert wc.simulate(hard, SOLVERS["pbd"], frames=2, record="energies").energies["Spring"].tolist() == [0.0] * 3
+    body = wc.Scene(wc.Mesh.grid(2, 2), density=1.0, terms=[wc.RigidCluster(vertices=[[0, 1, 2, 3]])], pins=[0])
+    with pytest.raises(ValueError, match=r"^XPBD has no multipliers of RigidCluster at pinned vertices"):
+        wc.simulate(body, SOLVERS["xpbd"], record="reactions")
