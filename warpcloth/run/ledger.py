@@ -240,7 +240,7 @@ class Ledger:
         self._total, self._frame = np.array(self.totals), max(map(len, self._rows.values())) - 1
 
     def by_name(self):
-        """Returns energies by name, (F,) or (F, B) [J], and reactions, (F, p, 3) or (F, B, p, 3) [N]; None where not recorded."""
+        """Returns energies by name, (F,) or (F, B) [J], and reactions, (F, p, 3) or (F, B, p, 3) [N], or None."""
         one = self.model.copies == 1
         energies = np.moveaxis(self.energies, -1, 0) if "energies" in self._record else None
         reactions = self.reactions if "reactions" in self._record else None
