@@ -250,7 +250,8 @@ def test_copies_have_strain_and_residual_of_their_own(device):
     assert np.array_equal(found.status.residual, [one.status.residual for one in alone])
     assert all(isinstance(number, float) for number in (alone[0].worst_strain, alone[0].status.residual))
     assert len(set(found.worst_strain)) == len(set(found.status.residual)) == 3
-    assert f"in copy {np.argmax(found.status.residual)} " in found.status.message
+    assert f" {found.status.unit}, in copy {np.argmax(found.status.residual)} (" in found.status.message
+    assert found.status.message.count(found.status.unit) == 1
 
 
 def test_a_step_without_finite_forces_ends_the_copy(device):

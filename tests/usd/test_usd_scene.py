@@ -2,6 +2,7 @@
 
 import math
 import sys
+import warnings
 from dataclasses import fields
 from pathlib import Path
 
@@ -359,6 +360,19 @@ def test_standard_names_are_read_in_units_of_the_stage(tmp_path, options, densit
     terms = terms or [("Spring", 3e3), ("QuadraticBending", 2.0)]
     assert [type(term).__name__ for term in scene.terms] == [kind for kind, _ in terms]
     np.testing.assert_allclose([term.stiffness for term in scene.terms], [stiffness for _, stiffness in terms], rtol=4 * EPS)
+
+
+@pytest.mark.parametrize(("attributes", "shear", "warned"), [({}, 1e6, 1), ({}, 0.0, 0), (OWN, 1e6, 0)])
+def test_a_stiffness_in_shear_is_not_dropped_in_silence(tmp_path, attributes, shear, warned):
+    """It has no spring; with terms of our own nothing of the material is read, as the page says."""
+    material = MATERIAL | {"physics:surfaceShearStiffness": ("Float", shear)}
+    artist(tmp_path / "artist.usda", attributes, material=material).Save()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        read_scene(tmp_path / "artist.usda")
+    assert [str(each.message).partition(" is not read")[0].split(".")[-1] for each in said] == [
+        "physics:surfaceShearStiffness"
+    ] * warned
 
 
 @pytest.mark.parametrize("given", [None, (0.0, -1.62, 0.0), (0.0, 0.0, -1.62), (0.0, 0.0, 0.0)])

@@ -11,8 +11,8 @@ A cloth is a Mesh prim (or linear BasisCurves) with attributes. For a linen clot
 
 Our own names stand on the cloth's prim. They are in SI whatever the units of the stage, in world space, and as precise as
 the scene. Standard names are read where they stand, in the units of the stage; where both are authored ours are taken.
-Attributes that cloth tools keep to themselves (their tension, shear and bending) have no names in USD, and are not guessed;
-neither is a spring stiffness from `physics:youngsModulus`, nor per-point `physics:masses`.
+`physics:surfaceShearStiffness` is not read, with a warning; neither is a spring stiffness guessed from
+`physics:youngsModulus` or from the attributes that cloth tools have of their own, nor are per-point `physics:masses` read.
 
 What else a stage says:
 

@@ -1,6 +1,7 @@
 """Whole scenes read from USD stages and written as such. What stands where is said in `attributes`."""
 
 import os
+import warnings
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from .modules import Sdf, Usd, UsdGeom, UsdPhysics
 from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
 from .values import array_of, refuse_unknown, sentences, shown, time_codes_of
 
+_SHEAR = "physics:surfaceShearStiffness"
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none
 
 
@@ -175,12 +177,15 @@ def _density(values, mesh):
 
 
 def _terms(values, mesh):
-    """Our own terms, or else those of a surface material."""
+    """Our own terms, or else those of a surface material; warns if that has a stiffness in shear."""
     terms = [_term(values, key) for key in values.terms]
     if not terms and len(mesh.triangles):
         stretch, bend = values.get("(stretch stiffness)"), values.get("(bend stiffness)")
         terms += [] if stretch is None else [Spring(pairs="edges", stiffness=float(stretch))]
         terms += [] if bend is None else [QuadraticBending(stiffness=float(bend))]
+        shear = terms and values.locations["material"].GetAttribute(_SHEAR)
+        if shear and shear.HasAuthoredValue() and shear.Get():
+            warnings.warn(f"{shear.GetPath()} is not read; the springs of the edges resist shear too", stacklevel=2)
     return terms
 
 
