@@ -49,6 +49,28 @@ def solvers():
     return table(("Solver", "Method", "Takes"), rows)
 
 
+def methods():
+    """Lists the solvers with the scenes that they suit, and the time that an error of 1 % takes, from choosing.md."""
+    measured = (ROOT / "docs" / "choosing.md").read_text(encoding="utf-8").partition("## What one per cent costs")[2]
+    times = dict(re.findall(r"^\| `(\w+)[^|]*(?:\|[^|]*){2}\| ([\d.]+) \|", measured.partition("\n## ")[0], re.MULTILINE))
+    rows = []
+    for record in SOLVERS.values():
+        name, facts = record.__name__, record.facts
+        rows.append([f"`{name}`", facts.suits, f"{times[name]} ms" if name in times else "–", facts.weakness])
+    return table(("Method", "For", "1 %, n = 64", "Weakness"), rows)
+
+
+def residuals():
+    """Lists the residuals of the solvers that have one."""
+    rows = []
+    for record in SOLVERS.values():
+        if record.residual is not None:
+            measure, weightless, unit = record.residual
+            held = "`tolerance`" if hasattr(record, "tolerance") else "–"
+            rows.append([f"`{record.__name__}`", measure, unit, weightless, held])
+    return table(("Solver", "Measure", "Unit", "Unit without gravity", "Compared with"), rows)
+
+
 def refused(record, hard):
     """The energies that lack what a solver needs, with finite or infinite stiffness."""
     of = {name: SimpleNamespace(term=energy.term, hard=hard, damping=None) for name, energy in TERMS.items()}
@@ -140,6 +162,8 @@ def solver_options():
 TABLES = {
     "energies": energies,
     "solvers": solvers,
+    "methods": methods,
+    "residuals": residuals,
     "attributes": attributes,
     "term attributes": term_attributes,
     "options": options,

@@ -17,7 +17,6 @@ import warpcloth as wc
 from warpcloth.analysis.measures import MEASURES
 from warpcloth.cli import _parser
 from warpcloth.solvers import SOLVERS
-from warpcloth.terms import TERMS
 
 ROOT = Path(__file__).parents[2]
 _spec = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "tables.py")
@@ -157,18 +156,19 @@ def test_extras_that_refusals_name_exist():
         assert re.match(r"pip install -e (['\"])\.\[(\w+)\]\1(``)? in the checkout", line)[2] in EXTRAS, line
 
 
-@pytest.mark.parametrize(
-    ("page", "head", "names"),
-    [
-        ("README.md", "Term", set(TERMS)),
-        ("README.md", "Solver", {record.__name__ for record in SOLVERS.values()}),
-        ("docs/scenes.md", "Scene", {path.stem for path in (ROOT / "scenes").glob("*.py")}),
-        ("docs/solvers.md", "Method", {record.__name__ for record in SOLVERS.values()}),
-    ],
-)
-def test_tables_are_whole(page, head, names):
-    table = re.search(rf"^\| {head} \|.*?(?=\n\n|\n<)", PAGES[page], re.MULTILINE | re.DOTALL)[0]
-    assert set(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) == names
+@pytest.mark.parametrize("name", tables.TABLES)
+def test_every_generated_table_is_on_one_page(name):
+    assert [text.count(f"<!-- {name} -->\n") for text in PAGES.values() if f"<!-- {name} -->" in text] == [1]
+
+
+def test_every_scene_is_in_the_docs():
+    table = re.search(r"^\| Scene \|.*?(?=\n\n)", PAGES["docs/scenes.md"], re.MULTILINE | re.DOTALL)[0]
+    assert set(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) == {path.stem for path in (ROOT / "scenes").glob("*.py")}
+
+
+def test_every_solver_of_the_package_says_what_it_suits():
+    assert all(record.facts.suits and record.facts.weakness for record in SOLVERS.values())
+    assert "| – |" not in tables.methods(), "the table in docs/choosing.md lacks a solver"
 
 
 def test_every_measure_is_in_the_docs():
@@ -179,14 +179,6 @@ def test_every_measure_is_in_the_docs():
             row = re.search(rf"^\| `{measure.name}` \| (.*?) \| (.*?) \|", rates if measure.rate else part, re.MULTILINE)
             assert row, measure.name
             assert row[1] == ("×".join(map(str, measure.shape)) or "–") and row[2] == measure.unit, measure.name
-
-
-def test_the_table_of_residuals_is_that_of_the_solvers():
-    section = PAGES["docs/solvers.md"].split("## The residual of a run")[1].split("\n## ")[0]
-    rows = re.findall(r"^\| `(\w+)` \| (.+) \| (.+) \| (.+) \| (.+) \|$", section, re.MULTILINE)
-    found = {name: (measure, weightless, unit, held == "`tolerance`") for name, measure, unit, weightless, held in rows}
-    solvers = {record.__name__: record for record in SOLVERS.values() if record.residual is not None}
-    assert found == {name: (*record.residual, hasattr(record, "tolerance")) for name, record in solvers.items()}
 
 
 # --- Results of the Python that pages show.

@@ -25,6 +25,7 @@ class Facts:
 
     Attributes:
         method: The method, in a few words for tables.
+        suits, weakness: The scenes that it suits, and where it fails or is slow, with measured figures, for tables.
         benchmarks: A :class:`Benchmark` each.
         runs: Options of settings that trade speed for accuracy: those near the Pareto front of error and time on ``hanging``
             with 32² and 64² vertices. Substeps are per 1/60 s; for a limited solver ``fewest``, a multiple of the fewest stable
@@ -36,6 +37,8 @@ class Facts:
     """
 
     method: str = ""
+    suits: str = ""
+    weakness: str = ""
     benchmarks: tuple = (Benchmark({"substeps": 4}),)
     runs: tuple = tuple({"substeps": substeps} for substeps in (1, 4, 16, 64))
     one_step: tuple = ()

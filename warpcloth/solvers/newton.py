@@ -50,7 +50,9 @@ class Newton(ImplicitStep):
     needs = (FINITE,)
     residual, locks = Residual(UNBALANCED, "times its value at the start of the step"), True
     facts = Facts(
-        method="implicit Euler by Newton's method with a line search",
+        method="implicit steps by Newton's method with a line search",
+        suits="convergence studies, equilibria, small stiff cloth; the reference for the others",
+        weakness='slow on large meshes; with `hessian="raw"` it fails in compression',
         benchmarks=(Benchmark({"substeps": 4}, cpu=(16, 32, 64), cuda=(32, 64, 128)),),
         runs=(
             *({"substeps": substeps} for substeps in (1, 4, 16)),

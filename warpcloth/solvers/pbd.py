@@ -57,6 +57,8 @@ class PBD(Step):
     closes, multipliers = True, False  # λ does not add up over the sweeps of a step
     facts = Facts(
         method="position based dynamics, by Gauss–Seidel or Jacobi sweeps over the constraints",
+        suits="cloth that only has to look like cloth",
+        weakness="its stiffness depends on the number of iterations and on the step",
         benchmarks=(
             Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),
             # Jacobi sweeps alone: so many that what a frame takes besides, its points on the host above all, does not count.

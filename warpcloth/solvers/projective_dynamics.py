@@ -69,7 +69,12 @@ class ProjectiveDynamics(ImplicitStep):
     needs, locks = (FINITE, MERGED_DAMPING, PROJECTION), True
     residual = Residual(UNBALANCED, "times its value at the start of the step")
     facts = Facts(
-        method="implicit Euler by local projections and global solves with a constant matrix, optionally accelerated",
+        method="implicit steps by local projections and global solves with a constant matrix, optionally accelerated",
+        suits="animation with few iterations; stretches little from the first iteration on",
+        weakness=(
+            "motion perpendicular to stiff springs lags: its error shrinks by 1 − μ per iteration, μ = 0.008 for n = 8 and h "
+            "= 1/240 s"
+        ),
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64), cuda=(32, 64, 128, 256)),),
         runs=(
             *grid([(8, 2), (16, 2), (24, 2), (48, 2), (96, 2)], integrator="midpoint", acceleration="none"),

@@ -74,7 +74,12 @@ class XPBD(ImplicitStep):
     needs, locks = (MERGED_DAMPING, LOCAL_STEP), True
     residual, multipliers = Residual(UNBALANCED, "m/s²"), True  # λ adds up over the sweeps of a step
     facts = Facts(
-        method="PBD with compliance; converges to implicit Euler with more sweeps",
+        method="PBD with compliance; converges to an implicit step with more sweeps",
+        suits="stiff cloth and hard constraints by many small steps; with BDF2 the cheapest method at any stiffness",
+        weakness=(
+            "too soft with few sweeps, more so on finer meshes: 26 % strain where converged sweeps leave 2.6 % (n = 32, 4 "
+            "substeps of 20)"
+        ),
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),),
         runs=(
             *grid([(10, 4), (20, 2), (20, 4), (40, 1), (80, 1), (160, 1)], integrator="bdf2"),
