@@ -42,7 +42,8 @@ class Plan:
 
     def gradient(self, corrected=False, terms=None):
         """Returns a :class:`warpcloth.core.gradient.Gradient`, or a faster class with the same methods."""
-        return (GatherGradient if self.backend == "gather" else Gradient)(self.model, corrected, terms)
+        of_backend = {"core": Gradient, "blocks": Gradient, "gather": GatherGradient}
+        return of_backend[self.backend](self.model, corrected, terms)
 
     def explicit_step(self, state, h, symplectic, count, pool):
         """Returns a :class:`warpcloth.core.explicit_step.ExplicitStep`, or a faster class with the same methods.
