@@ -41,6 +41,28 @@ def scene():
     return wc.Scene(wc.Mesh.grid(3, 3), density=1.0, terms=[Term(stiffness=1.0)], duration=0.1, pins=[0])
 """
 
+
+def test_a_run_writes_its_books(tmp_path, capfd, monkeypatch):
+    """The table has the energies and the summed reactions of each frame, the report those of each pin."""
+    monkeypatch.chdir(tmp_path)
+    options = ["--frames", "4", "--dtype", "float64", "-o", "a.usdc", "--csv", "a.csv", "--report", "a.json"]
+    code, out, err = run(capfd, "run", *SMALL, *options, "--json")
+    assert (code, err) == (0, "") and json.loads(out)["csv"] == "a.csv" and json.loads(out)["report"] == "a.json"
+    books = json.loads((tmp_path / "a.json").read_text())
+    rows = [line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines()]
+    assert rows[0] == ["frame", "time", "Spring", "QuadraticBending", "kinetic", "gravity", *(f"reaction {x}" for x in "xyz")]
+    assert list(books["energies"]) == rows[0][2:6] and len(rows) == 6
+    assert [row[:2] for row in rows[1:3]] == [["0", "0.0"], ["1", str(1 / 60)]]
+    assert np.shape(books["reactions"]) == (5, len(books["pins"]), 3) == (5, 2, 3)
+    np.testing.assert_array_equal([[float(cell) for cell in row[6:]] for row in rows[1:]], np.sum(books["reactions"], axis=1))
+    refused(capfd, ["run", *SMALL, "-o", "b.usdc", "--csv", "x.csv", "--report", "x.csv"], "given for two outputs")
+    refused(capfd, ["run", *SMALL, "-o", "b.usdc", "--report", "no/x.json"], "does not exist")
+    hard = ["-p", "n=5", "stiffness=inf", "--frames", "2", "-o", "c.usdc", "--report", "c.json"]
+    refused(capfd, ["run", "hanging", *hard, "--solver", "pbd"], "PBD has no multipliers")
+    assert run(capfd, "run", "hanging", *hard, "--solver", "xpbd")[0] == 0
+    assert json.loads((tmp_path / "c.json").read_text())["reactions"][0] == [[None] * 3] * 2  # of a step that has not been made
+
+
 SCENE_FILES = {
     "type.py": FAILING.format("None + 'a'"),
     "attribute.py": FAILING.format("().x"),

@@ -4,10 +4,14 @@ import os
 import statistics
 
 from ..base.quiet import find_device
+from .books import EPILOG as OF_BOOKS
+from .books import record_of, write_books
 from .render import check_drawing, draw_film
-from .setup import EPILOG as EPILOG
+from .setup import EPILOG as OF_STEPS
 from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
 from .terminal import Progress, check_writable, frames_folder_of, json_text, location, say
+
+EPILOG = f"{OF_STEPS}\n{OF_BOOKS}"
 
 
 def run(arguments):
@@ -18,6 +22,7 @@ def run(arguments):
     arguments.output = _own_output(scene, arguments.resume) if arguments.output is None else arguments.output
     check_writable(arguments.output)
     check_drawing(arguments.film, [arguments.output])
+    record = record_of(arguments)
     device = find_device(arguments.device)
     if arguments.tolerance is not None or arguments.budget is not None:
         from .choose import take_choice
@@ -37,9 +42,12 @@ def run(arguments):
             resume=arguments.resume,
             progress=progress,
             threads=arguments.threads,
+            record=record,
         )
         progress.close()
         status = animation.status
+        if record:
+            write_books(arguments, scene, animation)
         if arguments.film:
             draw_film([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
         facts = {
@@ -63,6 +71,8 @@ def run(arguments):
             "file": arguments.output,
             "frames_folder": frames_folder_of(arguments),
             "film": arguments.film,
+            "csv": arguments.csv,
+            "report": arguments.report,
         }
         print(json_text(facts) if arguments.json else _summary(facts))
         if status.ok:
@@ -99,6 +109,6 @@ def _summary(facts):
             f"  solver        {solver_line(facts)}",
             f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),
             f"  file          {location(facts)}",
-            *([f"  film          {facts['film']}"] if facts["film"] else []),
+            *(f"  {name:<13} {facts[name]}" for name in ("film", "csv", "report") if facts[name]),
         ]
     )

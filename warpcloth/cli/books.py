@@ -1,0 +1,40 @@
+"""The books of a run as files: energies and reactions at pins, frame by frame."""
+
+import numpy as np
+
+from ..base.outputs import TEXT, Output, check_apart, write_table
+from .terminal import check_writable, json_text
+
+EPILOG = """\
+Books: --csv and --report record the energies and the reactions at pins of every frame. The table has the energies [J] and the
+sum of all reactions [N]; the report also has the reaction of each pin. What is not known is an empty cell, or null.
+"""
+
+
+def record_of(arguments):
+    """The words for what a run must record; refuses files that cannot be written."""
+    files = [path for path in (arguments.csv, arguments.report) if path]
+    check_apart([arguments.output, arguments.film, *files])
+    for path in files:
+        check_writable(path)
+        Output(path, "x").discard()
+    return ("energies", "reactions") if files else ()
+
+
+def write_books(arguments, scene, animation):
+    """Writes the table and the report of a run that recorded both."""
+    energies, reactions = animation.energies, animation.reactions
+    if arguments.csv:
+        columns = ["frame", "time", *energies, *(f"reaction {axis}" for axis in "xyz")]
+        numbers = np.column_stack([animation.times, *energies.values(), reactions.sum(axis=1)])
+        write_table(arguments.csv, columns, ([frame, *row] for frame, row in enumerate(_known(numbers))))
+    if arguments.report:
+        found = {"scene": scene.name, "times": _known(animation.times), "pins": scene.pins.vertices.tolist()}
+        found |= {"energies": {name: _known(values) for name, values in energies.items()}, "reactions": _known(reactions)}
+        with Output(arguments.report, "x", **TEXT) as output:
+            output.file.write(json_text(found) + "\n")
+
+
+def _known(values):
+    """Numbers as lists, None in place of NaN."""
+    return np.where(np.isnan(values), None, values).tolist()
