@@ -7,10 +7,6 @@ import warp as wp
 # Of the size of the coordinates beside a point: what a ray starts above its surface, some ten roundings of float32.
 OFFSET = wp.constant(wp.float32(4e-6))
 FAR = wp.constant(wp.float32(1e30))
-# Of the plastic number g, g³ = g + 1: 1/g and 1/g², the most even additive sequence of pairs (Roberts 2018).
-PLASTIC_1 = wp.constant(wp.float32(0.7548776662))
-PLASTIC_2 = wp.constant(wp.float32(0.5698402910))
-
 # Of the light of the sky: what a ray brings that meets a surface instead.
 BOUNCE = wp.constant(wp.float32(0.3))
 # Of the shares of the sky that two points see: a difference that may be noise.
@@ -54,7 +50,8 @@ class Light:
 
     up: wp.vec3
     sun: wp.vec3  # towards it
-    sun_radius: wp.float32  # tangent of half the angle that it fills
+    sun_rays: wp.array(dtype=wp.vec2)  # sideways from the middle of a sun at distance 1
+    sky_rays: wp.array(dtype=wp.vec3)  # unit vectors about +z, their density the cosine
     sun_share: wp.float32  # of the light on a surface that faces it
     sky_share: wp.float32
     sky_tilt: wp.float32  # by which the sky is lighter above than below
@@ -188,25 +185,17 @@ def light_at(
     facing = wp.dot(n, light.sun)
     sun = wp.float32(0.0)
     start = p + offset * across
-    k = float(sun_sample)
     seen_sun = wp.float32(0.0)
     if facing > 0.0 and wp.dot(across, light.sun) > 0.0:
         sun = light.sun_share * facing
-        radius = light.sun_radius * wp.sqrt(wp.frac(0.5 + PLASTIC_1 * k))
-        angle = 2.0 * wp.pi * wp.frac(0.5 + PLASTIC_2 * k)
+        ray = light.sun_rays[sun_sample]
         x = beside(light.sun)
-        y = wp.cross(light.sun, x)
-        d = wp.normalize(light.sun + radius * (wp.cos(angle) * x + wp.sin(angle) * y))
+        d = wp.normalize(light.sun + ray[0] * x + ray[1] * wp.cross(light.sun, x))
         if not is_hidden(g, start, d, FAR):
             seen_sun = 1.0
-    k = float(sky_sample)
-    # With the cosine as density: a disc lifted to the half sphere (Malley)
-    a = wp.frac(0.25 + PLASTIC_1 * k)
-    radius = wp.sqrt(a)
-    angle = 2.0 * wp.pi * wp.frac(0.75 + PLASTIC_2 * k)
+    around = light.sky_rays[sky_sample]
     x = beside(n)
-    y = wp.cross(n, x)
-    d = radius * (wp.cos(angle) * x + wp.sin(angle) * y) + wp.sqrt(1.0 - a) * n
+    d = around[0] * x + around[1] * wp.cross(n, x) + around[2] * n
     below = wp.dot(d, across)
     if below < 0.0:
         d -= 2.0 * below * across
@@ -254,18 +243,26 @@ def trace():
             o = viewer.origin
             d = wp.normalize(viewer.forward + x * viewer.right + y * viewer.up)
             nearest = FAR
+            ground_share = wp.float32(0.0)
+            if light.has_ground != 0:
+                height = wp.dot(o, light.up) - light.ground
+                fall = -wp.dot(d, light.up)
+                if height > 0.0 and fall > 0.0:
+                    r = wp.length(o + (height / fall) * d) / light.ground_radius
+                    if r < 1.0:
+                        nearest = height / fall
+                        ground_share = (1.0 - r * r) * (1.0 - r * r)
             face = wp.int32(-1)
             u = wp.float32(0.0)
             v = wp.float32(0.0)
             if g.mesh != wp.uint64(0):
-                query = wp.mesh_query_ray(g.mesh, o, d, FAR)
+                query = wp.mesh_query_ray(g.mesh, o, d, nearest)
                 if query.result:
                     nearest = query.t
                     face = query.face
                     u = query.u
                     v = query.v
             nearest, tube, along = nearest_tube(g, o, d, nearest)
-            ground_share = wp.float32(0.0)
             colour = wp.vec3()
             share = wp.float32(1.0)
             n = wp.vec3()
@@ -312,18 +309,11 @@ def trace():
                 )
                 share = g.shares[face]
                 hit = True
-            elif light.has_ground != 0:
-                height = wp.dot(o, light.up) - light.ground
-                fall = -wp.dot(d, light.up)
-                if height > 0.0 and fall > 0.0:
-                    nearest = height / fall
-                    p = o + nearest * d
-                    r = wp.length(p) / light.ground_radius
-                    if r < 1.0:
-                        ground_share = (1.0 - r * r) * (1.0 - r * r)
-                        n = light.up
-                        across = n
-                        hit = True
+            elif ground_share > 0.0:
+                p = o + nearest * d
+                n = light.up
+                across = n
+                hit = True
             if not hit:
                 base += light.background
                 continue
@@ -331,7 +321,7 @@ def trace():
             sky_here, sun_here, seen_sky, seen_sun = light_at(
                 g, light, p, n, across, offset, in_square + sample, square + in_square + sample
             )
-            if ground_share > 0.0:
+            if tube < 0 and face < 0:
                 base += (1.0 - ground_share) * light.background
                 share = ground_share / (sky_here + sun_here)
                 colour = light.ground_colour

@@ -7,6 +7,9 @@ import numpy as np
 from ..base.checks import array, number
 from .view import View
 
+# Of the longest extent: half of what the picture shows at least, where a motion is nearest.
+_CLOSEST = 0.1
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -79,7 +82,8 @@ class Camera:
         if not (low <= high).all():
             raise ValueError("no point of the frames is finite; a camera must have something to show")
         size = (high - low).max() or 1.0
-        depth = max((most.sum(axis=0) / (2.0 * half)).max(), high[2] + 0.05 * size)
+        # What is seen along its length, or is a point, is not all of the picture.
+        depth = max((most.sum(axis=0) / (2.0 * half)).max(), high[2] + _CLOSEST * size / half.min())
         eye = np.append((most[0] - most[1]) / 2.0, depth)
         middle = np.append(eye[:2], (low[2] + high[2]) / 2.0)
         axes = view.project(np.eye(3))

@@ -81,9 +81,9 @@ class RayCaster:
     """Makes pictures of shapes that move: allocates once, and takes positions, a camera and colours for each picture.
 
     Light comes from a sun over the viewer's left shoulder and from the sky; a ray from each visible point finds whether it sees
-    the sun, one whether it sees the sky. The light on a surface that faces the sun and sees all of the sky is 1, nowhere more:
-    there the colour in the picture is the surface's. Rays are the same for each picture, so the same input gives the same bytes
-    on one device.
+    the sun, one whether it sees the sky. The light on a surface that faces the sun and sees all of the sky is 1: there the
+    colour in the picture is the surface's. It is nowhere above 1.01, and white, so that colours keep their hue. Rays are the
+    same for each picture, so the same input gives the same bytes on one device.
 
     Args:
         shapes: The :class:`Shape` list.
@@ -128,11 +128,13 @@ class RayCaster:
             number("ground", ground)
         choice("up_axis", up_axis, tuple(_UP))
         number("sun_angle", sun_angle, least=0.0)
-        number("contrast", contrast, least=0.0)
+        number("contrast", contrast)
+        if not 0.0 <= contrast <= 1.0:
+            raise ValueError(f"contrast is {contrast}; it must be a number from 0 to 1")
         self.shapes, self.left_out = list(shapes), 0
         self._size = int(width), int(height)
         self._ground, self._up = ground, np.array(_UP[up_axis])
-        self._sun_angle, self._contrast = sun_angle, contrast
+        self._contrast = contrast
         self._background, self._ground_colour = (
             array("background", background, (3,)),
             array("ground_colour", ground_colour, (3,)),
@@ -140,10 +142,10 @@ class RayCaster:
         self._device = find_device(device)
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._pool = ThreadPool(1 if not self._device.is_cpu else threads or cores)
-        self._allocate(samples)
+        self._allocate(samples, sun_angle)
 
     @in_turn
-    def _allocate(self, samples):
+    def _allocate(self, samples, sun_angle):
         shapes, offsets = self.shapes, np.cumsum([0, *(shape.count for shape in self.shapes)])
         empty = np.empty((0, 3), np.int32)
         self._points = np.zeros((max(1, offsets[-1]), 3))
@@ -176,6 +178,12 @@ class RayCaster:
             )
             layers.visible = wp.zeros(pixels, dtype=wp.vec2)
             self._samples = wp.array(pixel_samples(samples), dtype=wp.vec2)
+            radius = np.tan(np.radians(sun_angle) / 2.0)
+            self._sun_rays = wp.array(radius * disc(16 * samples), dtype=wp.vec2)
+            # A disc lifted to the half sphere has the cosine as density (Malley).
+            flat = disc(256 * samples)
+            lifted = np.sqrt(1.0 - (flat**2).sum(axis=1, keepdims=True))
+            self._sky_rays = wp.array(np.concatenate([flat, lifted], axis=1), dtype=wp.vec3)
             self._visible = wp.zeros_like(layers.visible)
             self._smooth = True
             self._image = wp.zeros((pixels, 3), dtype=wp.uint8)
@@ -205,7 +213,7 @@ class RayCaster:
         with wp.ScopedDevice(self._device):
             self._set_positions(points, np.asarray(camera.target), unit)
             self._colour(colours)
-            light = self._light(viewer, np.asarray(camera.target), unit)
+            light = self._light(camera, unit)
             self._launch_rows(kernels.trace(), [self._geometry, viewer, light], [self._layers])
             if self._smooth:
                 for step, vertical in ((1, 0), (1, 1), (4, 0), (4, 1)):
@@ -214,7 +222,7 @@ class RayCaster:
                     self._layers.visible, self._visible = other, visible
             width, height = self._size
             wp.launch(kernels.develop(), width * height, inputs=[self._layers], outputs=[self._image])
-            return self._image.numpy().reshape(height, width, 3)
+            return self._image.numpy().reshape(height, width, 3).copy()
 
     def _viewer(self, camera):
         """Length of one in coordinates of the picture [m], a power of two, and the rays of the camera in them."""
@@ -235,25 +243,31 @@ class RayCaster:
         viewer.width, viewer.height, viewer.samples = width, height, self._samples
         return unit, viewer
 
-    def _light(self, viewer, target, unit):
-        right = np.array(viewer.right) / np.linalg.norm(viewer.right)
+    def sun(self, camera):
+        """Unit vector towards the sun, over the left shoulder of a camera (3,)."""
+        view = np.subtract(camera.target, camera.position)
+        right = np.cross(view, camera.up)
+        right /= np.linalg.norm(right)
         back = np.cross(right, self._up)
         if not np.linalg.norm(back) > 1e-6:  # a camera that lies on its side
-            back = -np.array(viewer.forward)
+            back = -view
         sun = -0.55 * right + 0.8 * back / np.linalg.norm(back) + 0.85 * self._up
-        sun /= np.linalg.norm(sun)
+        return sun / np.linalg.norm(sun)
+
+    def _light(self, camera, unit):
+        sun = self.sun(camera)
         light = kernels.Light()
         light.up, light.sun = wp.vec3(*self._up), wp.vec3(*sun)
-        light.sun_radius = float(np.tan(np.radians(self._sun_angle) / 2.0))
-        # light = sky (1 + tilt (n·up − 1)) + sun n·s is largest, and 1, for n along this vector
-        largest = _SKY * (1.0 - _TILT) + np.linalg.norm(_SKY * _TILT * self._up + (1.0 - _SKY) * sun)
-        light.sky_share, light.sun_share, light.sky_tilt = _SKY / largest, (1.0 - _SKY) / largest, _TILT
-        light.sky_distance = _SKY_DISTANCE
+        light.sun_rays, light.sky_rays = self._sun_rays, self._sky_rays
+        # light = sky (1 + tilt (n·up − 1)) + sun n·s is 1 for n = s
+        full = _SKY * (1.0 + _TILT * (sun @ self._up - 1.0)) + 1.0 - _SKY
+        light.sky_share, light.sun_share, light.sky_tilt = _SKY / full, (1.0 - _SKY) / full, _TILT
+        half = np.linalg.norm(np.subtract(camera.target, camera.position)) * np.tan(np.radians(camera.fov) / 2.0) / unit
+        light.sky_distance, light.ground_radius = _SKY_DISTANCE * half, _GROUND * half
         light.has_ground = int(self._ground is not None)
         if self._ground is not None:
-            light.ground = float((self._ground - target @ self._up) / unit)
+            light.ground = float((self._ground - np.dot(camera.target, self._up)) / unit)
         light.ground_colour, light.background = wp.vec3(*self._ground_colour), wp.vec3(*self._background)
-        light.ground_radius = _GROUND
         return light
 
     def _set_positions(self, points, target, unit):
@@ -364,3 +378,14 @@ def pixel_samples(count):
 
     best = max((g for g in range(1, count + 1) if np.gcd(g, count) == 1), key=gap)
     return np.stack([k + 0.5, best * k % count + 0.5], axis=1) / count
+
+
+def disc(count):
+    """Points (count, 2) of a sequence that fills the unit disc, every part of it evenly.
+
+    Multiples of 1/g and 1/g² modulo 1, where g³ = g + 1 (Roberts 2018), are squared radii and angles.
+    """
+    g = 1.3247179572447460
+    squared, turn = np.modf(0.5 + np.arange(count)[:, None] / [g, g**2])[0].T
+    angle = 2.0 * np.pi * turn
+    return np.sqrt(squared)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
