@@ -15,6 +15,7 @@ from support.energies import DECLARED
 from support.outside import Plane
 from support.usd_validation import validate
 from warpcloth.terms import TERMS
+from warpcloth.terms.loads import LOADS
 from warpcloth.usd import read_scene, read_stage_mesh, write_scene
 from warpcloth.usd.attributes import attributes
 
@@ -137,7 +138,35 @@ def symmetry():
     return wc.Scene(mesh(), density=0.1, terms=[wc.Spring(stiffness=1.0)], pins=wc.Pins([0, 1], axes="zx"))
 
 
-SCENES = [rollers, symmetry, every_term, hard_springs, states, keyframes, one_keyframe, equilateral, chain, net, awkward_names]
+def loads():
+    sheet = mesh()
+    loads = [
+        wc.Pressure(vertices="all", pressure=100 / 3),
+        wc.Force(vertices=[3, 1], force=[[1 / 3, 0, 0], [0, 1, 0]], name="pull"),
+        wc.Force(vertices="corners", keyframes=[[0, 0, 0], [0, 1 / 3, 0], [1, 1, 1]], name="a:b"),
+        wc.Traction(vertices="z == 0", traction=(1.0, 0.0, 0.0)),
+        wc.Pressure(vertices="boundary or x < 0.4", keyframes=[0.0, 1 / 7, 3.0, 2.0]),
+        wc.Force(vertices=[5, 7], keyframes=np.arange(12.0).reshape(2, 2, 3)),
+        wc.Pressure(vertices="all", pressure=np.linspace(0, 1, len(sheet.triangles)), name="Force"),
+        wc.Pressure(vertices="all", keyframes=np.ones((1, len(sheet.triangles)))),
+    ]
+    return wc.Scene(sheet, density=0.1, terms=[wc.Spring(stiffness=1.0)], pins=[0], loads=loads, duration=1 / 30)
+
+
+SCENES = [
+    loads,
+    rollers,
+    symmetry,
+    every_term,
+    hard_springs,
+    states,
+    keyframes,
+    one_keyframe,
+    equilateral,
+    chain,
+    net,
+    awkward_names,
+]
 
 
 def assert_same(one, other, what):
@@ -167,8 +196,14 @@ def assert_same_scene(read, scene):
             one = one.astype(np.float32).astype(np.float64)
         assert_same(one, other, field.name)
     for field in fields(scene):
-        if field.name not in ("mesh", "terms", "pins", "stage"):
+        if field.name not in ("mesh", "terms", "pins", "stage", "loads"):
             assert_same(getattr(scene, field.name), getattr(read, field.name), field.name)
+    assert [type(load) for load in read.loads] == [type(load) for load in scene.loads]
+    for one, other in zip(scene.loads, read.loads, strict=True):
+        assert one.name == other.name
+        for field in ("vertices", one.quantity, "keyframes"):
+            value, found = getattr(one, field), getattr(other, field)
+            assert_same(value if isinstance(value, str) or value is None else np.array(value), found, field)
     assert [type(term) for term in read.terms] == [type(term) for term in scene.terms]
     for one, other in zip(scene.terms, read.terms, strict=True):
         for field in fields(one):
@@ -217,10 +252,19 @@ def test_the_comparison_can_fail():
 
 def test_every_field_has_a_row():
     known = {row.field for row in attributes()}
-    elsewhere = {"mesh", "terms", "pins", "stage", "fps"}  # the prim, other rows, a GeomSubset, the file, the stage's rate
+    elsewhere = {
+        "mesh",
+        "terms",
+        "loads",
+        "pins",
+        "stage",
+        "fps",
+    }  # the prim, other rows, a GeomSubset, the file, the stage's rate
     assert {field.name for field in fields(wc.Scene)} <= known | elsewhere
     for term in TERMS.values():
         assert {f"terms.{field.name}" for field in fields(term)} <= known
+    for load in LOADS.values():  # keyframes are samples
+        assert {f"loads.{field.name}" for field in fields(load)} <= known | {"loads.keyframes"}
     assert len({(row.name, row.location) for row in attributes()}) == len(attributes())
 
 
@@ -509,6 +553,17 @@ def own(name, type_name, value):
         (own("terms:threads:type", "Token", "Rope"), "type is 'Rope', must be one of Attachment, "),
         (own("terms:threads:vertices", "IntArray", [1]), "threads has vertices, which a Spring has not"),
         (own("terms:threads:stifness", "Double", 1.0), "threads:stifness is no attribute of a cloth, must be"),
+        (own("loads:wind:type", "Token", "Gale"), "warpcloth:loads:wind:type is 'Gale', must be one of Force, Traction, Press"),
+        (own("loads:wind:type", "Token", "Force"), "warpcloth:loads:wind:vertices is not given, must be a selection or ind"),
+        (
+            own("loads:a:type", "Token", "Force") | own("loads:a:pressure", "Double", 1.0),
+            "warpcloth:loads:a has pressure, which a Force has not; it must have none",
+        ),
+        (
+            own("loads:a:type", "Token", "Pressure") | own("loads:a:vertices", "String", "all"),
+            "warpcloth:loads:a: a: exactly one of pressure and keyframes must be given",
+        ),
+        (own("loads:a:strength", "Double", 1.0), "warpcloth:loads:a:strength is no attribute of a cloth, must be one of"),
         (own("freeAxes", "Int3Array", [(1, 1, 2)] * 9), r"warpcloth:freeAxes\[0\] has 2, must be 0 or 1 for each axis"),
         (own("freeAxes", "Int3Array", [(1, 1, 1)]), r"free_axes has shape \(1, 3\); it must be an array"),
         (own("mass", "Double", 1.0), "warpcloth:mass is no attribute of a cloth, must be one of .*density"),

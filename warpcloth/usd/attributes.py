@@ -79,6 +79,13 @@ ATTRIBUTES = (
     Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", ("double3[]",)),
     # The axes that the pins hold, such as "xz", or one text for each pin, those of lower index first.
     Attribute("pins.axes", "warpcloth:pins:axes", "cloth", ("token", "token[]")),
+    # Loads; a value that has time samples is that of keyframes, a sample for each frame.
+    Attribute("loads.type", "warpcloth:loads:<name>:type", "cloth", ("token",)),
+    Attribute("loads.name", "warpcloth:loads:<name>:name", "cloth", ("string",)),  # as that of a term
+    Attribute("loads.vertices", "warpcloth:loads:<name>:vertices", "cloth", ("string", "int[]")),
+    Attribute("loads.force", "warpcloth:loads:<name>:force", "cloth", ("double3", "double3[]")),
+    Attribute("loads.traction", "warpcloth:loads:<name>:traction", "cloth", ("double3", "double3[]")),
+    Attribute("loads.pressure", "warpcloth:loads:<name>:pressure", "cloth", ("double", "double[]")),
     # What the prim's own points and curves lose. Used while they agree with these: an artist's edit wins.
     Attribute("mesh.points", "warpcloth:points", "cloth", ("double3[]",)),  # in the prim's own space
     Attribute("mesh.edges", "warpcloth:edges", "cloth", ("int2[]",)),  # of curves, in order
@@ -101,6 +108,7 @@ ATTRIBUTES = (
 
 # Attributes of a term, whose names say which it is.
 TERMS_NAMESPACE = "warpcloth:terms"
+LOADS_NAMESPACE = "warpcloth:loads"
 
 _OF_TEXT = {"": (), "word": ("token", "token[]"), "selection": ("string", "token[]")}
 _OF_NUMBERS = {(): ("double", "double[]")} | {(n,): (f"double{n}", f"double{n}[]") for n in (2, 3, 4)}
@@ -146,12 +154,15 @@ class Values:
         self.locations["material"] = UsdShade.MaterialBindingAPI(cloth).ComputeBoundMaterial("physics")[0].GetPrim()
         names = [attribute.GetName() for attribute in cloth.GetAuthoredPropertiesInNamespace("warpcloth")]
         # In the order of the prim's properties, which is that of their names where nothing else is said.
-        self.terms = list(dict.fromkeys(name.split(":")[2] for name in names if name.startswith(f"{TERMS_NAMESPACE}:")))
-        known = {row.name.replace("<name>", key) for row in attributes() for key in self.terms or [""]}
+        self.terms, self.loads = (
+            list(dict.fromkeys(name.split(":")[2] for name in names if name.startswith(f"{namespace}:")))
+            for namespace in (TERMS_NAMESPACE, LOADS_NAMESPACE)
+        )
+        known = {row.name.replace("<name>", key) for row in attributes() for key in (*self.terms, *self.loads, "")}
         unknown = sorted(set(names) - known)
         if unknown:
             for key in self.terms:  # whose type may be the reason
-                kind_of_term(self, key)
+                kind_of(self, key)
             allowed = ", ".join(row.name for row in attributes() if row.name.startswith("warpcloth:"))
             raise ValueError(f"{unknown[0]} is no attribute of a cloth, must be one of {allowed}")
 
@@ -193,19 +204,17 @@ class Values:
         return None
 
 
-def kind_of_term(values, key):
-    """The name of the energy of a term.
+def kind_of(values, key, catalogue=TERMS, group="terms"):
+    """The name of the energy of a term, or of the kind of a load.
 
     Raises:
         ValueError: There is none of that name.
     """
-    kind = values.get("terms.type", key)
-    if kind not in TERMS:
+    kind = values.get(f"{group}.type", key)
+    if kind not in catalogue:
         given = "not given" if kind is None else repr(kind)
-        raise ValueError(
-            f"{TERMS_NAMESPACE}:{key}:type is {given}, must be one of {', '.join(TERMS)}, or of an energy from elsewhere that "
-            "is imported (--import)"
-        )
+        more = ", or of an energy from elsewhere that is imported (--import)" if group == "terms" else ""
+        raise ValueError(f"warpcloth:{group}:{key}:type is {given}, must be one of {', '.join(catalogue)}{more}")
     return kind
 
 

@@ -13,12 +13,13 @@ from ..mesh.mesh import Mesh
 from ..mesh.parts import Part
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
-from .attributes import TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of_term
+from ..terms.loads import LOADS
+from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of
 from .chunks import export
 from .layers import scene_layer
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics
 from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
-from .values import array_of, refuse_unknown, sentences, shown, time_codes_of
+from .values import array_of, refuse_unknown, sentences, shown, time_codes_of, value_of
 
 _SHEAR = "physics:surfaceShearStiffness"
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none
@@ -73,6 +74,7 @@ def _scene(stage, cloth, surroundings):
         terms=terms,
         pins=Pins(vertices, keyframes, values.get("pins.axes") or "xyz"),
         free_axes=_free_axes(values),
+        loads=[_load(values, key, surroundings, round(duration * fps), fps) for key in values.loads],
         gravity=_gravity(stage, values, surroundings.up_axis),
         duration=duration,
         fps=fps,
@@ -190,7 +192,7 @@ def _terms(values, mesh):
 
 
 def _term(values, key):
-    prefix, kind, given = f"{TERMS_NAMESPACE}:{key}", kind_of_term(values, key), {}
+    prefix, kind, given = f"{TERMS_NAMESPACE}:{key}", kind_of(values, key), {}
     for row in attributes():
         if row.name.startswith(f"{TERMS_NAMESPACE}:"):
             value = values.get(row.field, key)
@@ -209,6 +211,41 @@ def _term(values, key):
         return TERMS[kind](**given)
     except ValueError as error:
         raise ValueError(f"{prefix}: {error}") from error
+
+
+def _load(values, key, surroundings, frames, fps):
+    """A load, whose value has time samples where it has keyframes."""
+    prefix, kind = f"{LOADS_NAMESPACE}:{key}", kind_of(values, key, LOADS, "loads")
+    quantity, given = LOADS[kind].quantity, {"vertices": values.get("loads.vertices", key)}
+    wrong = [load.quantity for load in LOADS.values() if load.quantity != quantity]
+    for name in wrong:
+        if any(values.authored(f"loads.{name}", key)):
+            raise ValueError(f"{prefix} has {name}, which a {kind} has not; it must have none")
+    if given["vertices"] is None:
+        raise ValueError(f"{prefix}:vertices is not given, must be a selection or indices")
+    attribute = next((found for _, found in values.authored(f"loads.{quantity}", key)), None)
+    if attribute is not None and attribute.GetNumTimeSamples():
+        most = max(frames, attribute.GetNumTimeSamples() - 1)
+        codes = list(_codes(attribute, surroundings, most, fps))
+        given["keyframes"] = [_value_at(attribute, code) for code in codes]
+    else:
+        given[quantity] = values.get(f"loads.{quantity}", key)
+    name = values.get("loads.name", key)
+    given["name"] = ("" if key == kind else key) if name is None else name
+    try:
+        return LOADS[kind](**given | {"name": given["name"] or None})
+    except ValueError as error:
+        raise ValueError(f"{prefix}: {error}") from error
+
+
+def _value_at(attribute, code):
+    """The value of an attribute of numbers at a time code."""
+    value = value_of(attribute, code)
+    if value is None:
+        raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
+    value = np.array(value, dtype=np.float64)
+    refuse_unknown(attribute.GetName(), value, f" at time code {code:g}")
+    return value
 
 
 def _pinned(cloth, surroundings):
@@ -256,18 +293,22 @@ def _frames(attribute, surroundings, frames, fps):
 
 
 def _samples(attribute, surroundings, frames, fps):
-    """Values of an attribute at frames 0, 1, …, up to a number of frames and no further than its last sample."""
-    rate = surroundings.time_codes_per_second / fps
-    start = surroundings.start or 0.0
-    samples = time_codes_of(attribute)
-    last = np.ceil((samples[-1] - start) / rate * (1 - 1e-9)) if samples else 0
-    for frame in range(int(np.clip(last, 0, frames)) + 1):
-        code = start + frame * rate
+    """Values of an attribute of vectors at frames 0, 1, …, up to a number of frames and no further than its last sample."""
+    for code in _codes(attribute, surroundings, frames, fps):
         value = array_of(attribute, (3,), time=code)
         if value is None:
             raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
         refuse_unknown(attribute.GetName(), value, f" at time code {code:g}")
         yield value
+
+
+def _codes(attribute, surroundings, frames, fps):
+    """Time codes of frames 0, 1, …, up to a number of frames and no further than the last sample of an attribute."""
+    rate = surroundings.time_codes_per_second / fps
+    start = surroundings.start or 0.0
+    samples = time_codes_of(attribute)
+    last = np.ceil((samples[-1] - start) / rate * (1 - 1e-9)) if samples else 0
+    return (start + frame * rate for frame in range(int(np.clip(last, 0, frames)) + 1))
 
 
 def _free_axes(values):
@@ -341,16 +382,23 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     if scene.pins.keyframes is not None:
         for frame, positions in enumerate(scene.pins.keyframes[:, order]):
             author(cloth, "pins.keyframes", positions, time=frame)
-    keys = _term_keys(scene.terms)
+    keys = _keys_of(scene.terms)
     for key, term in zip(keys, scene.terms, strict=True):
-        kind = type(term).__name__
         given = {field.name: getattr(term, field.name) for field in fields(term)}
-        given["name"] = None if (term.name or "") == ("" if key == kind else key) else term.name or ""
-        for field, value in {"type": kind, **given}.items():
+        for field, value in {**given, **_kind_and_name(term, key)}.items():
             if value is not None:
                 author(cloth, f"terms.{field}", value, key)
+    keys_of_loads = _keys_of(scene.loads)
+    for key, load in zip(keys_of_loads, scene.loads, strict=True):
+        given = {"vertices": load.vertices, load.quantity: getattr(load, load.quantity)}
+        for field, value in {**_kind_and_name(load, key), **given}.items():
+            if value is not None:
+                author(cloth, f"loads.{field}", value, key)
+        for frame, value in enumerate(() if load.keyframes is None else np.asarray(load.keyframes)):
+            author(cloth, f"loads.{load.quantity}", value, key, time=frame)
     # USD sorts properties by name, and this is how it is told of another order.
-    cloth.SetPropertyOrder([f"{TERMS_NAMESPACE}:{key}:type" for key in keys])
+    of_terms = [f"{TERMS_NAMESPACE}:{key}:type" for key in keys]
+    cloth.SetPropertyOrder(of_terms + [f"{LOADS_NAMESPACE}:{key}:type" for key in keys_of_loads])
     export(layer, path)
     return str(path)
 
@@ -379,8 +427,14 @@ def _scene_values(scene):
     return given
 
 
-def _term_keys(terms):
-    """For each term a name that an attribute can have: its own, or else its kind, counted where that is taken."""
+def _kind_and_name(part, key):
+    """The type of a term or load, and its name where that is not ``key``."""
+    kind, name = type(part).__name__, part.name or ""
+    return {"type": kind, "name": None if name == ("" if key == kind else key) else name}
+
+
+def _keys_of(terms):
+    """For each term or load a name that an attribute can have: its own, or else its kind, counted where that is taken."""
     keys = []
     for term in terms:
         kind = type(term).__name__
