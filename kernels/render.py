@@ -186,7 +186,7 @@ def light_at(
     sun = wp.float32(0.0)
     start = p + offset * across
     seen_sun = wp.float32(0.0)
-    if facing > 0.0 and wp.dot(across, light.sun) > 0.0:
+    if facing > 0.0:
         sun = light.sun_share * facing
         ray = light.sun_rays[sun_sample]
         x = beside(light.sun)

@@ -99,8 +99,8 @@ def test_shadow_of_a_sphere_is_an_ellipse(device):
     shadow = lost / np.median(lost[lost > 0.5 * lost.max()])
     pixel = 2.0 * 2.0 * np.tan(np.radians(20.0)) / size
     a, b = r / sun[1] / pixel, r / pixel
-    # Eight bits of sRGB know a linear colour near 0.5 to 0.4 %, and where there is no shadow errors cancel.
-    assert abs(shadow.sum() - np.pi * a * b) < sampling_error(np.pi * (a + b), 16) + 0.004 * np.pi * a * b
+    # Eight bits of sRGB know a linear colour near 0.5 to 0.002, and the shadow is 0.35 darker than the light.
+    assert abs(shadow.sum() - np.pi * a * b) < sampling_error(np.pi * (a + b), 16) + 0.006 * np.pi * a * b
     rows, columns = np.indices(shadow.shape) + 0.5 - size / 2.0
     middle = np.array([(columns * shadow).sum(), (rows * shadow).sum()]) / shadow.sum()
     assert np.abs(middle).max() < 0.1

@@ -12,15 +12,15 @@ from ..base.turns import in_turn
 from ..core.thread_pool import ThreadPool
 from ..kernels import render as kernels
 
-CLOTH = (0.20, 0.42, 0.68)
-BACK = (1.0, 0.86, 0.74)
+CLOTH = (0.20, 0.43, 0.72)
+BACK = (1.7, 1.12, 0.86)
 BACKGROUND = (0.90, 0.92, 0.94)
 GROUND = (0.86, 0.87, 0.88)
 _UP = {"Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 # Of half the height of the picture: what a ray to the sky needs to be free, and where the ground has faded.
 _SKY_DISTANCE, _GROUND = 1.0, 6.0
 # How much of the light on a surface that faces the sun is the sky's, and by how much that is lighter above than below.
-_SKY, _TILT = 0.45, 0.3
+_SKY, _TILT = 0.42, 0.35
 # Beyond, products of three coordinates of float32 overflow.
 _FARTHEST = 1e9
 # Rows that a thread of the CPU takes at a time.
@@ -80,8 +80,8 @@ class Shape:
 class RayCaster:
     """Makes pictures of shapes that move: allocates once, and takes positions, a camera and colours for each picture.
 
-    Light comes from a sun over the viewer's left shoulder and from the sky; a ray from each visible point finds whether it sees
-    the sun, one whether it sees the sky. The light on a surface that faces the sun and sees all of the sky is 1: there the
+    Light comes from the sky and from a sun over the viewer's right shoulder; of each visible point a ray finds whether it sees
+    the sun, another whether it sees the sky. The light on a surface that faces the sun and sees all of the sky is 1: there the
     colour in the picture is the surface's. It is nowhere above 1.01, and white, so that colours keep their hue. Rays are the
     same for each picture, so the same input gives the same bytes on one device.
 
@@ -244,14 +244,14 @@ class RayCaster:
         return unit, viewer
 
     def sun(self, camera):
-        """Unit vector towards the sun, over the left shoulder of a camera (3,)."""
+        """Unit vector towards the sun, over the right shoulder of a camera (3,)."""
         view = np.subtract(camera.target, camera.position)
         right = np.cross(view, camera.up)
         right /= np.linalg.norm(right)
         back = np.cross(right, self._up)
         if not np.linalg.norm(back) > 1e-6:  # a camera that lies on its side
             back = -view
-        sun = -0.55 * right + 0.8 * back / np.linalg.norm(back) + 0.85 * self._up
+        sun = 0.8 * right + 0.9 * back / np.linalg.norm(back) + 0.8 * self._up
         return sun / np.linalg.norm(sun)
 
     def _light(self, camera, unit):
