@@ -68,8 +68,8 @@ class ADMM(ImplicitStep):
     =============================  =======  =======  =======
 
     With few iterations a small weight leaves the cloth soft, and in the next step the remaining error becomes a velocity.
-    Therefore, with n iterations, ``"auto"`` is at least c/n, and at most 1, where c is 2 for Euler, 4 for BDF2 and 20 for
-    midpoint, which damps that velocity least. With this bound ``hanging`` at 1e5 N/m and a cantilever have a smaller error
+    Therefore, with n iterations, ``"auto"`` is at least min(c/n, 1), where c is 2 for Euler, 4 for BDF2 and 20 for midpoint,
+    which damps that velocity least. With this bound ``hanging`` at 1e5 N/m and a cantilever have a smaller error
     than with r = 1 over 2 to 100 iterations a step, and do not tear, as they do with a weight of 0.03. For energies that
     are concave somewhere, hinges above all, it may not converge with a small weight.
 
