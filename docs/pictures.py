@@ -8,15 +8,11 @@ import numpy as np
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, LogNorm, Normalize
-from PIL import Image
+from matplotlib.colors import ListedColormap
 
 import warpcloth as wc
 from warpcloth.cli.reports import write_report
 from warpcloth.lab import elastica
-from warpcloth.picture.picture import paint
-from warpcloth.picture.view import View, brightness
 from warpcloth.scenes import bar_twist, bunny, cantilever, hanging, mobile
 
 DOCS = Path(__file__).parent
@@ -30,69 +26,17 @@ def save(figure, name):
     plt.close(figure)
 
 
-def strain(mesh, points):
-    """Mean of l/L − 1 over the edges of a vertex, averaged over each triangle, (T,)."""
-    lengths = [np.linalg.norm(np.diff(x[mesh.edges], axis=1)[:, 0], axis=1) for x in (points, mesh.points)]
-    ends, repeated = mesh.edges.ravel(), np.repeat(lengths[0] / lengths[1] - 1.0, 2)
-    at_vertices = np.bincount(ends, repeated) / np.bincount(ends)
-    return at_vertices[mesh.triangles].mean(axis=1)
-
-
-def draw(axes, mesh, seen, values, colours):
-    """The triangles of a mesh from the back to the front, coloured by values from 0 to 1 (T,)."""
-    corners = seen[mesh.triangles]
-    faces = colours(np.clip(values, 0.0, 1.0))
-    faces[:, :3] *= brightness(corners, 0.7)[:, None]
-    # Edges in the colour of their triangle close the hairlines between neighbours.
-    paint(axes, corners[..., :2], corners[..., 2].mean(axis=1), faces, 0.4)
-
-
-def finish(figure, axes, colours, norm, ticks, label, extend="neither"):
-    """Sets equal scales, hides the axes, and adds a colour bar with ticks."""
-    axes.set_aspect("equal")
-    axes.autoscale_view()
-    axes.axis("off")
-    scale = ScalarMappable(norm, colours)
-    bar = figure.colorbar(scale, ax=axes, shrink=0.6, aspect=14, pad=0.01, extend=extend)
-    bar.set_ticks(ticks, labels=[f"{tick:.3g}" for tick in ticks], minor=False)
-    bar.minorticks_off()
-    bar.set_label(label, color=GREY, fontsize=8)
-    bar.ax.tick_params(labelsize=8, colors=GREY)
-    bar.outline.set_visible(False)
-
-
-def picture_hanging(fps=25, colours=256, least=1e-4):
-    """Makes a GIF of the hanging cloth in real time, coloured by strain from ``least`` to the largest of the run."""
-    scene = replace(hanging.scene(n=64, duration=2.4), fps=fps)
-    animation = wc.simulate(scene, wc.Newton(substeps=10))
+def run(scene, solver, **options):
+    """The animation of a run that ends well."""
+    animation = wc.simulate(scene, solver, **options)
     assert animation.status.ok, animation.status
-    frames = np.asarray(animation.points, dtype=float)
-    most = max(strain(scene.mesh, points).max() for points in frames)
-    norm = LogNorm(100.0 * least, 100.0 * most)  # the strain at the pins is a hundred times that of the rest
-    view = View(elevation=18.0)
-    left, right, bottom, top = view.fit(frames).window
-    figure, axes = plt.subplots(figsize=(5.2, 3.2), layout="constrained", dpi=110)
-    finish(figure, axes, COLOURS, norm, [0.01, 0.1, 1.0, 100.0 * most], "strain [%]", "min")
-    images = []
-    for k, points in enumerate(frames):
-        seen = view.project(points)
-        draw(axes, scene.mesh, seen, norm(100.0 * np.maximum(strain(scene.mesh, points), least)), COLOURS)
-        axes.plot(*seen[scene.pins.vertices, :2].T, "o", color="black", markersize=4.0)
-        axes.text(left, bottom, f"{k / fps:.2f} s", color=GREY, fontsize=8)
-        axes.set(xlim=(left, right), ylim=(bottom, top))
-        figure.canvas.draw()
-        images.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
-        for artist in [*axes.collections, *axes.lines, *axes.texts]:
-            artist.remove()
-    plt.close(figure)
-    # One palette for all frames, so that what stands still is stored once, with a white that is white.
-    sample = Image.fromarray(np.concatenate([np.asarray(image) for image in images[::6]]))
-    entries = np.array(sample.quantize(colours).getpalette())
-    entries[entries > 248] = 255
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(entries.tolist())
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    images[0].save(DOCS / "hanging.gif", save_all=True, append_images=images[1:], duration=1000 // fps, loop=0, optimize=True)
+    return animation
+
+
+def picture_hanging():
+    """Makes a GIF of the hanging cloth in real time."""
+    animation = run(replace(hanging.scene(n=64, duration=2.4), fps=25), wc.Newton(substeps=10))
+    wc.render(animation, DOCS / "hanging.gif", size=(560, 315), samples=8, time=True)
 
 
 def picture_cantilever(gammas=(1.0, 5.0, 20.0), elements=40):
@@ -122,55 +66,41 @@ def picture_cantilever(gammas=(1.0, 5.0, 20.0), elements=40):
 
 
 def picture_deformation(frames=(0, 16, 32, 48), most=150.0):
-    """Frames of bar_twist below each other and of bunny beside them, coloured by the angle of rotation up to ``most`` [°]."""
-    figure, axes = plt.subplots(figsize=(11.0, 3.4))
+    """Frames of bar_twist below each other, two of bunny beside them, coloured by the angle of rotation up to ``most`` [°]."""
+    points, triangles, angles = [], [], []
     left = 0.0
-    for scene, azimuth, gap in ((bar_twist.scene(), -30.0, 0.05), (bunny.scene(), 25.0, 0.1)):
+    for scene, chosen, size in ((bar_twist.scene(), frames, 1.0), (bunny.scene(), frames[::3], 1.25)):
         found = wc.deform(scene.mesh, scene.pins, fps=scene.fps, energy="spokes_and_rims")
         assert found.converged.all()
-        size = np.ptp(scene.mesh.points[:, 1]) * (3.2 if scene.name == "bar_twist" else 0.5)
+        stacked = scene.name == "bar_twist"
         down = 0.0
-        for frame in frames if scene.name == "bar_twist" else frames[::3]:
-            seen = View(azimuth, 18.0).project(found.points[frame] / size)
-            seen[:, :2] += [left - seen[:, 0].min(), down - seen[:, 1].max()]
-            draw(axes, scene.mesh, seen, np.degrees(found.angles[frame])[scene.mesh.triangles].mean(axis=1) / most, COLOURS)
-            if scene.name == "bar_twist":
-                down = seen[:, 1].min() - gap
-            else:
-                left = seen[:, 0].max() + gap
-        left = max(left, seen[:, 0].max() + 0.3)
-    finish(figure, axes, COLOURS, Normalize(0.0, most), [0.0, most / 2, most], "rotation [°]")
-    save(figure, "deformation.png")
+        for frame in chosen:
+            part = found.points[frame] * size / np.ptp(scene.mesh.points, axis=0).max()
+            part = part - [part[:, 0].min() - left, part[:, 1].max() - down, 0.0]
+            triangles.append(scene.mesh.triangles + sum(map(len, points)))
+            points.append(part)
+            angles.append(np.degrees(found.angles[frame]))
+            left, down = (left, part[:, 1].min() - 0.08) if stacked else (part[:, 0].max() + 0.15, down)
+        left = max(each[:, 0].max() for each in points) + 0.2
+    mesh = wc.Mesh(np.concatenate(points), np.concatenate(triangles))
+    colour = {"rotation [°]": np.concatenate(angles)[None]}
+    looks = {"colour": colour, "colour_range": (0.0, most), "colormap": "YlOrRd", "ground": False}
+    wc.render(mesh, DOCS / "deformation.png", size=(1430, 540), samples=16, azimuth=-20.0, elevation=14.0, **looks)
 
 
 def picture_mobile(moments=(0.0, 1.0, 2.0, 3.0)):
-    """The mobile side by side at some moments [s]: strings and bars black, cloths in one colour."""
+    """The mobile side by side at some moments [s], drawn as the cloths of a batch."""
     scene = mobile.scene(n=13, push=0.8)
-    animation = wc.simulate(scene, wc.ConstrainedDynamics(substeps=4), frames=round(moments[-1] * scene.fps))
-    assert animation.status.ok, animation.status
-    bodies, strings = scene.terms[:2]
-    bars = [bodies.vertices[:3][[1, 0, 2]], bodies.vertices[3:6][[1, 0, 2]]]
-    figure, axes = plt.subplots(figsize=(11.0, 3.4))
-    left = 0.0
-    for time in moments:
-        seen = View(-30.0, 14.0).project(np.asarray(animation.points[round(time * scene.fps)], dtype=float))
-        seen[:, 0] += left - seen[:, 0].min()
-        draw(axes, scene.mesh, seen, np.full(len(scene.mesh.triangles), 0.6), COLOURS)
-        for line in [*bars, *strings.pairs]:
-            axes.plot(*seen[line, :2].T, "-", color="black", linewidth=1.6 if len(line) == 3 else 0.7)
-        right = seen[:, 0].max()
-        axes.text((left + right) / 2, 0.1, f"{time:g} s", ha="center", color=GREY)
-        left = right + 0.2
-    axes.set_aspect("equal")
-    axes.axis("off")
-    save(figure, "mobile.png")
+    animation = run(scene, wc.ConstrainedDynamics(substeps=4), frames=round(moments[-1] * scene.fps))
+    chosen = np.asarray(animation.points)[None, [round(time * scene.fps) for time in moments]]
+    animation = replace(animation, points=chosen, times=animation.times[:1])
+    wc.render(animation, DOCS / "mobile.png", size=(1430, 400), samples=16, azimuth=-30.0, elevation=14.0)
 
 
 def picture_analysis(n=32, frame=20):
     """A frame of the hanging cloth with its first principal stretch and both directions, as `analyze` makes it."""
     scene = hanging.scene(n=n)
-    animation = wc.simulate(scene, wc.Newton(dt=1 / 240), frames=frame)
-    assert animation.status.ok, animation.status
+    animation = run(scene, wc.Newton(dt=1 / 240), frames=frame)
     analyzer = wc.Analyzer(animation, scene.mesh, measures=("stretch", "directions"))
     write_report(analyzer, stills={frame: DOCS / "analysis.png"}, curves=True)
 

@@ -18,8 +18,8 @@ SHORTEST = 0.02
 _QUALITY = {"crf": "16", "preset": "slow"}
 # IEC 61966-2-1 (sRGB) on the primaries of Rec. 709, with the matrix of Rec. 709, 16 to 235.
 _PRIMARIES, _TRANSFER, _MATRIX, _RANGE = 1, 13, 1, 1
-# Pixels that the colours of a GIF are chosen from.
-_SAMPLE = 4_000_000
+# Of each channel, in which the colours of a GIF are counted.
+_BINS = 64
 
 
 def check_film(path, size):
@@ -83,12 +83,18 @@ class _Gif(Output):
     def __init__(self, path, size, times):
         super().__init__(path, "xb")
         self._times, self._held = times, []
+        self._pixels, self._sums = np.zeros(_BINS**3, np.int64), np.zeros((_BINS**3, 3))
 
     @property
     def frames(self):
         return len(self._held)
 
     def add(self, image):
+        values = np.asarray(image).reshape(-1, 3)
+        bins = (values.astype(np.int64) * _BINS // 256) @ (_BINS**2, _BINS, 1)
+        self._pixels += np.bincount(bins, minlength=len(self._pixels))
+        for channel in range(3):
+            self._sums[:, channel] += np.bincount(bins, values[:, channel], len(self._pixels))
         held = io.BytesIO()
         image.save(held, "PNG", compress_level=1)
         self._held.append(held.getvalue())
@@ -107,13 +113,15 @@ class _Gif(Output):
         return Image.open(io.BytesIO(self._held[k])).convert("RGB")
 
     def _palette(self):
-        """An image with the 256 colours that suit all frames."""
-        chosen = np.unique(np.linspace(0, len(self._held) - 1, 16).round().astype(int))
-        pixels = [np.asarray(self._image(k)).reshape(-1, 3) for k in chosen]
-        step = max(1, sum(map(len, pixels)) // _SAMPLE)
-        rows = np.concatenate([each[::step] for each in pixels])
-        rows = rows[: len(rows) // 64 * 64] if len(rows) >= 64 else rows
-        sample = Image.fromarray(rows.reshape(-1, 64 if len(rows) >= 64 else len(rows), 3))
+        """An image with the 256 colours that suit all frames.
+
+        A colour counts by the root of its pixels, or a large ground would take all entries and leave none to a small pin.
+        """
+        colours, found = np.nonzero(self._pixels)[0], self._pixels[self._pixels > 0]
+        means = np.round(self._sums[colours] / found[:, None]).astype(np.uint8)
+        rows = np.repeat(means, np.ceil(np.sqrt(found / found.min())).astype(int), axis=0)
+        rows = np.resize(rows, (-(-len(rows) // 256) * 256, 3))
+        sample = Image.fromarray(rows.reshape(-1, 256, 3))
         palette = Image.new("P", (1, 1))
         palette.putpalette(sample.quantize(256, Image.Quantize.MEDIANCUT).getpalette())
         return palette

@@ -112,14 +112,14 @@ class GivenScalar:
 
     unit = "1"
 
-    def __init__(self, values, subject):
+    def __init__(self, values, subject, name):
         shape = subject.shapes[subject.coloured]
         self.values = values if hasattr(values, "shape") else np.asarray(values)
         counts = (shape.count, len(shape.triangles))
         if self.values.ndim != 2 or len(self.values) != len(subject) or self.values.shape[1] not in counts:
             rule = f"({len(subject)}, {counts[0]}) of vertices or ({len(subject)}, {counts[1]}) of triangles"
             raise ValueError(f"colour has shape {self.values.shape}; it must be {rule} in all frames")
-        self.name = ""
+        self.name = name
 
     def scale(self, others, given, colormap):
         if given is None:

@@ -1,5 +1,6 @@
 """Draws the bar of the colours, names and the time on pictures, as large as the picture asks."""
 
+import unicodedata
 from functools import cached_property
 
 import numpy as np
@@ -28,8 +29,8 @@ class Overlay:
 
     def __init__(self, size, scale=None, title="", unit="1", names=(), background=(255, 255, 255)):
         self.width, self.height = size
-        self.scale, self.title, self.unit = scale, title, unit
-        self.names, self.background = names, tuple(background)
+        self.scale, self.title, self.unit = scale, written(title), written(unit)
+        self.names, self.background = [written(name) for name in names], tuple(background)
         self.letters = max(_LEAST, round(_LETTERS * min(self.height, self.width * 9 / 16)))
         self._font = ImageFont.load_default(self.letters)
 
@@ -53,7 +54,8 @@ class Overlay:
         digits = int(max(0, -np.floor(np.log10(step) + 1e-9), -np.floor(np.log10(step * 10) + 1e-9)))
         while digits and all(f"{value / factor:.{digits}f}".endswith("0") for value in values):
             digits -= 1
-        return [(value, f"{value / factor:.{digits}f}".replace("-", "−")) for value in values]
+        # With a hyphen before negative ones, for the font has no minus sign.
+        return [(value, f"{value / factor:.{digits}f}") for value in values]
 
     @cached_property
     def _exponent(self):
@@ -140,6 +142,13 @@ class Overlay:
             pen.text((start + 1.2 * em, y), "no value", INK, self._font, "lm")
 
 
+def written(text):
+    """A text in characters that the built-in font has: m² is m^2, é is e, and what has no such form a question mark."""
+    powers = text.translate(str.maketrans({"²": "^2", "³": "^3", "⁻": "-", "−": "-", "×": "x"}))
+    decomposed = "".join(c for c in unicodedata.normalize("NFKD", powers) if not unicodedata.combining(c))
+    return "".join(c if c.isascii() or c in "°·…" else "?" for c in decomposed)
+
+
 def round_numbers(low, high, most):
     """Multiples of 1, 2 or 5 times a power of ten from low to high, at most so many, or at least low and high."""
     rough = (high - low) / most
@@ -149,5 +158,5 @@ def round_numbers(low, high, most):
         first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
         if last - first + 1 <= most:
             break
-    found = step * np.arange(first, last + 1)
+    found = step * np.arange(first, last + 1) + 0.0  # no −0
     return found if len(found) > 1 else np.array([low, high])

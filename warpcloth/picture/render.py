@@ -45,7 +45,7 @@ def render(
     speed: float = 1.0,
     size: tuple[int, int] = (1280, 720),
     samples: int = 4,
-    colour: str | ArrayLike | None = None,
+    colour: str | ArrayLike | Mapping[str, ArrayLike] | None = None,
     colour_range: tuple[float, float] | None = None,
     colormap: str | None = None,
     measuring: Mapping[str, Any] | None = None,
@@ -81,7 +81,7 @@ def render(
         size: Width and height [px].
         samples: Rays through each pixel.
         colour: A number that ``warpcloth analyze`` measures, such as "stretch_1", shown with a bar; or values (F, n) of
-            vertices or (F, T) of triangles; None is the plain colour of cloth.
+            vertices or (F, T) of triangles, also as ``{"text above the bar": values}``; None is the plain colour of cloth.
         colour_range: Low and high of the colours; by default of all frames of the source, as `analyze` takes them.
         colormap: Name of a colour map of matplotlib.
         measuring: Options of :class:`warpcloth.Analyzer` for the colour, by name, such as ``{"neighbourhood": "1-ring"}``.
@@ -265,8 +265,9 @@ def _colours(subjects, colour, given, colormap, rest, device, measuring):
         options = dict(measuring or {})
         values = [MeasuredScalar(analyzers_of(each, colour, rest, device, options), colour) for each in subjects]
     else:
-        arrays = [colour] if len(subjects) == 1 else list(colour)
-        values = [GivenScalar(array, each) for array, each in zip(arrays, subjects, strict=True)]
+        ((title, given_values),) = colour.items() if isinstance(colour, Mapping) else [("", colour)]
+        arrays = [given_values] if len(subjects) == 1 else list(given_values)
+        values = [GivenScalar(array, each, title) for array, each in zip(arrays, subjects, strict=True)]
     return values, values[0].scale(values[1:], given, colormap)
 
 

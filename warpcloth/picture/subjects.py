@@ -27,6 +27,8 @@ SURROUNDINGS, LINES = (0.42, 0.41, 0.39), (0.06, 0.06, 0.065)
 _PIN, _PIN_EDGE = 0.009, 0.35
 # Radius of the tubes of a net or chain that says none, by its size: thinner ones are hardly seen.
 _THINNEST = 0.003
+# Likewise of strings and bars beside a cloth.
+_THINNEST_LINE = 0.001
 # From the middle of one cloth of a batch to that of the next, by their size.
 _APART = 1.12
 # Of the height of a cloth, how much farther behind it the next row of a batch is, so that it is seen.
@@ -135,7 +137,7 @@ def _of_stage(path, name, prim, fps):
     shapes = []
     for each in stage.prims:
         edge = np.linalg.norm(np.diff(each.points(codes[0])[each.edges], axis=1), axis=-1).mean() if len(each.edges) else 0.0
-        radius = max(each.radius, min(_THINNEST * size, 0.2 * edge)) if each.cloth else each.radius
+        radius = max(each.radius, min((_THINNEST if each.cloth else _THINNEST_LINE) * size, 0.2 * edge))
         colour = CLOTH if each.cloth else LINES if len(each.edges) else SURROUNDINGS
         shapes.append(_shape(each.count, each.triangles, each.edges, radius or 0.2 * edge, each.pins, size, edge, colour))
     labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
@@ -256,8 +258,8 @@ def _repeated(shape, batch):
 
 def _strings(mesh, lines):
     """Shapes of strings and bars, pairs and a thickness by name."""
-    count = len(mesh.points)
-    return [Shape(count, lines=pairs, radius=width / 2.0, colour=LINES) for pairs, width in (lines or {}).values()]
+    count, least = len(mesh.points), _THINNEST_LINE * _size(mesh.points)
+    return [Shape(count, lines=pairs, radius=max(width / 2.0, least), colour=LINES) for pairs, width in (lines or {}).values()]
 
 
 def _cloth(mesh, points, pins=()):
