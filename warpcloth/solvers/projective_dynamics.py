@@ -72,8 +72,8 @@ class ProjectiveDynamics(ImplicitStep):
         method="implicit steps by local projections and global solves with a constant matrix, optionally accelerated",
         suits="animation with few iterations; stretches little from the first iteration on",
         weakness=(
-            "motion perpendicular to stiff springs lags: its error shrinks by 1 − μ per iteration, μ = 0.008 for n = 8 and h "
-            "= 1/240 s"
+            "motion perpendicular to stiff springs lags: each iteration multiplies its error by 1 − μ, where μ is only 0.008 "
+            "for n = 8 and h = 1/240 s"
         ),
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64), cuda=(32, 64, 128, 256)),),
         runs=(

@@ -75,7 +75,7 @@ class XPBD(ImplicitStep):
     residual, multipliers = Residual(UNBALANCED, "m/s²"), True  # λ adds up over the sweeps of a step
     facts = Facts(
         method="PBD with compliance; converges to an implicit step with more sweeps",
-        suits="stiff cloth and hard constraints by many small steps; with BDF2 the cheapest method at any stiffness",
+        suits="stiff cloth and hard constraints by many small steps",
         weakness=(
             "too soft with few sweeps, more so on finer meshes: 26 % strain where converged sweeps leave 2.6 % (n = 32, 4 "
             "substeps of 20)"
