@@ -85,6 +85,14 @@ def test_silhouette_of_a_tube_is_that_of_its_projection(device, elevation):
     assert perspective < 0.02 * exact
 
 
+def test_a_tube_thinner_than_a_pixel_is_as_wide_as_one(device):
+    points = np.array([[-0.4, -1.0, 0.0], [0.5, 1.0, 0.0]])
+    camera = Camera((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), fov=20.0)
+    rows = coverage(Shape(2, lines=[[0, 1]], radius=1e-9), points, camera, (64, 64), device).sum(axis=1)
+    width = 1.0 / np.cos(np.arctan2(0.9, 2.0))
+    assert abs(rows.mean() - width) < 0.03 and rows.min() > 0.7
+
+
 def test_shadow_of_a_sphere_is_an_ellipse(device):
     """Of parallel light: with axes R and R/sin e, e the elevation of the sun, about where the ray through the centre lands."""
     r, size = 0.3, 200

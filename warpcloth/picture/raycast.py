@@ -35,7 +35,7 @@ class Shape:
         count: Number n of points.
         triangles: Vertices of triangles (T, 3), which are seen from both sides.
         lines: Vertices of tubes with round ends (E, 2).
-        radius: Of the tubes [m].
+        radius: Of the tubes [m]. Where they would be thinner than a pixel they are drawn as wide as one.
         balls: Vertices that are balls (k,).
         ball_radius: Of the balls [m].
         colour: Linear Rec. 709 of what has no colours of its own.
@@ -211,7 +211,7 @@ class RayCaster:
             raise ValueError(f"colours has {len(colours)} entries; there are {len(self.shapes)} shapes")
         unit, viewer = self._viewer(camera)
         with wp.ScopedDevice(self._device):
-            self._set_positions(points, np.asarray(camera.target), unit)
+            self._set_positions(points, camera, unit)
             self._colour(colours)
             light = self._light(camera, unit)
             self._launch_rows(kernels.trace(), [self._geometry, viewer, light], [self._layers])
@@ -270,7 +270,7 @@ class RayCaster:
         light.ground_colour, light.background = wp.vec3(*self._ground_colour), wp.vec3(*self._background)
         return light
 
-    def _set_positions(self, points, target, unit):
+    def _set_positions(self, points, camera, unit):
         """Copies the positions to the device, and fits the trees and the normals to them."""
         first = 0
         for k, (shape, found) in enumerate(zip(self.shapes, points, strict=True)):
@@ -280,7 +280,7 @@ class RayCaster:
             self._points[first : first + shape.count] = found
             first += shape.count
         with np.errstate(over="ignore", invalid="ignore"):
-            local = (self._points - target) / unit
+            local = (self._points - camera.target) / unit
             bad = ~(np.abs(local) < _FARTHEST).all(axis=1)
         local[bad] = 0.0
         flat, hollow = bad[self._triangles].any(axis=1), bad[self._tubes].any(axis=1)
@@ -295,7 +295,11 @@ class RayCaster:
             self._mesh = wp.Mesh(g.points, g.triangles)
             g.mesh = self._mesh.id
         if len(self._tubes):
-            g.radii.assign(np.where(hollow, 0.0, self._radii / unit))
+            # No thinner than a pixel, of which a few samples may miss all.
+            eye = np.subtract(camera.position, camera.target) / unit
+            nearest = np.linalg.norm(local[self._tubes] - eye, axis=2).min(axis=1)
+            pixel = 2.0 * np.tan(np.radians(camera.fov) / 2.0) / self._size[1]
+            g.radii.assign(np.where(hollow, 0.0, np.maximum(self._radii / unit, 0.5 * pixel * nearest)))
             wp.launch(kernels.tube_bounds(), len(hollow), inputs=[g.ends, g.radii, g.points], outputs=self._bounds)
             self._tree = wp.Bvh(*self._bounds)
             g.tree = self._tree.id
