@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pxr import Gf, Usd, UsdGeom
 from scipy.optimize import brentq
 
 import warpcloth as wc
 from support import setups
 from support.setups import square
+from support.usd_validation import validate
+from warpcloth.usd import read_scene, write_scene
+from warpcloth.usd.stage import find_prim
 
 BOTH = ("energies", "reactions")
 NONE = (0.0, 0.0, 0.0)
@@ -271,6 +275,45 @@ def test_books_leave_the_motion_as_it_is(name, device):
     assert (plain.points == recorded.points).all() and (plain.velocities == recorded.velocities).all()
     assert plain.energies is None and plain.reactions is None
     assert list(recorded.energies) == [*(type(term).__name__ for term in cloth.terms), "kinetic", "gravity"]
+
+
+@pytest.mark.host
+def test_energies_of_terms_of_one_name_are_told_apart():
+    names = [None, "Spring 2", None, "kinetic"]
+    terms = [wc.Spring(stiffness=float(k + 1), name=name) for k, name in enumerate(names)]
+    rest = replace(square(), terms=terms, pins="corners")
+    found = wc.equilibrium(rest, record="energies").energies
+    assert list(found) == ["Spring", "Spring 2", "Spring 3", "kinetic 2", "gravity"]
+    np.testing.assert_allclose(np.array(list(found.values())[:4]) / found["Spring"], [1.0, 2.0, 3.0, 4.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("source", [False, True])
+@pytest.mark.parametrize("single", [False, True])
+def test_books_are_primvars_of_the_animation(source, single, tmp_path, device):
+    """Reactions at pins, 0 elsewhere, and energies, sampled as the points are; in SI, over a stage in centimetres too."""
+    cloth = replace(lifted(), loads=[wc.Pressure(vertices="all", pressure=1.0)])
+    if source:
+        path = write_scene(cloth, tmp_path / "cloth.usda")
+        stage = Usd.Stage.Open(path)
+        UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+        UsdGeom.Xformable(stage.GetPrimAtPath("/World")).AddScaleOp().Set(Gf.Vec3f(100.0))
+        stage.Save()
+        cloth = read_scene(path)
+    run = {"device": device, "frames": 4, "record": BOTH, "output": tmp_path / "out.usdc", "single_file": single}
+    found = wc.simulate(cloth, SOLVERS["newton"], **run)
+    opened = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    prim = find_prim(opened, "out", None)
+    reaction = UsdGeom.PrimvarsAPI(prim).GetPrimvar("reaction")
+    assert reaction.GetInterpolation() == "vertex" and reaction.GetTypeName() == "float3[]"
+    for frame in range(5):
+        values = np.array(reaction.Get(frame))
+        np.testing.assert_array_equal(values[cloth.pins.vertices], found.reactions[frame].astype(np.float32))
+        assert (np.delete(values, cloth.pins.vertices, axis=0) == 0.0).all()
+        for name, energies in found.energies.items():
+            primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(f"energies:{name.replace(' ', '_')}")
+            assert primvar.GetInterpolation() == "constant" and primvar.Get(frame) == energies[frame]
+    assert "work of pins" in found.energies and "work of loads" in found.energies
+    assert validate(tmp_path / "out.usdc", path if source else None) == []
 
 
 @pytest.mark.host

@@ -4,29 +4,24 @@ import numpy as np
 import warp as wp
 
 
-def numbered_labels(model):
-    """The label of each term; terms of one label are numbered from the second on: Spring, Spring 2."""
-    labels = [elements.label for elements in model.terms]
-    before = [labels[:i].count(label) for i, label in enumerate(labels)]
-    return [label + (f" {count + 1}" if count else "") for label, count in zip(labels, before, strict=True)]
-
-
 def report(model):
     """Reports what was built: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels.
 
     Terms of one label are numbered from the second on: Spring, Spring 2. Kernels are factory(variant).Term.
     """
+    labels = [elements.label for elements in model.terms]
+    before = [labels[:i].count(label) for i, label in enumerate(labels)]
     arrays = [model.positions, model.velocities, model.mass, model.inverse_mass, model.gravity]
     arrays += [array for array in (model.pins, model.keyframes, model.pin_axes, model.mobility) if array is not None]
     arrays += [model.free_gravity[0]] * (model.mobility is not None)
     arrays += [] if model.loads is None else model.loads.arrays
     terms = [
         {
-            "term": label,
+            "term": elements.label + (f" {count + 1}" if count else ""),
             "elements": elements.count,
             "bytes": sum(_bytes(array) for array in elements.arrays),
         }
-        for elements, label in zip(model.terms, numbered_labels(model), strict=True)
+        for elements, count in zip(model.terms, before, strict=True)
     ]
     return {
         "scene": model.scene.name,

@@ -15,7 +15,6 @@ from ..core.sums import Sums
 from ..fast.plan import plan
 from ..kernels import ledger as kernels
 from ..model.damping import dissipations
-from ..model.report import numbered_labels
 from ..terms.refresh import STEP, Moment
 
 RECORDS = ("energies", "reactions")
@@ -35,6 +34,19 @@ def checked_record(record: Any) -> tuple[str, ...]:
     return tuple(word for word in RECORDS if word in words)
 
 
+def energy_names(scene):
+    """Names of the energies and works that a run of a scene records; of terms their labels, numbered where one is taken."""
+    others = ["kinetic", "gravity", *["work of pins"] * scene.pins.moves, *["work of loads"] * bool(scene.loads)]
+    found = []
+    for term in scene.terms:
+        name, number = term.label, 1
+        while name in found or name in others:
+            number += 1
+            name = f"{term.label} {number}"
+        found.append(name)
+    return found + others
+
+
 class Books:
     """Energies of a model and the forces of its pins, at any positions.
 
@@ -51,7 +63,7 @@ class Books:
         self._mass = model.mass.numpy().astype(np.float64).reshape(model.copies, -1)
         self._gravity = model.gravity.numpy().astype(np.float64)[:, None]
         self._start, self._energies = self._host(model.positions), None
-        self.labels = numbered_labels(model)
+        self.names = energy_names(model.scene)
         if not forces:
             return
         self.gradient = model.vectors()
@@ -89,7 +101,7 @@ class Books:
         if self._energies is None:
             sums = Sums(model)
             self._energies = [None if each.hard else Energy(model, sums, terms=(each,)) for each in model.terms]
-        for label, energy in zip(self.labels, self._energies, strict=True):
+        for label, energy in zip(self.names, self._energies, strict=False):  # those of terms are first
             total = model.scalars()
             if energy is not None:  # a hard term stores none
                 energy.add(x, total)
@@ -145,15 +157,13 @@ class Ledger:
     @in_turn
     def __init__(self, stepper, model, record):
         self._stepper, self.model, self._record = stepper, model, record
-        keyframes, held, loads = model.scene.pins.keyframes, model.scene.pins.held, model.loads
-        moving = keyframes is not None and bool((keyframes != keyframes[:1])[:, held].any())
-        self._moving, self._driven = (
-            "energies" in record and each for each in (moving, loads is not None and loads.constant is None)
-        )
+        changing = model.loads is not None and model.loads.constant is None
+        self._moving, self._driven = ("energies" in record and each for each in (model.scene.pins.moves, changing))
         forces = "reactions" in record or self._moving
         self._hidden = forces and any(elements.hard for elements in model.terms)
         self._books = Books(model, stepper.h, stepper.constraint_forces() if self._hidden else None, forces)
-        self._found, self._rows, self._frame, self.names = deque(), {name: [] for name in RECORDS}, 0, []
+        self._found, self._rows, self._frame = deque(), {name: [] for name in RECORDS}, 0
+        self.names = self._books.names
         self._total, self._each_step = np.zeros((2, model.copies)), None
         x, v = stepper.state
         if self._moving or self._driven:
@@ -217,7 +227,7 @@ class Ledger:
                 energies["work of pins"] = self._total[0] + books.kinetic_of_pins(v) - self._kinetic
             if self._driven:
                 energies["work of loads"] = self._total[1].copy()
-            self.names, found["energies"] = list(energies), np.stack(list(energies.values()), axis=-1)
+            found["energies"] = np.stack([energies[name] for name in self.names], axis=-1)
         if "reactions" in self._record:
             if loads is not None:
                 loads.launch(self.model, Moment(x, ahead=self._frame))
@@ -228,11 +238,12 @@ class Ledger:
         self._found.append((found, self._total.copy()))
 
     def keep(self, alive):
-        """Keeps what was found in the next frame, NaN in copies that are no longer ``alive`` (B,)."""
+        """Keeps what was found in the next frame, NaN in copies that are no longer ``alive`` (B,), and returns it by name."""
         found, self.totals = self._found.popleft()
         for name, values in found.items():
             values[~alive] = np.nan
             self._rows[name].append(values)
+        return found
 
     def go_on(self):
         """Goes on from the frame kept last, to which the stepper was set."""

@@ -1,10 +1,28 @@
 """Recorders of frames: in memory, or as a USD file."""
 
+import re
+
 import numpy as np
 
 from ..scene.lines import lines_of
 from ..usd import AnimationWriter, FrameSequence
 from .checkpoint import NAME, Checkpoint
+from .ledger import energy_names
+
+REACTION = "reaction"  # name of the primvar
+
+
+def primvar_names(names):
+    """Names of primvars for energies, such as energies:work_of_pins, by the names of these."""
+    found = {}
+    for name in names:
+        key = before = "energies:" + (re.sub(r"\W", "_", name, flags=re.ASCII) or "_")
+        number = 1
+        while key in found.values():
+            number += 1
+            key = f"{before}_{number}"
+        found[name] = key
+    return found
 
 
 class Memory:
@@ -15,7 +33,7 @@ class Memory:
 
     keeps = checkpoint = None  # no state
 
-    def append(self, points, velocities, state=None, watch=None):
+    def append(self, points, velocities, state=None, watch=None, recorded=None):
         if self.frames == 0:
             self.shape = (self._copies, len(points) // self._copies, 3) if self._copies > 1 else points.shape
             self.points, self.velocities = (np.empty((self._most, *self.shape), points.dtype) for _ in range(2))
@@ -45,6 +63,7 @@ class File:
         single_file: Whether it is one file in the end.
         facts: Function that gives the :func:`warpcloth.run.checkpoint.facts_of` of the run.
         resume: Whether to go on with the run that was interrupted.
+        record: What else is recorded, of :data:`warpcloth.run.ledger.RECORDS`.
 
     Attributes:
         checkpoint: The :class:`warpcloth.run.checkpoint.Checkpoint` to go on from, or None.
@@ -53,15 +72,20 @@ class File:
         ValueError: If there is nothing to resume, or it is another run.
     """
 
-    def __init__(self, scene, output, single_file, facts, resume=False):
+    def __init__(self, scene, output, single_file, facts, resume=False, record=()):
         stage, self.single_file, self._output = scene.stage, single_file, output
         self._facts, self._found, self.checkpoint, self._ended = facts, None, None, False
+        self._energies = primvar_names(energy_names(scene)) if "energies" in record else {}
+        self._pins, self._vertices = scene.pins.vertices, len(scene.mesh.points)
+        books = dict.fromkeys(self._energies.values(), "double") | ({REACTION: "float3[]"} if "reactions" in record else {})
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis, lines=lines)
+            self.writer = AnimationWriter(
+                output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis, lines=lines, books=books
+            )
         else:
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim)
+            self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim, books=books)
         self.saved = self.writer.saved
         if resume:
             try:
@@ -99,13 +123,23 @@ class File:
                 self._found = (None,)
         return self._found[0]
 
-    def append(self, points, velocities, state=None, watch=None):
+    def append(self, points, velocities, state=None, watch=None, recorded=None):
         """Adds a frame; with a checkpoint where it comes with the state and the watch and ends a chunk."""
-        self.writer.append(points, velocities)
+        self.writer.append(points, velocities, books=self._books(recorded or {}))
         if state is not None and self.writer.kept == self.writer.frames:
             chunks, span = self.writer.written()
             frame = self.writer.frames - 1
             Checkpoint(frame, self._known(), chunks, span, state, watch.to_host()).write(self.writer.run)
+
+    def _books(self, recorded):
+        """Returns the recorded values of a frame by the names of their primvars."""
+        found = {}
+        if "energies" in recorded:
+            found |= dict(zip(self._energies.values(), recorded["energies"][0].tolist(), strict=True))
+        if "reactions" in recorded:
+            found[REACTION] = np.zeros((self._vertices, 3))
+            found[REACTION][self._pins] = recorded["reactions"][0]
+        return found
 
     def finish(self):
         """The run has ended by itself, so that nothing is left to resume once the file is complete."""

@@ -110,8 +110,9 @@ def simulate(
         threads: See :class:`warpcloth.model.model.Model`.
         resume: Whether to continue the interrupted run to ``output`` after its last finished chunk of frames. The result equals
             that of an uninterrupted run bit for bit. All arguments but ``frames`` and ``single_file`` must be the same.
-        record: ``"energies"``, ``"reactions"`` or both, to have them in every frame of the :class:`Animation`. The motion is
-            the same to the bit. Work of moving pins and of loads that change is summed in every step, which takes more time.
+        record: ``"energies"``, ``"reactions"`` or both, to have them in each frame of the :class:`Animation`, and as primvars
+            of ``output``. The motion is the same to the bit. Work of moving pins and of loads that change is summed in every
+            step, which takes more time.
 
     Returns:
         :class:`Animation`. A run that diverges ends with its last good frame, and ``status`` says so. With several copies the
@@ -147,7 +148,7 @@ def simulate(
         return facts_of(scene, solver, device, dtype, vary, threads, record)
 
     # First, for it refuses a wrong output before anything compiles.
-    recorder = Memory(frames, copies) if output is None else File(scene, output, single_file, facts, resume)
+    recorder = Memory(frames, copies) if output is None else File(scene, output, single_file, facts, resume, record)
     with recording(recorder, frames):
         _refuse_size(frames, scene, dtype, copies, output)
         start = time.perf_counter()
@@ -161,18 +162,15 @@ def simulate(
         if resume:
             first = _resume(recorder.checkpoint, frames, stepper, watch)
         else:
-            recorder.append(*state_of(stepper))
-            if ledger:
-                ledger.keep(watch.alive)
+            recorder.append(*state_of(stepper), None, None, ledger and ledger.keep(watch.alive))
         timings["frames"] = watch.seconds
         if progress is not None:
             progress(first, frames)
         given = ledger or stepper, watch, frames, _ahead(model, output), first, recorder.keeps
         with closing(watched_frames(*given)) as found:
             for number, frame in found:
-                if ledger:
-                    ledger.keep(watch.alive)
-                recorder.append(frame.points, frame.velocities, frame.state, watch)
+                recorded = ledger and ledger.keep(watch.alive)
+                recorder.append(frame.points, frame.velocities, frame.state, watch, recorded)
                 if progress is not None:
                     progress(number, frames)
         recorder.finish()

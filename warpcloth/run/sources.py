@@ -231,6 +231,4 @@ def _loaded(loads: Loads, balance, _stepper):
 
 @source_of.register
 def _moving(pins: Pins, balance, _stepper):
-    keyframes = pins.keyframes
-    moves = keyframes is not None and keyframes.shape[1] and (keyframes != keyframes[0])[:, pins.held].any()
-    return MovingPins(balance) if moves else None
+    return MovingPins(balance) if pins.moves else None

@@ -58,6 +58,11 @@ class Pins:
         """Vertices that are held along every axis, (c,)."""
         return self.vertices[self.held.all(axis=1)]
 
+    @property
+    def moves(self) -> bool:
+        """Whether keyframes move pins of a scene along an axis that they hold."""
+        return self.keyframes is not None and bool((self.keyframes != self.keyframes[:1])[:, self.held].any())
+
     def refuse_far(self, positions: np.ndarray, copy: str = "") -> None:
         """Refuses pins whose first keyframe is not where their vertices start, at ``positions`` (n, 3) [m].
 

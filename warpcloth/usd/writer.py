@@ -47,6 +47,7 @@ class AnimationWriter(ChunkWriter):
         metadata: Mapping[str, object] | None = None,
         primvars: Mapping[str, Interpolation] | None = None,
         lines: Mapping[str, tuple[np.ndarray, float]] | None = None,
+        books: Mapping[str, str] | None = None,
     ) -> None:
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
@@ -65,6 +66,8 @@ class AnimationWriter(ChunkWriter):
                 vertex, or "uniform", one for each triangle.
             lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth;
                 `lines.lines_of` finds those of a scene. Not allowed with a source.
+            books: Type of each primvar of the books of a run, by name: "float3[]", a vector for each vertex, or "double", a
+                number of the whole cloth.
 
         Raises:
             FileNotFoundError: The output's folder or the source does not exist.
@@ -73,20 +76,20 @@ class AnimationWriter(ChunkWriter):
         super().__init__(output, mesh, chunk)
         up_axis = up_axis or mesh.up_axis or "Y"
         check_scene(fps, up_axis)
-        primvars = dict(primvars or {})
-        check_primvars(primvars, mesh)
+        primvars, books = dict(primvars or {}), dict(books or {})
+        check_primvars(primvars | dict.fromkeys(books, "vertex"), mesh)
         self._start, files, refit = 0.0, (), None
         if source is None:
             rest, target, root_metadata = scene_layer(mesh, pins, up_axis, prim or "Cloth")
-            target = replace(target, primvars=primvars)
+            target = replace(target, primvars=primvars, books=books)
             # Clips have samples alone; a name, type and interpolation have to stand on the stage itself.
-            target.declare(rest, [f"primvars:{name}" for name in primvars])
+            target.declare(rest, [f"primvars:{name}" for name in (*primvars, *books)])
             targets = [target, *define_lines(rest, mesh, lines or {})]
         else:
             for name, given in (("pins", pins), ("lines", lines)):
                 if given:
                     raise ValueError(f"{name}: a source has its own, and a layer over it writes none; leave them out")
-            rest, target, root_metadata, stage, files = over_layer(source, prim, mesh, primvars)
+            rest, target, root_metadata, stage, files = over_layer(source, prim, mesh, primvars, books)
             targets = [target]
             if stage.start is not None:
                 self._start = stage.start * fps / stage.time_codes_per_second
@@ -97,13 +100,20 @@ class AnimationWriter(ChunkWriter):
         root_metadata |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
         self._put_on(rest, targets, root_metadata, metadata, source, files, refit)
 
-    def append(self, points: np.ndarray, velocities: np.ndarray, primvars: Mapping[str, ArrayLike] | None = None) -> None:
+    def append(
+        self,
+        points: np.ndarray,
+        velocities: np.ndarray,
+        primvars: Mapping[str, ArrayLike] | None = None,
+        books: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
         """Adds a frame; every `chunk` frames they are written.
 
         Args:
             points: (n, 3) [m], world space.
             velocities: (n, 3) [m/s].
             primvars: Values by name of all primvars that were declared, (n,) or, where uniform, (T,).
+            books: Values by name of all books that were declared, (n, 3) or a number, in SI and in world space.
 
         Raises:
             ValueError: Other primvars than declared, a wrong shape, or a value that is not finite as float32, with the
@@ -111,10 +121,10 @@ class AnimationWriter(ChunkWriter):
         """
         self._check_open()
         vectors = {"points": self._checked("points", points), "velocities": self._checked("velocities", velocities)}
-        values = [self._checked_primvars(primvars), *[{}] * (len(self._targets) - 1)]
+        values = [(self._checked_primvars(primvars), None, books), *[({},)] * (len(self._targets) - 1)]
         samples = {
             f"{target.prim}.{name}": value
             for target, own in zip(self._targets, values, strict=True)
-            for name, value in target.samples(vectors, own).items()
+            for name, value in target.samples(vectors, *own).items()
         }
         self._append(self._start + self.frames, samples)
