@@ -101,6 +101,8 @@ def scene():
 # argv, with {} for a folder of SCENE_FILES, and a part of the line that it gives.
 WRONG_USES = [
     ("run", "the following arguments are required: SCENE; see warpcloth run --help"),
+    ("run -p n=8 hanging", "are required: SCENE (SCENE must stand before -p, which takes all that follows it); see"),
+    ("chart work-precision --solvers newton -p n=8 hanging", "are required: SCENE (SCENE must stand before --solvers"),
     ("run {}/good.py -p label=a/b", "the scene is called 'a/b', which cannot be the name of a file; give one with -o"),
     ("run {}/good.py -p label=..", "the scene is called '..', which cannot be the name of a file; give one with -o"),
     ("run {}/good.py -o {}/o.usdc --prim Cloth", "good.py is not a stage; leave it out"),

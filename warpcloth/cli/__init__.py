@@ -89,7 +89,17 @@ def _sentence(error, debug):
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
 
+    def parse_known_args(self, args=None, namespace=None):
+        self._given = args or ()
+        return super().parse_known_args(args, namespace)
+
     def error(self, message):
+        _said, required, names = message.partition(" are required: ")
+        first = {action.metavar for action in self._get_positional_actions()} & set(names.split(", "))
+        several = {option for action in self._get_optional_actions() if action.nargs == "+" for option in action.option_strings}
+        takes = next((option for option in self._given if option in several), None)
+        if required and first and takes:
+            message += f" ({' and '.join(sorted(first))} must stand before {takes}, which takes all that follows it)"
         raise ValueError(f"{message}; see {self.prog} --help")
 
 
@@ -101,8 +111,8 @@ def _parser():
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
 
     def add(name, command, text, **more):
-        form = argparse.RawDescriptionHelpFormatter
-        sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False, formatter_class=form, **more)
+        form = {"formatter_class": options.HelpFormatter, "allow_abbrev": False}
+        sub = commands.add_parser(name, help=text, description=text, **form, **more)
         sub.set_defaults(command=command)
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
         options.add_import(sub)
@@ -126,10 +136,8 @@ def _parser():
     bench.add_arguments(benches)
     for sub in (runs, infos):
         options.add_scene(sub)
-        of_info = "also show the step and the kernels of this solver (default with -s or --advise: newton)"
-        sub.add_argument(
-            "--solver", choices=options.solvers(), help=of_info if sub is infos else "the solver (default: newton)"
-        )
+        of_info = "also show the step and the kernels of this solver (default: none, or newton if -s or --advise is given)"
+        options.add_solver(sub, of_info if sub is infos else "the solver (default: newton)")
         options.add_values(sub, "-s", "option", "options of the solver")
         sub.add_argument("--prim", help="path or name of the cloth's prim, if the stage has several meshes")
         sub.add_argument(
@@ -138,20 +146,26 @@ def _parser():
     infos.add_argument(
         "--advise", action="store_true", help="find out which terms, precision, step and resolution change the result"
     )
-    infos.add_argument("--tolerance", metavar="SHARE", help="with --advise: smaller changes do not matter (default: 1%%)")
+    infos.add_argument(
+        "--tolerance", metavar="SHARE", help="with --advise: the largest change that does not matter (default: 1%%)"
+    )
     infos.add_argument(
         "--frames", type=int, metavar="N", help="with --advise: number of frames to simulate (default: at most 30)"
     )
     runs.add_argument(
         "--tolerance",
         metavar="SHARE",
-        help="use the cheapest solver and settings within this error, such as 1%%; see 'warpcloth choose'",
+        help="first measure which solver and settings are the cheapest with an error of at most this share of the size of the "
+        "cloth, such as 1%%, and run with them; see 'warpcloth choose'",
     )
     runs.add_argument(
-        "--budget", metavar="TIME", help="use the most accurate solver and settings within this time per frame, such as 16ms"
+        "--budget",
+        metavar="TIME",
+        help="first measure which solver and settings are the most accurate within this time per frame, such as 16ms, and run "
+        "with them",
     )
     runs.add_argument(
-        "--frames", type=int, metavar="N", help="number of frames after the start (default: the scene's duration)"
+        "--frames", type=int, metavar="N", help="number of frames after the start (default: those of the scene's duration)"
     )
     for sub in (runs, infos, deforms, analyzes, compares, renders, chooses, benches):
         sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
@@ -163,7 +177,11 @@ def _parser():
         sub.add_argument("--dtype", choices=DTYPES, default=default, help=f"precision (default: {default})")
     for sub in (runs, deforms):
         text = "the .usd, .usda, .usdc or .usdz file to write"
-        text += "" if sub is deforms else " (default: the scene's name and .usdc; an existing file is then not replaced)"
+        text += (
+            ""
+            if sub is deforms
+            else " (default: one with the name of the scene, such as hanging.usdc, which must not exist yet)"
+        )
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
     runs.add_argument("--film", metavar="FILE", help="also draw the run as a film, .mp4 or .gif; see 'warpcloth render'")
     runs.add_argument("--csv", metavar="FILE", help="also write a table of the energies and the summed reactions of each frame")

@@ -31,7 +31,8 @@ def add_arguments(parser):
         "input",
         metavar="INPUT",
         nargs="?",
-        help="the animation: a USD stage, a folder or pattern of mesh files, a .npz or a .npy file",
+        help="the animation: a USD stage, a folder or pattern of mesh files, a .npz or a .npy file; may be left out with "
+        "'--measure help'",
     )
     add_measuring(parser)
     add(
@@ -41,7 +42,11 @@ def add_arguments(parser):
         metavar="NAME",
         help="measures to compute, or all; '--measure help' lists them (default: stretch)",
     )
-    add("--pairs", metavar="A:B,…", help="compare these pairs of reference and frame instead, such as 1:2,1:3,72:75")
+    add(
+        "--pairs",
+        metavar="A:B,…",
+        help="compare these pairs of reference and frame, such as 1:2,1:3,72:75; in place of --reference and --lag",
+    )
     add("--every", type=int, default=1, metavar="K", help="measure only every K-th frame")
     add(
         "-o",
@@ -74,7 +79,7 @@ def add_arguments(parser):
     add(
         "--colormap",
         metavar="NAME",
-        help="a colour map of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
+        help="a colormap of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
     )
     add("--still-frames", type=float, nargs="+", metavar="FRAME", help="frames to show with --still (default: the last)")
 
@@ -87,7 +92,7 @@ def add_measuring(parser):
     add(
         "--rest",
         metavar="MESH",
-        help="mesh file or stage with the rest shape (default: the rest shape in INPUT, else its first frame)",
+        help="mesh file or stage with the rest shape (default: the rest shape in the animation, else its first frame)",
     )
     add("--rest-prim", metavar="PRIM", help="path or name of the mesh in the file of --rest")
     add(
@@ -96,18 +101,22 @@ def add_measuring(parser):
         help="measure vertices instead of triangles: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%",
     )
     add("--reference", metavar="R", help="compare each frame with rest (default), first, previous, or a frame number")
-    add("--lag", type=int, metavar="K", help="compare each frame with the one K frames earlier instead")
+    add("--lag", type=int, metavar="K", help="compare each frame with the one K frames earlier; in place of --reference")
     add(
         "--rates",
         choices=("midpoint", "forward", "logarithm"),
         default="midpoint",
-        help="formula of rates, see docs/measuring.md",
+        help="formula of rates (default: midpoint), see docs/measuring.md",
     )
-    add("--directions", metavar="D", help="direction of the warp: st for texture coordinates, or a vector such as 1,0,0")
+    add(
+        "--directions",
+        metavar="D",
+        help="direction of the warp threads, for measures along them: st for texture coordinates, or a vector such as 1,0,0",
+    )
     add(
         "--material",
         metavar="M",
-        help="membrane for energy and stress: neo-hookean (default with --stiffness), stvk or corotated",
+        help="membrane for energy and stress, with --stiffness: neo-hookean (default), stvk or corotated",
     )
     add("--stiffness", type=float, metavar="K", help="stiffness of the material, Young's modulus times thickness [N/m]")
     add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material (default: 0)")
@@ -183,7 +192,10 @@ def _analyzer(arguments):
     from ..mesh.sequences import open_sequence
 
     if arguments.input is None:
-        raise ValueError("INPUT is missing, what is to be measured; see warpcloth analyze --help")
+        raise ValueError(
+            "INPUT is missing, the animation to be measured; it must stand before options that take several values, such as "
+            "--measure; see warpcloth analyze --help"
+        )
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
     sequence = open_sequence(arguments.input, arguments.prim, arguments.fps, rest)
     return Analyzer(

@@ -6,7 +6,7 @@ from ..base.checks import whole
 from ..base.outputs import Output, check_apart
 from ..base.quiet import find_device
 from ..base.texts import assignments, options
-from .options import DEFAULT, add_scene, add_values, solvers
+from .options import DEFAULT, add_scene, add_solver, add_values
 from .setup import named_scene, solver_setup
 from .terminal import Interrupted, aligned, check_writable, json_text, open_bar, say
 
@@ -18,15 +18,16 @@ the step is that of 'warpcloth run'.
 Columns:
   ms a frame  time of a frame after warm-up, with its points copied to the host: median
   quartiles   of that time
-  cloths/s    frames per second, summed over all cloths of a batch
-  ns          time of a frame per element of all terms, iteration and substep (for newton per Newton iteration, for
-              hierarchical-pbd per sweep over all terms)
+  cloths/s    cloths in the batch, divided by the time of a frame
+  ns          time of a frame, divided by the number of elements of all terms, of iterations and of substeps; an iteration is
+              one of Newton's method for newton, and a sweep over all terms for hierarchical-pbd
   GB/s        bytes that a step must move, divided by its time: per iteration, positions read and written, inverse masses and
               the arrays of all terms read; per step, velocities read and written
-  share       GB/s relative to the faster of two copies on this device; small scenes fit into its caches and may exceed 100 %
+  share       GB/s divided by the bandwidth of the device, which is measured by a copy of memory and by a kernel that copies,
+              of which the faster counts; small scenes fit into the caches of the device and may exceed 100 %
   launches    kernel launches, fills and copies per step
   start s     from the start of a process to its first frame, with all kernels compiled before
-  compile s   additional time of a start that compiles all kernels
+  compile s   time that a start takes longer if it must compile all kernels
   factor s    time to factorise constant matrices
   MB          peak memory: of the process on a CPU, of Warp's memory pool on CUDA
 
@@ -43,7 +44,7 @@ def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
     add_scene(parser, nargs="?")
-    add("--solver", choices=solvers(), help="the solver (default: newton)")
+    add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
     add(
         "--sizes",
@@ -51,7 +52,7 @@ def add_arguments(parser):
         type=int,
         default=[],
         metavar="N",
-        help="resolutions to measure: values of the scene's parameter n, links or elements",
+        help="resolutions to measure: values of the parameter of the scene that sets it (n, links or elements)",
     )
     add(
         "--frames",
@@ -113,7 +114,7 @@ def _benchmarks(arguments, device):
         "threads": arguments.threads,
     }
     if arguments.scene is None:
-        _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which it is for")
+        _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which must stand before it")
         return standard(**given)
     _source, values, scene = named_scene(arguments)
     parameters = {name: values[name] for name in assignments(arguments.p)}

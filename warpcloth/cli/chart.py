@@ -1,6 +1,5 @@
 """The command ``chart``: measurements of many settings, as pictures and tables; each chart is a command of its own."""
 
-import argparse
 import sys
 from collections import Counter
 
@@ -10,7 +9,7 @@ from ..base.texts import assignments
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
-from .options import add_import, add_scene, solvers
+from .options import HelpFormatter, add_import, add_scene, solvers
 from .setup import named_scene
 from .terminal import DTYPES, add_dask, check_outputs, json_text, measuring
 
@@ -21,8 +20,9 @@ EPILOG = """\
 Diagrams:
   time       error of a motion against the compute time of one second of it, for many settings of every solver; the error
              is the RMS distance over vertices and frames to a reference solution of the same mesh
-  solver     one step: how much of its objective is left, against iterations and time, for solvers that minimise it
-  physics    error of rest shapes against mesh size and time, relative to closed forms; for the scenes cantilever (on four
+  solver     convergence within one step, for solvers that minimise its objective: the distance of the objective from its
+             minimum, divided by that at the start of the step, against iterations and time
+  physics    error of equilibria against mesh size and time, relative to closed forms; for the scenes cantilever (on four
              mesh patterns, straight and turned), chain and catenary
   spectrum   error of each iteration of projective dynamics, and the error that the eigenvalues of its matrix predict; for
              small meshes
@@ -60,8 +60,8 @@ def add_arguments(parser):
 
 def add(charts, name, command, text, epilog):
     """A command of a chart, with what all of them take."""
-    form = argparse.RawDescriptionHelpFormatter
-    sub = charts.add_parser(name, help=text, description=text, epilog=epilog, allow_abbrev=False, formatter_class=form)
+    form = {"formatter_class": HelpFormatter, "allow_abbrev": False}
+    sub = charts.add_parser(name, help=text, description=text, epilog=epilog, **form)
     sub.set_defaults(command=command)
     sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
     sub.add_argument("--workers", type=int, metavar="N", help="number of processes (default: one per core, or one on a GPU)")
@@ -77,7 +77,7 @@ def add(charts, name, command, text, epilog):
 def _add_work_precision(charts):
     sub = add(charts, "work-precision", work_precision, "Chart the error of solvers against their compute time.", EPILOG)
     add_scene(sub)
-    sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="diagram to measure")
+    sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="diagram to measure (default: time)")
     sub.add_argument(
         "--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure only these solvers (default: all)"
     )
@@ -85,7 +85,8 @@ def _add_work_precision(charts):
         "--frames",
         type=int,
         metavar="N",
-        help="frames to simulate (default: half of the scene's); for solver and spectrum those before the step (a third)",
+        help="frames to simulate (default: half of the scene's); for the diagrams solver and spectrum, frames to simulate "
+        "before the step that is measured (default: a third)",
     )
     sub.add_argument("--dtype", choices=DTYPES, help="precision (default: float32 for the diagram time, else float64)")
     sub.add_argument(
@@ -100,9 +101,13 @@ def _add_work_precision(charts):
 def _add_failure(charts):
     names = list_failures()
     sub = add(
-        charts, "failure", failure, "Chart where energies, weights and fits fail, and what theory predicts.", FAILURE_EPILOG
+        charts,
+        "failure",
+        failure,
+        "Chart known failures of energies, edge weights and fitted rotations, and what theory predicts.",
+        FAILURE_EPILOG,
     )
-    sub.add_argument("failure", metavar="FAILURE", choices=names, help=f"one of {', '.join(names)}")
+    sub.add_argument("failure", metavar="FAILURE", choices=names, help=f"the failure: one of {', '.join(names)}")
 
 
 def failure(arguments):
@@ -152,7 +157,7 @@ def work_precision(arguments):
         name: getattr(arguments, name) for name in ("solvers", "frames", "dtype") if getattr(arguments, name) is not None
     }
     if arguments.diagram == "physics" and (set(options) & {"solvers", "frames"}):
-        raise ValueError("the diagram physics is of rest shapes; --solvers and --frames are for the others")
+        raise ValueError("the diagram physics is of equilibria; --solvers and --frames are for the others")
     elif arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
         raise ValueError("the diagram spectrum is of projective dynamics in float64; --solvers and --dtype are for the others")
     measure, plot, lines = _parts(arguments.diagram)

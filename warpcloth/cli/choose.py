@@ -10,8 +10,10 @@ from .setup import named_scene
 from .terminal import Interrupted, Settings, add_dask, executing, json_text
 
 EPILOG = """\
-Settings of each solver are tried from coarse to fine, until one meets the tolerance or costs more than a setting that does.
-The error is the RMS distance over vertices and frames to a reference solution, divided by the longest side of the cloth.
+Give --tolerance for the cheapest setting within this error, --budget for the most accurate setting within this time, or both
+for the cheapest within both. Settings of each solver are tried from coarse to fine, until one meets the tolerance, exceeds the
+budget, or takes longer than a setting of any solver that meets the tolerance. The error is the RMS distance over vertices and
+frames to a reference solution, divided by the longest side of the cloth.
 Measurements are stored and reused.
 
   warpcloth choose hanging -p n=32 --tolerance 1%
@@ -23,10 +25,14 @@ def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
     add_scene(parser)
-    add("--tolerance", metavar="SHARE", help="largest error allowed, such as 1%% of the size of the cloth")
-    add("--budget", metavar="TIME", help="longest time per frame allowed, such as 16ms")
-    add("--solvers", nargs="+", metavar="NAME", help="solvers to choose among (default: all)")
-    add("--frames", type=int, metavar="N", help="number of frames to simulate (default: the scene's duration)")
+    add(
+        "--tolerance",
+        metavar="SHARE",
+        help="largest error allowed, as a share of the size of the cloth, such as 1%%; needed unless --budget is given",
+    )
+    add("--budget", metavar="TIME", help="longest time per frame allowed, such as 16ms; needed unless --tolerance is given")
+    add("--solvers", nargs="+", metavar="SOLVER", help="solvers to choose among (default: all)")
+    add("--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)")
     add("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
     add_dask(parser)
 

@@ -14,10 +14,10 @@ _SHOWN = 8  # frames or exclusions of each that the summary names
 
 EPILOG = """\
 A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames that
-both have at the same time are compared, and the others are listed. If A and B have the same triangles, vertices and stretches
-are compared, otherwise only surfaces. Stretches are relative to the rest shape of each. The rest shape of a folder or an .npz
-file is its first frame, unless --rest-a or --rest-b gives another. If one is Y up and the other Z up, B is turned to the up
-axis of A.
+both have at the same time are compared, and the others are listed. Surfaces are always compared. Positions of vertices and
+stretches are compared too if both have the same triangles. Stretches are relative to the rest shape of each. The rest shape of
+a folder or an .npz file is its first frame, unless --rest-a or --rest-b gives another. If one is Y up and the other Z up, B is
+turned to the up axis of A.
 
   warpcloth compare hanging.usdc frames --fps-b 24 --rest-b rest.obj --csv apart.csv
 """

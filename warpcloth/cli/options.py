@@ -114,6 +114,22 @@ def _allowed(call, name, parameter):
     return rule.replace("'", "") + (", or none" if type(None) in kinds else "")
 
 
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of notes, and puts SCENE before options that would take it as one of their values."""
+
+    def add_usage(self, usage, actions, groups, prefix=None):
+        first = [action for action in actions if not action.option_strings and not isinstance(action.choices, dict)]
+        for action in first:
+            self._prog += f" {self._format_args(action, action.dest.upper())}"
+        super().add_usage(usage, [action for action in actions if action not in first], groups, prefix)
+
+
+def add_solver(parser, text):
+    """Adds the option that names a solver."""
+    names = solvers()
+    parser.add_argument("--solver", choices=names, metavar="SOLVER", help=f"{text}: one of {', '.join(names)}")
+
+
 def add_scene(parser, **more):
     """Adds the scene and its parameters."""
     text = "a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage"

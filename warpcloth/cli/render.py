@@ -12,9 +12,9 @@ from .terminal import check_writable, json_text, open_bar
 
 SIZE = (1280, 720)
 EPILOG = """\
-FILE is a USD stage, all of whose meshes and linear curves are drawn, a mesh file, a folder or pattern of mesh files, or arrays
-in .npz or .npy. Two of them are drawn side by side. The ending of -o says what is made: .png is one frame, .gif and .mp4 are
-films in real time (.mp4 needs PyAV: pip install -e '.[video]' in the checkout). Colours need matplotlib.
+FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. Of a stage all meshes and linear
+curves are drawn. With two FILEs the second is drawn on the right. The ending of -o says what is made: .png is one frame, .gif
+and .mp4 are films in real time (.mp4 needs PyAV: pip install -e '.[video]' in the checkout). Colours need matplotlib.
 
   warpcloth render hanging.usdc -o hanging.mp4
   warpcloth render hanging.usdc -o last.png --size 1920x1080 --samples 16
@@ -26,7 +26,8 @@ films in real time (.mp4 needs PyAV: pip install -e '.[video]' in the checkout).
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
-    add("files", metavar="FILE", nargs="+", help="what is drawn; two are drawn side by side")
+    add("file", metavar="FILE", help="the animation or mesh to draw")
+    add("beside", metavar="FILE", nargs="?", help="another one to draw beside it")
     add("-o", "--output", metavar="FILE", required=True, help="the file to write: .png, .gif or .mp4")
     add("--frame", type=float, metavar="N", help="the frame of a .png, as FILE numbers them (default: the last)")
     add("--frames", type=frames, metavar="A:B", help="the first and the last frame of a film (default: all)")
@@ -45,7 +46,7 @@ def add_arguments(parser):
     add(
         "--colormap",
         metavar="NAME",
-        help="a colour map of matplotlib (default: viridis, or coolwarm around the undeformed value)",
+        help="a colormap of matplotlib (default: viridis, or coolwarm around the undeformed value)",
     )
     add("--azimuth", type=float, default=-38.0, metavar="DEGREES", help="angle of the camera about the vertical (default: -38)")
     add(
@@ -86,20 +87,19 @@ def frames(text):
 def render(arguments):
     from ..mesh.mesh import Surface
 
-    if len(arguments.files) > 2:
-        raise ValueError(f"{len(arguments.files)} files are given; one is drawn, or two side by side")
+    files = [file for file in (arguments.file, arguments.beside) if file is not None]
     if arguments.no_ground and arguments.ground is not None:
         raise ValueError("--ground and --no-ground are given; give one of them")
     measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
     if arguments.colour is None:
         for name in (*measuring, *(["range"] if arguments.range else []), *(["colormap"] if arguments.colormap else [])):
             raise ValueError(f"--{name} is given without --colour, the name of what is measured")
-    check_drawing(arguments.output, arguments.files, arguments.size)
+    check_drawing(arguments.output, files, arguments.size)
     device = find_device(arguments.device)
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
     started = time.perf_counter()
     pictures = draw_film(
-        arguments.files,
+        files,
         arguments.output,
         mesh=rest,
         prim=arguments.prim,
@@ -123,7 +123,7 @@ def render(arguments):
         device=device.alias,
     )
     facts = {
-        "input": arguments.files,
+        "input": files,
         "file": arguments.output,
         "pictures": pictures,
         "width": arguments.size[0],

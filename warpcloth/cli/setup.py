@@ -14,9 +14,10 @@ _STEPS_A_SECOND = 240
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
-The step by default: solvers with a stability limit, such as explicit, take the fewest substeps that are stable. Their step
-is 10 % below the limit for small motion about the rest shape, and below a bound for any motion. (The bound is exact for
-springs; hinges count as at rest.) All other solvers take a step of about 1/240 s.
+If neither dt nor substeps is given, the step is chosen. Most solvers take a step of about 1/240 s. Solvers with a stability
+limit, such as explicit, take the fewest substeps whose step is below two limits. It is 10 % below the limit for small motion
+about the rest shape. It is also below an estimate of the limit in large motion: for springs and quadratic bending a bound that
+always holds, for hinges and membranes the value at rest.
 """
 
 

@@ -11,18 +11,30 @@ from .terminal import DTYPES, check_outputs, json_text, measuring
 
 _COUNT = 9
 
+
+def _axes():
+    """Lines of help on the axes."""
+    width = max(map(len, AXES))
+    return "\n".join(f"  {name:<{width}}   {axis.low:g} to {axis.high:g}: {axis.label}" for name, axis in AXES.items())
+
+
 EPILOG = f"""\
-Axes: {", ".join(AXES)}.
-Stiffness and mass-ratio are multiples of the scene's own, compression is 1 − l/L at the start, and resolution is the scene's
-parameter n, links or elements. A METHOD is the NAME of a solver, or NAME:option=value,option=value.
+Axes, with their default ranges of {_COUNT} values:
+{_axes()}
+Resolution is the parameter of the scene that sets it: n, links or elements.
 
 All runs are compared over the same simulated time. A run with a large step continues until it has taken --steps steps, to
-show whether it diverges. Runs with small steps cost the most. The verdicts:
-  diverged     its energy is three times what the start, falling and moving pins can have put in
-  inaccurate   its error exceeds --accuracy by more than the error of the reference; it is the RMS distance to the reference
-               over vertices and frames, divided by the size of the cloth
-  unsure       the reference is not accurate enough to tell
-The reference is Newton's method with BDF2 and a quarter of the step, in float64. Measured rows are stored and reused.
+show whether it diverges. Runs with small steps cost the most. The error is the RMS distance to a reference over vertices and
+frames, divided by the size of the cloth. The reference is Newton's method with BDF2 and a quarter of the step, but with at most
+2000 steps, in float64. Verdicts:
+  stable       none of the others
+  inaccurate   the error exceeds --accuracy by more than the reference may be wrong
+  unsure       the reference is missing, or not accurate enough to tell
+  stalled      a step ended at no minimum
+  diverged     the energy is three times what the start, falling, moving pins and loads can have put in
+  refused      the solver does not take the scene or the setting
+  slow         the run took longer than --limit
+Measured rows are stored and reused.
 
   warpcloth chart stability hanging -p n=8 --x stiffness --y dt -o map.png
   warpcloth chart stability net -p n=12 stiffness=inf --x resolution --y relaxation --solvers pbd:sweep=jacobi -o jacobi.png
@@ -38,7 +50,8 @@ def add_arguments(parser):
             f"--{of}-range",
             nargs=3,
             metavar=("LOW", "HIGH", "N"),
-            help="lowest value, highest value and number of values, spaced logarithmically (compression: evenly)",
+            help="lowest value, highest value and number of values, spaced logarithmically (compression: evenly); "
+            "see below for the defaults",
         )
     parser.add_argument(
         "--at",
@@ -49,7 +62,10 @@ def add_arguments(parser):
         help="values of axes that are not drawn, such as dt=1/60",
     )
     parser.add_argument(
-        "--solvers", nargs="+", metavar="METHOD", help="solvers, each as NAME or NAME:option=value,option=value (default: all)"
+        "--solvers",
+        nargs="+",
+        metavar="SOLVER",
+        help="solvers, each with options if wanted, such as xpbd:sweep=sequential,iterations=5 (default: all)",
     )
     parser.add_argument(
         "--duration", type=float, metavar="SECONDS", help="simulated time that is compared (default: half of the scene's)"
