@@ -100,7 +100,7 @@ def measure_rates(dtype):
     """Kernel over elements: the velocity gradient L = ḞF⁻¹ = D + W and other rates between the gradients F̂₀ and F̂₁.
 
     L is 2(F̂₁ − F̂₀)(F̂₁ + F̂₀)⁻¹/dt by midpoint, (F̂₁ − F̂₀)F̂₀⁻¹/dt forward, log(F̂₁F̂₀⁻¹)/dt by logarithm. D = P ½(L + Lᵀ) P with
-    P the projection to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch of the normal is not measured; W = ½(L − Lᵀ).
+    P the projection to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch of the normal is not measured; Ω = ½(L − Lᵀ).
     Rates of stretches and of lengths are of the numbers themselves by the same method; of angles, differences. Points are
     rounded by ``rounding`` [m], and elements in the reference as wide as ``sizes`` [m].
     """

@@ -42,7 +42,7 @@ _THREADS: dict[str, Any] = {"needs": "directions", "undefined": "has collapsed, 
 _RATES = (
     Measure("velocity_gradient", (3, 3), "1/s", "L = ḞF⁻¹", 0.0, True, undefined=_TURNED),
     Measure("rate_of_strain", (3, 3), "1/s", "D = ½(L + Lᵀ) in the tangent plane", 0.0, True, undefined=_TURNED),
-    Measure("spin", (3, 3), "1/s", "W = ½(L − Lᵀ)", 0.0, True, undefined=_TURNED),
+    Measure("spin", (3, 3), "1/s", "Ω = ½(L − Lᵀ)", 0.0, True, undefined=_TURNED),
     Measure("stretch_rate", (2,), "1/s", "λ̇/λ of the principal stretches in the tangent plane", 0.0, True),
     Measure("rest_direction_rate", (), "rad/s", "turn of the first principal direction in the material, about the normal", 0.0,
             True, undefined=_EQUAL),
