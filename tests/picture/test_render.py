@@ -59,6 +59,26 @@ def BasisCurves "Rope"
     point3f[] points = [(0, 0, 50), (50, 50, 90), (100, 100, 50)]
     float[] widths = [4]
 }
+def Sphere "Ball"
+{
+    double radius = 10
+    double3 xformOp:translate.timeSamples = {1: (0, 0, 0), 3: (0, 0, 10)}
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+def Cylinder "Pole"
+{
+    double radius = 2
+    double height = 80
+    uniform token axis = "X"
+}
+def Plane "Wall"
+{
+    double width = 300
+    double length = 200
+    uniform token axis = "Y"
+    double3 xformOp:translate = (0, 200, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
 def Mesh "Guide"
 {
     uniform token purpose = "guide"
@@ -121,7 +141,7 @@ def picture(path):
     ("name", "shapes", "labels", "interval"),
     [
         ("cloth.usdc", 1, list(range(FRAMES)), 1 / 24),
-        ("scene.usda", 3, [1, 3], 2 / 30),
+        ("scene.usda", 6, [1, 3], 2 / 30),
         ("chain.usdc", 1, [0, 1, 2], 1 / 24),
         ("cloth.npz", 1, list(range(FRAMES)), 1 / 24),
         ("frames", 1, [10, 12, 14, 16, 18, 20], None),
@@ -143,12 +163,15 @@ def test_every_file_is_drawn(folder, name, shapes, labels, interval, tmp_path):
 
 def test_a_stage_shows_its_surroundings_in_metres_and_nothing_hidden(folder):
     subject = subject_of(folder / "scene.usda")
-    sheet, table, rope = subject.shapes
+    sheet, table, rope, ball, pole, wall = subject.shapes
     assert subject.up_axis == "Z" and subject.coloured == 0 and len(sheet.triangles) == 2
     assert len(rope.lines) == 2 and rope.radius == pytest.approx(0.02)
     assert len({tuple(shape.colour) for shape in subject.shapes}) == 3
     points = subject.read(1)
     assert points[0][:, 2] == pytest.approx([0.2] * 4) and points[1][:, 2] == pytest.approx([-0.1] * 3)
+    assert np.linalg.norm(points[3] - [0.0, 0.0, 0.1], axis=1) == pytest.approx([0.1] * ball.count)
+    assert np.ptp(points[4], axis=0) == pytest.approx([0.8, 0.04, 0.04], rel=0.01) and len(pole.triangles)
+    assert np.ptp(points[5], axis=0) == pytest.approx([3.0, 0.0, 2.0]) and len(wall.triangles) == 2
     chosen = subject_of(folder / "scene.usda", prim="Table")
     assert chosen.shapes[0].count == table.count and tuple(chosen.shapes[0].colour) == tuple(sheet.colour)
     pinned = subject_of(folder / "cloth.usdc").shapes[0]

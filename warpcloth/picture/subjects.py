@@ -19,12 +19,12 @@ from ..scene.lines import lines_of
 from ..scene.scene import Scene
 from ..usd.drawn import read_drawn
 from ..usd.layers import CURVE_WIDTH
-from .raycast import CLOTH, Shape
+from .raycast import BACK, CLOTH, Shape
 
 # Linear Rec. 709 of meshes beside the cloth, and of strings and bars.
 SURROUNDINGS, LINES = (0.42, 0.41, 0.39), (0.06, 0.06, 0.065)
-# Radius of pins, by the size of the cloth and, of coarse ones, by the mean edge.
-_PIN, _PIN_EDGE = 0.009, 0.35
+# Radius of pins by the size of the cloth: as large as neighbours do not touch, within these.
+_PIN, _PIN_LEAST, _PIN_EDGE = 0.009, 0.006, 0.35
 # Radius of the tubes of a net or chain that says none, by its size: thinner ones are hardly seen.
 _THINNEST = 0.003
 # Likewise of strings and bars beside a cloth.
@@ -272,8 +272,17 @@ def _cloth(mesh, points, pins=()):
 
 
 def _shape(count, triangles, edges, radius, pins, size, edge, colour):
-    ball = max(min(_PIN * size, _PIN_EDGE * edge or np.inf), 1.6 * radius) or 1.0
-    return Shape(count, triangles, edges, radius, np.asarray(pins, dtype=int), ball, colour)
+    ball = max(_PIN_LEAST * size, min(_PIN * size, _PIN_EDGE * edge), 1.6 * radius) or 1.0
+    return Shape(
+        count,
+        triangles,
+        edges,
+        radius,
+        np.asarray(pins, dtype=int),
+        ball,
+        colour,
+        back=BACK if colour == CLOTH else (1.0, 1.0, 1.0),
+    )
 
 
 def _size(points):

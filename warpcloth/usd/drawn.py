@@ -1,4 +1,4 @@
-"""All that a stage shows: its meshes and linear curves, read at one time code after another."""
+"""All that a stage shows: its meshes, solids and linear curves, read at one time code after another."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from .values import array_of, check_composed, sentences, time_codes_of
 
 @dataclass(frozen=True, eq=False)
 class DrawnPrim:
-    """A Mesh prim or linear BasisCurves as it is drawn.
+    """A Mesh prim, a solid such as a Sphere, or linear BasisCurves as it is drawn.
 
     Attributes:
         path: Path of the prim.
@@ -70,7 +70,7 @@ class DrawnStage:
 
 
 def read_drawn(path, prim=None):
-    """Reads all meshes and linear curves that a stage shows.
+    """Reads all meshes, solids and linear curves that a stage shows. Solids keep their first size.
 
     The cloth is the prim that is named or that an earlier run animated, or else each prim whose points move, or else all of
     them. Prims that are invisible, guides or proxies, and prototypes of point instancers are left out.
@@ -95,7 +95,8 @@ def read_drawn(path, prim=None):
         found = ([chosen] if chosen else []) + found
         codes = {each: _codes(each) for each in found}
         moving = [each for each in found if len(codes[each]) > 1]
-        cloths = [chosen] if chosen else moving or found
+        moving = [each for each in moving if each.IsA(UsdGeom.PointBased)]
+        cloths = [chosen] if chosen else moving or [each for each in found if each.IsA(UsdGeom.PointBased)]
         prims = [_drawn(each, path, each in cloths, codes[each]) for each in found]
         prims = [each for each in prims if each is not None]
         if not prims:
@@ -113,7 +114,7 @@ def _shown(stage):
             walk.PruneChildren()
             continue
         linear = prim.IsA(UsdGeom.BasisCurves) and UsdGeom.BasisCurves(prim).GetTypeAttr().Get() == UsdGeom.Tokens.linear
-        if not (linear or prim.IsA(UsdGeom.Mesh)):
+        if not (linear or prim.IsA(UsdGeom.Mesh) or prim.GetTypeName() in _SOLIDS):
             continue
         seen = UsdGeom.Imageable(prim)
         hidden = seen.ComputeVisibility(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.invisible
@@ -123,7 +124,7 @@ def _shown(stage):
 
 def _codes(prim):
     """Time codes of the samples of a prim's points, or else of its space."""
-    codes = time_codes_of(UsdGeom.PointBased(prim).GetPointsAttr())
+    codes = time_codes_of(UsdGeom.PointBased(prim).GetPointsAttr()) if prim.IsA(UsdGeom.PointBased) else []
     ancestor = prim
     while not codes and ancestor and not ancestor.IsPseudoRoot():
         codes = UsdGeom.Xformable(ancestor).GetTimeSamples() if ancestor.IsA(UsdGeom.Xformable) else []
@@ -138,11 +139,12 @@ def _drawn(prim, path, cloth, codes):
     first = codes[0] if codes else Usd.TimeCode.Default()
     moving = moving_space(prim) is not None
     transform = None if moving else local_to_metres(prim, where)
-    attribute = UsdGeom.PointBased(prim).GetPointsAttr()
+    solid = _SOLIDS[prim.GetTypeName()](prim) if prim.GetTypeName() in _SOLIDS else None
+    attribute = UsdGeom.PointBased(prim).GetPointsAttr() if solid is None else None
 
     def points(code, count=None):
         try:
-            found = array_of(attribute, (3,), time=code)
+            found = array_of(attribute, (3,), time=code) if solid is None else solid.vertices
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
         number = 0 if found is None else len(found)
@@ -158,7 +160,9 @@ def _drawn(prim, path, cloth, codes):
             raise ValueError(f"{where}: has no points")
         return None
     try:
-        if prim.IsA(UsdGeom.Mesh):
+        if solid is not None:
+            triangles, edges, radius = np.asarray(solid.faces, np.int32), np.empty((0, 2), np.int32), 0.0
+        elif prim.IsA(UsdGeom.Mesh):
             corners, triangles = face_corners(prim, len(start))
             triangles, edges, radius = corners[triangles], np.empty((0, 2), np.int32), 0.0
             linear = local_to_metres(prim, where, first)[:3, :3]
@@ -167,12 +171,51 @@ def _drawn(prim, path, cloth, codes):
         else:
             triangles, edges = np.empty((0, 3), np.int32), curve_edges(prim, len(start)).astype(np.int32)
             radius = _radius(prim, start, edges, local_to_metres(prim, where, first))
-        pins = _pinned(prim, len(start))
+        pins = _pinned(prim, len(start)) if solid is None else np.empty(0, np.int32)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     return DrawnPrim(
         str(prim.GetPath()), cloth, len(start), triangles, edges, radius, pins, partial(points, count=len(start)), codes
     )
+
+
+def _solid(make, *sizes):
+    """Function that gives the surface of a solid from its prim, in the prim's own space.
+
+    Args:
+        make: Function of the module trimesh and of the sizes, which makes it along z.
+        sizes: Names of attributes.
+    """
+
+    def made(prim):
+        import trimesh
+
+        code = Usd.TimeCode.EarliestTime()
+        found = make(trimesh, *(float(prim.GetAttribute(name).Get(code)) for name in sizes))
+        axis = prim.GetAttribute("axis")
+        along = "XYZ".index(axis.Get() if axis and axis.Get() else "Z")
+        order = [0, 1, 2]
+        order[along], order[2] = 2, along
+        found.vertices = (found.vertices - found.bounds.mean(axis=0))[:, order]
+        return found
+
+    return made
+
+
+def _plane(trimesh, width, length):
+    corners = np.array([[0.0, 0.0, 0.0], [width, 0.0, 0.0], [width, length, 0.0], [0.0, length, 0.0]])
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+# By the name of their type.
+_SOLIDS = {
+    "Cube": _solid(lambda trimesh, size: trimesh.creation.box((size, size, size)), "size"),
+    "Sphere": _solid(lambda trimesh, radius: trimesh.creation.icosphere(4, radius), "radius"),
+    "Cylinder": _solid(lambda trimesh, radius, height: trimesh.creation.cylinder(radius, height, 64), "radius", "height"),
+    "Capsule": _solid(lambda trimesh, radius, height: trimesh.creation.capsule(height, radius, (64, 64)), "radius", "height"),
+    "Cone": _solid(lambda trimesh, radius, height: trimesh.creation.cone(radius, height, 64), "radius", "height"),
+    "Plane": _solid(_plane, "width", "length"),
+}
 
 
 def _radius(prim, points, edges, transform):
