@@ -156,10 +156,11 @@ def is_hidden(g: Geometry, o: wp.vec3, d: wp.vec3, most: float):
         k = wp.int32(0)
         while wp.bvh_query_next(query, k, most):
             r = g.radii[k]
-            if r > 0.0 and not hidden:
+            if r > 0.0:
                 t, _s = meet_tube(o, d, g.points[g.ends[k][0]], g.points[g.ends[k][1]], r)
                 if t < most:
                     hidden = True
+                    break
     return hidden
 
 

@@ -221,6 +221,13 @@ def test_the_same_picture_has_the_same_bytes(device):
         assert (picture(device, points, shape, threads=1) == picture(device, points, shape, threads=2)).all()
 
 
+def test_a_few_samples_show_what_many_do(device):
+    """To 3.5 of 255 (rms), edges included; by 5.8 if they are not smoothed."""
+    points, shape = scene()
+    few, many = (picture(device, points, shape, samples=n, sun_angle=20.0).astype(float) for n in (4, 64))
+    assert np.sqrt(((few - many) ** 2).mean()) < 4.5
+
+
 @pytest.mark.parametrize("factor", [2.0**20, 2.0**-20, 1e6, 1e-6, 1e30, 1e-30])
 def test_size_does_not_matter(device, factor):
     """By a power of two no number changes but its exponent; otherwise rounding moves rays that pass an edge."""
@@ -333,6 +340,12 @@ def test_a_framed_camera_sees_all_of_a_motion_and_no_more(azimuth, elevation, up
         (
             lambda: RayCaster([Shape(4, HALVES)], 4, 4).image([SQUARE], Camera((0, 0, 1), (0, 0, 0)), [np.ones((3, 3))]),
             r"colours\[0\] has shape \(3, 3\); it must be \(4, 3\) of vertices, \(2, 3, 3\) of corners",
+        ),
+        (
+            lambda: RayCaster([Shape(4, HALVES)], 4, 4).image(
+                [SQUARE], Camera((0, 0, 1), (0, 0, 0)), [np.full((4, 3), np.nan)]
+            ),
+            r"colours\[0\]\[0, 0\] is nan; it must be finite",
         ),
     ],
 )

@@ -8,6 +8,13 @@ import warp as wp
 from ..base.checks import whole
 
 
+def cores(device):
+    """The number of cores of the CPU that this process may use; 1 for another device."""
+    if not device.is_cpu:
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def threads_on(device, threads):
     """The number of threads, refused where one device or mode cannot have it."""
     whole("threads", threads, 1)
@@ -18,7 +25,6 @@ def threads_on(device, threads):
             f"threads is {threads} in Warp's debug mode, where threads of one kernel share the pointer to its tiles; "
             "wp.config.mode='release' or wp.config.enable_tiles_in_stack_memory=False take more than 1"
         )
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if threads > cores:
-        warnings.warn(f"threads is {threads} on {cores} cores; more threads than cores are slower", stacklevel=5)
+    if threads > cores(device):
+        warnings.warn(f"threads is {threads} on {cores(device)} cores; more threads than cores are slower", stacklevel=5)
     return int(threads)

@@ -1,16 +1,16 @@
 """Pictures of surfaces and tubes in the light of a sun and the sky, by rays."""
 
-import os
 from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
 
-from ..base.checks import array, choice, number, whole
+from ..base.checks import array, choice, number, refuse, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..core.thread_pool import ThreadPool
 from ..kernels import render as kernels
+from ..model.threads import cores, threads_on
 
 CLOTH = (0.20, 0.43, 0.72)
 BACK = (1.7, 1.12, 0.86)
@@ -23,6 +23,8 @@ _SKY_DISTANCE, _GROUND = 1.0, 6.0
 _SKY, _TILT = 0.42, 0.35
 # Beyond, products of three coordinates of float32 overflow.
 _FARTHEST = 1e9
+# Samples a pixel from which on their noise is less than what smoothing blurs.
+_PLAIN = 32
 # Rows that a thread of the CPU takes at a time.
 _ROWS = 8
 
@@ -140,8 +142,7 @@ class RayCaster:
             array("ground_colour", ground_colour, (3,)),
         )
         self._device = find_device(device)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._pool = ThreadPool(1 if not self._device.is_cpu else threads or cores)
+        self._pool = ThreadPool(cores(self._device) if threads is None else threads_on(self._device, threads))
         self._allocate(samples, sun_angle)
 
     @in_turn
@@ -185,7 +186,7 @@ class RayCaster:
             lifted = np.sqrt(1.0 - (flat**2).sum(axis=1, keepdims=True))
             self._sky_rays = wp.array(np.concatenate([flat, lifted], axis=1), dtype=wp.vec3)
             self._visible = wp.zeros_like(layers.visible)
-            self._smooth = True
+            self._smooth = samples < _PLAIN
             self._image = wp.zeros((pixels, 3), dtype=wp.uint8)
 
     @in_turn
@@ -323,6 +324,7 @@ class RayCaster:
             painted = [False, False]
             if found is not None:
                 found = np.asarray(found, dtype=np.float64)
+                refuse(f"colours[{k}]", found, ~np.isfinite(found), "must be finite")
                 if found.shape == (shape.count, 3):
                     start = add(found)
                     corner, end, painted = shape.triangles + start, shape.lines + start, [True, True]
