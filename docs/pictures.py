@@ -1,4 +1,4 @@
-"""Makes the pictures of the README and of docs/ from animations and rest shapes: python docs/pictures.py"""
+"""Makes the pictures of the README and of docs/ from animations and equilibria: python docs/pictures.py"""
 
 from dataclasses import replace
 from pathlib import Path

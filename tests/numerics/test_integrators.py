@@ -8,9 +8,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import warpcloth as wc
+from warpcloth.numerics.integrators import INTEGRATORS
 
 EPS = np.finfo(np.float64).eps
-INTEGRATORS = ("euler", "midpoint", "bdf2")
 # So far converged that the error is that of the step.
 SOLVERS = {
     "newton": wc.Newton(substeps=1, tolerance=1e-11),

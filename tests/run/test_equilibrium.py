@@ -164,7 +164,7 @@ def test_what_rounding_hides_is_no_rest_shape(device):
     """With kL²/D = 1e6 float32 leaves forces of 8 times the weight, and the strip 0.2 m away."""
     rest = wc.equilibrium(scene("cantilever", stretching=1e6), dtype="float32", device=device)
     assert rest.status.result not in SETTLED
-    assert rest.status.message.startswith("rounding hides the rest shape in float32")
+    assert rest.status.message.startswith("rounding hides the equilibrium in float32")
 
 
 def test_a_sheet_too_stiff_to_move_is_no_rest_shape(device):
@@ -276,7 +276,7 @@ def test_rigid_motions_are_no_instability(device):
     assert pinned.stable and pinned.lowest_eigenvalue == np.inf
     unfinished = wc.equilibrium(wc.Scene(mesh, density=0.1, terms=terms), iterations=20, device=device)
     assert not unfinished.stable and np.isnan(unfinished.lowest_eigenvalue)
-    assert "; not a rest shape: " in unfinished.status.message
+    assert "; not an equilibrium: " in unfinished.status.message
 
 
 @pytest.mark.parametrize("lowest", [-3e4, -1e-3, 0.0, 1e-3, 10.0])

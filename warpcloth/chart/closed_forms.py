@@ -10,7 +10,7 @@ _MARKS = "os^Dv"
 def plot_physics(path, results):
     """Plots the error against h and against the time, two panels a case, pattern and angle.
 
-    Dashed: what the free sides of a cantilever cost, below which no mesh comes; and how well the rest shapes are known, below
+    Dashed: what the free sides of a cantilever cost, below which no mesh comes; and how well the equilibria are known, below
     which errors mean nothing, written where it is below the picture. What did not end well is named beside.
 
     Args:
@@ -61,7 +61,7 @@ def _floor(left, right, floors):
         return
     (low, high), floor = left.get_ylim(), max(floors)
     for axes in (left, right):
-        axes.axhline(floor, color=GREY, linewidth=0.8, linestyle="--", label=f"rest shapes are known to {floor:.1g}")
+        axes.axhline(floor, color=GREY, linewidth=0.8, linestyle="--", label=f"equilibria are known to {floor:.1g}")
         axes.set_ylim(low, max(high, 2.0 * floor))
     left.legend(frameon=False, fontsize=7, labelcolor=GREY)
 

@@ -45,7 +45,7 @@ CASES = ("cylinder", "cantilever", "chain", "catenary", "patch")
 BENDING = {"dihedral": DihedralBending, "quadratic": QuadraticBending}
 D = 1e-3  # [N·m]
 G = 9.81  # [m/s²]
-SEED = 0  # of the changes that say how well a rest shape is known
+SEED = 0  # of the changes that say how well an equilibrium is known
 # Newton iterations after which the time is looked at.
 _CHUNK = 200
 # Solutions of which the median time counts, begun within so many seconds.
@@ -83,7 +83,7 @@ def measure(
     Returns:
         dict: ``status`` "ok", "diverged" (which is also what does not settle) or "slow", and ``reason``; relative ``error``;
         ``stiffness``, the bending stiffness that it seems to have, over D; ``sides``, see above; ``floor``, how far the
-        error of the rest shape is known: the most it changes by where every coordinate is rounded, and where the shape is
+        error of the equilibrium is known: the most it changes by where every coordinate is rounded, and where the shape is
         shaken by a thousandth of an edge and settles again; ``ms``, the median time of a warm solution,
         with building its model and recording its launches, and ``spread``, its quartiles, of as many as are brief;
         ``elements``, ``h`` over L and ``iterations``. What is not known is None.
@@ -117,7 +117,7 @@ def measure(
 
 
 class _Settling:
-    """Rest shapes within a time."""
+    """Equilibria within a time."""
 
     def __init__(self, device, dtype, limit):
         self.options, self.limit = {"device": device, "dtype": dtype}, limit
@@ -151,7 +151,7 @@ class _Settling:
         return rest.points
 
     def _solve(self, scene, options):
-        """The rest shape, Newton iterations and seconds."""
+        """The equilibrium, Newton iterations and seconds."""
         started, iterations = time.perf_counter(), 0
         while True:
             rest = equilibrium(scene, iterations=_CHUNK, **options, **self.options)

@@ -153,7 +153,7 @@ PHYSICS = {
 
 
 def physics_diagram(scene, device="cpu", dtype="float64", limit=20.0, **run):
-    """Errors of rest shapes to closed forms against mesh size and time, see :func:`physics.measure`.
+    """Errors of equilibria to closed forms against mesh size and time, see :func:`physics.measure`.
 
     Args:
         scene: A :class:`SceneRef` of "cantilever", "chain" or "catenary", without parameters: sizes and nets are varied.

@@ -1,4 +1,4 @@
-"""Rest shapes: where the energy of a scene and of its weight is least, without inertia."""
+"""Static equilibria: where the energy of a scene and of its weight is least, without inertia."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -24,7 +24,7 @@ NEAR = 1e-5
 
 
 class Equilibrium(NamedTuple):
-    """A rest shape.
+    """A static equilibrium.
 
     Attributes:
         points: (n, 3) [m].
@@ -70,7 +70,7 @@ def equilibrium(
     Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
     the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
     is taken with inertia, s/2‖x − x_now‖²_M, and s is lowered from there: a proximal point method, which goes downhill all
-    the way. Cloth that nothing holds has no rest shape and is reported as not converged. Where the Hessian has a negative
+    the way. Cloth that nothing holds has no equilibrium and is reported as not converged. Where the Hessian has a negative
     eigenvalue in the end, the shape is in balance without being a minimum: it is nudged and settles again.
 
     Args:
@@ -126,9 +126,9 @@ def equilibrium(
         result = Result.CONVERGED
     # A sheet that has not moved leaves its whole weight, up to an ulp. Without gravity a start at rest leaves its own rounding.
     elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity_scale.gravity[0] > 0.0:
-        result, began = Result.STALLED, f"rounding hides the rest shape in {dtype}"
+        result, began = Result.STALLED, f"rounding hides the equilibrium in {dtype}"
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
-    use = None if result in SETTLED else "not a rest shape"
+    use = None if result in SETTLED else "not an equilibrium"
     if result is Result.SADDLE:
         use = f"not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
     unit = RESIDUAL.unit if minimiser.gravity_scale.gravity[0] > 0.0 else RESIDUAL.weightless
