@@ -97,7 +97,7 @@ def rate_measures(dtype):
 
 @cache
 def measure_rates(dtype):
-    """Kernel over elements: the velocity gradient L = ḞF⁻¹ = D + W and other rates between the gradients F̂₀ and F̂₁.
+    """Kernel over elements: the velocity gradient L = ḞF⁻¹ = D + Ω and other rates between the gradients F̂₀ and F̂₁.
 
     L is 2(F̂₁ − F̂₀)(F̂₁ + F̂₀)⁻¹/dt by midpoint, (F̂₁ − F̂₀)F̂₀⁻¹/dt forward, log(F̂₁F̂₀⁻¹)/dt by logarithm. D = P ½(L + Lᵀ) P with
     P the projection to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch of the normal is not measured; Ω = ½(L − Lᵀ).
