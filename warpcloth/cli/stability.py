@@ -27,7 +27,7 @@ All runs are compared over the same simulated time. A run with a large step cont
 show whether it diverges. Runs with small steps cost the most. The error is the RMS distance to a reference over vertices and
 frames, divided by the size of the cloth. The reference is Newton's method with BDF2 and a quarter of the step, but with at most
 2000 steps, in float64. Verdicts:
-  stable       none of the others
+  stable       none of the others: the run went well, and with an error within --accuracy, if that is measured
   inaccurate   the error exceeds --accuracy by more than the reference may be wrong
   unsure       the reference is missing, or not accurate enough to tell
   stalled      a step ended at no minimum
@@ -50,8 +50,8 @@ def add_arguments(parser):
             f"--{of}-range",
             nargs=3,
             metavar=("LOW", "HIGH", "N"),
-            help="lowest value, highest value and number of values, spaced logarithmically (compression: evenly); "
-            "see below for the defaults",
+            help="lowest value, highest value and number of values, spaced logarithmically (compression: evenly; "
+            "default: by axis, see 'warpcloth chart stability --help')",
         )
     parser.add_argument(
         "--at",
