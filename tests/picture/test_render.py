@@ -223,10 +223,10 @@ def test_strings_and_bars_of_a_scene_are_drawn():
 def test_the_same_bytes_come_twice(folder, ending, tmp_path):
     if ending == ".mp4":
         pytest.importorskip("av")
-    paths = [tmp_path / f"{name}{ending}" for name in "ab"]
+    paths = [tmp_path / f"{name}{ending}" for name in ("abcdefgh" if ending == ".mp4" else "ab")]
     for path in paths:
         wc.render(folder / "cloth.usdc", path, **SMALL, time=True)
-    assert paths[0].read_bytes() == paths[1].read_bytes()
+    assert len({path.read_bytes() for path in paths}) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == [path.name for path in paths]
 
 
