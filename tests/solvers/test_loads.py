@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 import warpcloth as wc
 from support import setups
-from support.setups import square
+from support.setups import allocations, square
 from warpcloth.fast.plan import plan
 
 SOLVERS = {name: replace(solver, substeps=8) for name, solver in setups.SOLVERS.items()}
@@ -82,6 +83,19 @@ def test_a_traction_strains_a_strip_by_its_ratio_to_the_stiffness(keyframes, dev
     assert rest.stable
 
 
+@pytest.mark.filterwarnings("ignore:.* encountered in:RuntimeWarning")
+def test_a_pressure_that_bursts_a_sheet_has_no_rest_shape(device):
+    """The tension of stretched springs grows with their length, as the force of the pressure does; with 1000 Pa that wins."""
+    sheet = wc.Mesh.grid(9, 9, pattern="alternating")
+    given = {"density": 0.1, "terms": [wc.Spring(stiffness=100.0)], "pins": "boundary", "gravity": NONE}
+    found = [
+        wc.equilibrium(wc.Scene(sheet, loads=[wc.Pressure(vertices="all", pressure=p)], **given), device=device)
+        for p in (200.0, 1000.0)
+    ]
+    assert found[0].status.ok and found[0].points[:, 1].max() > 0.3
+    assert not found[1].status.ok and not found[1].stable
+
+
 def balloon(pressure, **given):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     term = wc.NeoHookeanMembrane(stiffness=500.0)
@@ -151,6 +165,15 @@ def test_loads_vary_in_a_batch(name, device):
     if device == "cpu":
         shared = wc.simulate(scene, solver, copies=3, vary=vary, threads=2, **run).points
         assert (shared == batch).all()
+
+
+@pytest.mark.parametrize("name", ["explicit", "newton", "xpbd"])
+def test_steps_with_loads_allocate_nothing(name, device):
+    stepper = SOLVERS[name].bind(sail().build(device=device, dtype="float64"))
+    stepper.step()
+    with wp.ScopedMemoryTracker("steps", print=False) as tracker:
+        assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1, "the tracker sees an allocation"
+        assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
 
 
 @pytest.mark.parametrize("name", ["explicit", "newton midpoint", "xpbd"])

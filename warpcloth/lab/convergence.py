@@ -87,8 +87,8 @@ class OneStep:
             stepper.count.fill_(self._count)
 
     def correction(self, stepper):
-        """d (n, 3) [m] of a step from the state: x − x̃ = h(v − v₀ − hg), which float32 resolves better than x does."""
-        change = stepper.state.v.numpy() - self._start[1] - self.h * self.model.gravity.numpy()
+        """d (n, 3) [m] of a step from the state: x − x̃ = h(v − v₀ − hg), g with loads, which float32 resolves better than x."""
+        change = stepper.state.v.numpy() - self._start[1] - self.h * self.model.free_gravity[0].numpy()
         return np.where(self.free[:, None], self.h * change, 0.0)
 
     @in_turn

@@ -162,7 +162,8 @@ def simulate(
         if resume:
             first = _resume(recorder.checkpoint, frames, stepper, watch)
         else:
-            recorder.append(*state_of(stepper), None, None, ledger and ledger.keep(watch.alive))
+            points, velocities = state_of(stepper)
+            recorder.append(points, velocities, recorded=ledger and ledger.keep(watch.alive))
         timings["frames"] = watch.seconds
         if progress is not None:
             progress(first, frames)
