@@ -64,6 +64,20 @@ class Light:
 
 
 @wp.struct
+class Sight:
+    """What a ray meets."""
+
+    distance: wp.float32
+    point: wp.vec3
+    normal: wp.vec3  # in which it is lit, towards the viewer
+    across: wp.vec3  # of the surface itself
+    colour: wp.vec3
+    share: wp.float32  # of the colour that light and shadow change; the rest is seen as it is
+    is_ground: wp.bool
+    clear: wp.float32  # share of the background that is seen through the ground
+
+
+@wp.struct
 class Layers:
     """Parts of the colour of each pixel: base + sky visible_sky + sun visible_sun."""
 
@@ -178,6 +192,104 @@ def size_of(p: wp.vec3):
 
 
 @wp.func
+def find_ground(light: Light, o: wp.vec3, d: wp.vec3):
+    """(distance, share that has not faded) at which a ray from above meets the ground, FAR if it does not."""
+    t = FAR
+    share = wp.float32(0.0)
+    if light.has_ground != 0:
+        height = wp.dot(o, light.up) - light.ground
+        fall = -wp.dot(d, light.up)
+        if height > 0.0 and fall > 0.0:
+            r = wp.length(o + (height / fall) * d) / light.ground_radius
+            if r < 1.0:
+                t = height / fall
+                share = (1.0 - r * r) * (1.0 - r * r)
+    return t, share
+
+
+@wp.func
+def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: float):
+    """What a ray sees of a tube, from the parameter along it."""
+    ends = g.ends[tube]
+    colours = g.end_colours[tube]
+    axis = (1.0 - along) * g.points[ends[0]] + along * g.points[ends[1]]
+    s = Sight()
+    s.distance = t
+    s.normal = wp.normalize(o + t * d - axis)
+    s.across = s.normal
+    s.point = axis + g.radii[tube] * s.normal
+    s.colour = (1.0 - along) * g.colours[colours[0]] + along * g.colours[colours[1]]
+    s.share = g.shares[g.triangles.shape[0] // 3 + tube]
+    return s
+
+
+@wp.func
+def see_triangle(g: Geometry, d: wp.vec3, t: float, face: int, u: float, v: float):
+    """What a ray sees of a triangle, from barycentric coordinates of its first two corners."""
+    w = 1.0 - u - v
+    a = g.points[g.triangles[3 * face]]
+    b = g.points[g.triangles[3 * face + 1]]
+    c = g.points[g.triangles[3 * face + 2]]
+    na = g.normals[3 * face]
+    nb = g.normals[3 * face + 1]
+    nc = g.normals[3 * face + 2]
+    s = Sight()
+    s.distance = t
+    s.share = g.shares[face]
+    s.colour = (
+        u * g.colours[g.corner_colours[3 * face]]
+        + v * g.colours[g.corner_colours[3 * face + 1]]
+        + w * g.colours[g.corner_colours[3 * face + 2]]
+    )
+    across = wp.normalize(wp.cross(b - a, c - a))
+    side = wp.float32(1.0)
+    if wp.dot(across, d) > 0.0:
+        side = -1.0
+        s.colour = wp.cw_mul(s.colour, g.backs[face])
+    s.across = side * across
+    s.normal = side * wp.normalize(u * na + v * nb + w * nc)
+    # Onto the round surface that the normals tell of, so that no flat one hides it (Hanika 2021)
+    p = u * a + v * b + w * c
+    s.point = p + (
+        (u * wp.max(0.0, side * wp.dot(a - p, na)) * side) * na
+        + (v * wp.max(0.0, side * wp.dot(b - p, nb)) * side) * nb
+        + (w * wp.max(0.0, side * wp.dot(c - p, nc)) * side) * nc
+    )
+    return s
+
+
+@wp.func
+def see(g: Geometry, light: Light, o: wp.vec3, d: wp.vec3):
+    """What a ray meets first; its distance is FAR if that is nothing."""
+    t, share = find_ground(light, o, d)
+    face = wp.int32(-1)
+    u = wp.float32(0.0)
+    v = wp.float32(0.0)
+    if g.mesh != wp.uint64(0):
+        query = wp.mesh_query_ray(g.mesh, o, d, t)
+        if query.result:
+            t = query.t
+            face = query.face
+            u = query.u
+            v = query.v
+    t, tube, along = nearest_tube(g, o, d, t)
+    s = Sight()
+    if tube >= 0:
+        s = see_tube(g, o, d, t, tube, along)
+    elif face >= 0:
+        s = see_triangle(g, d, t, face, u, v)
+    else:
+        s.distance = t
+        s.point = o + t * d
+        s.normal = light.up
+        s.across = light.up
+        s.colour = light.ground_colour
+        s.is_ground = True
+        s.clear = 1.0 - share
+    return s
+
+
+@wp.func
 def light_at(
     g: Geometry, light: Light, p: wp.vec3, n: wp.vec3, across: wp.vec3, offset: float, sun_sample: int, sky_sample: int
 ):
@@ -243,101 +355,31 @@ def trace():
             y = 0.5 * float(viewer.height) - float(row) - viewer.samples[sample][1]
             o = viewer.origin
             d = wp.normalize(viewer.forward + x * viewer.right + y * viewer.up)
-            nearest = FAR
-            ground_share = wp.float32(0.0)
-            if light.has_ground != 0:
-                height = wp.dot(o, light.up) - light.ground
-                fall = -wp.dot(d, light.up)
-                if height > 0.0 and fall > 0.0:
-                    r = wp.length(o + (height / fall) * d) / light.ground_radius
-                    if r < 1.0:
-                        nearest = height / fall
-                        ground_share = (1.0 - r * r) * (1.0 - r * r)
-            face = wp.int32(-1)
-            u = wp.float32(0.0)
-            v = wp.float32(0.0)
-            if g.mesh != wp.uint64(0):
-                query = wp.mesh_query_ray(g.mesh, o, d, nearest)
-                if query.result:
-                    nearest = query.t
-                    face = query.face
-                    u = query.u
-                    v = query.v
-            nearest, tube, along = nearest_tube(g, o, d, nearest)
-            colour = wp.vec3()
-            share = wp.float32(1.0)
-            n = wp.vec3()
-            across = wp.vec3()
-            p = wp.vec3()
-            hit = wp.bool(False)
-            if tube >= 0:
-                a = g.points[g.ends[tube][0]]
-                b = g.points[g.ends[tube][1]]
-                p = o + nearest * d
-                n = wp.normalize(p - ((1.0 - along) * a + along * b))
-                p = (1.0 - along) * a + along * b + g.radii[tube] * n
-                across = n
-                colour = (1.0 - along) * g.colours[g.end_colours[tube][0]] + along * g.colours[g.end_colours[tube][1]]
-                share = g.shares[g.triangles.shape[0] // 3 + tube]
-                hit = True
-            elif face >= 0:
-                w = 1.0 - u - v
-                a = g.points[g.triangles[3 * face]]
-                b = g.points[g.triangles[3 * face + 1]]
-                c = g.points[g.triangles[3 * face + 2]]
-                na = g.normals[3 * face]
-                nb = g.normals[3 * face + 1]
-                nc = g.normals[3 * face + 2]
-                across = wp.normalize(wp.cross(b - a, c - a))
-                n = wp.normalize(u * na + v * nb + w * nc)
-                p = u * a + v * b + w * c
-                side = wp.float32(1.0)
-                colour = (
-                    u * g.colours[g.corner_colours[3 * face]]
-                    + v * g.colours[g.corner_colours[3 * face + 1]]
-                    + w * g.colours[g.corner_colours[3 * face + 2]]
-                )
-                if wp.dot(across, d) > 0.0:
-                    side = -1.0
-                    colour = wp.cw_mul(colour, g.backs[face])
-                across = side * across
-                n = side * n
-                # Onto the round surface that the normals tell of, so that no flat one hides it (Hanika 2021)
-                p += (
-                    (u * wp.max(0.0, side * wp.dot(a - p, na)) * side) * na
-                    + (v * wp.max(0.0, side * wp.dot(b - p, nb)) * side) * nb
-                    + (w * wp.max(0.0, side * wp.dot(c - p, nc)) * side) * nc
-                )
-                share = g.shares[face]
-                hit = True
-            elif ground_share > 0.0:
-                p = o + nearest * d
-                n = light.up
-                across = n
-                hit = True
-            if not hit:
+            s = see(g, light, o, d)
+            if s.distance == FAR:
                 base += light.background
                 continue
-            offset = OFFSET * (size_of(p) + size_of(o))
+            offset = OFFSET * (size_of(s.point) + size_of(o))
             sky_here, sun_here, seen_sky, seen_sun = light_at(
-                g, light, p, n, across, offset, in_square + sample, square + in_square + sample
+                g, light, s.point, s.normal, s.across, offset, in_square + sample, square + in_square + sample
             )
-            if tube < 0 and face < 0:
-                base += (1.0 - ground_share) * light.background
-                share = ground_share / (sky_here + sun_here)
-                colour = light.ground_colour
+            if s.is_ground:  # its colour is that in full light
+                s.share = (1.0 - s.clear) / (sky_here + sun_here)
+                base += s.clear * light.background
             else:
-                base += (1.0 - share) * colour
-            brightness = wp.vec2(sky_here, sun_here) * (share * (colour[0] + colour[1] + colour[2]))
+                base += (1.0 - s.share) * s.colour
+            brightness = wp.vec2(sky_here, sun_here) * (s.share * (s.colour[0] + s.colour[1] + s.colour[2]))
             lit += brightness
             visible += wp.cw_mul(brightness, wp.vec2(seen_sky, seen_sun))
-            base += (BOUNCE * share * sky_here) * colour
-            sky += ((1.0 - BOUNCE) * share * sky_here) * colour
-            sun += (share * sun_here) * colour
+            base += (BOUNCE * s.share * sky_here) * s.colour
+            sky += ((1.0 - BOUNCE) * s.share * sky_here) * s.colour
+            sun += (s.share * sun_here) * s.colour
             if hits == 0:
-                normal = n
-                point = p
-            elif wp.dot(n, normal) < 0.5 or wp.abs(wp.dot(normal, p - point)) > 4.0 * nearest * wp.length(viewer.up):
+                normal = s.normal
+                point = s.point
+            elif wp.dot(s.normal, normal) < 0.5 or wp.abs(wp.dot(normal, s.point - point)) > 4.0 * s.distance * wp.length(
+                viewer.up
+            ):
                 mixed = True
             hits += 1
         per_sample = 1.0 / float(count)

@@ -124,8 +124,8 @@ class RayCaster:
         background=BACKGROUND,
         ground_colour=GROUND,
     ):
-        for name, value in (("width", width), ("height", height), ("samples", samples)):
-            whole(name, value, 1, 16384)
+        for name, value, most in (("width", width, 16384), ("height", height, 16384), ("samples", samples, 1024)):
+            whole(name, value, 1, most)
         if ground is not None:
             number("ground", ground)
         choice("up_axis", up_axis, tuple(_UP))
