@@ -1,4 +1,4 @@
-"""Kernels of the ray caster: normals, bounds of tubes, the rays of a pixel, and its colour."""
+"""Rays from a camera through each pixel, and from what they meet to the sun and the sky."""
 
 from functools import cache
 
@@ -9,8 +9,6 @@ OFFSET = wp.constant(wp.float32(4e-6))
 FAR = wp.constant(wp.float32(1e30))
 # Of the light of the sky: what a ray brings that meets a surface instead.
 BOUNCE = wp.constant(wp.float32(0.3))
-# Of the shares of the sky that two points see: a difference that may be noise.
-SIMILAR = wp.constant(wp.float32(0.08))
 
 
 @wp.struct
@@ -65,7 +63,7 @@ class Light:
 
 @wp.struct
 class Sight:
-    """What a ray meets."""
+    """The point that a ray meets, and how it looks."""
 
     distance: wp.float32
     point: wp.vec3
@@ -209,7 +207,7 @@ def find_ground(light: Light, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: float):
-    """What a ray sees of a tube, from the parameter along it."""
+    """The point of a tube that a ray meets, from the parameter along it."""
     ends = g.ends[tube]
     colours = g.end_colours[tube]
     axis = (1.0 - along) * g.points[ends[0]] + along * g.points[ends[1]]
@@ -225,7 +223,7 @@ def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: fl
 
 @wp.func
 def see_triangle(g: Geometry, d: wp.vec3, t: float, face: int, u: float, v: float):
-    """What a ray sees of a triangle, from barycentric coordinates of its first two corners."""
+    """The point of a triangle that a ray meets, from barycentric coordinates of its first two corners."""
     w = 1.0 - u - v
     a = g.points[g.triangles[3 * face]]
     b = g.points[g.triangles[3 * face + 1]]
@@ -260,7 +258,7 @@ def see_triangle(g: Geometry, d: wp.vec3, t: float, face: int, u: float, v: floa
 
 @wp.func
 def see(g: Geometry, light: Light, o: wp.vec3, d: wp.vec3):
-    """What a ray meets first; its distance is FAR if that is nothing."""
+    """The first point that a ray meets; its distance is FAR if there is none."""
     t, share = find_ground(light, o, d)
     face = wp.int32(-1)
     u = wp.float32(0.0)
@@ -394,183 +392,3 @@ def trace():
         out.point[pixel] = point
 
     return trace_pixel
-
-
-@cache
-def smooth():
-    """Kernel over pixels, from ``first`` on: means of ``visible`` along a row or a column over what belongs to one surface.
-
-    Weights 1, 2, 3, 4, 3, 2, 1 sum to the same for each of four neighbours in turn, whose samples are parts of one even
-    sequence. They fall where the normal turns and where a point is off the plane of the middle one. With steps of four pixels,
-    from square to square, only the sky's share is smoothed, and only where it is nearly the same.
-    """
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def smooth_pixel(
-        # state in
-        layers: Layers,
-        visible: wp.array(dtype=wp.vec2),
-        # parameters
-        viewer: Viewer,
-        vertical: int,
-        step: int,
-        first: int,
-        # out
-        out: wp.array(dtype=wp.vec2),
-    ):
-        pixel = first + wp.tid()
-        n = layers.normal[pixel]
-        own = visible[pixel]
-        if wp.dot(n, n) == 0.0:
-            out[pixel] = own
-            return
-        p = layers.point[pixel]
-        # Of a pixel, there
-        width = wp.length(p - viewer.origin) * wp.length(viewer.up)
-        sky = wp.vec2()  # sums of weights, and of weights times what is visible
-        sun = wp.vec2()
-        at = wp.where(vertical != 0, pixel // viewer.width, pixel % viewer.width)
-        count = wp.where(vertical != 0, viewer.height, viewer.width)
-        stride = wp.where(vertical != 0, viewer.width, 1)
-        for k in range(-3, 4):
-            if at + step * k >= 0 and at + step * k < count:
-                other = pixel + step * k * stride
-                turn = wp.dot(n, layers.normal[other])
-                if turn > 0.0:
-                    off = wp.dot(n, layers.point[other] - p) / width
-                    turn = turn * turn
-                    turn = turn * turn
-                    w = (4.0 - wp.abs(float(k))) * turn * turn / (1.0 + off * off * off * off)
-                    seen = visible[other]
-                    if seen[0] >= 0.0:
-                        change = wp.where(step > 1, (seen[0] - own[0]) / SIMILAR, 0.0)
-                        sky += w / (1.0 + change * change * change * change) * wp.vec2(1.0, seen[0])
-                    if seen[1] >= 0.0:
-                        sun += w * wp.vec2(1.0, seen[1])
-        if sky[0] > 0.0:
-            own[0] = sky[1] / sky[0]
-        if sun[0] > 0.0 and step == 1:
-            own[1] = sun[1] / sun[0]
-        out[pixel] = own
-
-    return smooth_pixel
-
-
-@wp.func
-def to_srgb(x: float):
-    """Linear Rec. 709 to sRGB (IEC 61966-2-1), in 8 bits."""
-    x = wp.clamp(x, 0.0, 1.0)
-    y = 12.92 * x
-    if x > 0.0031308:
-        y = 1.055 * wp.pow(x, 1.0 / 2.4) - 0.055
-    return wp.uint8(255.0 * y + 0.5)
-
-
-@cache
-def develop():
-    """Kernel over pixels: the colour of each in sRGB."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def develop_pixel(
-        # state in
-        layers: Layers,
-        # out
-        out: wp.array2d(dtype=wp.uint8),
-    ):
-        pixel = wp.tid()
-        seen = layers.visible[pixel]
-        colour = layers.base[pixel] + seen[0] * layers.sky[pixel] + seen[1] * layers.sun[pixel]
-        for channel in range(3):
-            out[pixel, channel] = to_srgb(colour[channel])
-
-    return develop_pixel
-
-
-@cache
-def tube_bounds():
-    """Kernel over tubes: boxes about them."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def bound_tube(
-        # elements
-        ends: wp.array(dtype=wp.vec2i),
-        radii: wp.array(dtype=wp.float32),
-        # state in
-        points: wp.array(dtype=wp.vec3),
-        # out
-        low: wp.array(dtype=wp.vec3),
-        high: wp.array(dtype=wp.vec3),
-    ):
-        k = wp.tid()
-        a = points[ends[k][0]]
-        b = points[ends[k][1]]
-        r = wp.vec3(radii[k], radii[k], radii[k])
-        low[k] = wp.min(a, b) - r
-        high[k] = wp.max(a, b) + r
-
-    return bound_tube
-
-
-@cache
-def face_normals():
-    """Kernel over triangles: unit normals, 0 of those without area, and the angles at their corners."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def find_face_normal(
-        # elements
-        triangles: wp.array(dtype=wp.int32),
-        # state in
-        points: wp.array(dtype=wp.vec3),
-        # out
-        normals: wp.array(dtype=wp.vec3),
-        angles: wp.array(dtype=wp.float32),
-    ):
-        t = wp.tid()
-        a = points[triangles[3 * t]]
-        b = points[triangles[3 * t + 1]]
-        c = points[triangles[3 * t + 2]]
-        n = wp.cross(b - a, c - a)
-        area = wp.length(n)
-        normals[t] = wp.normalize(n)
-        angles[3 * t] = wp.atan2(area, wp.dot(b - a, c - a))
-        angles[3 * t + 1] = wp.atan2(area, wp.dot(c - b, a - b))
-        angles[3 * t + 2] = wp.atan2(area, wp.dot(a - c, b - c))
-
-    return find_face_normal
-
-
-@cache
-def corner_normals():
-    """Kernel over corners of triangles: the mean of the normals about a vertex, by their angles (Thürmer & Wüthrich 1998).
-
-    Normals count only where the surface bends by less than some 75°, whichever side they are on: boxes keep their edges,
-    and triangles may be wound either way.
-    """
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def find_corner_normal(
-        # elements
-        triangles: wp.array(dtype=wp.int32),
-        smooth: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
-        corners: wp.array(dtype=wp.int32),
-        # state in
-        face_normals: wp.array(dtype=wp.vec3),
-        angles: wp.array(dtype=wp.float32),
-        # out
-        normals: wp.array(dtype=wp.vec3),
-    ):
-        corner = wp.tid()
-        own = face_normals[corner // 3]
-        n = own
-        if smooth[corner // 3] != 0:
-            n = wp.vec3()
-            vertex = triangles[corner]
-            for k in range(starts[vertex], starts[vertex + 1]):
-                other = face_normals[corners[k] // 3]
-                along = wp.dot(own, other)
-                n += (wp.sign(along) * angles[corners[k]] * wp.smoothstep(0.25, 0.6, wp.abs(along))) * other
-            n = wp.normalize(n)
-        normals[corner] = n
-
-    return find_corner_normal

@@ -8,7 +8,8 @@ import trimesh
 
 from warpcloth.picture.camera import Camera
 from warpcloth.picture.colour import Scale, to_linear
-from warpcloth.picture.raycast import RayCaster, Shape
+from warpcloth.picture.raycast import RayCaster
+from warpcloth.picture.shape import Shape
 
 SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 HALVES = np.array([[0, 1, 2], [0, 2, 3]])

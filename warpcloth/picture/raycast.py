@@ -1,7 +1,5 @@
 """Pictures of surfaces and tubes in the light of a sun and the sky, by rays."""
 
-from dataclasses import dataclass, field
-
 import numpy as np
 import warp as wp
 
@@ -9,11 +7,10 @@ from ..base.checks import array, choice, number, refuse, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..core.thread_pool import ThreadPool
-from ..kernels import render as kernels
+from ..kernels import develop, render, shading
 from ..model.threads import cores, threads_on
+from .patterns import disc, pixel_samples
 
-CLOTH = (0.20, 0.43, 0.72)
-BACK = (1.7, 1.12, 0.86)
 BACKGROUND = (0.90, 0.92, 0.94)
 GROUND = (0.86, 0.87, 0.88)
 _UP = {"Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
@@ -27,56 +24,6 @@ _FARTHEST = 1e9
 _PLAIN = 32
 # Rows that a thread of the CPU takes at a time.
 _ROWS = 8
-
-
-@dataclass(frozen=True, eq=False)
-class Shape:
-    """One thing in a picture: what it is made of, and its looks. Its positions come with each picture.
-
-    Attributes:
-        count: Number n of points.
-        triangles: Vertices of triangles (T, 3), which are seen from both sides.
-        lines: Vertices of tubes with round ends (E, 2).
-        radius: Of the tubes [m]. Where they would be thinner than a pixel they are drawn as wide as one.
-        balls: Vertices that are balls (k,).
-        ball_radius: Of the balls [m].
-        colour: Linear Rec. 709 of what has no colours of its own.
-        ball_colour: Of the balls.
-        back: Factors of the colour on the back of triangles. Colours of a measure are the same on both sides.
-        smooth: Whether triangles are lit as a smooth surface. Where it bends by more than some 70° it keeps its edges.
-
-    Raises:
-        ValueError: An array has another shape, an index is of no point, or a radius is not above 0.
-    """
-
-    count: int
-    triangles: np.ndarray = field(default_factory=lambda: np.empty((0, 3), int))
-    lines: np.ndarray = field(default_factory=lambda: np.empty((0, 2), int))
-    radius: float = 0.0
-    balls: np.ndarray = field(default_factory=lambda: np.empty(0, int))
-    ball_radius: float = 0.0
-    colour: tuple[float, float, float] = CLOTH
-    ball_colour: tuple[float, float, float] = (0.60, 0.05, 0.03)
-    back: tuple[float, float, float] = BACK
-    smooth: bool = True
-
-    def __post_init__(self):
-        whole("count", self.count, 0)
-        for name, shape in (("triangles", (3,)), ("lines", (2,)), ("balls", ())):
-            found = np.asarray(getattr(self, name))
-            found = found.reshape(0, *shape) if found.size == 0 else found
-            if found.shape[1:] != shape or found.ndim != 1 + len(shape) or (found.size and found.dtype.kind not in "iu"):
-                wanted = ", ".join(map(str, ("k", *shape)))
-                raise ValueError(f"{name} has shape {found.shape} and type {found.dtype}; it must be ({wanted}), whole numbers")
-            if found.size and not 0 <= found.min() <= found.max() < self.count:
-                raise ValueError(f"{name} refers to vertices {found.min()} to {found.max()}; there are {self.count}")
-            object.__setattr__(self, name, found.astype(np.int32))
-        if len(self.lines):
-            number("radius", self.radius, above=0.0)
-        if len(self.balls):
-            number("ball_radius", self.ball_radius, above=0.0)
-        for name in ("colour", "ball_colour", "back"):
-            object.__setattr__(self, name, array(name, getattr(self, name), (3,)))
 
 
 class RayCaster:
@@ -164,7 +111,7 @@ class RayCaster:
         corners = np.argsort(flat, kind="stable").astype(np.int32)
         pixels = self._size[0] * self._size[1]
         with wp.ScopedDevice(self._device):
-            g = self._geometry = kernels.Geometry()
+            g = self._geometry = render.Geometry()
             g.points = wp.zeros(len(self._points), dtype=wp.vec3)
             g.triangles = wp.array(flat, dtype=wp.int32)
             g.normals = wp.zeros(len(flat), dtype=wp.vec3)
@@ -173,7 +120,7 @@ class RayCaster:
             self._smoothing = [wp.array(a, dtype=wp.int32) for a in (smooth, starts, corners)]
             self._faces = [wp.zeros(len(self._triangles), dtype=wp.vec3), wp.zeros(len(flat), dtype=wp.float32)]
             self._bounds = [wp.zeros(len(self._radii), dtype=wp.vec3) for _ in range(2)]
-            layers = self._layers = kernels.Layers()
+            layers = self._layers = render.Layers()
             layers.base, layers.sky, layers.sun, layers.normal, layers.point = (
                 wp.zeros(pixels, dtype=wp.vec3) for _ in range(5)
             )
@@ -215,14 +162,14 @@ class RayCaster:
             self._set_positions(points, camera, unit)
             self._colour(colours)
             light = self._light(camera, unit)
-            self._launch_rows(kernels.trace(), [self._geometry, viewer, light], [self._layers])
+            self._launch_rows(render.trace(), [self._geometry, viewer, light], [self._layers])
             if self._smooth:
                 for step, vertical in ((1, 0), (1, 1), (4, 0), (4, 1)):
                     visible, other = self._layers.visible, self._visible
-                    self._launch_rows(kernels.smooth(), [self._layers, visible, viewer, vertical, step], [other])
+                    self._launch_rows(develop.smooth(), [self._layers, visible, viewer, vertical, step], [other])
                     self._layers.visible, self._visible = other, visible
             width, height = self._size
-            wp.launch(kernels.develop(), width * height, inputs=[self._layers], outputs=[self._image])
+            wp.launch(develop.develop(), width * height, inputs=[self._layers], outputs=[self._image])
             return self._image.numpy().reshape(height, width, 3).copy()
 
     def _viewer(self, camera):
@@ -238,7 +185,7 @@ class RayCaster:
         right /= np.linalg.norm(right)
         pixel = 2.0 * tangent / height
         shift = 2.0 * tangent * camera.shift * right
-        viewer = kernels.Viewer()
+        viewer = render.Viewer()
         viewer.origin, viewer.forward = wp.vec3(*((position - target) / unit)), wp.vec3(*(forward + shift))
         viewer.right, viewer.up = wp.vec3(*(pixel * right)), wp.vec3(*(pixel * np.cross(right, forward)))
         viewer.width, viewer.height, viewer.samples = width, height, self._samples
@@ -257,7 +204,7 @@ class RayCaster:
 
     def _light(self, camera, unit):
         sun = self.sun(camera)
-        light = kernels.Light()
+        light = render.Light()
         light.up, light.sun = wp.vec3(*self._up), wp.vec3(*sun)
         light.sun_rays, light.sky_rays = self._sun_rays, self._sky_rays
         # light = sky (1 + tilt (n·up − 1)) + sun n·s is 1 for n = s
@@ -290,9 +237,9 @@ class RayCaster:
         g.points.assign(local)
         if len(self._triangles):
             g.triangles.assign(np.where(flat[:, None], 0, self._triangles).ravel())
-            wp.launch(kernels.face_normals(), len(flat), inputs=[g.triangles, g.points], outputs=self._faces)
+            wp.launch(shading.face_normals(), len(flat), inputs=[g.triangles, g.points], outputs=self._faces)
             inputs = [g.triangles, *self._smoothing, *self._faces]
-            wp.launch(kernels.corner_normals(), 3 * len(flat), inputs=inputs, outputs=[g.normals])
+            wp.launch(shading.corner_normals(), 3 * len(flat), inputs=inputs, outputs=[g.normals])
             self._mesh = wp.Mesh(g.points, g.triangles)
             g.mesh = self._mesh.id
         if len(self._tubes):
@@ -301,7 +248,7 @@ class RayCaster:
             nearest = np.linalg.norm(local[self._tubes] - eye, axis=2).min(axis=1)
             pixel = 2.0 * np.tan(np.radians(camera.fov) / 2.0) / self._size[1]
             g.radii.assign(np.where(hollow, 0.0, np.maximum(self._radii / unit, 0.5 * pixel * nearest)))
-            wp.launch(kernels.tube_bounds(), len(hollow), inputs=[g.ends, g.radii, g.points], outputs=self._bounds)
+            wp.launch(shading.tube_bounds(), len(hollow), inputs=[g.ends, g.radii, g.points], outputs=self._bounds)
             self._tree = wp.Bvh(*self._bounds)
             g.tree = self._tree.id
 
@@ -366,32 +313,3 @@ class RayCaster:
                 launch.launch()
 
         self._pool.run([work] * self._pool.threads)
-
-
-def pixel_samples(count):
-    """Positions (count, 2) in a pixel from 0 to 1, as even as they can be in each direction.
-
-    Four are the corners of a square that is turned by atan ½; others are the lattice (k + ½, gk + ½)/count with the g that
-    keeps them farthest apart.
-    """
-    if count == 4:
-        return np.array([(0.125, 0.625), (0.375, 0.125), (0.625, 0.875), (0.875, 0.375)])
-    k = np.arange(count)
-
-    def gap(g):
-        apart = np.stack([k[1:], g * k[1:] % count])
-        return (np.minimum(apart, count - apart) ** 2).sum(axis=0).min(initial=2 * count**2)
-
-    best = max((g for g in range(1, count + 1) if np.gcd(g, count) == 1), key=gap)
-    return np.stack([k + 0.5, best * k % count + 0.5], axis=1) / count
-
-
-def disc(count):
-    """Points (count, 2) of a sequence that fills the unit disc, every part of it evenly.
-
-    Multiples of 1/g and 1/g² modulo 1, where g³ = g + 1 (Roberts 2018), are squared radii and angles.
-    """
-    g = 1.3247179572447460
-    squared, turn = np.modf(0.5 + np.arange(count)[:, None] / [g, g**2])[0].T
-    angle = 2.0 * np.pi * turn
-    return np.sqrt(squared)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -19,7 +19,7 @@ from ..scene.lines import lines_of
 from ..scene.scene import Scene
 from ..usd.drawn import read_drawn
 from ..usd.layers import CURVE_WIDTH
-from .raycast import BACK, CLOTH, Shape
+from .shape import BACK, CLOTH, Shape
 
 # Linear Rec. 709 of meshes beside the cloth, and of strings and bars.
 SURROUNDINGS, LINES = (0.42, 0.41, 0.39), (0.06, 0.06, 0.065)
