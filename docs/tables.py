@@ -30,8 +30,8 @@ def energies():
         said = inspect.getdoc(energy)
         first = re.sub(r" \([A-Z][^()]*\d{4}\)", "", " ".join(said.partition("\n\n")[0].split()))  # without its source
         symbol, unit = re.search(r"stiffness: (\S+?),? .*?(\[.*?\])", said, re.DOTALL).groups()
-        rows.append([f"`{name}`", first.rstrip(".").replace("|", "\\|"), f"{symbol} {unit}"])
-    return table(("Term", "Energy", "Stiffness"), rows)
+        rows.append([f"`{name}`", first.rstrip(".").replace("U = ", "").replace("|", "\\|"), f"{symbol} {unit}"])
+    return table(("Term", "Energy U", "Stiffness"), rows)
 
 
 def solvers():
