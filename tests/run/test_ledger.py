@@ -11,6 +11,7 @@ import warpcloth as wc
 from support import setups
 from support.setups import square
 from support.usd_validation import validate
+from warpcloth.run.ledger import Books
 from warpcloth.usd import read_scene, write_scene
 from warpcloth.usd.stage import find_prim
 
@@ -138,14 +139,17 @@ def quadratic():
     return wc.Scene(mesh, density=0.5, terms=terms, velocities=velocities, pins=wc.Pins([5, 9], keyframes), loads=loads)
 
 
-@pytest.mark.parametrize("loaded", [False, True])
-def test_midpoint_balances_quadratic_energies_to_rounding(loaded, device):
-    scene = quadratic() if loaded else replace(quadratic(), loads=())
+@pytest.mark.parametrize("loads", ["none", "constant", "keyframes"])
+def test_midpoint_balances_quadratic_energies_to_rounding(loads, device):
+    constant = [wc.Force(vertices="x > 0.5", force=(0.1, 0.2, 0.3)), wc.Traction(vertices="z == 0", traction=(0.0, 0.1, 0.0))]
+    scene = quadratic()
+    scene = replace(scene, loads={"none": [], "constant": constant, "keyframes": scene.loads}[loads])
     solver = wc.Newton(substeps=2, integrator="midpoint", tolerance=1e-12, linear="factorised")
     run = wc.simulate(scene, solver, device=device, dtype="float64", frames=8, record="energies")
     sums = total(run.energies)
     np.testing.assert_allclose(sums, sums[0], rtol=0.0, atol=1e-11 * np.abs(run.energies["kinetic"]).max())
     assert np.abs(run.energies["work of pins"]).max() > 0.1
+    assert loads == "none" or np.abs(run.energies["work of loads"]).max() > 0.01
 
 
 def test_implicit_euler_loses_half_the_squares_of_its_changes(device):
@@ -265,6 +269,39 @@ def test_copies_have_books_of_their_own(device):
         shared = wc.simulate(cloth, solver, copies=3, vary=vary, threads=2, **run)
         assert np.array_equal(shared.reactions, batch.reactions, equal_nan=True)
         assert all(np.array_equal(shared.energies[name], batch.energies[name], equal_nan=True) for name in batch.energies)
+
+
+def test_threads_share_the_multipliers_of_a_batch(device):
+    if device != "cpu":
+        pytest.skip("threads are of the CPU")
+    scene = replace(pendulum(), terms=[wc.Spring(stiffness=np.inf)])
+    run = {
+        "dtype": "float64",
+        "frames": 3,
+        "copies": 3,
+        "vary": {"gravity": [[0, -9.81, 0], [0, 0, 5], [1, 2, 3]]},
+        "record": BOTH,
+    }
+    alone, shared = (wc.simulate(scene, HARD["xpbd"], threads=threads, **run) for threads in (1, 2))
+    assert np.array_equal(alone.reactions, shared.reactions, equal_nan=True)
+
+
+def test_books_follow_the_order_of_the_vertices(device):
+    """Of a model whose vertices are in another order: at the start, which is out of balance."""
+    rng = np.random.default_rng(0)
+    cloth = square(
+        pins=wc.Pins([5, 30, 2], axes=["xyz", "y", "xz"]), loads=[wc.Force(vertices="x > 0.5", force=(1.0, 2.0, 3.0))]
+    )
+    cloth = replace(cloth, positions=cloth.positions + rng.normal(scale=0.02, size=cloth.positions.shape))
+    found = []
+    for order in (None, rng.permutation(36)):
+        model = cloth.build(device=device, dtype="float64", order=order)
+        books, x = Books(model), model.array(model.positions.numpy() * 1.1, model.vec3)
+        books.launch(x)
+        found.append((books.reactions(), np.array(list(books.energies(x).values()))))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
+    assert np.abs(found[0][0]).max() > 1.0 and found[0][1][-1] != 0.0
 
 
 @pytest.mark.parametrize("name", SOLVERS)
