@@ -9,7 +9,7 @@ from pathlib import Path
 import warpcloth
 
 PACKAGE = Path(warpcloth.__file__).parent
-HEAVY = {"warp", "scipy", "trimesh", "matplotlib", "pxr", "tqdm"}
+HEAVY = {"warp", "scipy", "trimesh", "matplotlib", "pxr", "tqdm", "PIL", "av"}
 # The command line imports what loads Warp where it is used; the package passes its names on when one is first used; and what a
 # Dask worker is sent by value imports the rest of its module there.
 DEFERRED = ("cli/", "__init__.py", "lab/cluster.py")
