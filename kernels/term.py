@@ -67,7 +67,8 @@ class Term:
             factors (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it
             does not), and how stiff a spring between them would be, kₑ = 1; or None.
         cells: Whether elements of K = 1 are the vertices of cells of any size, see :class:`warpcloth.model.model.Cells`.
-        project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or None.
+        project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or where there is a
+            ``prox`` too, any p with ∂u/∂y = y − p(y); or None.
         prox: (v, rest, compliance) → argmin u(y) + ‖y − v‖²/(2·compliance) (M, 3), compliance 0 or more, in closed form, the
             local step where u is not ½‖y − p(y)‖²; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices.
@@ -78,6 +79,9 @@ class Term:
         stiffening: (y, rest, tension) → B (N, 3M), with BᵀB the positive half of tension·∂²C/∂y².
         stiffening_rows: N.
         dissipation: :class:`Dissipation`, or None for what cannot be damped.
+        bounded: The :class:`Term` on the same elements that explicit steps take instead, as the curvature of this one has no
+            bound: that of its energy is at most 1, and its ``hessian`` is one that is nowhere smaller than the curvature, by
+            which steps are limited; or None.
     """
 
     name: str
@@ -103,6 +107,7 @@ class Term:
     stiffening: Any = None
     stiffening_rows: int = 0
     dissipation: Dissipation | None = None
+    bounded: Any = None
 
     @property
     def moves(self):

@@ -35,6 +35,11 @@ if TYPE_CHECKING:  # the table below, as type checkers read it
     from .run.equilibrium import equilibrium as equilibrium
     from .run.simulate import Animation as Animation
     from .run.simulate import simulate as simulate
+    from .scene.colliders import Box as Box
+    from .scene.colliders import Capsule as Capsule
+    from .scene.colliders import Contact as Contact
+    from .scene.colliders import Plane as Plane
+    from .scene.colliders import Sphere as Sphere
     from .scene.scene import Pins as Pins
     from .scene.scene import Scene as Scene
     from .solvers import *  # noqa: F403
@@ -67,6 +72,11 @@ _MODULES = {
     "equilibrium": "run.equilibrium",
     "Animation": "run.simulate",
     "simulate": "run.simulate",
+    "Box": "scene.colliders",
+    "Capsule": "scene.colliders",
+    "Contact": "scene.colliders",
+    "Plane": "scene.colliders",
+    "Sphere": "scene.colliders",
     "Pins": "scene.scene",
     "Scene": "scene.scene",
     "Force": "terms.loads",

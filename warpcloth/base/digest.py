@@ -21,6 +21,7 @@ def scene_digest(scene):
     facts = [mesh.points, mesh.triangles, mesh.edges, mesh.grid_shape, scene.vertex_masses, scene.positions, scene.velocities]
     if mesh.parts:
         facts += [(name, *part) for name, part in mesh.parts.items()]
+    facts += [scene.colliders, scene.contact] if scene.colliders else []
     return digest_of((*facts, scene.terms, scene.pins, scene.free_axes, scene.gravity, float(scene.fps), *scene.loads))
 
 

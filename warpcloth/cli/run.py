@@ -61,6 +61,7 @@ def run(arguments):
             "seconds_per_frame": statistics.median(animation.timings["frames"]),
             "compile_seconds": setup.seconds + animation.timings["compile"],
             "worst_strain": animation.worst_strain,
+            **({"cut": animation.cut} if scene.colliders else {}),
             "residual": status.residual,
             "residual_measure": status.measure,
             "residual_unit": status.unit,
@@ -99,12 +100,14 @@ def _summary(facts):
 
     threads, measured = facts["threads"], facts["residual_measure"] is not None
     residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none, the method does not compute one"
+    cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by colliders"] if "cut" in facts else []
     return "\n".join(
         [
             f"{facts['scene']}: {facts['message']}",
             f"  frames        {facts['frames']} of {facts['frames_asked']}, {facts['seconds_per_frame']:.3g} s each (median)",
             f"  compiling     {facts['compile_seconds']:.3g} s",
             f"  worst strain  {100.0 * facts['worst_strain']:.3g} %",
+            *cut,
             f"  residual      {residual}",
             f"  solver        {solver_line(facts)}",
             f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),

@@ -28,6 +28,7 @@ class DeviceElements:
         damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
         refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
         cells: :class:`Cells` or :class:`SparseCells` that the elements are the vertices of, or None.
+        collider: Index of the collider of the scene that they are the contact with or the friction on, or None.
     """
 
     label: str
@@ -40,6 +41,7 @@ class DeviceElements:
     damping: wp.array | None = None
     refresh: Refresh | None = None
     cells: Cells | SparseCells | None = None
+    collider: int | None = None
 
     @property
     def arguments(self):
@@ -109,7 +111,10 @@ class DeviceElements:
         return replace(self, **changed, refresh=self.refresh and self.refresh.with_arrays(change), cells=cells)
 
     def at_limit(self, points):
-        """Of a limit the elements with no range at all about the rest shape ``points`` of one copy; else these."""
+        """Of a limit the elements with no range at all about the rest shape ``points`` of one copy, of contact those with the
+        largest Hessian that explicit steps may meet; else these."""
+        if self.term.bounded is not None:
+            return replace(self, term=self.term.bounded)
         if not self.term.dead_zone:
             return self
         rest = self.term.rest_state(points, host_values(self.stencil) % len(points), least=1.0, most=1.0)
@@ -161,6 +166,7 @@ def elements_on(model, term, positions, vary):
         damping=_numbers(model, f"{one.label}.damping", damping, E) if damping.any() else None,
         cells=cells,
         refresh=one.refresh,
+        collider=getattr(term, "collider", None),
     )
     return found if model.order is None or cells else found.by_lowest()
 

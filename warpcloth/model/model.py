@@ -14,6 +14,7 @@ from ..kernels.term import Term
 from ..kernels.vectors import types
 from ..mesh.selection import distinct_vertices
 from ..terms.refresh import STEP, Moment
+from .device_colliders import colliders_on
 from .elements import elements_on
 from .host_values import keep, repeat
 from .loads import loads_on
@@ -50,7 +51,9 @@ class Model:
         pins, keyframes: Moved pins (p,) and their positions (F, p) [m], or None.
         pin_axes: 1 along axes that each moved pin holds and 0 along others, (p,) vectors; None where all hold all axes.
         loads: The :class:`warpcloth.model.loads.DeviceLoads`, or None.
-        terms: One :class:`warpcloth.model.elements.DeviceElements` for each declared term.
+        terms: One :class:`warpcloth.model.elements.DeviceElements` for each declared term, then for contact with each collider
+            and friction on it.
+        colliders: :class:`warpcloth.model.device_colliders.DeviceColliders`, or None.
         rest_points: Rest shape of one copy, (n, 3) [m].
         order: As given, int32, or None.
         indices: Index in a copy of each vertex of the scene, (n,) int32; None without an order.
@@ -124,7 +127,10 @@ class Model:
                 self._vertex_gravity = self._put("gravity", "m/s²", np.repeat(gravity, self.per_copy, axis=1), self.vec3)
             self.loads = loads_on(self, scene.loads, vary, self._vertex_gravity)
             self.loads.set(self, Moment(self.positions))
-        self.terms = tuple(elements_on(self, term, positions, vary) for term in scene.terms)
+        for copy, start in enumerate(positions if vary.has("positions") else positions[:1]):
+            scene.refuse_inside(start, f" in copy {copy}" if copies > 1 else "")
+        self.colliders = colliders_on(self, scene)
+        self.terms = tuple(elements_on(self, term, positions, vary) for term in (*scene.terms, *scene.contact_terms))
         vary.refuse_rest()
 
     def _set_order(self, order):

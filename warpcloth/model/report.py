@@ -13,6 +13,7 @@ def report(model):
     before = [labels[:i].count(label) for i, label in enumerate(labels)]
     arrays = [model.positions, model.velocities, model.mass, model.inverse_mass, model.gravity]
     arrays += [array for array in (model.pins, model.keyframes, model.pin_axes, model.mobility) if array is not None]
+    arrays += [] if model.colliders is None else model.colliders.arrays
     arrays += [model.free_gravity[0]] * (model.mobility is not None)
     arrays += [] if model.loads is None else model.loads.arrays
     terms = [

@@ -137,9 +137,13 @@ class BDF2(Euler):
             wp.copy(self.v_before, v)
             if stepper.count is not None:
                 stepper.count.fill_(-1)  # pins are led to their first keyframe, which is where they are
+            if stepper.colliders is not None:
+                stepper.colliders.steps.fill_(-1)  # likewise
             stepper.step()
         self._launch(kernels.start_bdf2, [model.velocities, v, stepper.h], [self.move, self.v_before])
         stepper.state.start_here("move before", "v before")
+        if stepper.colliders is not None:
+            stepper.colliders.start_again()
         wp.copy(x, model.positions)
         wp.copy(v, model.velocities)
 

@@ -24,8 +24,8 @@ def best_weights(model, elements, he, curvature=None):
 
 
 def curvatures(model, elements):
-    """Computes the unit s of r for each element (E,): 1 for a squared distance, else the curvature of its energy at rest."""
-    if elements.term.project is not None:
+    """Computes the unit s of r for each element (E,): 1 for a squared distance and for contact, else the curvature at rest."""
+    if elements.term.project is not None or elements.term.bounded is not None:
         return np.ones(elements.count, dtype=model.numpy_dtype)
     scale = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
     rest_shape = model.array(np.tile(model.rest_points, (model.copies, 1)), model.vec3)

@@ -50,6 +50,10 @@ class Search:
     def launch_start(self):
         """d = 0, with its φ and ∇φ."""
         self.correction.zero_()
+        self.launch_again()
+
+    def launch_again(self):
+        """φ and ∇φ at the d that is there."""
         self.direction.zero_()
         self.step.zero_()
         self._launch_trial()

@@ -65,7 +65,8 @@ def equilibrium(
 
     Pins with keyframes end at the last keyframe; all others stay where they start. Loads have the values of their last
     keyframes, and pressure, which follows the cloth, is that of the shape found: its forces are kept while the cloth settles
-    and taken anew until they balance; ``stable`` and ``lowest_eigenvalue`` are of these forces.
+    and taken anew until they balance; ``stable`` and ``lowest_eigenvalue`` are of these forces. Colliders must stand still
+    and be without friction, with which there is more than one rest shape.
 
     Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
     the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
@@ -91,7 +92,7 @@ def equilibrium(
         :class:`Equilibrium`.
 
     Raises:
-        ValueError: If an argument breaks a rule, or a stiffness is infinite.
+        ValueError: If an argument breaks a rule, a stiffness is infinite, or a collider moves or has friction.
 
     Examples:
         >>> import warpcloth as wc
@@ -106,7 +107,11 @@ def equilibrium(
     whole("load_steps", load_steps, 1)
     whole("iterations", iterations, 1)
     choice("linear", linear, ("factorised", "cg"))
-    record = checked_record(record)
+    record = checked_record(record, scene)
+    for collider in scene.colliders:
+        if collider.moves or collider.friction:
+            has = "moves" if collider.moves else f"has friction {collider.friction:g}"
+            raise ValueError(f"the collider {collider.label} {has}; for a rest shape it must stand still and have none")
     model = scene.build(device=device, dtype=dtype)
     refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
     base = wp.clone(model.positions)

@@ -15,22 +15,25 @@ from ..core.sums import Sums
 from ..fast.plan import plan
 from ..kernels import ledger as kernels
 from ..model.damping import dissipations
+from ..scene.scene import Scene
 from ..terms.refresh import STEP, Moment
 
 RECORDS = ("energies", "reactions")
 
 
-def checked_record(record: Any) -> tuple[str, ...]:
+def checked_record(record: Any, scene: Scene) -> tuple[str, ...]:
     """Returns what to record, each word once, in the order of :data:`RECORDS`.
 
     Raises:
-        ValueError: If a word is another.
+        ValueError: If a word is another, or the scene has colliders, whose work and reactions are not recorded.
     """
     words = (record,) if isinstance(record, str) else record if isinstance(record, Iterable) else (record,)
     words = tuple(words)
     for word in words:
         if word not in RECORDS:
             raise ValueError(f"record is {shown(word)}; it must be some of {', '.join(map(repr, RECORDS))}")
+    if words and scene.colliders:
+        raise ValueError(f"record is {shown(record)}; the work of colliders is not recorded yet, leave them or record out")
     return tuple(word for word in RECORDS if word in words)
 
 

@@ -54,6 +54,8 @@ class Animation:
             loads"``. A copy that diverged is NaN from then on.
         reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (frames+1, p,
             3) or (frames+1, B, p, 3) [N], in the order of ``scene.pins.vertices``.
+        cut: The share of the moves of free vertices, of all steps, that were cut short because they would have ended in a
+            collider or crossed one; with B > 1 copies one value per copy, (B,).
     """
 
     points: np.ndarray | FrameSequence
@@ -66,6 +68,7 @@ class Animation:
     scene: Scene | None = None
     energies: dict[str, np.ndarray] | None = None
     reactions: np.ndarray | None = None
+    cut: float | np.ndarray = 0.0
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
@@ -138,7 +141,7 @@ def simulate(
     whole("frames", frames, 1, MOST_FRAMES)
     whole("copies", copies, 1)
     choice("dtype", dtype, tuple(DTYPES))
-    record = checked_record(record)
+    record = checked_record(record, scene)
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
     if resume and output is None:
@@ -179,7 +182,8 @@ def simulate(
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     recorded = ledger.by_name() if ledger else (None, None)
-    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), output, scene, *recorded)
+    rest = output, scene, *recorded, of_copies(stepper.cut)
+    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), *rest)
 
 
 @in_turn

@@ -9,6 +9,7 @@ from functools import cached_property, singledispatch
 import numpy as np
 
 from ..numerics.rotation import kabsch
+from ..scene.colliders import Collider
 from ..scene.scene import Pins
 from ..solvers.solver import Stepper
 from ..terms.loads import Loads
@@ -232,3 +233,35 @@ def _loaded(loads: Loads, balance, _stepper):
 @source_of.register
 def _moving(pins: Pins, balance, _stepper):
     return MovingPins(balance) if pins.moves else None
+
+
+@source_of.register(Collider)
+def moving_collider(collider, balance, stepper):
+    return MovingCollider(collider, balance) if collider.moves else None
+
+
+class MovingCollider(Source):
+    """A collider that keyframes move.
+
+    In a frame in which its surface moves at V it may give each vertex a velocity of up to 2V, as a bat does a ball, and lift it
+    by V over the frame rate. A half-space that turns is taken as large as the cloth.
+    """
+
+    name = "moving colliders"
+
+    def __init__(self, collider, balance):
+        scene, self._balance = balance.model.scene, balance
+        poses, (half, radius) = collider.poses, collider.core
+        extent = np.linalg.norm(half) + radius
+        if not np.isfinite(extent):
+            extent = np.linalg.norm(scene.positions - poses[0, :3], axis=1).max() + np.ptp(scene.positions, axis=0).max()
+        turns = 2.0 * np.arccos(np.clip(np.abs((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1)), 0.0, 1.0))
+        moves = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + extent * turns
+        self._speeds = np.append(0.0, scene.fps * moves)
+        self._lifts = np.cumsum(np.append(0.0, moves))
+
+    def energy(self, frame, speed):
+        speeds = 2.0 * self._speeds[: frame + 1]
+        gravity = np.linalg.norm(self._balance.model.gravity.numpy().astype(np.float64), axis=1)
+        lifted = gravity * self._lifts[min(frame, len(self._lifts) - 1)]
+        return self._balance.total * (0.5 * (speeds**2).sum() + speeds.sum() * speed + lifted)

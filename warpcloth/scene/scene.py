@@ -1,7 +1,7 @@
 """Scenes: a scene is data without a solver. Any solver that supports its terms runs it unchanged."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,8 +14,10 @@ from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 from ..mesh.stage_mesh import StageMesh
 from ..model.model import Model
+from ..terms.contact import VertexContact, VertexFriction
 from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
+from .colliders import Collider, Contact, default_stiffness, refuse_inside
 
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
@@ -102,6 +104,9 @@ class Scene:
             keeps its value, and its velocity is 0, which makes planes of symmetry and rails. A vertex without a free axis is
             a pin that stands still. Values of pinned vertices are ignored.
         loads: Forces, tractions and pressures on the cloth: :class:`Force`, :class:`Traction`, :class:`Pressure`.
+        colliders: What the cloth touches, such as :class:`warpcloth.Sphere`. Pinned vertices touch nothing.
+        contact: How it touches them, a :class:`warpcloth.Contact`, by default ``Contact()``, with its stiffness as a number;
+            None without colliders.
 
     Raises:
         ValueError: If a value breaks a rule; the sentence names it.
@@ -128,11 +133,13 @@ class Scene:
     stage: StageMesh | None = None
     free_axes: Converted[ArrayLike | None, np.ndarray | None] = default(None)
     loads: Converted[Load | Iterable[Load], Loads] = default(())
+    colliders: Converted[Iterable[Collider], tuple[Collider, ...]] = default(())
+    contact: Contact | None = None
 
     @property
     def declared(self) -> tuple[object, ...]:
         """All that it declares besides the cloth itself; any of it may put energy into the cloth."""
-        return (self.pins, *self.terms, self.loads)
+        return (self.pins, *self.terms, self.loads, *self.colliders)
 
     def __post_init__(self) -> None:
         if not isinstance(self.mesh, Mesh):
@@ -165,6 +172,9 @@ class Scene:
         else:
             keep("masses", array("masses", self.masses, (n,)))
         self._check_masses()
+        keep("colliders", self._checked_colliders())
+        keep("contact", self._checked_contact())
+        self.refuse_inside(self.positions)
 
     def _checked_terms(self):
         rule = "it must be a list of energies, such as [Spring(stiffness=1e3)]"
@@ -178,6 +188,80 @@ class Scene:
                 given = f"the class {term.__name__}" if isinstance(term, type) else shown(term)
                 raise ValueError(f"terms[{i}] is {given}; it must be an energy, such as Spring(stiffness=1e3)")
         return terms
+
+    def _checked_colliders(self):
+        rule = "it must be a list of colliders, such as [Plane()]"
+        if isinstance(self.colliders, Collider) or not isinstance(self.colliders, Iterable):
+            raise ValueError(f"colliders is {shown(self.colliders)}; {rule}")
+        colliders = tuple(self.colliders)
+        for i, collider in enumerate(colliders):
+            if not isinstance(collider, Collider):
+                raise ValueError(f"colliders[{i}] is {shown(collider)}; it must be a collider, such as Plane()")
+        return colliders
+
+    def _checked_contact(self):
+        if not (self.contact is None or isinstance(self.contact, Contact)):
+            raise ValueError(f"contact is {shown(self.contact)}; it must be a Contact or None")
+        if not self.colliders:
+            if self.contact is not None:
+                raise ValueError("contact is given without colliders; give colliders, or leave it out")
+            return None
+        contact = self.contact or Contact()
+        for collider in (each for each in self.colliders if each.friction and np.isinf(contact.stiffness or 0.0)):
+            raise ValueError(
+                f"{collider.label} has friction {collider.friction:g} and contact.stiffness is infinite, which leaves no gap "
+                "that says how large the normal force is; give a finite stiffness, or leave friction at 0"
+            )
+        if contact.stiffness is not None:
+            return contact
+        weight = self._areal_mass * float(np.linalg.norm(self.gravity))
+        if not weight > 0.0:
+            raise ValueError("contact.stiffness has no default without gravity; give one [Pa/m]")
+        return replace(contact, stiffness=default_stiffness(weight, contact.distance))
+
+    @property
+    def _touching_areas(self):
+        """Areas of the vertices [m²]; of a mesh of edges their lengths times twice the contact distance."""
+        mesh = self.mesh
+        if len(mesh.triangles):
+            return mesh.vertex_areas
+        distance = Contact.distance if self.contact is None else self.contact.distance
+        return 2.0 * distance * mesh.vertex_lengths
+
+    @property
+    def _areal_mass(self):
+        """Mass over area [kg/m²] of the vertices that have an area."""
+        areas = self._touching_areas
+        return float(self.vertex_masses[areas > 0.0].sum() / areas.sum())
+
+    @property
+    def contact_terms(self) -> tuple[VertexContact, ...]:
+        """The terms that its colliders are: contact of the free vertices with each, and friction on those that have it."""
+        if not self.colliders or self.contact is None or self.contact.stiffness is None:
+            return ()
+        areas, mass = self._touching_areas, self._areal_mass
+        areas = np.where(areas > 0.0, areas, self.vertex_masses / mass)  # of a vertex without a triangle, by its mass
+        free = np.delete(np.arange(len(areas), dtype=np.int32), self.fixed)
+        given = {"vertices": free, "areas": areas[free]}
+        given |= {"stiffness": self.contact.stiffness, "distance": self.contact.distance}
+        found: list[VertexContact] = []
+        for c, collider in enumerate(self.colliders):
+            core, radius = collider.core
+            given |= {"collider": c, "pose": collider.poses[0], "core": core, "radius": radius}
+            found.append(VertexContact(name=f"contact with {collider.label}", **given))
+            if collider.friction:
+                found.append(VertexFriction(name=f"friction on {collider.label}", **given))
+        return tuple(found)
+
+    def refuse_inside(self, positions: np.ndarray, copy: str = "") -> None:
+        """Refuses free vertices that start inside a collider, at ``positions`` (n, 3) [m].
+
+        Raises:
+            ValueError: Naming the vertex and the collider.
+        """
+        free = np.ones(len(positions), dtype=bool)
+        free[self.fixed] = False
+        refuse_inside(self.colliders, positions, free, copy)
 
     def _check_masses(self):
         masses = self.vertex_masses
@@ -261,6 +345,9 @@ class Scene:
         if self.locked is not None:
             counts = ", ".join(f"{count} {axis}" for axis, count in zip("xyz", self.locked.sum(axis=0), strict=True))
             lines.append(f"  locked coordinates: {counts}")
+        if self.contact is not None and self.contact.stiffness is not None:
+            lines += [f"  {_described(collider)}" for collider in self.colliders]
+            lines.append(f"  contact: distance {self.contact.distance:g} m, stiffness {self.contact.stiffness:.4g} Pa/m")
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
 
 

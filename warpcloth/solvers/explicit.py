@@ -247,12 +247,12 @@ class ExplicitStepper(LaunchedStepper):
     """
 
     def __init__(self, options, model, backend="auto"):
-        super().__init__(options, model)
+        super().__init__(options, model, None)
         symplectic = options.scheme == "symplectic"
-        self.plan = plan(model, backend)
+        self.plan = plan(self.model, backend)
         self._steps = self.plan.explicit_step(tuple(self.state), self.h, symplectic, self.count, self.pool)
         self.state.add("position residual", self._steps.residual)
         self.record((lambda: self.launch_steps(1), 1))
 
     def launch_steps(self, steps):
-        self._steps.launch(steps, self.launch_pins_of)
+        self._steps.launch(steps, self.launch_end_of)

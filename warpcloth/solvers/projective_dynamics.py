@@ -16,10 +16,11 @@ from ..kernels.accelerate import plain_step
 from ..model.model import Model
 from ..numerics.accelerated_step import AcceleratedStep
 from ..numerics.acceleration import accelerated
+from ..numerics.contact_system import ContactSystem
 from ..numerics.inertia import Inertia
 from ..numerics.iterate import GravityScale
 from ..numerics.linear import DiagonalScaling, factorise_copies
-from ..terms.needs import FINITE, MERGED_DAMPING, PROJECTION
+from ..terms.needs import FINITE, MERGED_DAMPING, PROJECTION_OR_CONTACT
 from .facts import Benchmark, Facts, grid
 from .implicit import ImplicitStepper
 from .solver import Stepper
@@ -66,7 +67,7 @@ class ProjectiveDynamics(ImplicitStep):
     """
 
     name = "projective-dynamics"
-    needs, locks = (FINITE, MERGED_DAMPING, PROJECTION), True
+    needs, locks = (FINITE, MERGED_DAMPING, PROJECTION_OR_CONTACT), True
     residual = Residual(UNBALANCED, "times its value at the start of the step")
     facts = Facts(
         method="implicit steps by local projections and global solves with a constant matrix, optionally accelerated",
@@ -121,12 +122,16 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         super().__init__(options, model)
         model = self.model
         self.inertia, self.sums = Inertia(model, 1.0 / self.he**2), Sums(model)
-        matrices = constant_matrices(model, self.inertia.s)
+        projected = model.with_terms([elements for elements in model.terms if elements.collider is None])
+        matrices = constant_matrices(projected, self.inertia.s)
         self._sizes = np.stack([np.asarray(abs(matrix).sum(axis=1)).ravel() for matrix in matrices])
         self._linear = (
             factorise_copies(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
         )
         self.factorise_seconds = self._linear.seconds
+        self._contact = None
+        if model.colliders is not None:
+            self._contact = ContactSystem(model, self.state.x, self._linear, self.sums, self.inertia.s)
         self._gradient_of = plan(model).gradient(corrected=True)
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
         self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
@@ -150,6 +155,8 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
     def iterate(self, active):
         self._active.write(active)
         self._linear.solve(self.gradient, self.w)
+        if self._contact:
+            self._contact.correct(self.correction, self.gradient, self.w, active)
         if self._accelerated:
             self._accelerated.propose(active)
         self._move()

@@ -2,9 +2,11 @@
 
 from functools import partial
 
+import numpy as np
 import warp as wp
 
 from ..base.turns import in_turn, methods_in_turn
+from ..contact.collider_steps import ColliderSteps
 from ..core.capture import Segment
 from ..core.reset import Reset
 from ..core.state import State
@@ -28,6 +30,7 @@ class Stepper:
             minimiser; None for solvers without x̃.
         he: Effective step hₑ of the integrator [s], else h.
         steps_per_frame: Steps a frame.
+        colliders: :class:`warpcloth.contact.collider_steps.ColliderSteps`, or None if the scene has none.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 for methods that have none.
         iterations: Iterations or sweeps of the last step; 1 for methods that do not iterate.
@@ -55,6 +58,11 @@ class Stepper:
         self.state.add("steps of keyframes", self.count)
         self._reset = None
         self.integrator, self.he = None, self.h
+        self.colliders = None
+        if model.colliders is not None:
+            part = 0.0 if integrator is None else 0.5 if integrator == "midpoint" else 1.0
+            self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
+            self.model = model = model.with_terms(self.colliders.terms)
         if integrator is not None:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he
@@ -84,6 +92,11 @@ class Stepper:
     @residual.setter
     def residual(self, residual):
         self.state.residual = residual
+
+    @property
+    def cut(self):
+        """The share of the moves of free vertices that contact with colliders cut short so far, (B,)."""
+        return np.zeros(self.model.copies) if self.colliders is None else self.colliders.share
 
     def launch_pins(self, parts=1):
         """Moves the pins that have keyframes on by h/``parts``, the same in all calls."""
@@ -131,6 +144,14 @@ class Stepper:
     def launch_finish(self, correction):
         """x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser."""
         self.integrator.launch_finish(correction)
+        if self.colliders is not None:
+            self.colliders.launch_end(*self.state, self.state.arrays.get("move before"))
+
+    def launch_end_of(self, pins, keyframes, count, x, v):
+        """The end of an explicit step in x and v (N,): pins move on, and vertices are kept out of colliders."""
+        self.launch_pins_of(pins, keyframes, count, x, v)
+        if self.colliders is not None:
+            self.colliders.launch_end(x, v)
 
     def step(self):
         """One step of h."""

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import numpy as np
 import warp as wp
 
 from ..core.reset import Reset
@@ -55,6 +56,10 @@ class ThreadedStepper(Stepper):
                 of_part(out[first * n : end * n])
 
         return launch
+
+    @property
+    def cut(self):
+        return np.concatenate([part.cut for part in self.parts])
 
     def step(self):
         self.pool.run([part.step for part in self.parts])

@@ -7,6 +7,8 @@ whether its damping merges with it; its elements say whether a stiffness is infi
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..kernels.terms.friction import FRICTION
+
 
 @dataclass(frozen=True)
 class Need:
@@ -27,6 +29,15 @@ class Need:
 FINITE = Need(lambda elements: not elements.hard, "{label} with infinite stiffness", "give a finite stiffness")
 ELEMENTS = Need(lambda elements: not elements.term.cells, "{label}, whose bodies are no elements by themselves")
 PROJECTION = Need(lambda elements: elements.term.project is not None, "{label}, whose energy is no squared distance to a set")
+# A projection, or contact, whose Hessian is added to that of projections.
+PROJECTION_OR_CONTACT = Need(
+    lambda elements: elements.term.project is not None or elements.term.bounded is not None, PROJECTION.lack
+)
+NORMAL_FORCE = Need(
+    lambda elements: elements.term is not FRICTION,
+    "{label}, whose normal force does not follow from positions",
+    "leave friction at 0",
+)
 # A projection, a scalar constraint or a prox.
 LOCAL_STEP = Need(lambda elements: elements.term.moves, "{label}, whose energy is no distance to a constraint")
 ROWS = Need(

@@ -1,0 +1,344 @@
+"""Factories of the kernels of colliders: their motion, the start of a step, and the filter at its end.
+
+A pose is a position and a quaternion (x, y, z, w), seven numbers. A step needs the poses at its start and at its end, and those
+where its forces are taken, see :func:`move_colliders`.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .rotation import epsilon
+from .terms import contact
+from .terms.contact import local_gap, turned
+from .vectors import types
+
+local_gap_of, turned_by, slope_of, DELTA = local_gap, turned, contact.slope, contact.DELTA
+ROUNDS = wp.constant(4)  # in which a vertex between moving colliders is looked at again
+MARCHES = wp.constant(32)  # planes that a vertex meets on its way past a collider, at most
+
+
+@cache
+def pose_types(dtype):
+    """The types of a pose and of an anchor with its ε."""
+    return wp.types.vector(7, dtype), wp.types.vector(4, dtype)
+
+
+@cache
+def shapes(dtype):
+    """The struct of the shapes of C colliders, see :mod:`.terms.contact`: half sizes of the core, and radius."""
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Shapes:
+        core: wp.array(dtype=vec3)
+        radius: wp.array(dtype=dtype)
+
+    return Shapes
+
+
+@cache
+def step_poses(dtype):
+    """The struct of the poses (copies, colliders) at the start and end of a step, and ``at`` where its forces are taken."""
+    pose_type, _anchor = pose_types(dtype)
+
+    @wp.struct
+    class StepPoses:
+        before: wp.array2d(dtype=pose_type)
+        at: wp.array2d(dtype=pose_type)
+        after: wp.array2d(dtype=pose_type)
+
+    return StepPoses
+
+
+@cache
+def of_pose(dtype):
+    """The device functions (pose, x) → x in the frame of a pose, and (pose, X) → X in space."""
+    vec3, _ = types(dtype)
+    pose_type, _anchor = pose_types(dtype)
+
+    @wp.func
+    def to_local(pose: pose_type, x: vec3):
+        return turned_by(-vec3(pose[3], pose[4], pose[5]), pose[6], x - vec3(pose[0], pose[1], pose[2]))
+
+    @wp.func
+    def to_space(pose: pose_type, X: vec3):
+        return turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], X) + vec3(pose[0], pose[1], pose[2])
+
+    return to_local, to_space
+
+
+@cache
+def move_colliders(dtype):
+    """Kernel over (copies, colliders): the poses of a step, in a :func:`step_poses`, ``at`` being ``halves`` half steps on.
+
+    Between keyframes positions are linear and rotations turn at one speed; after the last they stand still.
+    """
+    pose_type, _anchor = pose_types(dtype)
+    quat_type = wp.types.quaternion(dtype=dtype)
+
+    @wp.func
+    def pose_at(keyframes: wp.array(dtype=pose_type), first: int, count: int, halves: int, per_frame: int):
+        frame = wp.max(wp.min(halves // per_frame, count - 1), 0)
+        found = keyframes[first + frame]
+        if frame + 1 < count and halves > 0:
+            after = keyframes[first + frame + 1]
+            part = dtype(halves - frame * per_frame) / dtype(per_frame)
+            q = wp.quat_slerp(
+                quat_type(found[3], found[4], found[5], found[6]), quat_type(after[3], after[4], after[5], after[6]), part
+            )
+            for k in range(3):
+                found[k] = (dtype(1.0) - part) * found[k] + part * after[k]
+            for k in range(4):
+                found[3 + k] = q[k]
+        return found
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def move(
+        # elements
+        keyframes: wp.array(dtype=pose_type),
+        firsts: wp.array(dtype=wp.int32),
+        # state in
+        step: wp.array(dtype=wp.int32),
+        # parameters
+        steps_per_frame: int,
+        halves: int,
+        # out
+        poses: step_poses(dtype),
+    ):
+        copy, c = wp.tid()
+        first = firsts[c]
+        count = firsts[c + 1] - first
+        now = 2 * step[copy]
+        poses.before[copy, c] = pose_at(keyframes, first, count, now, 2 * steps_per_frame)
+        poses.at[copy, c] = pose_at(keyframes, first, count, now + halves, 2 * steps_per_frame)
+        poses.after[copy, c] = pose_at(keyframes, first, count, now + 2, 2 * steps_per_frame)
+
+    return move
+
+
+@cache
+def kept_part(dtype):
+    """The device function (X, move, core, radius, least) → the part of a move from X, in the frame of a collider, that is kept.
+
+    As colliders are convex, the plane normal to the distance from the surface has all of the collider behind it. The move is
+    kept until it would come nearer to that plane than ``least``, or than where it started; from there the next plane decides.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def kept(X: vec3, move: vec3, core: vec3, radius: dtype, least: dtype):
+        d, n = local_gap_of(X, core, radius)
+        t = dtype(0.0)
+        if d > wp.length(move) + least:
+            t = dtype(1.0)
+        lowest = wp.min(least, d)
+        for _k in range(MARCHES):
+            if t < dtype(1.0):
+                approach = -wp.dot(move, n)
+                further = d - lowest
+                if approach * (dtype(1.0) - t) <= further:
+                    t = dtype(1.0)
+                elif further > dtype(0.01) * least:
+                    t += further / approach
+                    d, n = local_gap_of(X + t * move, core, radius)
+        return t
+
+    return kept
+
+
+@cache
+def pose_collider(dtype):
+    """Kernel over the elements of contact with one collider, at the start of a step: rest states with its pose, or a plane.
+
+    A vertex whose prediction, x + h v + h² g, crosses the collider has contact with the half-space behind the plane that
+    touches the collider where it meets it: beyond a thin collider there would be no force that leads back. Other rest states
+    are written where they change.
+    """
+    vec3, _ = types(dtype)
+    to_local, to_space = of_pose(dtype)
+    kept, rest_type = kept_part(dtype), wp.types.vector(contact.PARAMETERS, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def set_pose(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        shape: shapes(dtype),
+        gravity: wp.array(dtype=vec3),
+        per_gravity: int,
+        # state in
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        poses: step_poses(dtype),
+        # parameters
+        collider: int,
+        per_copy: int,
+        least: dtype,
+        h: dtype,
+        # in and out
+        rest: wp.array(dtype=rest_type),
+    ):
+        e = wp.tid()
+        i = stencil[e, 0]
+        copy = e // per_copy
+        pose = poses.at[copy, collider]
+        core = shape.core[collider]
+        radius = shape.radius[collider]
+        if wp.isfinite(core[0]):
+            X = to_local(poses.before[copy, collider], x[i])
+            ahead = x[i] + h * (v[i] + h * gravity[i // per_gravity])
+            way = to_local(poses.after[copy, collider], ahead) - X
+            t = kept(X, way, core, radius, least)
+            if t < dtype(1.0):
+                X = X + t * way
+                d, n = local_gap_of(X, core, radius)
+                position = to_space(pose, X - d * n)
+                normal = turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], n)
+                turn = vec3(normal[2], dtype(0.0), -normal[0])
+                w = dtype(1.0) + normal[1]
+                size = wp.sqrt(wp.dot(turn, turn) + w * w)
+                if w <= dtype(0.0) or size == dtype(0.0):
+                    turn = vec3(dtype(1.0), dtype(0.0), dtype(0.0))
+                    w = dtype(0.0)
+                    size = dtype(1.0)
+                for k in range(3):
+                    pose[k] = position[k]
+                    pose[3 + k] = turn[k] / size
+                pose[6] = w / size
+                core = vec3(dtype(wp.inf), dtype(wp.inf), dtype(wp.inf))
+                radius = dtype(0.0)
+        r = rest[e]
+        changed = wp.isfinite(r[7]) != wp.isfinite(core[0])
+        for k in range(7):
+            if r[k] != pose[k]:
+                changed = True
+        if changed:
+            for k in range(7):
+                r[k] = pose[k]
+            for k in range(3):
+                r[7 + k] = core[k]
+            r[10] = radius
+            rest[e] = r
+
+    return set_pose
+
+
+@cache
+def anchor_vertices(dtype, bounded: bool):
+    """Kernel over the elements of friction on one collider, at the start of a step: anchors, and the rest states of the step.
+
+    With N = −kAφ′(d) of the state, or kA(r − d) of ``bounded`` contact, ε = μN/(kA). A vertex that comes into contact is
+    anchored where it is. One that slid, ‖u‖ above the ε of the step before, drags its anchor after it, to that ε. Anchors are
+    in the frame of the collider, with ε, which is 0 without contact.
+    """
+    vec3, _ = types(dtype)
+    _pose, anchor_type = pose_types(dtype)
+    to_local, to_space = of_pose(dtype)
+    rest_type = wp.types.vector(8, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def anchor(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        shape: shapes(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        poses: step_poses(dtype),
+        # parameters
+        collider: int,
+        per_copy: int,
+        distance: dtype,
+        friction: dtype,
+        # in and out
+        anchors: wp.array(dtype=anchor_type),
+        rest: wp.array(dtype=rest_type),
+    ):
+        e = wp.tid()
+        i = stencil[e, 0]
+        copy = e // per_copy
+        pose = poses.before[copy, collider]
+        X = to_local(pose, x[i])
+        d, n = local_gap_of(X, shape.core[collider], shape.radius[collider])
+        depth = -slope_of(d, distance)
+        if wp.static(bounded):
+            depth = wp.max(distance - d, dtype(0.0))
+        held = anchors[i]
+        r = rest[e]
+        a = X
+        if depth > dtype(0.0):
+            if held[3] > dtype(0.0):
+                u = X - vec3(held[0], held[1], held[2])
+                u = u - wp.dot(n, u) * n
+                l = wp.length(u)
+                a = X - wp.where(l > held[3], held[3] / wp.max(l, held[3]), dtype(1.0)) * u
+            now = poses.at[copy, collider]
+            target = to_space(now, a)
+            normal = turned_by(vec3(now[3], now[4], now[5]), now[6], n)
+            for k in range(3):
+                r[k] = target[k]
+                r[3 + k] = normal[k]
+        r[6] = friction * depth
+        rest[e] = r
+        anchors[i] = anchor_type(a[0], a[1], a[2], friction * depth)
+
+    return anchor
+
+
+@cache
+def filter_step(dtype):
+    """Kernel over vertices, at the end of a step: no free vertex is inside a collider, and none has crossed its surface.
+
+    In the frame of a collider a vertex moves along a segment from where it was when the step began, of which :func:`kept_part`
+    remains. A vertex that would come nearer than ``least`` stops where it is nearer than ``landing``, at most. What is cut off
+    x is also cut off v, over h, and off ``move``, which may be None. ``cut`` counts the vertices of each copy that were cut.
+    """
+    vec3, _ = types(dtype)
+    to_local, to_space = of_pose(dtype)
+    kept = kept_part(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def filter_vertices(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        shape: shapes(dtype),
+        # state in
+        x_before: wp.array(dtype=vec3),
+        poses: step_poses(dtype),
+        # parameters
+        per_copy: int,
+        least: dtype,
+        landing: dtype,
+        h: dtype,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        cut: wp.array(dtype=wp.int64),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] > dtype(0.0):
+            copy = i // per_copy
+            x0 = x_before[i]
+            end = x[i]
+            rounded = least + dtype(8.0) * epsilon(least) * wp.max(wp.abs(end))
+            cuts = wp.int32(0)
+            rounds = wp.int32(0)
+            while rounds <= cuts and rounds < ROUNDS:  # another one after each that has cut
+                rounds += 1
+                for c in range(shape.radius.shape[0]):
+                    X = to_local(poses.before[copy, c], x0)
+                    way = to_local(poses.after[copy, c], end) - X
+                    t = kept(X, way, shape.core[c], shape.radius[c], rounded)
+                    if t < dtype(1.0):
+                        t = kept(X, way, shape.core[c], shape.radius[c], rounded + landing)
+                        end = to_space(poses.after[copy, c], X + t * way)
+                        cuts = rounds
+            if cuts > 0:
+                change = end - x[i]
+                x[i] = end
+                v[i] = v[i] + change / h
+                if move:
+                    move[i] = move[i] + change
+                wp.atomic_add(cut, copy, wp.int64(1))
+
+    return filter_vertices

@@ -1,0 +1,311 @@
+"""Contact of a vertex with a collider: U = Σ kA φ(d), k in Pa/m, A the area of the vertex and d its distance to the surface.
+
+With the contact distance r and τ = r/2 (the two stages of Chen et al. 2025, *Offset geometric contact*):
+
+    φ = ½(r − d)²  for τ ≤ d < r,   ½τ² + τ² ln(τ/d)  for d < τ,   0  for d ≥ r
+
+φ is C² at τ and C¹ at r. The force is a pressure: a load p leaves the gap r − p/k, or τ²k/p below τ. Below δ = r/1000 φ goes
+on as its Taylor polynomial of second degree, so that what starts inside a collider has a force that leads out of it.
+
+Stencil (x₀), y = x₀, measure A. Rest state: the pose of the collider (position, quaternion x, y, z, w), the half sizes of its
+core box, its radius, r and A. A collider is what is nearer to its core than its radius: a sphere has a core of no size, a
+capsule a segment, a box has radius 0. A core of infinite size is the half-space below y = 0. Colliders are convex, so that
+∂²d ⪰ 0 and φ′∂²d ⪯ 0: clamping drops that.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..term import HessianPolicy, Term
+from .attachment import weight
+
+RAW = wp.constant(int(HessianPolicy.RAW))
+CLAMP = wp.constant(int(HessianPolicy.CLAMP))
+# δ/r, below which φ is a parabola, and below which no vertex ends a step.
+FLOOR = 1e-3
+DELTA = wp.constant(FLOOR)
+# Where the rest state has what.
+POSE, CORE, RADIUS, DISTANCE, AREA, PARAMETERS = 0, 7, 10, 11, 12, 13
+STANDING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def rest_state(points, stencil, pose=STANDING, core=(0.0, 0.0, 0.0), radius=0.0, distance=1e-3, areas=1.0):
+    """Rest states (E, 13) of the vertices ``stencil`` (E, 1)."""
+    rest = np.empty((len(stencil), PARAMETERS))
+    rest[:, POSE:CORE], rest[:, CORE:RADIUS] = pose, core
+    rest[:, RADIUS], rest[:, DISTANCE], rest[:, AREA] = radius, distance, areas
+    return rest
+
+
+@wp.func
+def measure(rest: Any):
+    return rest[12]
+
+
+@wp.func
+def turned(u: Any, w: Any, v: Any):
+    """v turned by the quaternion (u, w)."""
+    t = type(w)(2.0) * wp.cross(u, v)
+    return v + w * t + wp.cross(u, t)
+
+
+@wp.func
+def from_core(X: Any, half: Any):
+    """The vector from the nearest point of a core, a box of half sizes, to X in its frame; 0 inside."""
+    return X - wp.min(wp.max(X, -half), half)
+
+
+@wp.func
+def local_gap(X: Any, half: Any, radius: Any):
+    """Signed distance d of X to the surface of a collider and the outward normal ∇d, in the frame of the collider."""
+    zero = type(radius)(0.0)
+    d = X[1]
+    n = wp.vector(zero, type(radius)(1.0), zero)
+    if wp.isfinite(half[0]):
+        away = from_core(X, half)
+        l = wp.length(away)
+        if l > zero:
+            d = l - radius
+            n = away / l
+        else:
+            axis = wp.int32(0)
+            for i in range(1, 3):
+                if half[i] - wp.abs(X[i]) < half[axis] - wp.abs(X[axis]):
+                    axis = i
+            d = wp.abs(X[axis]) - half[axis] - radius
+            n[1] = zero
+            n[axis] = wp.where(X[axis] < zero, type(radius)(-1.0), type(radius)(1.0))
+    return d, n
+
+
+@wp.func
+def gap(y: Any, rest: Any):
+    """Signed distance of a vertex and the outward normal, in space."""
+    u = wp.vector(rest[3], rest[4], rest[5])
+    X = turned(-u, rest[6], y[0] - wp.vector(rest[0], rest[1], rest[2]))
+    d, n = local_gap(X, wp.vector(rest[7], rest[8], rest[9]), rest[10])
+    return d, turned(u, rest[6], n)
+
+
+@wp.func
+def curvature(y: Any, rest: Any, n: Any):
+    """∂²d, which is that of the distance to a point, a line or a plane, by the region in which the vertex is."""
+    u = wp.vector(rest[3], rest[4], rest[5])
+    H = wp.matrix(shape=(3, 3), dtype=y.dtype)
+    if wp.isfinite(rest[7]):
+        X = turned(-u, rest[6], y[0] - wp.vector(rest[0], rest[1], rest[2]))
+        away = from_core(X, wp.vector(rest[7], rest[8], rest[9]))
+        l = wp.length(away)
+        if l > y.dtype(0.0):
+            H -= wp.outer(n, n) / l
+            for i in range(3):
+                if away[i] != y.dtype(0.0):
+                    axis = wp.vector(y.dtype(0.0), y.dtype(0.0), y.dtype(0.0))
+                    axis[i] = y.dtype(1.0)
+                    axis = turned(u, rest[6], axis)
+                    H += wp.outer(axis, axis) / l
+    return H
+
+
+@wp.func
+def potential(d: Any, r: Any):
+    """φ."""
+    half = type(r)(0.5)
+    tau = half * r
+    delta = type(r)(DELTA) * r
+    phi = type(r)(0.0)
+    if d < tau:
+        e = wp.max(d, delta)
+        phi = tau * tau * (half + wp.log(tau / e))
+        more = wp.min(d - delta, type(r)(0.0)) / delta
+        phi += tau * tau * (half * more * more - more)
+    elif d < r:
+        phi = half * (r - d) * (r - d)
+    return phi
+
+
+@wp.func
+def slope(d: Any, r: Any):
+    """φ′."""
+    tau = type(r)(0.5) * r
+    delta = type(r)(DELTA) * r
+    found = type(r)(0.0)
+    if d < delta:
+        found = tau / delta * (tau * (d - delta) / delta - tau)
+    elif d < tau:
+        found = -tau * tau / d
+    elif d < r:
+        found = d - r
+    return found
+
+
+@wp.func
+def bend(d: Any, r: Any):
+    """φ″; at r that of inside."""
+    tau = type(r)(0.5) * r
+    found = type(r)(0.0)
+    if d < tau:
+        ratio = tau / wp.max(d, type(r)(DELTA) * r)
+        found = ratio * ratio
+    elif d <= r:
+        found = type(r)(1.0)
+    return found
+
+
+@wp.func
+def energy(y: Any, rest: Any):
+    d, _n = gap(y, rest)
+    return potential(d, rest[11])
+
+
+@wp.func
+def gradient(y: Any, rest: Any):
+    d, n = gap(y, rest)
+    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    g[0] = slope(d, rest[11]) * n
+    return g
+
+
+@wp.func
+def hessian(y: Any, rest: Any, policy: int):
+    d, n = gap(y, rest)
+    H = bend(d, rest[11]) * wp.outer(n, n)
+    if policy != CLAMP and d < rest[11]:
+        transverse = slope(d, rest[11])
+        if policy != RAW:
+            transverse = -transverse
+        H += transverse * curvature(y, rest, n)
+    return H
+
+
+@wp.func
+def prox(v: Any, rest: Any, compliance: Any):
+    """Along n: (d − v)/c = −φ′(d), in closed form in each stage; to r where the compliance is infinite."""
+    d, n = gap(v, rest)
+    r = rest[11]
+    half = v.dtype(0.5)
+    tau = half * r
+    after = d
+    if d < r:
+        after = r - (r - d) / (v.dtype(1.0) + compliance)
+        if after < tau:
+            c = compliance * tau * tau
+            root = wp.sqrt(half * half * d * d + c)
+            if d > v.dtype(0.0):
+                after = half * d + root
+            else:  # without the difference of two numbers that are nearly the same
+                after = c / (root - half * d)
+            delta = v.dtype(DELTA) * r
+            if after < delta:
+                after = (d + v.dtype(2.0) * c / delta) / (v.dtype(1.0) + c / (delta * delta))
+    p = v
+    p[0] = v[0] + (after - d) * n
+    return p
+
+
+@wp.func
+def constraint(y: Any, rest: Any):
+    """C = −√(2φ), which is d − r from τ on."""
+    d, _n = gap(y, rest)
+    return -wp.sqrt(y.dtype(2.0) * potential(d, rest[11]))
+
+
+@wp.func
+def constraint_slope(d: Any, r: Any):
+    """C′ = φ′/C."""
+    found = type(r)(0.0)
+    if d < type(r)(0.5) * r:
+        found = -slope(d, r) / wp.sqrt(type(r)(2.0) * potential(d, r))
+    elif d < r:
+        found = type(r)(1.0)
+    return found
+
+
+@wp.func
+def constraint_bend(d: Any, r: Any):
+    """C″ = (φ″ − C′²)/C, 0 or less."""
+    found = type(r)(0.0)
+    if d < type(r)(0.5) * r:
+        steep = constraint_slope(d, r)
+        found = wp.min((steep * steep - bend(d, r)) / wp.sqrt(type(r)(2.0) * potential(d, r)), found)
+    return found
+
+
+@wp.func
+def constraint_gradient(y: Any, rest: Any):
+    d, n = gap(y, rest)
+    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    g[0] = constraint_slope(d, rest[11]) * n
+    return g
+
+
+@wp.func
+def constraint_hessian(y: Any, rest: Any):
+    d, n = gap(y, rest)
+    return constraint_bend(d, rest[11]) * wp.outer(n, n) + constraint_slope(d, rest[11]) * curvature(y, rest, n)
+
+
+@wp.func
+def stiffening(y: Any, rest: Any, tension: Any):
+    """Of a pressure, tension < 0, the half along n; a pull on the curvature of a collider is left out, as none lasts."""
+    d, n = gap(y, rest)
+    rows = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    rows[0] = wp.sqrt(wp.max(tension * constraint_bend(d, rest[11]), y.dtype(0.0))) * n
+    return rows
+
+
+@wp.func
+def bounded_energy(y: Any, rest: Any):
+    d, _n = gap(y, rest)
+    depth = wp.max(rest[11] - d, y.dtype(0.0))
+    return y.dtype(0.5) * depth * depth
+
+
+@wp.func
+def bounded_gradient(y: Any, rest: Any):
+    d, n = gap(y, rest)
+    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    g[0] = -wp.max(rest[11] - d, y.dtype(0.0)) * n
+    return g
+
+
+@wp.func
+def bounded_hessian(y: Any, rest: Any, policy: int):
+    """I, that of contact with friction wherever the vertex is and more than that of contact alone."""
+    return wp.identity(n=3, dtype=y.dtype)
+
+
+BOUNDED_CONTACT = Term(
+    name="Contact",
+    vertices=1,
+    rows=1,
+    parameters=PARAMETERS,
+    rest_state=rest_state,
+    weight=weight,
+    measure=measure,
+    energy=bounded_energy,
+    gradient=bounded_gradient,
+    hessian=bounded_hessian,
+)
+
+CONTACT = Term(
+    name="Contact",
+    vertices=1,
+    rows=1,
+    parameters=PARAMETERS,
+    rest_state=rest_state,
+    weight=weight,
+    measure=measure,
+    energy=energy,
+    gradient=gradient,
+    hessian=hessian,
+    prox=prox,
+    constraint=constraint,
+    constraint_gradient=constraint_gradient,
+    constraint_hessian=constraint_hessian,
+    stiffening=stiffening,
+    stiffening_rows=1,
+    bounded=BOUNDED_CONTACT,
+)

@@ -1,0 +1,110 @@
+"""Friction of a vertex on a collider: U = Σ kA H(‖u‖), u = (I − nnᵀ)(y − a), k in Pa/m.
+
+H is the Huber function, H = ½u² for u < ε and εu − ½ε² beyond, with ε = μN/(kA): a spring to the anchor a whose force is no
+more than μN (Cundall and Strack 1979, *A discrete numerical model for granular assemblies*). Anchor, normal n and N are those
+of the start of a step.
+
+Stencil (x₀), y = x₀, measure A. Rest state: a, n, ε [m] and A. With ε = 0 there is neither energy nor force.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..term import Term
+from .attachment import weight
+
+
+def rest_state(points, stencil, areas=1.0):
+    """Rest states (E, 8) of the vertices ``stencil`` (E, 1) without contact."""
+    rest = np.zeros((len(stencil), 8))
+    rest[:, 7] = areas
+    return rest
+
+
+@wp.func
+def measure(rest: Any):
+    return rest[7]
+
+
+@wp.func
+def slip(y: Any, rest: Any):
+    """u."""
+    n = wp.vector(rest[3], rest[4], rest[5])
+    away = y[0] - wp.vector(rest[0], rest[1], rest[2])
+    return away - wp.dot(n, away) * n
+
+
+@wp.func
+def energy(y: Any, rest: Any):
+    l = wp.length(slip(y, rest))
+    least = wp.min(l, rest[6])
+    return least * (l - y.dtype(0.5) * least)
+
+
+@wp.func
+def gradient(y: Any, rest: Any):
+    u = slip(y, rest)
+    l = wp.length(u)
+    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    g[0] = wp.where(l > rest[6], rest[6] / wp.max(l, rest[6]), y.dtype(1.0)) * u
+    return g
+
+
+@wp.func
+def hessian(y: Any, rest: Any, policy: int):
+    n = wp.vector(rest[3], rest[4], rest[5])
+    u = slip(y, rest)
+    l = wp.length(u)
+    H = wp.matrix(shape=(3, 3), dtype=y.dtype)
+    if rest[6] > y.dtype(0.0):
+        H = wp.identity(n=3, dtype=y.dtype) - wp.outer(n, n)
+        if l > rest[6]:
+            H = rest[6] / l * (H - wp.outer(u, u) / (l * l))
+    return H
+
+
+@wp.func
+def project(y: Any, rest: Any):
+    """y − ∂u/∂y."""
+    return y - gradient(y, rest)
+
+
+@wp.func
+def prox(v: Any, rest: Any, compliance: Any):
+    """v moved along u by its part c/(1 + c), and by no more than cε."""
+    u = slip(v, rest)
+    l = wp.length(u)
+    part = v.dtype(1.0) - v.dtype(1.0) / (v.dtype(1.0) + compliance)
+    if part * l > compliance * rest[6]:
+        part = compliance * rest[6] / l
+    p = v
+    p[0] = v[0] - part * u
+    return p
+
+
+@wp.func
+def bounded_hessian(y: Any, rest: Any, policy: int):
+    """0, as the bounded Hessian of contact includes that of friction."""
+    return wp.matrix(shape=(3, 3), dtype=y.dtype)
+
+
+BOUNDED_FRICTION = Term("Friction", 1, 1, 8, rest_state, weight, measure, energy, gradient, bounded_hessian)
+
+FRICTION = Term(
+    name="Friction",
+    vertices=1,
+    rows=1,
+    parameters=8,
+    rest_state=rest_state,
+    weight=weight,
+    measure=measure,
+    energy=energy,
+    gradient=gradient,
+    hessian=hessian,
+    dead_zone=True,
+    project=project,
+    prox=prox,
+    bounded=BOUNDED_FRICTION,
+)

@@ -1,0 +1,116 @@
+"""The colliders of a scene in the steps of a solver."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from ..kernels import colliders as kernels
+from ..kernels.step import count_step
+from ..kernels.terms.contact import FLOOR
+from ..kernels.terms.friction import FRICTION
+from ..terms.refresh import STEP, Refresh
+
+# Where a vertex stops that would end in a collider, relative to the contact distance: where it comes to rest, a deep gap would
+# be a strong force, and in float32 a noisy one.
+LANDING = 0.1
+
+
+class ColliderSteps:
+    """The motion of colliders, anchors of friction and the filter, in the steps of one solver.
+
+    Where a step begins (a ``Refresh`` of the terms) colliders move on, the positions of the vertices are kept, and friction
+    anchors them. Where it ends, :meth:`launch_end` keeps vertices out of colliders.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model` of a scene with colliders.
+        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds its own arrays.
+        h: Step [s].
+        steps_per_frame: Steps a frame.
+        part: Where in a step its forces are taken, from 0, its start, to 1; 0 is that of explicit steps, whose contact is
+            ``bounded``.
+
+    Attributes:
+        terms: The elements of the model, those of contact as steps take them.
+        steps: Steps that the colliders have made, (B,) int32.
+        cut: How often a vertex was cut short, in all steps, (B,) int64.
+    """
+
+    def __init__(self, model, state, h, steps_per_frame, part):
+        self.model, self.h, device = model, h, model.device
+        declared = model.colliders
+        pose_type, self._anchor_type = kernels.pose_types(model.dtype)
+        self._shapes = kernels.shapes(model.dtype)()
+        self._shapes.core, self._shapes.radius = declared.core, declared.radius
+        self._dim, self._poses = (model.copies, len(declared.radius)), kernels.step_poses(model.dtype)()
+        for name in ("before", "at", "after"):
+            setattr(self._poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
+        self._x_before = model.vectors()
+        self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device))
+        self.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
+        self._anchors = []
+        self._least = FLOOR * declared.distance
+        # Of midpoint forces are those half-way, of others at the end.
+        self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
+        self._bounded = part == 0.0
+        self._move, self._count = model.kernel(kernels.move_colliders, model.dtype), model.kernel(count_step)
+        self._filter = model.kernel(kernels.filter_step, model.dtype)
+        self.terms = []
+        for elements in model.terms:
+            c = elements.collider
+            self.terms.append(elements if c is None else self._bound(elements, c, state))
+
+    def _bound(self, elements, c, state):
+        """The elements of contact or friction with collider c, with rest states of their own."""
+        model, declared = self.model, self.model.colliders
+        first = all(each.refresh is None or each.collider is None for each in self.terms)
+        if elements.term is FRICTION:
+            anchors = state.add(f"anchors on collider {c}", wp.zeros(model.count, dtype=self._anchor_type, device=model.device))
+            self._anchors.append(anchors)
+            kernel = model.kernel(kernels.anchor_vertices, model.dtype, self._bounded)
+            launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
+        elif declared.moves[c] or not (self._bounded or declared.half_space[c]):
+            launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype), c, state.v)
+        else:
+            launch = None
+        term = elements.term.bounded if self._bounded else elements.term
+        refresh = Refresh(STEP, partial(self._refresh, first, launch))
+        return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=refresh)
+
+    def _refresh(self, first, launch, model, elements, moment):
+        """Where a step begins: by the first of the terms for all of them, then for each."""
+        if first:
+            model.launch(self._move, self._dim, self._given, [self._poses])
+            wp.copy(self._x_before, moment.x)
+        if launch is not None:
+            launch(model, elements)
+
+    def _pose_elements(self, kernel, c, v, model, elements):
+        given = [elements.stencil, self._shapes, *model.free_gravity, self._x_before, v, self._poses]
+        given += [c, elements.per_copy, self._least, 0.0 if self._bounded else self.h]
+        model.launch(kernel, elements.count, given, [elements.rest])
+
+    def _anchor(self, kernel, c, anchors, friction, model, elements):
+        given = [elements.stencil, self._shapes, self._x_before, self._poses]
+        given += [c, elements.per_copy, model.colliders.distance, friction]
+        model.launch(kernel, elements.count, given, [anchors, elements.rest])
+
+    def launch_end(self, x, v, move=None):
+        """Cuts the step short of vertices that would end in a collider or cross one, in x, v and ``move`` (N,)."""
+        model = self.model
+        given = [model.inverse_mass, self._shapes, self._x_before, self._poses]
+        given += [model.per_copy, self._least, LANDING * model.colliders.distance, self.h]
+        model.launch(self._filter, model.count, given, [x, v, move, self.cut])
+        model.launch(self._count, model.copies, [], [self.steps])
+
+    @property
+    def share(self):
+        """The share of the moves of free vertices in all steps that were cut short, (B,)."""
+        free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
+        return self.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
+
+    def start_again(self):
+        """Forgets the steps that an integrator made to find its past."""
+        for array in (self.steps, self.cut, *self._anchors):
+            array.zero_()

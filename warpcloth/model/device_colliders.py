@@ -1,0 +1,53 @@
+"""The colliders of a scene on a device."""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from ..kernels.colliders import pose_types
+
+
+class DeviceColliders(NamedTuple):
+    """The C colliders of a scene, which all copies share.
+
+    Attributes:
+        keyframes: Poses of all colliders, one after another, seven numbers each.
+        firsts: Index of the first pose of each, (C + 1,) int32.
+        core, radius: Their shapes, (C,) vectors and (C,) numbers [m].
+        distance: Contact distance [m].
+        friction: μ of each, (C,) on the host.
+        moves, half_space: Whether each has more than one pose, and whether it is a half-space, lists of C.
+    """
+
+    keyframes: wp.array
+    firsts: wp.array
+    core: wp.array
+    radius: wp.array
+    distance: float
+    friction: np.ndarray
+    moves: list
+    half_space: list
+
+    @property
+    def arrays(self):
+        return [self.keyframes, self.firsts, self.core, self.radius]
+
+
+def colliders_on(model, scene):
+    """The colliders of a scene on the device of a model, or None if there are none."""
+    if not scene.colliders:
+        return None
+    poses = [collider.poses for collider in scene.colliders]
+    cores, radii = zip(*(collider.core for collider in scene.colliders), strict=True)
+    firsts = np.cumsum([0, *map(len, poses)])
+    return DeviceColliders(
+        keyframes=model.array(np.concatenate(poses), pose_types(model.dtype)[0]),
+        firsts=wp.array(firsts.astype(np.int32), dtype=wp.int32, device=model.device),
+        core=model.array(np.array(cores), model.vec3),
+        radius=model.array(np.array(radii), model.dtype),
+        distance=float(scene.contact.distance),
+        friction=np.array([collider.friction for collider in scene.colliders]),
+        moves=[collider.moves for collider in scene.colliders],
+        half_space=[bool(np.isinf(core[0])) for core in cores],
+    )

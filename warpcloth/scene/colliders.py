@@ -1,0 +1,268 @@
+"""Colliders: what cloth touches, standing or moved as rigid bodies, and how it touches them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..base.checks import array, number, shown
+from ..base.types import Converted, default
+
+# The part of the contact distance by which the weight of the cloth presses it in, with the default stiffness.
+_SAG = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """How cloth touches colliders: a pressure k(r − d) at a distance d below r, and kr²/(4d) below r/2.
+
+    That is the gradient of U = Σ kA φ(d) over the vertices of area A, see :mod:`warpcloth.kernels.terms.contact`. A pressure p
+    leaves a gap of r − p/k, or kr²/(4p) where that is below r/2. Friction has the stiffness k too: a vertex that sticks moves
+    by up to μN/(kA) before it slides.
+
+    Attributes:
+        distance: Contact distance r [m].
+        stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default 10 w/r with the weight w of the cloth
+            per area, so that the weight of one layer leaves a gap of 0.9 r.
+
+    Raises:
+        ValueError: If a value breaks a rule.
+    """
+
+    distance: float = 1e-3
+    stiffness: float | None = None
+
+    def __post_init__(self) -> None:
+        number("contact.distance", self.distance, above=0.0)
+        if self.stiffness is not None and not (np.ndim(self.stiffness) == 0 and self.stiffness > 0.0):
+            raise ValueError(f"contact.stiffness is {shown(self.stiffness)}; it must be above 0, or None")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Collider:
+    """The base of colliders.
+
+    Attributes:
+        position: Where its centre is, (3,) [m], or at the frames 0 … F−1 of the scene, (F, 3).
+        rotation: Quaternion (x, y, z, w) by which it is turned, (4,), or at these frames, (F, 4). Between frames it moves
+            linearly and turns at one speed, by the shorter way; after the last it stands still.
+        friction: Coefficient μ of friction.
+        name: Its name in messages and files; by default that of the class.
+
+    Raises:
+        ValueError: If a value breaks a rule.
+    """
+
+    position: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 0.0, 0.0))
+    rotation: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 0.0, 0.0, 1.0))
+    friction: float = 0.0
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.name is None or isinstance(self.name, str)):
+            raise ValueError(f"{type(self).__name__}.name is {shown(self.name)}; it must be a text or None")
+        number(f"{self.label}.friction", self.friction, least=0.0)
+        counts = []
+        for name, size in (("position", 3), ("rotation", 4)):
+            given = getattr(self, name)
+            frames = len(given) if np.ndim(given) == 2 else None
+            if frames == 0:
+                raise ValueError(f"{self.label}.{name} has no frame; it must have one or more, (F, {size})")
+            values = array(f"{self.label}.{name}", given, (size,) if frames is None else (frames, size))
+            counts += [] if frames is None else [frames]
+            object.__setattr__(self, name, values)
+        if len(set(counts)) > 1:
+            raise ValueError(f"{self.label} has {counts[0]} positions and {counts[1]} rotations; it must have as many of both")
+        length = np.linalg.norm(self.rotation, axis=-1)
+        if (np.abs(length - 1.0) > 1e-3).any():
+            raise ValueError(f"{self.label}.rotation has length {np.ravel(length)[0]:g}; quaternions must have length 1")
+
+    @property
+    def label(self) -> str:
+        """The name, or else that of the class."""
+        return self.name or type(self).__name__
+
+    @property
+    def core(self) -> tuple[np.ndarray, float]:
+        """Half sizes (3,) of the core box and the radius about it [m], see :mod:`warpcloth.kernels.terms.contact`."""
+        raise NotImplementedError  # each shape has its own
+
+    @property
+    def up(self) -> np.ndarray:
+        """The direction in the frame of ``rotation`` of the y axis in which :attr:`core` is, (3,)."""
+        return np.array([0.0, 1.0, 0.0])
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has more than one keyframe."""
+        return len(self.poses) > 1
+
+    @property
+    def poses(self) -> np.ndarray:
+        """Position and quaternion (x, y, z, w) of the frame in which :attr:`core` is, (F, 7), F = 1 if it stands."""
+        rotations = _product(np.atleast_2d(self.rotation), _from_y(self.up))
+        rotations = rotations / np.linalg.norm(rotations, axis=1)[:, None]
+        signs = np.sign(np.einsum("fi,fi->f", rotations[1:], rotations[:-1]))
+        rotations[1:] *= np.cumprod(np.where(signs < 0.0, -1.0, 1.0))[:, None]  # the shorter way
+        positions = np.atleast_2d(self.position)
+        frames = max(len(positions), len(rotations))
+        return np.column_stack([np.broadcast_to(positions, (frames, 3)), np.broadcast_to(rotations, (frames, 4))])
+
+    def distances(self, points: np.ndarray, frame: int = 0) -> np.ndarray:
+        """Signed distances (…,) [m] of points (…, 3) [m] to the surface at a frame, below 0 inside."""
+        pose, (half, radius) = self.poses[min(frame, len(self.poses) - 1)], self.core
+        local = _turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
+        if np.isinf(half[0]):
+            return local[..., 1]
+        away = np.abs(local) - half
+        return np.linalg.norm(np.maximum(away, 0.0), axis=-1) + np.minimum(away.max(axis=-1), 0.0) - radius
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plane(Collider):
+    """The half-space below a plane.
+
+    Attributes:
+        normal: The side on which the cloth is, (3,), turned by ``rotation``.
+        position: A point of the plane, (3,) or (F, 3) [m].
+    """
+
+    normal: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 1.0, 0.0))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "normal", _direction(f"{self.label}.normal", self.normal))
+
+    @property
+    def core(self) -> tuple[np.ndarray, float]:
+        return np.full(3, np.inf), 0.0
+
+    @property
+    def up(self) -> np.ndarray:
+        return self.normal
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sphere(Collider):
+    """A ball about ``position``.
+
+    Attributes:
+        radius: Its radius [m].
+    """
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        number(f"{self.label}.radius", self.radius, above=0.0)
+
+    @property
+    def core(self) -> tuple[np.ndarray, float]:
+        return np.zeros(3), float(self.radius)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Capsule(Collider):
+    """All that is nearer than ``radius`` to a segment, whose middle is ``position``.
+
+    Attributes:
+        radius: Its radius [m].
+        length: Length of the segment [m], without the caps.
+        axis: Direction of the segment (3,), turned by ``rotation``.
+    """
+
+    radius: float
+    length: float
+    axis: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 1.0, 0.0))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        number(f"{self.label}.radius", self.radius, above=0.0)
+        number(f"{self.label}.length", self.length, above=0.0)
+        object.__setattr__(self, "axis", _direction(f"{self.label}.axis", self.axis))
+
+    @property
+    def core(self) -> tuple[np.ndarray, float]:
+        return np.array([0.0, 0.5 * self.length, 0.0]), float(self.radius)
+
+    @property
+    def up(self) -> np.ndarray:
+        return self.axis
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Box(Collider):
+    """A box about ``position``, with edges along the axes turned by ``rotation``.
+
+    Attributes:
+        size: Lengths of its edges (3,) [m].
+    """
+
+    size: Converted[Sequence | np.ndarray, np.ndarray] = default((1.0, 1.0, 1.0))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        size = array(f"{self.label}.size", self.size, (3,))
+        if not (size > 0.0).all():
+            raise ValueError(f"{self.label}.size is {size.tolist()}; each length must be above 0")
+        object.__setattr__(self, "size", size)
+
+    @property
+    def core(self) -> tuple[np.ndarray, float]:
+        return 0.5 * self.size, 0.0
+
+
+def _direction(name, given):
+    """A vector of length 1."""
+    values = array(name, given, (3,))
+    length = np.linalg.norm(values)
+    if not length > 0.0:
+        raise ValueError(f"{name} is {values.tolist()}; it must not be 0")
+    return values / length
+
+
+def _from_y(direction):
+    """The quaternion (x, y, z, w) that turns the y axis to a direction by the shortest way."""
+    x, y, z = direction
+    if y < -1.0 + 1e-12:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    found = np.array([z, 0.0, -x, 1.0 + y])
+    return found / np.linalg.norm(found)
+
+
+def _product(p, q):
+    """Products of quaternions (F, 4) and (4,)."""
+    u, v = p[:, :3], q[:3]
+    vector = p[:, 3:] * v + q[3] * u + np.cross(u, v)
+    return np.column_stack([vector, p[:, 3] * q[3] - u @ v])
+
+
+def _turned(q, vectors):
+    """Vectors (…, 3) turned by a quaternion."""
+    t = 2.0 * np.cross(q[:3], vectors)
+    return vectors + q[3] * t + np.cross(q[:3], t)
+
+
+def default_stiffness(weight: float, distance: float) -> float:
+    """The stiffness k [Pa/m] that a weight per area [Pa] presses in by a tenth of the contact distance [m]."""
+    return weight / (_SAG * distance)
+
+
+def refuse_inside(colliders: Sequence[Collider], positions: np.ndarray, free: np.ndarray, copy: str = "") -> None:
+    """Refuses free vertices that start inside a collider.
+
+    Args:
+        colliders: The colliders.
+        positions: Where the vertices start, (n, 3) [m].
+        free: Which of them move, (n,).
+        copy: Words that follow, of a copy.
+
+    Raises:
+        ValueError: Naming the first one.
+    """
+    for collider in colliders:
+        found = collider.distances(positions)
+        for vertex in np.flatnonzero(free & ~(found > 0.0))[:1]:
+            raise ValueError(
+                f"vertex {vertex} starts {-found[vertex]:.3g} m inside the collider {collider.label}{copy}; it must be outside"
+            )
