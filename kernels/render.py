@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-# Of the size of the coordinates beside a point: what a ray starts above its surface, some ten roundings of float32.
+# Of the coordinates that a point is computed from: what a ray starts above its surface, some tens of roundings of float32.
 OFFSET = wp.constant(wp.float32(4e-6))
 FAR = wp.constant(wp.float32(1e30))
 # Of the light of the sky: what a ray brings that meets a surface instead.
@@ -71,6 +71,7 @@ class Sight:
     across: wp.vec3  # of the surface itself
     colour: wp.vec3
     share: wp.float32  # of the colour that light and shadow change; the rest is seen as it is
+    size: wp.float32  # of the coordinates that the point is computed from
     is_ground: wp.bool
     clear: wp.float32  # share of the background that is seen through the ground
 
@@ -213,6 +214,7 @@ def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: fl
     axis = (1.0 - along) * g.points[ends[0]] + along * g.points[ends[1]]
     s = Sight()
     s.distance = t
+    s.size = wp.max(size_of(g.points[ends[0]]), size_of(g.points[ends[1]])) + size_of(o)
     s.normal = wp.normalize(o + t * d - axis)
     s.across = s.normal
     s.point = axis + g.radii[tube] * s.normal
@@ -222,7 +224,7 @@ def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: fl
 
 
 @wp.func
-def see_triangle(g: Geometry, d: wp.vec3, t: float, face: int, u: float, v: float):
+def see_triangle(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, face: int, u: float, v: float):
     """The point of a triangle that a ray meets, from barycentric coordinates of its first two corners."""
     w = 1.0 - u - v
     a = g.points[g.triangles[3 * face]]
@@ -233,6 +235,7 @@ def see_triangle(g: Geometry, d: wp.vec3, t: float, face: int, u: float, v: floa
     nc = g.normals[3 * face + 2]
     s = Sight()
     s.distance = t
+    s.size = wp.max(size_of(a), wp.max(size_of(b), size_of(c))) + size_of(o)
     s.share = g.shares[face]
     s.colour = (
         u * g.colours[g.corner_colours[3 * face]]
@@ -275,10 +278,11 @@ def see(g: Geometry, light: Light, o: wp.vec3, d: wp.vec3):
     if tube >= 0:
         s = see_tube(g, o, d, t, tube, along)
     elif face >= 0:
-        s = see_triangle(g, d, t, face, u, v)
+        s = see_triangle(g, o, d, t, face, u, v)
     else:
         s.distance = t
         s.point = o + t * d
+        s.size = size_of(s.point) + size_of(o)
         s.normal = light.up
         s.across = light.up
         s.colour = light.ground_colour
@@ -357,7 +361,7 @@ def trace():
             if s.distance == FAR:
                 base += light.background
                 continue
-            offset = OFFSET * (size_of(s.point) + size_of(o))
+            offset = OFFSET * s.size
             sky_here, sun_here, seen_sky, seen_sun = light_at(
                 g, light, s.point, s.normal, s.across, offset, in_square + sample, square + in_square + sample
             )

@@ -246,6 +246,17 @@ def test_position_and_the_vertical_axis_do_not_matter(device):
     assert differ(picture(device, *scene("Z"), up_axis="Z"), reference, by=12) < 0.005
 
 
+@pytest.mark.parametrize("extent", [1.0, 1e4])
+@pytest.mark.parametrize("samples", [1, 3, 64])
+def test_a_flat_surface_does_not_hide_itself(device, extent, samples):
+    """However large its triangles are, and so their rounding: it is lit as evenly as it is flat."""
+    sheet = SQUARE[:, [0, 2, 1]] * [1.3 * extent, 1.0, extent] + [0.0, 0.3, 0.0]
+    tilted = sheet @ np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    camera = Camera((0.1, 2.0, 0.4), (0.2, 0.4, 0.1), fov=10.0)
+    image = RayCaster([Shape(4, HALVES)], 48, 32, samples, device=device).image([tilted], camera)
+    assert np.ptp(image.reshape(-1, 3), axis=0).max() <= 1
+
+
 def test_what_has_a_point_that_is_not_finite_is_left_out_and_counted(device):
     points, shape = scene()
     without = replace(
