@@ -42,6 +42,7 @@ turned = wc.deform(scene.mesh, wc.Pins([0], np.zeros((2, 1, 3)))).largest_angles
 solved = wc.Arap(mesh, [0]).solve([[0.0, 0.0, 1.0]]).points.max()
 R = wc.kabsch(mesh.points, mesh.points) @ np.eye(3)
 frame = wc.open_sequence("out.usdc")[0].max()
+film = wc.render(animation, "out.gif", size=(64, 36), colour="stretch_1", frames=(0, 3)).upper()
 name = usd.write_scene(usd.read_scene("in.usda"), "out.usda").upper()
 """
 # Every line is wrong by itself.
@@ -57,6 +58,7 @@ wc.Spring(stiffness="stiff")
 wc.PBD(substeps=2, stiffness="per-step")
 wc.Pins([0], keyframes=0.5).vertices.nothing
 wc.equilibrium(scene, linear="cholesky")
+wc.render("out.usdc", "out.png", size=64)
 scene.stage.prim
 wc.Sceen
 """

@@ -20,7 +20,7 @@ def lines_of(scene):
             thickness.
     """
     mesh = scene.mesh
-    lines = {}
+    lines: dict[str, tuple[np.ndarray, float]] = {}
     if not len(mesh.triangles) or not len(mesh.isolated):
         return lines
     loose = np.zeros(len(mesh.points), dtype=bool)
