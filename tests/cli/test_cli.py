@@ -42,19 +42,19 @@ def scene():
 """
 
 
-def test_a_run_writes_its_books(tmp_path, capfd, monkeypatch):
+def test_a_run_writes_its_history(tmp_path, capfd, monkeypatch):
     """The table has the energies and the summed reactions of each frame, the report those of each pin."""
     monkeypatch.chdir(tmp_path)
     options = ["--frames", "4", "--dtype", "float64", "-o", "a.usdc", "--csv", "a.csv", "--report", "a.json"]
     code, out, err = run(capfd, "run", *SMALL, *options, "--json")
     assert (code, err) == (0, "") and json.loads(out)["csv"] == "a.csv" and json.loads(out)["report"] == "a.json"
-    books = json.loads((tmp_path / "a.json").read_text())
+    history = json.loads((tmp_path / "a.json").read_text())
     rows = [line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines()]
     assert rows[0] == ["frame", "time", "Spring", "QuadraticBending", "kinetic", "gravity", *(f"reaction {x}" for x in "xyz")]
-    assert list(books["energies"]) == rows[0][2:6] and len(rows) == 6
+    assert list(history["energies"]) == rows[0][2:6] and len(rows) == 6
     assert [row[:2] for row in rows[1:3]] == [["0", "0.0"], ["1", str(1 / 60)]]
-    assert np.shape(books["reactions"]) == (5, len(books["pins"]), 3) == (5, 2, 3)
-    np.testing.assert_array_equal([[float(cell) for cell in row[6:]] for row in rows[1:]], np.sum(books["reactions"], axis=1))
+    assert np.shape(history["reactions"]) == (5, len(history["pins"]), 3) == (5, 2, 3)
+    np.testing.assert_array_equal([[float(cell) for cell in row[6:]] for row in rows[1:]], np.sum(history["reactions"], axis=1))
     refused(capfd, ["run", *SMALL, "-o", "b.usdc", "--csv", "x.csv", "--report", "x.csv"], "given for two outputs")
     refused(capfd, ["run", *SMALL, "-o", "b.usdc", "--report", "no/x.json"], "does not exist")
     hard = ["-p", "n=5", "stiffness=inf", "--frames", "2", "-o", "c.usdc", "--report", "c.json"]

@@ -4,14 +4,14 @@ import os
 import statistics
 
 from ..base.quiet import find_device
-from .books import EPILOG as OF_BOOKS
-from .books import record_of, write_books
+from .history_files import EPILOG as OF_HISTORY
+from .history_files import record_of, write_history
 from .render import check_drawing, draw_film
 from .setup import EPILOG as OF_STEPS
 from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
 from .terminal import Progress, check_writable, frames_folder_of, json_text, location, say
 
-EPILOG = f"{OF_STEPS}\n{OF_BOOKS}"
+EPILOG = f"{OF_STEPS}\n{OF_HISTORY}"
 
 
 def run(arguments):
@@ -47,7 +47,7 @@ def run(arguments):
         progress.close()
         status = animation.status
         if record:
-            write_books(arguments, scene, animation)
+            write_history(arguments, scene, animation)
         if arguments.film:
             draw_film([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
         facts = {

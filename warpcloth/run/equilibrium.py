@@ -15,7 +15,7 @@ from ..numerics.minimise import Minimiser
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
 from ..terms.refresh import Moment
-from .ledger import Books, checked_record
+from .history import Evaluation, checked_record
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
@@ -143,12 +143,12 @@ def equilibrium(
     status = Status(result, residual=residual, message=message, measure=RESIDUAL.measure, unit=unit)
     energies = reactions = None
     if record:
-        books = Books(model, forces="reactions" in record)
+        evaluation = Evaluation(model, forces="reactions" in record)
         if "energies" in record:
-            energies = {name: float(value[0]) for name, value in books.energies(base).items()}
+            energies = {name: float(value[0]) for name, value in evaluation.energies(base).items()}
         if "reactions" in record:
-            books.launch(base)
-            reactions = books.reactions()[0]
+            evaluation.launch(base)
+            reactions = evaluation.reactions()[0]
     return Equilibrium(np.array(base.numpy()), status, descent.used, lowest, result in SETTLED, energies, reactions)
 
 

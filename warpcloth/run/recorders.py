@@ -7,7 +7,7 @@ import numpy as np
 from ..scene.lines import lines_of
 from ..usd import AnimationWriter, FrameSequence
 from .checkpoint import NAME, Checkpoint
-from .ledger import energy_names
+from .history import energy_names
 
 REACTION = "reaction"  # name of the primvar
 
@@ -63,7 +63,7 @@ class File:
         single_file: Whether it is one file in the end.
         facts: Function that gives the :func:`warpcloth.run.checkpoint.facts_of` of the run.
         resume: Whether to go on with the run that was interrupted.
-        record: What else is recorded, of :data:`warpcloth.run.ledger.RECORDS`.
+        record: What else is recorded, of :data:`warpcloth.run.history.RECORDS`.
 
     Attributes:
         checkpoint: The :class:`warpcloth.run.checkpoint.Checkpoint` to go on from, or None.
@@ -77,15 +77,15 @@ class File:
         self._facts, self._found, self.checkpoint, self._ended = facts, None, None, False
         self._energies = primvar_names(energy_names(scene)) if "energies" in record else {}
         self._pins, self._vertices = scene.pins.vertices, len(scene.mesh.points)
-        books = dict.fromkeys(self._energies.values(), "double") | ({REACTION: "float3[]"} if "reactions" in record else {})
+        history = dict.fromkeys(self._energies.values(), "double") | ({REACTION: "float3[]"} if "reactions" in record else {})
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
             self.writer = AnimationWriter(
-                output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis, lines=lines, books=books
+                output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis, lines=lines, history=history
             )
         else:
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim, books=books)
+            self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim, history=history)
         self.saved = self.writer.saved
         if resume:
             try:
@@ -125,13 +125,13 @@ class File:
 
     def append(self, points, velocities, state=None, watch=None, recorded=None):
         """Adds a frame; with a checkpoint where it comes with the state and the watch and ends a chunk."""
-        self.writer.append(points, velocities, books=self._books(recorded or {}))
+        self.writer.append(points, velocities, history=self._history(recorded or {}))
         if state is not None and self.writer.kept == self.writer.frames:
             chunks, span = self.writer.written()
             frame = self.writer.frames - 1
             Checkpoint(frame, self._known(), chunks, span, state, watch.to_host()).write(self.writer.run)
 
-    def _books(self, recorded):
+    def _history(self, recorded):
         """Returns the recorded values of a frame by the names of their primvars."""
         found = {}
         if "energies" in recorded:

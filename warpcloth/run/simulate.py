@@ -24,7 +24,7 @@ from ..solvers.step import Step
 from ..usd import FrameSequence
 from .checkpoint import facts_of
 from .frames_ahead import state_of
-from .ledger import Ledger, checked_record
+from .history import History, checked_record
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
 
@@ -161,19 +161,19 @@ def simulate(
         stepper = solver.bind(model)
         timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds}
         watch, first = Watch(model, stepper), 0
-        ledger = watch.ledger = Ledger(stepper, model, record) if record else None
+        history = watch.history = History(stepper, model, record) if record else None
         if resume:
             first = _resume(recorder.checkpoint, frames, stepper, watch)
         else:
             points, velocities = state_of(stepper)
-            recorder.append(points, velocities, recorded=ledger and ledger.keep(watch.alive))
+            recorder.append(points, velocities, recorded=history and history.keep(watch.alive))
         timings["frames"] = watch.seconds
         if progress is not None:
             progress(first, frames)
-        given = ledger or stepper, watch, frames, _ahead(model, output), first, recorder.keeps
+        given = history or stepper, watch, frames, _ahead(model, output), first, recorder.keeps
         with closing(watched_frames(*given)) as found:
             for number, frame in found:
-                recorded = ledger and ledger.keep(watch.alive)
+                recorded = history and history.keep(watch.alive)
                 recorder.append(frame.points, frame.velocities, frame.state, watch, recorded)
                 if progress is not None:
                     progress(number, frames)
@@ -181,7 +181,7 @@ def simulate(
     status = watch.status(solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
-    recorded = ledger.by_name() if ledger else (None, None)
+    recorded = history.by_name() if history else (None, None)
     rest = output, scene, *recorded, of_copies(stepper.cut)
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), *rest)
 
@@ -193,8 +193,8 @@ def _resume(checkpoint, frames, stepper, watch):
         raise ValueError(f"frames is {frames}; the run to be resumed has {checkpoint.frame} already, and this must be no less")
     stepper.state.from_host(checkpoint.state)
     watch.from_host(checkpoint.watch, stepper.state)
-    if watch.ledger:
-        watch.ledger.go_on()
+    if watch.history:
+        watch.history.go_on()
     return checkpoint.frame
 
 

@@ -58,7 +58,7 @@ class Watch:
         growth: Largest energy of motion and height in a good frame, divided by what the sources can have put in, (B,).
         last: The last frame that was watched.
         seconds: What computing each frame took, a list.
-        ledger: The :class:`warpcloth.run.ledger.Ledger` of the run, if it has one.
+        history: The :class:`warpcloth.run.history.History` of the run, if it has one.
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
     """
 
@@ -70,7 +70,7 @@ class Watch:
         self.ends = scene.mesh.edges[scene.mesh.edge_lengths > 0.0].T.astype(np.intp)
         self.worst_strain, self.messages, self.seconds = np.zeros(model.copies), {}, []
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
-        self.growth, self.balance, self.ledger = np.zeros(model.copies), Balance(model, stepper), None
+        self.growth, self.balance, self.history = np.zeros(model.copies), Balance(model, stepper), None
 
     def passes(self, number, frame):
         """Whether any copy is still good; marks those that no longer are, and puts NaN in their place.
@@ -117,8 +117,8 @@ class Watch:
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
             yield source, source.carried
-        if self.ledger is not None:
-            yield self.ledger, self.ledger.carried
+        if self.history is not None:
+            yield self.history, self.history.carried
 
     def to_host(self):
         """All that it knows of the frames until now, as arrays by name."""

@@ -11,7 +11,7 @@ from ..core.capture import Mirror, Segment
 from ..core.status import Residual, Result
 from ..core.sums import RowSums, Sums
 from ..kernels import elementwise as kernels
-from ..kernels.ledger import add_scaled
+from ..kernels.work import add_scaled
 from ..model.model import Model
 from ..numerics.constraints import Constraints
 from ..numerics.iterate import GravityScale

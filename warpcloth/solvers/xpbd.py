@@ -11,7 +11,7 @@ from ..core.status import UNBALANCED, Residual, Result
 from ..core.sums import Sums
 from ..core.transpose import Transpose
 from ..fast.plan import plan
-from ..kernels import ledger
+from ..kernels import work
 from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..model.model import Model
@@ -202,9 +202,9 @@ class XPBDStepper(LaunchedStepper):
                     f"XPBD has no multipliers of {elements.label} at pinned vertices, so that what pins bear is not known; "
                     "ConstrainedDynamics has them"
                 )
-            data = ledger.multiplier_pull(*key).data()
+            data = work.multiplier_pull(*key).data()
             data.stencil, data.values, data.x, data.factor = elements.stencil, values, self.state.x, -1.0 / self.he**2
-            factories = ledger.scatter_multipliers, ledger.gather_multipliers
+            factories = work.scatter_multipliers, work.gather_multipliers
             pulls.append((Transpose(model, elements, *factories, *key), data))
 
         def launch(out):

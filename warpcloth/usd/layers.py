@@ -191,7 +191,7 @@ def bind_material(prim, material):
     UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
 
-def over_layer(source, prim, mesh, primvars, books):
+def over_layer(source, prim, mesh, primvars, history):
     """A layer of opinions on the artist's prim, to be animated: it says how to read normals, and has no points.
 
     The artist's default points stay the rest shape; only where there are none (samples alone) ours are given.
@@ -201,7 +201,7 @@ def over_layer(source, prim, mesh, primvars, books):
         prim: Path or name of the prim, or None.
         mesh: The `Mesh` that is simulated.
         primvars: Interpolation of those that will be sampled, by name; the artist's of the same name are blocked.
-        books: Types of those of the books, likewise.
+        history: Types of the primvars of the history of a run, likewise.
 
     Returns:
         The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, and real paths of all files of the
@@ -214,7 +214,7 @@ def over_layer(source, prim, mesh, primvars, books):
     stage, artist = artist_prim(surroundings, mesh)
     identity = np.array_equal(surroundings.transform, np.eye(4))
     target = artist_target(artist, surroundings, primvars, transform=None if identity else surroundings.transform)
-    target = replace(target, books=books)
+    target = replace(target, history=history)
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     over = Sdf.CreatePrimInLayer(layer, surroundings.prim)
     rest = target.samples({"points": surroundings.mesh.points})

@@ -29,7 +29,7 @@ class Target:
         face_triangles: Number of triangles of each face of the prim (F,), a hole 0, or None where each has one.
         vectors: Names of the vectors that are sampled, of `SAMPLED`; curves are drawn as tubes, which need no normals.
         primvars: Interpolation of each sampled primvar, "vertex" or "uniform", by name.
-        books: Type of each further primvar that is sampled, by name: "float3[]" of vertices, or "double" of the whole cloth,
+        history: Type of each further primvar that is sampled, by name: "float3[]" of vertices, or "double" of the whole cloth,
             in SI and in world space whatever the prim is in.
         coloured: Name of the primvar that a sampled displayColor shows, or None: no colours are sampled.
     """
@@ -43,14 +43,14 @@ class Target:
     vectors: tuple = tuple(SAMPLED)
     primvars: dict = field(default_factory=dict)
     coloured: str | None = None
-    books: dict = field(default_factory=dict)
+    history: dict = field(default_factory=dict)
 
     @property
     def attributes(self):
         """Types of the sampled attributes by name."""
         own = {name: SAMPLED[name] for name in self.vectors if name != "normals" or len(self.triangles)}
         own |= {f"primvars:{name}": "float[]" for name in self.primvars}
-        own |= {f"primvars:{name}": type_name for name, type_name in self.books.items()}
+        own |= {f"primvars:{name}": type_name for name, type_name in self.history.items()}
         own |= {DISPLAY_COLOUR: "color3f[]"} if self.coloured else {}
         return {name: Sdf.ValueTypeNames.Find(type_name) for name, type_name in own.items()}
 
@@ -62,10 +62,10 @@ class Target:
                 Sdf.AttributeSpec(prim, name, self.attributes[name])
             if name.startswith("primvars:"):
                 shown = self.coloured if name == DISPLAY_COLOUR else name.removeprefix("primvars:")
-                of_books = "constant" if self.books.get(shown) == "double" else "vertex"
-                prim.attributes[name].SetInfo("interpolation", self.primvars.get(shown, of_books))
+                of_history = "constant" if self.history.get(shown) == "double" else "vertex"
+                prim.attributes[name].SetInfo("interpolation", self.primvars.get(shown, of_history))
 
-    def samples(self, vectors, primvars=None, colours=None, books=None):
+    def samples(self, vectors, primvars=None, colours=None, history=None):
         """The attribute values of a frame.
 
         Args:
@@ -73,7 +73,7 @@ class Target:
             primvars: Values by name, (n,) or, where uniform, one for each triangle (T,). NaN is a value that is not known: a
                 face has the mean of the others.
             colours: (n, 3) or (T, 3), as the primvar that they show; a face has the mean over its triangles with a value.
-            books: Values by name, (n, 3) or a number. NaN is a value that is not known.
+            history: Values by name, (n, 3) or a number. NaN is a value that is not known.
 
         Returns:
             dict: An array of pxr for each of `attributes`.
@@ -81,8 +81,8 @@ class Target:
         own = self._vectors(vectors)
         for name, values in (primvars or {}).items():
             own[f"primvars:{name}"] = Vt.FloatArray.FromNumpy(self._shown(values, name, np.isfinite(values)))
-        for name, value in (books or {}).items():
-            if self.books[name] == "double":
+        for name, value in (history or {}).items():
+            if self.history[name] == "double":
                 own[f"primvars:{name}"] = float(value)
             else:
                 value = value if self.point_vertices is None else value[self.point_vertices]

@@ -47,7 +47,7 @@ class AnimationWriter(ChunkWriter):
         metadata: Mapping[str, object] | None = None,
         primvars: Mapping[str, Interpolation] | None = None,
         lines: Mapping[str, tuple[np.ndarray, float]] | None = None,
-        books: Mapping[str, str] | None = None,
+        history: Mapping[str, str] | None = None,
     ) -> None:
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
@@ -66,7 +66,7 @@ class AnimationWriter(ChunkWriter):
                 vertex, or "uniform", one for each triangle.
             lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth;
                 `lines.lines_of` finds those of a scene. Not allowed with a source.
-            books: Type of each primvar of the books of a run, by name: "float3[]", a vector for each vertex, or "double", a
+            history: Type of each primvar of the history of a run, by name: "float3[]", a vector for each vertex, or "double", a
                 number of the whole cloth.
 
         Raises:
@@ -76,20 +76,20 @@ class AnimationWriter(ChunkWriter):
         super().__init__(output, mesh, chunk)
         up_axis = up_axis or mesh.up_axis or "Y"
         check_scene(fps, up_axis)
-        primvars, books = dict(primvars or {}), dict(books or {})
-        check_primvars(primvars | dict.fromkeys(books, "vertex"), mesh)
+        primvars, history = dict(primvars or {}), dict(history or {})
+        check_primvars(primvars | dict.fromkeys(history, "vertex"), mesh)
         self._start, files, refit = 0.0, (), None
         if source is None:
             rest, target, root_metadata = scene_layer(mesh, pins, up_axis, prim or "Cloth")
-            target = replace(target, primvars=primvars, books=books)
+            target = replace(target, primvars=primvars, history=history)
             # Clips have samples alone; a name, type and interpolation have to stand on the stage itself.
-            target.declare(rest, [f"primvars:{name}" for name in (*primvars, *books)])
+            target.declare(rest, [f"primvars:{name}" for name in (*primvars, *history)])
             targets = [target, *define_lines(rest, mesh, lines or {})]
         else:
             for name, given in (("pins", pins), ("lines", lines)):
                 if given:
                     raise ValueError(f"{name}: a source has its own, and a layer over it writes none; leave them out")
-            rest, target, root_metadata, stage, files = over_layer(source, prim, mesh, primvars, books)
+            rest, target, root_metadata, stage, files = over_layer(source, prim, mesh, primvars, history)
             targets = [target]
             if stage.start is not None:
                 self._start = stage.start * fps / stage.time_codes_per_second
@@ -105,7 +105,7 @@ class AnimationWriter(ChunkWriter):
         points: np.ndarray,
         velocities: np.ndarray,
         primvars: Mapping[str, ArrayLike] | None = None,
-        books: Mapping[str, ArrayLike] | None = None,
+        history: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         """Adds a frame; every `chunk` frames they are written.
 
@@ -113,7 +113,7 @@ class AnimationWriter(ChunkWriter):
             points: (n, 3) [m], world space.
             velocities: (n, 3) [m/s].
             primvars: Values by name of all primvars that were declared, (n,) or, where uniform, (T,).
-            books: Values by name of all books that were declared, (n, 3) or a number, in SI and in world space.
+            history: Values by name of all that `history` declared, (n, 3) or a number, in SI and in world space.
 
         Raises:
             ValueError: Other primvars than declared, a wrong shape, or a value that is not finite as float32, with the
@@ -121,7 +121,7 @@ class AnimationWriter(ChunkWriter):
         """
         self._check_open()
         vectors = {"points": self._checked("points", points), "velocities": self._checked("velocities", velocities)}
-        values = [(self._checked_primvars(primvars), None, books), *[({},)] * (len(self._targets) - 1)]
+        values = [(self._checked_primvars(primvars), None, history), *[({},)] * (len(self._targets) - 1)]
         samples = {
             f"{target.prim}.{name}": value
             for target, own in zip(self._targets, values, strict=True)

@@ -1,4 +1,4 @@
-"""The books of a run: energies, works and the reactions at pins, frame by frame, where they are asked for."""
+"""The history of a run: energies, work and the reactions at pins, frame by frame, where they are asked for."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from ..core.capture import Segment
 from ..core.energy import Energy
 from ..core.sums import Sums
 from ..fast.plan import plan
-from ..kernels import ledger as kernels
+from ..kernels import work as kernels
 from ..model.damping import dissipations
 from ..scene.scene import Scene
 from ..terms.refresh import STEP, Moment
@@ -50,7 +50,7 @@ def energy_names(scene):
     return found + others
 
 
-class Books:
+class Evaluation:
     """Energies of a model and the forces of its pins, at any positions.
 
     Args:
@@ -133,8 +133,8 @@ class Books:
         return array.numpy().astype(np.float64).reshape(*self._mass.shape, 3)
 
 
-class Ledger:
-    """Stands in for a stepper and keeps its books: finds what is recorded after each frame, at which it is left as it was.
+class History:
+    """Wraps a stepper and records energies and reactions after each frame, without changing its state.
 
     Work that depends on the path, that of moving pins and of loads that change or follow the cloth, is summed in every step,
     and steps are then launched one by one; frames stay equal to the bit. What holds or drives the cloth besides pins and loads,
@@ -164,29 +164,29 @@ class Ledger:
         self._moving, self._driven = ("energies" in record and each for each in (model.scene.pins.moves, changing))
         forces = "reactions" in record or self._moving
         self._hidden = forces and any(elements.hard for elements in model.terms)
-        self._books = Books(model, stepper.h, stepper.constraint_forces() if self._hidden else None, forces)
+        self._evaluation = Evaluation(model, stepper.h, stepper.constraint_forces() if self._hidden else None, forces)
         self._found, self._rows, self._frame = deque(), {name: [] for name in RECORDS}, 0
-        self.names = self._books.names
+        self.names = self._evaluation.names
         self._total, self._each_step = np.zeros((2, model.copies)), None
         x, v = stepper.state
         if self._moving or self._driven:
-            self._kinetic = self._books.kinetic_of_pins(v)
+            self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
         self._note()
 
     def _recorded_step(self, x, v):
         """Allocates what is summed in every step, and records its launches."""
-        model, books = self.model, self._books
+        model, evaluation = self.model, self._evaluation
         self._before = before = kernels.past(model.dtype)()
         before.x, before.gradient, before.force = (model.vectors() for _ in range(3))
         self._works = [wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2)]
-        held, gradient = (books.mask(), books.gradient) if self._moving else (None, None)
+        held, gradient = (evaluation.mask(), evaluation.gradient) if self._moving else (None, None)
         force, kernel = None if model.loads is None else model.loads.force, model.kernel(kernels.add_work, model.dtype)
         share = 0.5 if self._stepper.loads_at_end else 0.0
 
         def launch():
             if self._moving:
-                books.launch(x, v)
+                evaluation.launch(x, v)
             given = [model.mass, model.gravity, held, x, gradient, force, model.per_copy, share]
             model.launch(kernel, model.count, given, [before, *self._works])
 
@@ -200,8 +200,8 @@ class Ledger:
             loads.launch(self.model, Moment(x, ahead=self._frame))
             wp.copy(before.force, loads.force)
         if self._moving:
-            self._books.launch(x, v)
-            wp.copy(before.gradient, self._books.gradient)
+            self._evaluation.launch(x, v)
+            wp.copy(before.gradient, self._evaluation.gradient)
 
     def __getattr__(self, name):
         return getattr(self._stepper, name)
@@ -223,19 +223,19 @@ class Ledger:
 
     def _note(self):
         """Finds what is recorded of the present state."""
-        books, loads, (x, v), found = self._books, self.model.loads, self._stepper.state, {}
+        evaluation, loads, (x, v), found = self._evaluation, self.model.loads, self._stepper.state, {}
         if "energies" in self._record:
-            energies = books.energies(x, v)
+            energies = evaluation.energies(x, v)
             if self._moving:
-                energies["work of pins"] = self._total[0] + books.kinetic_of_pins(v) - self._kinetic
+                energies["work of pins"] = self._total[0] + evaluation.kinetic_of_pins(v) - self._kinetic
             if self._driven:
                 energies["work of loads"] = self._total[1].copy()
             found["energies"] = np.stack([energies[name] for name in self.names], axis=-1)
         if "reactions" in self._record:
             if loads is not None:
                 loads.launch(self.model, Moment(x, ahead=self._frame))
-            books.launch(x, v)
-            found["reactions"] = books.reactions()
+            evaluation.launch(x, v)
+            found["reactions"] = evaluation.reactions()
             if self._hidden and not self._frame:  # multipliers are those of a step
                 found["reactions"][:] = np.nan
         self._found.append((found, self._total.copy()))

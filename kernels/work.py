@@ -1,4 +1,4 @@
-"""Factories of the kernels that keep the books of a run: forces of multipliers, work of pins and loads."""
+"""Factories of kernels for the forces of multipliers and for the work of pins and loads."""
 
 from functools import cache
 
@@ -51,7 +51,7 @@ def add_scaled(dtype):
     """Kernel over vertices: out += factor·a."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.ledger.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
     def add(
         # state in
         a: wp.array(dtype=vec3),
@@ -71,7 +71,7 @@ def step_back(dtype):
     """Kernel over vertices: d = h v, before = x − d, from where a step at the present velocity would lead to x."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.ledger.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
     def back(
         # state in
         x: wp.array(dtype=vec3),
@@ -117,7 +117,7 @@ def add_work(dtype):
     def product(a: vec3, b: vec3):
         return wp.float64(a[0]) * wp.float64(b[0]) + wp.float64(a[1]) * wp.float64(b[1]) + wp.float64(a[2]) * wp.float64(b[2])
 
-    @wp.kernel(module=f"warpcloth.ledger.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
     def add(
         # elements
         mass: wp.array(dtype=dtype),

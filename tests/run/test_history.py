@@ -11,7 +11,7 @@ import warpcloth as wc
 from support import setups
 from support.setups import square
 from support.usd_validation import validate
-from warpcloth.run.ledger import Books
+from warpcloth.run.history import Evaluation
 from warpcloth.usd import read_scene, write_scene
 from warpcloth.usd.stage import find_prim
 
@@ -99,7 +99,7 @@ ORDERS = {"explicit": 2, "newton": 2, "newton midpoint": 4, "newton bdf2": 4, "x
 @pytest.mark.parametrize("name", ORDERS)
 @pytest.mark.parametrize("driven", ["pins", "loads"])
 def test_energies_and_works_balance_to_the_order_of_the_scheme(name, driven, device):
-    """Moved pins, or a pressure and a force that change; the motion is the same to the bit as without the books."""
+    """Moved pins, or a pressure and a force that change; the motion is the same to the bit as without a history."""
     if driven == "pins":
         cloth = lifted()
     else:
@@ -296,9 +296,9 @@ def test_books_follow_the_order_of_the_vertices(device):
     found = []
     for order in (None, rng.permutation(36)):
         model = cloth.build(device=device, dtype="float64", order=order)
-        books, x = Books(model), model.array(model.positions.numpy() * 1.1, model.vec3)
-        books.launch(x)
-        found.append((books.reactions(), np.array(list(books.energies(x).values()))))
+        evaluation, x = Evaluation(model), model.array(model.positions.numpy() * 1.1, model.vec3)
+        evaluation.launch(x)
+        found.append((evaluation.reactions(), np.array(list(evaluation.energies(x).values()))))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
     assert np.abs(found[0][0]).max() > 1.0 and found[0][1][-1] != 0.0

@@ -1,4 +1,4 @@
-"""The books of a run as files: energies and reactions at pins, frame by frame."""
+"""The history of a run as files: energies and reactions at pins, frame by frame."""
 
 import numpy as np
 
@@ -6,8 +6,9 @@ from ..base.outputs import TEXT, Output, check_apart, write_table
 from .terminal import check_writable, json_text
 
 EPILOG = """\
-Books: --csv and --report record the energies and the reactions at pins of every frame. The table has the energies [J] and the
-sum of all reactions [N]; the report also has the reaction of each pin. What is not known is an empty cell, or null.
+Energies and reactions: --csv and --report record the energies and the reactions at pins of every frame. The table has the
+energies [J] and the sum of all reactions [N]; the report also has the reaction of each pin. What is not known is an empty cell,
+or null.
 """
 
 
@@ -21,7 +22,7 @@ def record_of(arguments):
     return ("energies", "reactions") if files else ()
 
 
-def write_books(arguments, scene, animation):
+def write_history(arguments, scene, animation):
     """Writes the table and the report of a run that recorded both."""
     energies, reactions = animation.energies, animation.reactions
     if arguments.csv:
