@@ -12,6 +12,7 @@ at once before it runs a command. No other part of the package defers an import 
 
 import argparse
 import contextlib
+import re
 import sys
 import traceback
 import warnings
@@ -88,6 +89,11 @@ def _sentence(error, debug):
 
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        # argparse would take "-1e-3", "-1,0,0" and "-1:2" for options, before Python 3.14.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def parse_known_args(self, args=None, namespace=None):
         self._given = args or ()

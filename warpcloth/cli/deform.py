@@ -2,7 +2,6 @@
 
 import argparse
 import math
-import re
 import statistics
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,8 +48,6 @@ class _Move:
 
 def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
-    # argparse would take "-1e-3" and "-1,0,0" for options, before Python 3.14.
-    parser._negative_number_matcher = re.compile(r"-\.?\d")
     text = "a mesh file, a USD stage, or a scene with moving pins (a name or a .py file)"
     parser.add_argument("mesh", metavar="MESH", help=text)
     hold = "vertices to hold in place; may be repeated"
