@@ -258,8 +258,8 @@ def _open_npz(path, fps):
         times = archive["times"] if "times" in archive.files and fps is None else None
     with _numpy_reads():
         points = _mapped(path, "points.npy")
-    if points.ndim != 3:
-        raise ValueError(f"points has shape {points.shape}; it must be (frames, vertices, 3)")
+    if points.ndim != 3 or not len(points):
+        raise ValueError(f"points has shape {points.shape}; it must be (frames, vertices, 3), of one frame or more")
     mesh = Surface(points[0], triangles)
     count, read, precision = _array("points", points, mesh)
     times = _even(count, fps) if times is None else _increasing(times, count)

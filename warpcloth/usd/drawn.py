@@ -19,6 +19,7 @@ from .stage import (
     open_stage,
     pins_of,
     placed,
+    refuse_moving_topology,
 )
 from .values import array_of, check_composed, sentences, time_codes_of
 
@@ -84,7 +85,7 @@ def read_drawn(path, prim=None):
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no stage or shows neither a mesh nor linear curves; there is no such prim; a prim is broken.
+        ValueError: It is no stage or shows no mesh, solid or linear curves; there is no such prim; a prim is broken.
     """
     with sentences(path):
         stage = open_stage(path)
@@ -96,11 +97,12 @@ def read_drawn(path, prim=None):
         codes = {each: _codes(each) for each in found}
         moving = [each for each in found if len(codes[each]) > 1]
         moving = [each for each in moving if each.IsA(UsdGeom.PointBased)]
-        cloths = [chosen] if chosen else moving or [each for each in found if each.IsA(UsdGeom.PointBased)]
+        moving = [each for each in moving if len(time_codes_of(UsdGeom.PointBased(each).GetPointsAttr())) > 1] or moving
+        cloths = [chosen] if chosen else moving or [each for each in found if each.IsA(UsdGeom.PointBased)] or found
         prims = [_drawn(each, path, each in cloths, codes[each]) for each in found]
         prims = [each for each in prims if each is not None]
         if not prims:
-            raise ValueError(f"{path}: has no Mesh prim and no linear curves with points; there is nothing to draw")
+            raise ValueError(f"{path}: shows no Mesh prim, solid or linear curves with points; there is nothing to draw")
         times = sorted({code for each in prims if each.cloth for code in each.codes})
         times = times or sorted({code for each in prims for code in each.codes}) or [0.0]
         return DrawnStage(prims, np.array(times), stage.GetTimeCodesPerSecond(), str(UsdGeom.GetStageUpAxis(stage)), stage)
@@ -160,6 +162,8 @@ def _drawn(prim, path, cloth, codes):
             raise ValueError(f"{where}: has no points")
         return None
     try:
+        if solid is None:
+            refuse_moving_topology(prim)
         if solid is not None:
             triangles, edges, radius = np.asarray(solid.faces, np.int32), np.empty((0, 2), np.int32), 0.0
         elif prim.IsA(UsdGeom.Mesh):

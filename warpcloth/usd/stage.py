@@ -81,7 +81,7 @@ def _stage_mesh(stage, path, prim, kind, time):
     try:
         points = placed(_rest_points(found, where, time), transform)
         if time is None:
-            _refuse_moving_topology(found)
+            refuse_moving_topology(found)
         if found.IsA(UsdGeom.Mesh):
             corners, triangles = face_corners(found, len(points))
             if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # only the sign, because the determinant may overflow
@@ -332,8 +332,12 @@ def refuse_change(name, now, fixed, code):
         raise ValueError(f"{name}[{first}] is {now[first]} at time code {code:g}, must stay {fixed[first]}")
 
 
-def _refuse_moving_topology(prim):
-    """Refuses faces or curves that change over time: a cloth has one topology."""
+def refuse_moving_topology(prim):
+    """Refuses faces or curves that change over time: a cloth has one topology.
+
+    Raises:
+        ValueError: They change; the message names the first entry that does.
+    """
     if prim.IsA(UsdGeom.Mesh):
         mesh = UsdGeom.Mesh(prim)
         sampled = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr())
