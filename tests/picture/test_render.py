@@ -18,7 +18,8 @@ from warpcloth.picture.colour import Scale
 from warpcloth.picture.films import durations
 from warpcloth.picture.measured import scale_of
 from warpcloth.picture.overlay import Overlay, round_numbers, written
-from warpcloth.picture.subjects import subject_of
+from warpcloth.picture.shape import CLOTH
+from warpcloth.picture.subjects import SURROUNDINGS, subject_of
 from warpcloth.run import recorders
 from warpcloth.usd import AnimationWriter
 
@@ -354,6 +355,37 @@ def test_values_of_ones_own_and_of_vertices_are_colours(folder, tmp_path):
         wc.render(MOTION, path, mesh=MESH, colour=np.zeros((2, 3)), **SMALL)
 
 
+@pytest.mark.parametrize("values", [np.full(16, np.nan), np.where(np.arange(16) % 2, np.inf, 1.0), np.arange(16) > 3])
+def test_values_that_are_not_finite_do_not_count_for_the_scale(values, tmp_path):
+    path = tmp_path / "out.png"
+    wc.render(MESH, path, colour=values[None], **SMALL)
+    assert np.ptp(picture(path)) > 10
+
+
+def test_what_is_not_drawn_is_not_in_the_way_of_the_camera(tmp_path):
+    """Points without triangles, and nothing else, are all that differs."""
+    more = wc.Mesh(np.vstack([MESH.points, [[50.0, -20.0, 3.0]]]), MESH.triangles)
+    for name, mesh in (("a.png", MESH), ("b.png", more)):
+        wc.render(mesh, tmp_path / name, **SMALL)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_what_moves_as_a_whole_is_beside_a_cloth(tmp_path, capfd):
+    """The one mesh whose points move is the cloth, also where it is coloured; a solid alone is drawn."""
+    path = tmp_path / "both.usda"
+    turning = "double3 xformOp:translate.timeSamples = {1: (0, 0, -10), 3: (0, 0, -20)}"
+    path.write_text(
+        STAGE.replace("double3 xformOp:translate = (0, 0, -10)", turning).replace('type = "linear"', 'type = "cubic"')
+    )
+    subject = subject_of(path)
+    first, *others = [tuple(shape.colour) for shape in subject.shapes]
+    assert first == CLOTH and set(others) == {SURROUNDINGS}
+    options = ("--colour", "stretch_1", "--range", "-1e-3", "1e-3", *SIZE)
+    assert run(capfd, "render", path, "-o", tmp_path / "a.png", *options)[0] == 0
+    (tmp_path / "ball.usda").write_text('#usda 1.0\ndef Sphere "Ball"\n{\n}\n')
+    wc.render(tmp_path / "ball.usda", tmp_path / "a.png", **SMALL)
+
+
 def test_the_bar_has_round_numbers_and_fits(folder):
     assert round_numbers(0.93, 1.07, 6).tolist() == pytest.approx([0.95, 1.0, 1.05])
     assert round_numbers(0.0, 1.0, 6).tolist() == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
@@ -434,6 +466,11 @@ def test_the_command_draws(folder, tmp_path, capfd):
         (("CLOTH", "-o", "a.gif", "--frames", "1-2"), "'1-2' is no range"),
         (("CLOTH", "-o", "a.gif", "--every", "0"), "every is 0"),
         (("CLOTH", "-o", "a.gif", "--speed", "0"), "speed is 0.0"),
+        (("CLOTH", "-o", "a.gif", "--speed", "1e-5"), "shown for 4.17e+03 s; a .gif can show one for 0.01 to 655 s"),
+        (("CLOTH", "-o", "a.mp4", "--speed", "1e9"), "shown for 4.17e-11 s; a .mp4 can show one for 1e-06 to 1000 s"),
+        (("ZERO", "-o", "a.png"), "points has shape (0, 16, 3); it must be (frames, vertices, 3), of one frame or more"),
+        (("NAN", "-o", "a.png"), "nan.npz: no point of the frames is finite"),
+        (("CHANGING", "-o", "a.png"), "faceVertexIndices[1] is 2 at time code 1, must stay 1"),
         (("CLOTH", "-o", "a.png", "--zoom", "-1"), "zoom is -1.0"),
         (("CLOTH", "-o", "a.png", "--samples", "0"), "samples is 0"),
         (("CLOTH", "-o", "a.png", "--colour", "strech_1"), "colour is 'strech_1'; it must be one of"),
@@ -457,16 +494,28 @@ def test_what_cannot_be_drawn_is_refused_in_a_sentence(argv, fragment, folder, t
     (tmp_path / "empty").mkdir()
     (tmp_path / "bare.usda").write_text('#usda 1.0\ndef Xform "World"\n{\n}\n')
     (tmp_path / "text.png").write_text("no picture")
+    moving = "int[] faceVertexIndices.timeSamples = {0: [0, 1, 2, 3], 1: [0, 2, 1, 3]}"
+    (tmp_path / "changing.usda").write_text(STAGE.replace("int[] faceVertexIndices = [0, 1, 2, 3]", moving))
+    np.savez(tmp_path / "zero.npz", points=MOTION[:0], triangles=MESH.triangles)
+    np.savez(tmp_path / "nan.npz", points=np.full_like(MOTION, np.nan), triangles=MESH.triangles)
+    before = sorted(os.listdir(tmp_path))
     files = {"CLOTH": folder / "cloth.usdc", "CHAIN": folder / "chain.usdc", "NPY": folder / "cloth.npy"}
     files |= {"EMPTY": "empty", "BARE": "bare.usda", "PNG": "text.png"}
+    files |= {"ZERO": "zero.npz", "NAN": "nan.npz", "CHANGING": "changing.usda"}
     refused(capfd, ["render", *(files.get(word, word) for word in argv)], fragment)
-    assert sorted(os.listdir(tmp_path)) == ["bare.usda", "empty", "text.png"]
+    assert sorted(os.listdir(tmp_path)) == before
 
 
 @pytest.mark.parametrize(
     ("source", "options", "message"),
     [
         (MESH, {"output": "a.png", "copy": 1}, "copy is 1; the source is one cloth"),
+        (MOTION[:0], {"output": "a.png", "mesh": MESH}, "frames is empty; there must be one at least"),
+        (MOTION, {"output": "a.png", "mesh": 3}, "mesh is 3; it must be a Mesh"),
+        (MESH, {"output": "a.png", "up_axis": "X"}, "up_axis is 'X'; it must be one of 'Y', 'Z'"),
+        (MESH, {"output": "a.png", "colour": {}}, "colour has 0 entries; it must be one text with its values"),
+        ([MESH] * 2, {"output": "a.png", "colour": [np.zeros((1, 16))]}, "colour has 1 arrays; it must have one for each"),
+        (MESH, {"output": "a.png", "colour": np.full((1, 16), "a")}, "colour has type <U1; it must be real numbers"),
         (3, {"output": "a.png"}, "source is 3; it must be a path, an Animation"),
         (MOTION, {"output": "a.png"}, "source is ndarray; arrays need their mesh"),
         (MOTION[:, :3], {"output": "a.png", "mesh": MESH}, r"frames have shape \(3, 3\); they must be \(16, 3\)"),

@@ -19,6 +19,9 @@ SHORTEST = 0.02
 _QUALITY = {"crf": "16", "preset": "slow", "x264-params": "mbtree=0"}
 # IEC 61966-2-1 (sRGB) on the primaries of Rec. 709, with the matrix of Rec. 709, 16 to 235.
 _PRIMARIES, _TRANSFER, _MATRIX, _RANGE = 1, 13, 1, 1
+# Seconds that a picture is shown: the longest of a GIF, which holds 16 bits of hundredths, and the shortest of an .mp4, whose
+# inverse is its rate.
+_INTERVALS = {".gif": (0.01, 655.0), ".mp4": (1e-6, 1000.0)}
 # Of each channel, in which the colours of a GIF are counted.
 _BINS = 64
 
@@ -46,6 +49,26 @@ def check_film(path, size):
             raise ValueError(f"size is {width}x{height}; a film in .mp4 must have even numbers, such as {even}")
         if not importlib.util.find_spec("av"):
             raise ImportError("films in .mp4 need PyAV: pip install -e '.[video]' in the checkout; .gif and .png need nothing")
+
+
+def check_times(path, times):
+    """Refuses a film whose pictures are shown for longer or shorter than its format can say.
+
+    Args:
+        path: The file.
+        times: When each picture is shown [s], rising (F,).
+
+    Raises:
+        ValueError: An interval is beyond what the format holds.
+    """
+    ending, intervals = Path(path).suffix.lower(), np.diff(times)
+    if not len(intervals) or ending not in _INTERVALS:
+        return
+    found = intervals.max() if ending == ".gif" else intervals.min()
+    least, most = _INTERVALS[ending]
+    if not least <= found <= most:
+        rule = f"a {ending} can show one for {least:g} to {most:g} s, so that speed must be another"
+        raise ValueError(f"{path}: a picture would be shown for {found:.3g} s; {rule}")
 
 
 def open_film(path, size, times):

@@ -116,6 +116,8 @@ class GivenScalar:
         shape = subject.shapes[subject.coloured]
         self.values = values if hasattr(values, "shape") else np.asarray(values)
         counts = (shape.count, len(shape.triangles))
+        if self.values.dtype.kind not in "fiub":
+            raise ValueError(f"colour has type {self.values.dtype}; it must be real numbers")
         if self.values.ndim != 2 or len(self.values) != len(subject) or self.values.shape[1] not in counts:
             rule = f"({len(subject)}, {counts[0]}) of vertices or ({len(subject)}, {counts[1]}) of triangles"
             raise ValueError(f"colour has shape {self.values.shape}; it must be {rule} in all frames")
@@ -123,7 +125,9 @@ class GivenScalar:
 
     def scale(self, others, given, colormap):
         if given is None:
-            ends = [np.nanpercentile(row, [0, 1, 5, 25, 50, 75, 95, 99, 100]) for one in (self, *others) for row in one.values]
+            rows = (np.asarray(row, dtype=np.float64) for one in (self, *others) for row in one.values)
+            finite = [row for row in (row[np.isfinite(row)] for row in rows) if row.size]
+            ends = [np.percentile(row, [0, 1, 5, 25, 50, 75, 95, 99, 100]) for row in finite]
             given = range_over([SimpleNamespace(percentiles=each) for each in ends])
         return Scale(*given, None, colormap)
 

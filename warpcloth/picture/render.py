@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import array, number, shown, whole
+from ..base.checks import array, choice, number, shown, whole
 from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart
 from ..base.types import FilePath, Progress, UpAxis
 from ..mesh.mesh import Mesh
 from .camera import Camera
 from .colour import check_colormap
-from .films import SHORTEST, STILL, check_film, open_film
+from .films import SHORTEST, STILL, check_film, check_times, open_film
 from .measured import GivenScalar, MeasuredScalar, analyzers_of
 from .overlay import Overlay
 from .raycast import BACKGROUND, RayCaster
@@ -118,6 +118,10 @@ def render(
     if fps is not None:
         number("fps", fps, above=0.0)
     whole("every", every, 1)
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise ValueError(f"mesh is {shown(mesh)}; it must be a Mesh")
+    if up_axis is not None:
+        choice("up_axis", up_axis, ("Y", "Z"))
     if not isinstance(ground, bool | np.bool_):
         number("ground", ground)
     if colour_range is not None:
@@ -131,9 +135,10 @@ def render(
         raise ValueError("source: one is Y up and the other Z up; two that are drawn side by side must have one up axis")
     check_apart([output], [path for each in subjects for path in each.files])
     shots = _shots(subjects, Path(output).suffix.lower(), frame, frames, every, speed)
+    times = [shot.time for shot in shots]
+    check_times(output, times)
     values, scale = _colours(subjects, colour, colour_range, colormap, mesh, device, measuring)
     picture = _Picture(subjects, shots, size, samples, (azimuth, elevation, zoom), ground, values, scale, device)
-    times = [shot.time for shot in shots]
     with open_film(output, size, times) as film:
         try:
             if progress is not None:
@@ -265,8 +270,12 @@ def _colours(subjects, colour, given, colormap, rest, device, measuring):
         options = dict(measuring or {})
         values = [MeasuredScalar(analyzers_of(each, colour, rest, device, options), colour) for each in subjects]
     else:
+        if isinstance(colour, Mapping) and len(colour) != 1:
+            raise ValueError(f"colour has {len(colour)} entries; it must be one text with its values")
         ((title, given_values),) = colour.items() if isinstance(colour, Mapping) else [("", colour)]
         arrays = [given_values] if len(subjects) == 1 else list(given_values)
+        if len(arrays) != len(subjects):
+            raise ValueError(f"colour has {len(arrays)} arrays; it must have one for each of the {len(subjects)} sources")
         values = [GivenScalar(array, each, title) for array, each in zip(arrays, subjects, strict=True)]
     return values, values[0].scale(values[1:], given, colormap)
 
@@ -302,13 +311,15 @@ class _Picture:
         up = "YZ".index(self._up) + 1
         lowest, span = np.inf, [np.full(3, np.inf), np.full(3, -np.inf)]
         fitted = [_fitted(each) for each in self._subjects]
+        seen = [[_seen(shape) for shape in each.shapes] for each in self._subjects]
 
         def frames():
             nonlocal lowest
             for shot in self._shots:
-                for subject, k, chosen in zip(self._subjects, shot.frames, fitted, strict=True):
+                for subject, k, chosen, drawn in zip(self._subjects, shot.frames, fitted, seen, strict=True):
                     points = subject.read(k)
                     for index, (shape, found) in enumerate(zip(subject.shapes, points, strict=True)):
+                        found = found[drawn[index]]
                         finite = found[np.isfinite(found).all(axis=1)]
                         if not len(finite):
                             continue
@@ -317,7 +328,10 @@ class _Picture:
                             span[0], span[1] = np.minimum(span[0], finite.min(axis=0)), np.maximum(span[1], finite.max(axis=0))
                             yield finite
 
-        camera = Camera.framed(frames(), azimuth, elevation, self._up, aspect)
+        try:
+            camera = Camera.framed(frames(), azimuth, elevation, self._up, aspect)
+        except ValueError as error:
+            raise ValueError(f"{self._subjects[0].name}: {error}") from error
         position, target = np.array(camera.position), np.array(camera.target)
         self._camera = replace(camera, position=tuple(target + (position - target) / zoom))
         return float(lowest - _BELOW * np.linalg.norm(span[1] - span[0]))
@@ -358,9 +372,15 @@ def _held(rows, frames):
 
 def _fitted(subject):
     """Indices of the shapes that the camera shows all of: the cloth, and surroundings that are not much larger."""
-    finite = [each[np.isfinite(each).all(axis=1)] for each in subject.read(0)]
+    drawn = [each[_seen(shape)] for shape, each in zip(subject.shapes, subject.read(0), strict=True)]
+    finite = [each[np.isfinite(each).all(axis=1)] for each in drawn]
     sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]
     return [k for k, size in enumerate(sizes) if k == subject.coloured or size <= _LARGE * sizes[subject.coloured]]
+
+
+def _seen(shape):
+    """Indices of the points of a shape that something is drawn of; others are nowhere in the picture."""
+    return np.unique(np.concatenate([shape.triangles.ravel(), shape.lines.ravel(), shape.balls]))
 
 
 def _srgb(linear):

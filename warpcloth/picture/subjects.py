@@ -146,12 +146,14 @@ def _of_stage(path, name, prim, fps):
     def read(frame):
         return [each.points(codes[frame]) for each in stage.prims]
 
-    def sequences():
-        return [open_sequence(path, prim, fps)]
+    cloths = [k for k, each in enumerate(stage.prims) if each.cloth]
+    measured = stage.prims[cloths[0]].path if prim is None and len(cloths) == 1 else prim
 
-    cloth = next(k for k, each in enumerate(stage.prims) if each.cloth)
+    def sequences():
+        return [open_sequence(path, measured, fps)]
+
     files = tuple(layer.realPath for layer in stage.stage.GetUsedLayers() if layer.realPath)
-    return Subject(name, shapes, labels, times, read, stage.up_axis, sequences, cloth, files)
+    return Subject(name, shapes, labels, times, read, stage.up_axis, sequences, cloths[0], files)
 
 
 def _of_sequence(sequence, mesh):
@@ -183,7 +185,9 @@ def _reader(frames, mesh):
     """Function that gives a frame (n, 3) from its index, and the number of frames."""
     if not hasattr(frames, "exact"):
         frames = frames if isinstance(frames, (list, tuple)) else np.asarray(frames)
-    shape = np.shape(frames[0]) if len(frames) else None
+    if not len(frames):
+        raise ValueError("frames is empty; there must be one at least")
+    shape = np.shape(frames[0])
     if shape != mesh.points.shape:
         raise ValueError(f"frames have shape {shape}; they must be {mesh.points.shape}, as the points of the mesh")
     return (lambda frame: np.asarray(frames[frame], dtype=np.float64)), len(frames)
@@ -264,7 +268,8 @@ def _strings(mesh, lines):
 
 def _cloth(mesh, points, pins=()):
     """The shape of a cloth: its triangles, or the tubes of a mesh of edges, and its pins as balls."""
-    edge = float(np.nanmean(mesh.edge_lengths)) if len(mesh.edges) else 0.0
+    lengths = mesh.edge_lengths[np.isfinite(mesh.edge_lengths)]
+    edge = float(lengths.mean()) if len(lengths) else 0.0
     edges = np.empty((0, 2), int) if len(mesh.triangles) else mesh.edges
     size = _size(points)
     radius = max(0.5 * CURVE_WIDTH * edge, min(_THINNEST * size, 0.2 * edge))
