@@ -8,7 +8,6 @@ import numpy as np
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from matplotlib.colors import ListedColormap
 
 import warpcloth as wc
 from warpcloth.cli.reports import write_report
@@ -17,7 +16,6 @@ from warpcloth.scenes import bar_twist, bunny, cantilever, hanging, mobile
 
 DOCS = Path(__file__).parent
 GREY = "0.35"
-COLOURS = ListedColormap(plt.get_cmap("viridis")(np.linspace(0.25, 1.0, 256)))
 
 
 def save(figure, name):
@@ -34,9 +32,10 @@ def run(scene, solver, **options):
 
 
 def picture_hanging():
-    """Makes a GIF of the hanging cloth in real time."""
+    """The hanging cloth as a GIF in real time, and a frame of it in the colours of a measure."""
     animation = run(replace(hanging.scene(n=64, duration=2.4), fps=25), wc.Newton(substeps=10))
     wc.render(animation, DOCS / "hanging.gif", size=(560, 315), samples=8, time=True)
+    wc.render(animation, DOCS / "stretch.png", size=(960, 540), samples=16, time=True, frame=48, colour="stretch_1")
 
 
 def picture_cantilever(gammas=(1.0, 5.0, 20.0), elements=40):
