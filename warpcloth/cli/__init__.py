@@ -125,8 +125,8 @@ def _parser():
         return sub
 
     runs = add("run", run.run, "Run a scene and write its animation as USD.", epilog=run.EPILOG)
-    infos = add("info", info.info, "Show what a scene contains and what is built from it.", epilog=info.EPILOG)
-    deforms = add("deform", deform.deform, "Deform a mesh as rigidly as its handles allow.", epilog=deform.EPILOG)
+    infos = add("info", info.info, "Show what a scene contains, and the model that is built from it.", epilog=info.EPILOG)
+    deforms = add("deform", deform.deform, "Deform a mesh by handles, as rigidly as possible (ARAP).", epilog=deform.EPILOG)
     deform.add_arguments(deforms)
     analyzes = add("analyze", analyze.analyze, "Measure how an animated cloth deforms.", epilog=analyze.EPILOG)
     analyze.add_arguments(analyzes)
@@ -150,7 +150,9 @@ def _parser():
             "--pins", metavar="SELECTION", help="pin these vertices in place of the scene's pins, such as 'x < 0.1'"
         )
     infos.add_argument(
-        "--advise", action="store_true", help="find out which terms, precision, step and resolution change the result"
+        "--advise",
+        action="store_true",
+        help="find out whether each term, the precision, the step and the resolution matter to the result",
     )
     infos.add_argument(
         "--tolerance", metavar="SHARE", help="with --advise: the largest change that does not matter (default: 1%%)"
@@ -161,14 +163,13 @@ def _parser():
     runs.add_argument(
         "--tolerance",
         metavar="SHARE",
-        help="first measure which solver and settings are the cheapest with an error of at most this share of the size of the "
-        "cloth, such as 1%%, and run with them; see 'warpcloth choose'",
+        help="find the cheapest solver and settings with at most this error, such as 1%% of the size of the cloth, and run "
+        "with them; this takes many trial runs, see 'warpcloth choose'",
     )
     runs.add_argument(
         "--budget",
         metavar="TIME",
-        help="first measure which solver and settings are the most accurate within this time per frame, such as 16ms, and run "
-        "with them",
+        help="find the most accurate solver and settings within this time per frame, such as 16ms, and run with them",
     )
     runs.add_argument(
         "--frames", type=int, metavar="N", help="number of frames after the start (default: those of the scene's duration)"
@@ -186,7 +187,7 @@ def _parser():
         text += (
             ""
             if sub is deforms
-            else " (default: one with the name of the scene, such as hanging.usdc, which must not exist yet)"
+            else " (default: named after the scene, such as hanging.usdc; an existing file is then not replaced)"
         )
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
     runs.add_argument("--film", metavar="FILE", help="also draw the run as a film, .mp4 or .gif; see 'warpcloth render'")

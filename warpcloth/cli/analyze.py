@@ -12,9 +12,8 @@ from .terminal import Progress, aligned, check_writable, frames_folder_of, json_
 
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays in .npz or .npy.
---measure help lists the measures. --colour shows one component of a measure, such as stretch_1, or a measure that is one
-number, such as area_ratio. What cannot be measured, such as triangles without area or points that are not finite, is left out
-and listed.
+--measure help lists the measures. --colour takes a scalar measure, such as area_ratio, or a component of a vector, such as
+stretch_1. What cannot be measured, such as triangles without area or points that are not finite, is left out and listed.
 
   warpcloth analyze cache.usdc --measure stretch area_ratio -o measured.usdc --plot measured.png
   warpcloth analyze frames/ --fps 24 --rest pattern.obj --neighbourhood 1-ring --measure rotation residual --csv table.csv
@@ -57,7 +56,7 @@ def add_arguments(parser):
     add(
         "--colour",
         metavar="NAME",
-        help="the value shown as colour, such as stretch_1, or none (default: the first one measured)",
+        help="the value to show as colour, such as stretch_1, or none (default: the first that is measured)",
     )
     add(
         "--range",
@@ -111,7 +110,7 @@ def add_measuring(parser):
     add(
         "--directions",
         metavar="D",
-        help="direction of the warp threads, for measures along them: st for texture coordinates, or a vector such as 1,0,0",
+        help="direction of the warp, for measures along warp and weft: st for texture coordinates, or a vector such as 1,0,0",
     )
     add(
         "--material",

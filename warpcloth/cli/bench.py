@@ -12,22 +12,22 @@ from .terminal import Interrupted, aligned, check_writable, json_text, open_bar,
 
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
-scene net; this takes a few minutes. Each row is measured in a process of its own, one after another. Without dt or substeps
-the step is that of 'warpcloth run'.
+scene net; this takes a few minutes. Rows are measured one after another, each in its own process. If neither dt nor substeps
+is given, the step is chosen as by 'warpcloth run'.
 
 Columns:
   ms a frame  time of a frame after warm-up, with its points copied to the host: median
   quartiles   of that time
   cloths/s    cloths in the batch, divided by the time of a frame
-  ns          time of a frame, divided by the number of elements of all terms, of iterations and of substeps; an iteration is
-              one of Newton's method for newton, and a sweep over all terms for hierarchical-pbd
-  GB/s        bytes that a step must move, divided by its time: per iteration, positions read and written, inverse masses and
-              the arrays of all terms read; per step, velocities read and written
-  share       GB/s divided by the bandwidth of the device, which is measured by a copy of memory and by a kernel that copies,
-              of which the faster counts; small scenes fit into the caches of the device and may exceed 100 %
+  ns          time per element, iteration and substep, counting the elements of all terms; an iteration is one of Newton's
+              method for newton, and a sweep over all terms for hierarchical-pbd
+  GB/s        the least memory traffic of a step, divided by its time: per iteration, positions read and written, inverse
+              masses and the arrays of all terms read; per step, velocities read and written
+  share       GB/s divided by the bandwidth of the device, as measured by copying memory; small scenes fit into the caches
+              of the device and may exceed 100 %
   launches    kernel launches, fills and copies per step
-  start s     from the start of a process to its first frame, with all kernels compiled before
-  compile s   time that a start takes longer if it must compile all kernels
+  start s     from the start of a process to its first frame, when all kernels are in the cache
+  compile s   additional time when all kernels must be compiled
   factor s    time to factorise constant matrices
   MB          peak memory: of the process on a CPU, of Warp's memory pool on CUDA
 
@@ -63,7 +63,7 @@ def add_arguments(parser):
     )
     add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="number of cloths in a batch (default: 1)")
     add("--csv", metavar="FILE", help="write the measurements as a table")
-    add("--compare", nargs=2, metavar=("OLD", "NEW"), help="print the ratios of two results that --json printed")
+    add("--compare", nargs=2, metavar=("OLD", "NEW"), help="compare two files saved from --json, and print the ratios")
 
 
 def bench(arguments):

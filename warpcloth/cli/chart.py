@@ -18,14 +18,14 @@ DIAGRAMS = ("time", "solver", "physics", "spectrum")
 
 EPILOG = """\
 Diagrams:
-  time       error of a motion against the compute time of one second of it, for many settings of every solver; the error
-             is the RMS distance over vertices and frames to a reference solution of the same mesh
-  solver     convergence within one step, for solvers that minimise its objective: the distance of the objective from its
-             minimum, divided by that at the start of the step, against iterations and time
-  physics    error of equilibria against mesh size and time, relative to closed forms; for the scenes cantilever (on four
-             mesh patterns, straight and turned), chain and catenary
-  spectrum   error of each iteration of projective dynamics, and the error that the eigenvalues of its matrix predict; for
-             small meshes
+  time       error against compute time per simulated second, for many settings of every solver; the error is the RMS
+             distance over vertices and frames to a reference solution of the same mesh
+  solver     convergence within one step, for solvers that minimise an objective: how far it is above its minimum, relative
+             to the start of the step, against iterations and time
+  physics    error of equilibria relative to closed forms, against mesh size and time; for the scenes cantilever (on four
+             mesh patterns, straight and rotated), chain and catenary
+  spectrum   measured error of each iteration of projective dynamics, and the error that the eigenvalues of its iteration
+             matrix predict; for small meshes
 Settings that diverge, are refused or take too long are listed with the reason.
 
 Measurements are stored in WARPCLOTH_CACHE, or ~/.cache/warpcloth, and reused while the code is the same; after an

@@ -10,10 +10,10 @@ from .setup import named_scene
 from .terminal import Interrupted, Settings, add_dask, executing, json_text
 
 EPILOG = """\
-Give --tolerance for the cheapest setting within this error, --budget for the most accurate setting within this time, or both
-for the cheapest within both. Settings of each solver are tried from coarse to fine, until one meets the tolerance, exceeds the
-budget, or takes longer than a setting of any solver that meets the tolerance. The error is the RMS distance over vertices and
-frames to a reference solution, divided by the longest side of the cloth.
+--tolerance finds the cheapest setting with at most this error, --budget the most accurate setting within this time, and both
+together the cheapest setting that meets both. The settings of each solver are tried from coarse to fine. A solver is done when
+a setting meets the tolerance, exceeds the budget, or takes longer than the fastest setting found to meet the tolerance. The
+error is the RMS distance over vertices and frames to a reference solution, divided by the longest side of the cloth.
 Measurements are stored and reused.
 
   warpcloth choose hanging -p n=32 --tolerance 1%

@@ -13,11 +13,11 @@ from .terminal import Progress, check_writable, json_text
 _SHOWN = 8  # frames or exclusions of each that the summary names
 
 EPILOG = """\
-A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames that
-both have at the same time are compared, and the others are listed. Surfaces are always compared. Positions of vertices and
-stretches are compared too if both have the same triangles. Stretches are relative to the rest shape of each. The rest shape of
-a folder or an .npz file is its first frame, unless --rest-a or --rest-b gives another. If one is Y up and the other Z up, B is
-turned to the up axis of A.
+A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames are
+matched by their time; those without a match are listed. Distances between the surfaces are always measured. If A and B have the
+same triangles, the positions of vertices and the stretches are compared too. The stretches of each are relative to its own rest
+shape. The rest shape of a folder or an .npz file is its first frame, unless --rest-a or --rest-b gives another. If one is Y up
+and the other Z up, B is rotated to the up axis of A.
 
   warpcloth compare hanging.usdc frames --fps-b 24 --rest-b rest.obj --csv apart.csv
 """

@@ -77,7 +77,7 @@ def add_arguments(parser):
         "--energy",
         choices=("spokes", "spokes_and_rims"),
         default="spokes",
-        help="kind of energy (default: spokes)",
+        help="edges in the ARAP energy of each vertex (default: spokes)",
     )
     parser.add_argument(
         "--iterations", type=int, default=500, metavar="N", help="maximum number of iterations per frame (default: 500)"

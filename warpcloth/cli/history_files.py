@@ -6,9 +6,8 @@ from ..base.outputs import TEXT, Output, check_apart, write_table
 from .terminal import check_writable, json_text
 
 EPILOG = """\
-Energies and reactions: --csv and --report record the energies and the reactions at pins of every frame. The table has the
-energies [J] and the sum of all reactions [N]; the report also has the reaction of each pin. What is not known is an empty cell,
-or null.
+--csv and --report record energies [J] and the reaction forces of pins [N] in every frame. The table of --csv has the sum of the
+reactions; the JSON of --report has the reaction of each pin. An unknown value is an empty cell in the table, and null in JSON.
 """
 
 

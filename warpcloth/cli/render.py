@@ -12,9 +12,9 @@ from .terminal import check_writable, json_text, open_bar
 
 SIZE = (1280, 720)
 EPILOG = """\
-FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. Of a stage all meshes and linear
-curves are drawn. With two FILEs the second is drawn on the right. The ending of -o says what is made: .png is one frame, .gif
-and .mp4 are films in real time (.mp4 needs PyAV: pip install -e '.[video]' in the checkout). Colours need matplotlib.
+FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. All meshes and linear curves of
+a stage are drawn. A second FILE is drawn to the right of the first. The extension of -o selects the format: .png for one frame,
+.gif or .mp4 for a film in real time (.mp4 needs PyAV: pip install -e '.[video]' in the checkout). --colour needs matplotlib.
 
   warpcloth render hanging.usdc -o hanging.mp4
   warpcloth render hanging.usdc -o last.png --size 1920x1080 --samples 16
@@ -27,7 +27,7 @@ def add_arguments(parser):
     """Adds what the command takes but for what all commands do."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to draw")
-    add("beside", metavar="FILE", nargs="?", help="another one to draw beside it")
+    add("beside", metavar="FILE", nargs="?", help="a second one to draw beside it")
     add("-o", "--output", metavar="FILE", required=True, help="the file to write: .png, .gif or .mp4")
     add("--frame", type=float, metavar="N", help="the frame of a .png, as FILE numbers them (default: the last)")
     add("--frames", type=frames, metavar="A:B", help="the first and the last frame of a film (default: all)")
@@ -35,7 +35,7 @@ def add_arguments(parser):
     add("--speed", type=float, default=1.0, metavar="FACTOR", help="0.5 plays at half speed (default: 1, real time)")
     add("--size", type=size, default=SIZE, metavar="WxH", help="width and height in pixels (default: 1280x720)")
     add("--samples", type=int, default=4, metavar="N", help="rays through each pixel (default: 4)")
-    add("--colour", metavar="NAME", help="show a measured value as colour, such as stretch_1 (default: one colour of cloth)")
+    add("--colour", metavar="NAME", help="show a measured value as colour, such as stretch_1 (default: plain cloth)")
     add(
         "--range",
         type=float,
@@ -56,7 +56,7 @@ def add_arguments(parser):
         metavar="DEGREES",
         help="angle of the camera above the horizontal (default: 24)",
     )
-    add("--zoom", type=float, default=1.0, metavar="FACTOR", help="go nearer by this factor (default: 1, all of the motion)")
+    add("--zoom", type=float, default=1.0, metavar="FACTOR", help="zoom in by this factor (default: 1, the whole motion)")
     add("--ground", type=float, metavar="HEIGHT", help="height of the ground [m] (default: the lowest point of the motion)")
     add("--no-ground", action="store_true", help="draw no ground")
     add("--time", action="store_true", help="write the time into a corner")

@@ -14,10 +14,10 @@ _STEPS_A_SECOND = 240
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
-If neither dt nor substeps is given, the step is chosen. Most solvers take a step of about 1/240 s. Solvers with a stability
-limit, such as explicit, take the fewest substeps whose step is below two limits. It is 10 % below the limit for small motion
-about the rest shape. It is also below an estimate of the limit in large motion: for springs and quadratic bending a bound that
-always holds, for hinges and membranes the value at rest.
+If neither dt nor substeps is given, the step is chosen: about 1/240 s for most solvers. Solvers with a stability limit, such as
+explicit, take the fewest substeps that respect two limits. The first is for small motion about the rest shape, and is kept with
+a margin of 10 %. The second is for large motion. It is a strict bound for springs and quadratic bending, but only an estimate
+for dihedral bending and membranes, which are taken as stiff as at rest.
 """
 
 

@@ -25,13 +25,13 @@ Resolution is the parameter of the scene that sets it: n, links or elements.
 
 All runs are compared over the same simulated time. A run with a large step continues until it has taken --steps steps, to
 show whether it diverges. Runs with small steps cost the most. The error is the RMS distance to a reference over vertices and
-frames, divided by the size of the cloth. The reference is Newton's method with BDF2 and a quarter of the step, but with at most
-2000 steps, in float64. Verdicts:
-  stable       none of the others: the run went well, and with an error within --accuracy, if that is measured
-  inaccurate   the error exceeds --accuracy by more than the reference may be wrong
-  unsure       the reference is missing, or not accurate enough to tell
-  stalled      a step ended at no minimum
-  diverged     the energy is three times what the start, falling, moving pins and loads can have put in
+frames, divided by the size of the cloth. The reference is Newton's method with BDF2 in float64, with steps of a quarter of the
+size, but at most 2000 of them. Verdicts:
+  stable       the run ended well, and its error is within --accuracy, if errors are measured
+  inaccurate   the error exceeds --accuracy, even if the uncertainty of the reference is subtracted
+  unsure       there is no reference, or it is too uncertain to tell stable from inaccurate
+  stalled      a step could not be finished: no lower energy, a saddle point, or contradictory constraints
+  diverged     the run broke a bound on its energy or strain, see docs/stability.md
   refused      the solver does not take the scene or the setting
   slow         the run took longer than --limit
 Measured rows are stored and reused.
@@ -51,7 +51,7 @@ def add_arguments(parser):
             nargs=3,
             metavar=("LOW", "HIGH", "N"),
             help="lowest value, highest value and number of values, spaced logarithmically (compression: evenly; "
-            "default: by axis, see 'warpcloth chart stability --help')",
+            "default: depends on the axis, see 'warpcloth chart stability --help')",
         )
     parser.add_argument(
         "--at",
@@ -78,7 +78,7 @@ def add_arguments(parser):
         type=float,
         default=ACCURACY,
         metavar="SHARE",
-        help=f"runs with a larger error are inaccurate (default: {ACCURACY:g}); with 0 errors are not measured",
+        help=f"runs with a larger error are inaccurate (default: {ACCURACY:g}); 0 measures no errors",
     )
     parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
     parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default: float64)")
