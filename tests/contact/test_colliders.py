@@ -1,5 +1,6 @@
 """Colliders: their shapes and motion, the energies of contact and friction, and that no step ends inside or crosses one."""
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -361,3 +362,44 @@ def test_the_default_stiffness_is_said():
     scene = falling([wc.Plane()])
     assert scene.contact.stiffness == pytest.approx(10.0 * 0.15 * 9.81 / R)
     assert "contact: distance 0.001 m, stiffness 1.472e+04 Pa/m" in str(scene)
+
+
+def test_an_animation_has_colliders_as_primitives(tmp_path):
+    """With their sizes, and where they are at each frame."""
+    from pxr import Usd, UsdGeom
+
+    colliders = [
+        wc.Sphere(radius=0.1, position=[(0.25, -0.3, 0.1 * k) for k in range(3)], name="ball"),
+        wc.Capsule(radius=0.05, length=0.2, axis=(1.0, 0.0, 0.0), position=(0.0, -1.0, 0.0)),
+        wc.Box(size=(0.1, 0.2, 0.3), position=(0.0, -2.0, 0.0), rotation=TILTED),
+        wc.Plane(position=(0.0, -3.0, 0.0), name="ball"),
+    ]
+    path = str(tmp_path / "a.usda")
+    wc.simulate(falling(colliders, n=3), wc.Newton(substeps=4), output=path, frames=2)
+    stage = Usd.Stage.Open(path)
+    names = {prim.GetName(): prim.GetTypeName() for prim in stage.GetPrimAtPath("/World/Colliders").GetChildren()}
+    assert names == {"ball": "Sphere", "Capsule": "Capsule", "Box": "Cube", "ball_2": "Plane"}
+    for name, collider in zip(names, colliders, strict=True):
+        for frame in (0, 1, 2):
+            gprim = UsdGeom.Xformable(stage.GetPrimAtPath(f"/World/Colliders/{name}"))
+            to_world = np.array(gprim.ComputeLocalToWorldTransform(frame))
+            half, radius = collider.core
+            sizes = np.where(np.isfinite(half), 1.0 if name == "Box" else half + radius, 0.0)
+            surface = np.append(sizes * (0.5 if name == "Box" else 1.0) * [0.0, 1.0, 0.0], 1.0) @ to_world
+            assert collider.distances(surface[:3], frame) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_scene_incline_slides():
+    scene = importlib.import_module("warpcloth.scenes.incline").scene(angle=30.0, friction=0.3, n=4, duration=0.5)
+    animation = wc.simulate(scene, wc.Newton(substeps=2, tolerance=1e-6), dtype="float64")
+    speeds = (animation.velocities @ [np.sqrt(0.75), -0.5, 0.0]).mean(axis=1)
+    assert (speeds[-1] - speeds[15]) / 0.25 == pytest.approx(9.81 * (0.5 - 0.3 * np.sqrt(0.75)), rel=1e-3)
+
+
+def test_the_scene_drape_stays_outside():
+    scene = importlib.import_module("warpcloth.scenes.drape").scene(n=12, duration=1.0)
+    animation = wc.simulate(scene, wc.Newton(substeps=2))
+    assert animation.status.ok
+    points = animation.points.astype(np.float64)
+    assert min(collider.distances(points).min() for collider in scene.colliders) > 0.0
+    assert scene.colliders[0].distances(points[-1]).min() < 1e-3 < points[-1][:, 1].max()

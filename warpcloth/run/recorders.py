@@ -82,7 +82,14 @@ class File:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
             self.writer = AnimationWriter(
-                output, scene.mesh, scene.fps, pins=pins, up_axis=scene.up_axis, lines=lines, history=history
+                output,
+                scene.mesh,
+                scene.fps,
+                pins=pins,
+                up_axis=scene.up_axis,
+                lines=lines,
+                history=history,
+                colliders=scene.colliders,
             )
         else:
             self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim, history=history)

@@ -1,6 +1,6 @@
 """Writing an animation: the motion of a cloth, and numbers that go with it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +8,9 @@ from numpy.typing import ArrayLike
 
 from ..base.types import FilePath, UpAxis
 from ..mesh.mesh import Mesh
+from ..scene.colliders import Collider
 from .chunks import ChunkWriter, check_scene
+from .gprims import define_colliders
 from .layers import artist_prim, define_lines, over_layer, scene_layer
 from .stage import read_stage_mesh
 from .targets import Interpolation, check_primvars
@@ -47,6 +49,7 @@ class AnimationWriter(ChunkWriter):
         metadata: Mapping[str, object] | None = None,
         primvars: Mapping[str, Interpolation] | None = None,
         lines: Mapping[str, tuple[np.ndarray, float]] | None = None,
+        colliders: Sequence[Collider] = (),
         history: Mapping[str, str] | None = None,
     ) -> None:
         """Checks everything that can be checked before the first frame; writes nothing yet.
@@ -66,6 +69,7 @@ class AnimationWriter(ChunkWriter):
                 vertex, or "uniform", one for each triangle.
             lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth;
                 `lines.lines_of` finds those of a scene. Not allowed with a source.
+            colliders: Drawn as gprims under /World/Colliders, with their motion; a layer over a source has none.
             history: Type of each primvar of the history of a run, by name: "float3[]", a vector for each vertex, or "double", a
                 number of the whole cloth.
 
@@ -85,6 +89,7 @@ class AnimationWriter(ChunkWriter):
             # Clips have samples alone; a name, type and interpolation have to stand on the stage itself.
             target.declare(rest, [f"primvars:{name}" for name in (*primvars, *history)])
             targets = [target, *define_lines(rest, mesh, lines or {})]
+            define_colliders(rest, colliders, mesh)
         else:
             for name, given in (("pins", pins), ("lines", lines)):
                 if given:
