@@ -133,15 +133,18 @@ def kept_part(dtype):
         if d > wp.length(move) + least:
             t = dtype(1.0)
         lowest = wp.min(least, d)
-        for _k in range(MARCHES):
-            if t < dtype(1.0):
-                approach = -wp.dot(move, n)
-                further = d - lowest
-                if approach * (dtype(1.0) - t) <= further:
-                    t = dtype(1.0)
-                elif further > dtype(0.01) * least:
-                    t += further / approach
-                    d, n = local_gap_of(X + t * move, core, radius)
+        k = wp.int32(0)
+        while t < dtype(1.0) and k < MARCHES:
+            k += 1
+            approach = -wp.dot(move, n)
+            further = d - lowest
+            if approach * (dtype(1.0) - t) <= further:
+                t = dtype(1.0)
+            elif further > dtype(0.01) * least:
+                t += further / approach
+                d, n = local_gap_of(X + t * move, core, radius)
+            else:
+                k = MARCHES
         return t
 
     return kept

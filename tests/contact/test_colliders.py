@@ -323,7 +323,6 @@ REFUSED = {
     "friction": (lambda: wc.Plane(friction=-0.1), "Plane.friction is -0.1; it must be a number of 0 or more"),
     "distance": (lambda: wc.Contact(distance=0.0), "contact.distance is 0.0"),
     "stiffness": (lambda: wc.Contact(stiffness=0.0), "contact.stiffness is 0.0; it must be above 0"),
-    "contact alone": (lambda: falling((), contact=wc.Contact()), "contact is given without colliders"),
     "weightless": (lambda: falling([wc.Plane()], gravity=(0, 0, 0)), "contact.stiffness has no default without gravity"),
     "hard friction": (
         lambda: falling([wc.Plane(friction=0.1)], contact=wc.Contact(stiffness=np.inf)),

@@ -106,7 +106,7 @@ class Scene:
         loads: Forces, tractions and pressures on the cloth: :class:`Force`, :class:`Traction`, :class:`Pressure`.
         colliders: What the cloth touches, such as :class:`warpcloth.Sphere`. Pinned vertices touch nothing.
         contact: How it touches them, a :class:`warpcloth.Contact`, by default ``Contact()``, with its stiffness as a number;
-            None without colliders.
+            without colliders it does not matter.
 
     Raises:
         ValueError: If a value breaks a rule; the sentence names it.
@@ -203,9 +203,7 @@ class Scene:
         if not (self.contact is None or isinstance(self.contact, Contact)):
             raise ValueError(f"contact is {shown(self.contact)}; it must be a Contact or None")
         if not self.colliders:
-            if self.contact is not None:
-                raise ValueError("contact is given without colliders; give colliders, or leave it out")
-            return None
+            return self.contact
         contact = self.contact or Contact()
         for collider in (each for each in self.colliders if each.friction and np.isinf(contact.stiffness or 0.0)):
             raise ValueError(
@@ -345,7 +343,7 @@ class Scene:
         if self.locked is not None:
             counts = ", ".join(f"{count} {axis}" for axis, count in zip("xyz", self.locked.sum(axis=0), strict=True))
             lines.append(f"  locked coordinates: {counts}")
-        if self.contact is not None and self.contact.stiffness is not None:
+        if self.colliders and self.contact is not None and self.contact.stiffness is not None:
             lines += [f"  {_described(collider)}" for collider in self.colliders]
             lines.append(f"  contact: distance {self.contact.distance:g} m, stiffness {self.contact.stiffness:.4g} Pa/m")
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
