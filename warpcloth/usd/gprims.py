@@ -1,10 +1,10 @@
 """Colliders as geometric primitives of a stage."""
 
 import numpy as np
-from pxr import Gf, Tf, Usd, UsdGeom, UsdShade
 
 from ..scene.colliders import Box, Capsule, Plane, Sphere
 from .layers import bind_material
+from .modules import Gf, Tf, Usd, UsdGeom, UsdShade
 
 _COLOUR = (0.55, 0.55, 0.6)
 _SPREAD = 4.0  # of a plane, in sizes of the cloth
