@@ -402,3 +402,21 @@ def test_the_scene_drape_stays_outside():
     points = animation.points.astype(np.float64)
     assert min(collider.distances(points).min() for collider in scene.colliders) > 0.0
     assert scene.colliders[0].distances(points[-1]).min() < 1e-3 < points[-1][:, 1].max()
+
+
+@pytest.mark.parametrize("name", ("explicit", "newton"))
+def test_a_resumed_run_has_its_anchors(name, tmp_path):
+    colliders = [wc.Sphere(radius=0.1, position=[(0.25, -0.08 + 0.002 * k, 0.25) for k in range(25)], friction=0.3)]
+    scene = falling(colliders, fps=120.0, n=4, duration=0.2)
+
+    def stop(frame, frames):
+        if frame == 13:
+            raise KeyboardInterrupt
+
+    paths = [str(tmp_path / f"{each}.usdc") for each in ("whole", "resumed")]
+    whole = wc.simulate(scene, SOLVERS[name], output=paths[0])
+    with pytest.raises(KeyboardInterrupt):
+        wc.simulate(scene, SOLVERS[name], output=paths[1], progress=stop)
+    resumed = wc.simulate(scene, SOLVERS[name], output=paths[1], resume=True)
+    assert np.asarray(resumed.points).tobytes() == np.asarray(whole.points).tobytes()
+    assert resumed.cut == whole.cut

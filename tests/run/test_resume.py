@@ -65,9 +65,9 @@ def test_a_resumed_run_is_the_same_to_the_bit(name, offset, dtype, tmp_path, dev
     scene, solver, kept = moved(offset), SOLVERS[name], []
     append = recorders.File.append
 
-    def keep(self, points, velocities, *carried):
+    def keep(self, points, velocities, *carried, **more):
         kept[-1].append((points.copy(), velocities.copy()))
-        append(self, points, velocities, *carried)
+        append(self, points, velocities, *carried, **more)
 
     monkeypatch.setattr(recorders.File, "append", keep)
     given, outputs = {"device": device, "dtype": dtype}, [tmp_path / f"{k}.usdc" for k in range(2)]
