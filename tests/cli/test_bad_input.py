@@ -311,8 +311,9 @@ def test_gaps_without_end(tmp_path):
         (["info", "memory.py"], "memory.py, line 2: MemoryError"),
         (
             ["run", "later.py", "-o", "o.usdc"],
-            "there is not enough memory; a smaller mesh, fewer copies or fewer frames take less: 16",
+            "there is not enough memory; a smaller mesh or picture, fewer copies or fewer frames take less: 16",
         ),
+        (["run", "device.py", "-o", "o.usdc"], "there is not enough memory; a smaller mesh or picture, "),
         (["run", "disk.py", "-o", "o.usdc"], "a file could not be read or written: No space left on device"),
         (["run", "deep.py", "-o", "o.usdc"], "the input is nested too deeply to be read"),
     ],
@@ -325,7 +326,12 @@ def test_one_line_at_the_command_line(tmp_path, monkeypatch, capfd, arguments, l
     (tmp_path / "utf8.usda").write_bytes(STAGE.encode().replace(b'"Spring"', b'"Spr\xff\xfeing"'))
     (tmp_path / "huge.usda").write_text(STAGE.replace("(1, 0, 0)", "(1e38, 0, 0)").replace("(0, 0, 1)", "(0, 0, -1e38)"))
     (tmp_path / "memory.py").write_text("def scene():\n    raise MemoryError\n")
-    raised = {"later": "MemoryError('16 GiB')", "disk": "OSError(28, 'No space left on device')", "deep": "RecursionError"}
+    raised = {
+        "later": "MemoryError('16 GiB')",
+        "device": "RuntimeError('Failed to allocate 3 bytes on device')",
+        "disk": "OSError(28, 'No space left on device')",
+        "deep": "RecursionError",
+    }
     for name, error in raised.items():  # past what is said of a scene file, as in a step
         text = f"import warpcloth as wc\nclass Broken(wc.Scene):\n    def build(self, **_):\n        raise {error}\n"
         make = "def scene():\n    return Broken(wc.Mesh.grid(3, 3), density=1.0, terms=[wc.Spring(stiffness=1.0)])\n"

@@ -457,6 +457,7 @@ def test_the_command_draws(folder, tmp_path, capfd):
         (("CLOTH", "-o", "a.jpg"), "a.jpg: the ending is '.jpg'; it must be .png, .gif or .mp4"),
         (("CLOTH", "-o", "nowhere/a.png"), "nowhere"),
         (("CLOTH", "-o", "a.mp4", "--size", "65x36"), "size is 65x36; a film in .mp4 must have even numbers, such as 66x36"),
+        (("CLOTH", "-o", "EMPTY.png"), "EMPTY.png: is no regular file; it must be one, or free"),
         (("CLOTH", "-o", "a.png", "--size", "65"), "'65' is no size"),
         (("CLOTH", "-o", "a.png", "--size", "2x2"), "size: width is 2; it must be a whole number of 8 or more"),
         (("CLOTH", "-o", "a.png", "--frame", "99"), "frame is 99; it must be one of the 6 from 0 to 5"),
@@ -469,7 +470,7 @@ def test_the_command_draws(folder, tmp_path, capfd):
         (("CLOTH", "-o", "a.gif", "--speed", "1e-5"), "shown for 4.17e+03 s; a .gif can show one for 0.01 to 655 s"),
         (("CLOTH", "-o", "a.mp4", "--speed", "1e9"), "shown for 4.17e-11 s; a .mp4 can show one for 1e-06 to 1000 s"),
         (("ZERO", "-o", "a.png"), "points has shape (0, 16, 3); it must be (frames, vertices, 3), of one frame or more"),
-        (("NAN", "-o", "a.png"), "nan.npz: no point of the frames is finite"),
+        (("NAN", "-o", "a.png"), "nan.npz: no position in the frames is finite; there is nothing to draw"),
         (("CHANGING", "-o", "a.png"), "faceVertexIndices[1] is 2 at time code 1, must stay 1"),
         (("CLOTH", "-o", "a.png", "--zoom", "-1"), "zoom is -1.0"),
         (("CLOTH", "-o", "a.png", "--samples", "0"), "samples is 0"),
@@ -492,6 +493,7 @@ def test_the_command_draws(folder, tmp_path, capfd):
 def test_what_cannot_be_drawn_is_refused_in_a_sentence(argv, fragment, folder, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
+    (tmp_path / "EMPTY.png").mkdir()
     (tmp_path / "bare.usda").write_text('#usda 1.0\ndef Xform "World"\n{\n}\n')
     (tmp_path / "text.png").write_text("no picture")
     moving = "int[] faceVertexIndices.timeSamples = {0: [0, 1, 2, 3], 1: [0, 2, 1, 3]}"
@@ -560,7 +562,9 @@ def test_a_run_draws_its_film(small_films, capfd):
     assert (code, err, json.loads(out)["film"]) == (0, "", "a.gif")
     wc.render("a.usdc", "b.gif", **SMALL)
     assert (small_films / "a.gif").read_bytes() == (small_films / "b.gif").read_bytes()
-    for film, fragment in (("a.avi", "the ending is '.avi'"), ("none/a.gif", "folder none does not exist")):
+    (small_films / "folder.gif").mkdir()
+    refusals = {"a.avi": "the ending is '.avi'", "none/a.gif": "folder none does not exist", "folder.gif": "is no regular file"}
+    for film, fragment in refusals.items():
         refused(capfd, ["run", "hanging", "-p", "n=4", "-o", "c.usdc", "--film", film], fragment)
     assert not (small_films / "c.usdc").exists()
 

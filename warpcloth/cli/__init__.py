@@ -75,8 +75,10 @@ def _sentence(error, debug):
         if error.strerror is None:
             return error
         return f"{error.filename or 'a file could not be read or written'}: {error.strerror}"
-    if isinstance(error, MemoryError):
-        return f"there is not enough memory; a smaller mesh, fewer copies or fewer frames take less: {error}".removesuffix(": ")
+    refused = isinstance(error, RuntimeError) and str(error).startswith("Failed to allocate")  # by Warp
+    if refused or isinstance(error, MemoryError):
+        less = "a smaller mesh or picture, fewer copies or fewer frames take less"
+        return f"there is not enough memory; {less}: {error}".removesuffix(": ")
     if isinstance(error, RecursionError):
         return f"the input is nested too deeply to be read: {error}"
     if isinstance(error, ImportError) and error.name is None:  # a sentence about an extra, no module that broke

@@ -36,13 +36,15 @@ def check_film(path, size):
     Raises:
         FileNotFoundError: The folder does not exist.
         ImportError: PyAV, which writes films, is not installed.
-        ValueError: The ending is none of the three, or the size does not suit it.
+        ValueError: The ending is none of the three, the size does not suit it, or there is a folder or device.
     """
     path, (width, height) = Path(path), size
     if path.suffix.lower() not in (STILL, *FILMS):
         raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {', '.join((STILL, *FILMS[:-1]))} or {FILMS[-1]}")
     if not path.absolute().parent.is_dir():
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: is no regular file; it must be one, or free")
     if path.suffix.lower() == ".mp4":
         if width % 2 or height % 2:
             even = f"{width + width % 2}x{height + height % 2}"

@@ -327,11 +327,10 @@ class _Picture:
                         if index in chosen:
                             span[0], span[1] = np.minimum(span[0], finite.min(axis=0)), np.maximum(span[1], finite.max(axis=0))
                             yield finite
+            if lowest == np.inf:
+                raise ValueError(f"{self._subjects[0].name}: no position in the frames is finite; there is nothing to draw")
 
-        try:
-            camera = Camera.framed(frames(), azimuth, elevation, self._up, aspect)
-        except ValueError as error:
-            raise ValueError(f"{self._subjects[0].name}: {error}") from error
+        camera = Camera.framed(frames(), azimuth, elevation, self._up, aspect)
         position, target = np.array(camera.position), np.array(camera.target)
         self._camera = replace(camera, position=tuple(target + (position - target) / zoom))
         return float(lowest - _BELOW * np.linalg.norm(span[1] - span[0]))
