@@ -424,7 +424,7 @@ def test_an_interrupt_leaves_the_good_pictures_or_nothing(folder, tmp_path):
         return progress
 
     path = tmp_path / "out.mp4"
-    with pytest.raises(KeyboardInterrupt, match="interrupted before the first picture; nothing was saved"):
+    with pytest.raises(KeyboardInterrupt, match="interrupted before the first picture; no picture was saved"):
         wc.render(folder / "cloth.usdc", path, **SMALL, progress=stop(0))
     assert not list(tmp_path.iterdir())
     with pytest.raises(KeyboardInterrupt, match="interrupted after 4 of 6 pictures, which are in "):
@@ -576,6 +576,18 @@ def test_a_run_that_diverges_has_a_film_of_its_good_frames(small_films, capfd):
     assert code == 1 and good > 0
     with Image.open("a.gif") as film:
         assert film.n_frames == good // 2 + 1, "60 frames a second are more than a GIF shows"
+
+
+@pytest.mark.parametrize(("pictures", "said"), [(0, "before the first picture; no picture was saved"), (1, "after 1 of 2")])
+def test_an_interrupt_while_a_film_is_drawn_says_where_the_frames_are(pictures, said, small_films, capfd, monkeypatch):
+    def stop(self, done, total):
+        if done == pictures:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(drawing._Drawing, "__call__", stop)
+    code, out, err = run(capfd, "run", "hanging", "-p", "n=4", "--frames", "2", "-o", "a.usdc", "--film", "a.gif")
+    assert (code, out) == (130, "") and said in err and err.endswith("; frames 0 to 2 are in a.usdc\n")
+    assert (small_films / "a.gif").exists() == (pictures > 0) and (small_films / "a.usdc").exists()
 
 
 def test_a_resumed_run_draws_all_of_it(small_films, capfd, monkeypatch):

@@ -3,6 +3,7 @@
 import os
 import statistics
 
+from ..base.interrupts import Interrupted
 from ..base.quiet import find_device
 from .history_files import EPILOG as OF_HISTORY
 from .history_files import record_of, write_history
@@ -49,7 +50,10 @@ def run(arguments):
         if record:
             write_history(arguments, scene, animation)
         if arguments.film:
-            draw_film([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
+            try:
+                draw_film([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
+            except Interrupted as interrupted:
+                raise Interrupted(f"{interrupted}; frames 0 to {status.frame} are in {arguments.output}") from None
         facts = {
             "scene": scene.name,
             "source": str(source.path),

@@ -150,7 +150,7 @@ def render(
         except KeyboardInterrupt:
             if not film.frames:
                 film.discard()
-                raise Interrupted("interrupted before the first picture; nothing was saved") from None
+                raise Interrupted("interrupted before the first picture; no picture was saved") from None
             raise Interrupted(f"interrupted after {film.frames} of {len(shots)} pictures, which are in {output}") from None
     if picture.left_out:
         warnings.warn(
