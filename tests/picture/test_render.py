@@ -401,8 +401,8 @@ def test_the_bar_has_round_numbers_and_fits(folder):
 
 def test_what_is_not_finite_is_left_out_and_said(tmp_path):
     broken = MOTION.copy()
-    broken[3, 0] = np.nan
-    with pytest.warns(UserWarning, match="without a finite position are not drawn"):
+    broken[3, 0], broken[4, 0] = np.nan, 1e200
+    with pytest.warns(UserWarning, match="are not drawn, in all pictures together: a position is not finite, or too far away"):
         wc.render(broken, tmp_path / "out.gif", mesh=MESH, **SMALL)
 
 

@@ -22,7 +22,7 @@ from .films import SHORTEST, STILL, check_film, check_times, open_film
 from .measured import GivenScalar, MeasuredScalar, analyzers_of
 from .overlay import Overlay
 from .raycast import BACKGROUND, RayCaster
-from .subjects import subject_of
+from .subjects import located, subject_of
 
 # Surroundings that are so many times as large as the cloth are not fitted into the picture.
 _LARGE = 1.5
@@ -153,10 +153,9 @@ def render(
                 raise Interrupted("interrupted before the first picture; no picture was saved") from None
             raise Interrupted(f"interrupted after {film.frames} of {len(shots)} pictures, which are in {output}") from None
     if picture.left_out:
-        warnings.warn(
-            f"{picture.left_out} triangles, lines or pins without a finite position are not drawn, in all pictures together",
-            stacklevel=2,
-        )
+        why = "a position is not finite, or too far away"
+        count = f"{picture.left_out} triangles, lines or pins are not drawn, in all pictures together"
+        warnings.warn(f"{count}: {why}", stacklevel=2)
     return output
 
 
@@ -320,7 +319,7 @@ class _Picture:
                     points = subject.read(k)
                     for index, (shape, found) in enumerate(zip(subject.shapes, points, strict=True)):
                         found = found[drawn[index]]
-                        finite = found[np.isfinite(found).all(axis=1)]
+                        finite = located(found)
                         if not len(finite):
                             continue
                         lowest = min(lowest, finite[:, up].min() - (shape.radius if len(shape.lines) else 0.0))
@@ -372,7 +371,7 @@ def _held(rows, frames):
 def _fitted(subject):
     """Indices of the shapes that the camera shows all of: the cloth, and surroundings that are not much larger."""
     drawn = [each[_seen(shape)] for shape, each in zip(subject.shapes, subject.read(0), strict=True)]
-    finite = [each[np.isfinite(each).all(axis=1)] for each in drawn]
+    finite = [located(each) for each in drawn]
     sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]
     return [k for k, size in enumerate(sizes) if k == subject.coloured or size <= _LARGE * sizes[subject.coloured]]
 

@@ -33,6 +33,8 @@ _THINNEST_LINE = 0.001
 _APART = 1.12
 # Of the height of a cloth, how much farther behind it the next row of a batch is, so that it is seen.
 _HIDES = 1.0
+# Beyond, the cube of a distance [m] overflows.
+_FARTHEST = 1e100
 _SOURCES = "a path, an Animation, a Deformation, a Scene, a Mesh, a Sequence, or an array of frames with its mesh"
 
 
@@ -290,7 +292,12 @@ def _shape(count, triangles, edges, radius, pins, size, edge, colour):
     )
 
 
+def located(points):
+    """Those of points (n, 3) that a camera can show: finite, and not so far away that products of distances overflow."""
+    return points[(np.abs(points) < _FARTHEST).all(axis=1)]
+
+
 def _size(points):
     """Diagonal of the box of points that are finite [m]."""
-    finite = points[np.isfinite(points).all(axis=1)]
+    finite = located(points)
     return float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 1.0
