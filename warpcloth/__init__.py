@@ -86,17 +86,19 @@ _MODULES = {
 _CATALOGUES = ("solvers", "terms")
 
 
-def __getattr__(name):
-    if name == "__all__":
-        value = [*_MODULES, *(public for room in _CATALOGUES for public in _from(room, "__all__"))]
-    elif name.startswith("__"):  # Python and its tools ask every module for these
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    else:
-        import_module(".usd", __name__)  # whatever is used may be given a stage
-        value = _find(name)
-        prepare_warp()
-        load_installed()
-    return globals().setdefault(name, value)
+if not TYPE_CHECKING:  # a type checker would find every name in it, those misspelt too
+
+    def __getattr__(name):
+        if name == "__all__":
+            value = [*_MODULES, *(public for room in _CATALOGUES for public in _from(room, "__all__"))]
+        elif name.startswith("__"):  # Python and its tools ask every module for these
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        else:
+            import_module(".usd", __name__)  # whatever is used may be given a stage
+            value = _find(name)
+            prepare_warp()
+            load_installed()
+        return globals().setdefault(name, value)
 
 
 def _find(name):
@@ -116,7 +118,7 @@ def _from(module, name):
 
 
 def __dir__():
-    return __getattr__("__all__")
+    return sys.modules[__name__].__all__
 
 
 if sys.modules.get("warp"):  # whose settings may be changed from here on

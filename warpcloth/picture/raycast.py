@@ -12,12 +12,13 @@ from ..model.threads import cores, threads_on
 from .patterns import disc, pixel_samples
 
 BACKGROUND = (0.90, 0.92, 0.94)
-GROUND = (0.86, 0.87, 0.88)
+GROUND = BACKGROUND  # so that only shadows are seen of it: over a fade 8 bits show rings
 _UP = {"Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 # Of half the height of the picture: what a ray to the sky needs to be free, and where the ground has faded.
 _SKY_DISTANCE, _GROUND = 1.0, 6.0
-# How much of the light on a surface that faces the sun is the sky's, and by how much that is lighter above than below.
-_SKY, _TILT = 0.42, 0.35
+# How much of the light on a surface that faces the sun is the sky's, and by how much that is lighter above than below, where a
+# light ground reflects it.
+_SKY, _TILT = 0.42, 0.15
 # Beyond, products of three coordinates of float32 overflow.
 _FARTHEST = 1e9
 # Samples a pixel from which on their noise is less than what smoothing blurs.
