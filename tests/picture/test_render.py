@@ -399,6 +399,12 @@ def test_the_bar_has_round_numbers_and_fits(folder):
             assert image.shape == (size[1], size[0], 3) and (image != 255).any()
 
 
+def test_a_long_name_stays_beside_the_bar():
+    overlay = Overlay((320, 180), Scale(0.0, 1.0), "stretch_1", names=["a", "b" * 99])
+    image = np.asarray(overlay.draw([np.full((180, 160, 3), 255, np.uint8)] * 2))
+    assert (image[:17, 160 : 320 - overlay.beside] < 128).any() and (image[:17, 320 - overlay.beside :] == 255).all()
+
+
 def test_what_is_not_finite_is_left_out_and_said(tmp_path):
     broken = MOTION.copy()
     broken[3, 0], broken[4, 0] = np.nan, 1e200

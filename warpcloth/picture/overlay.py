@@ -98,7 +98,8 @@ class Overlay:
             if k:
                 pen.line([(left, 0), (left, self.height)], (205, 207, 210), max(1, em // 12))
             if k < len(self.names):
-                self._write(pen, (left + 0.6 * em, 0.5 * em), self._short(self.names[k], panel.shape[1] - 1.2 * em), "la")
+                room = min(panel.shape[1], self.width - self.beside - left) - 1.2 * em  # not over the bar
+                self._write(pen, (left + 0.6 * em, 0.5 * em), self._short(self.names[k], room), "la")
             left += panel.shape[1]
         if time is not None:
             self._write(pen, (0.6 * em, self.height - 0.5 * em), time, "ld")
