@@ -14,7 +14,7 @@ import warpcloth as wc
 from support.command_line import refused, run
 from warpcloth.cli import render as drawing
 from warpcloth.picture import render as rendering
-from warpcloth.picture.colour import Scale
+from warpcloth.picture.colour import Scale, to_linear
 from warpcloth.picture.films import durations
 from warpcloth.picture.measured import scale_of
 from warpcloth.picture.overlay import Overlay, round_numbers, written
@@ -341,7 +341,9 @@ def test_colours_are_those_of_the_scale(folder, tmp_path, monkeypatch):
     wc.render(cloth, path, size=(128, 72), samples=1, colour="stretch_1", colour_range=(0.75, 1.25), frame=5, ground=False)
     top, wanted = picture(path)[:, :90], 255 * Scale(0.75, 1.25, 1.0).srgb(1.25)
     coloured = top[np.abs(top - top[0, 0]).max(axis=-1) > 60]
-    assert len(coloured) > 100 and np.abs(np.median(coloured, axis=0) - wanted).max() < 10, "in light that is nearly full"
+    found, wanted = to_linear(np.median(coloured, axis=0) / 255), to_linear(wanted / 255)
+    assert len(coloured) > 100 and 0.75 < found[0] / wanted[0] <= 1.01, "in light that is nearly full"
+    assert found / found[0] == pytest.approx(wanted / wanted[0], abs=0.005), "of one hue, but for the rounding to 8 bits"
     assert np.ptp(red) > 0
 
 
