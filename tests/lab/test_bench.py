@@ -340,7 +340,7 @@ def test_scenes_without_sizes_are_taken_as_they_are(monkeypatch, tmp_path):
         ("bench flag --sizes 4 -p m=3", "has no parameter 'm'"),
         ("bench bunny --sizes 4", "bunny has no resolution to vary; its scene() must take n or links or elements"),
         ("bench hanging --csv none/t.csv", "none does not exist"),
-        ("bench --sizes 4", "--sizes is given without SCENE, which it is for"),
+        ("bench --sizes 4", "--sizes is given without SCENE, which must stand before it"),
         ("bench -p n=4", "-p is given without SCENE"),
         ("bench --solver xpbd", "--solver is given without SCENE"),
         ("bench --compare old.json", "expected 2 arguments"),

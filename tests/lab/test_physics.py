@@ -489,7 +489,7 @@ def test_the_plot(tmp_path, monkeypatch):
     # The largest floor of a panel is a line, and its words say where it is; one far below does not squeeze the errors.
     chain = results[-1][1]["floor"]
     for panel, floor in zip(kept[0].axes[::2], (1e-9, 3.2, chain), strict=True):
-        (line,) = (line for line in panel.lines if line.get_label() == f"rest shapes are known to {floor:.1g}")
+        (line,) = (line for line in panel.lines if line.get_label() == f"equilibria are known to {floor:.1g}")
         assert list(line.get_ydata()) == [floor] * 2 and panel.get_ylim()[1] >= floor
     for axes in (axes for axes in kept[0].axes if axes.get_xlabel() == "time [ms]"):
         low, high = axes.get_xlim()

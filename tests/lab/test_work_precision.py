@@ -503,7 +503,7 @@ def test_command(tmp_path, monkeypatch, capsys):
 )
 def test_wrong_use_is_said_before_anything_is_measured(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(work_precision, "sweep", lambda *_, **__: pytest.fail("measured"))
+    monkeypatch.setattr(work_precision, "collect", lambda *_, **__: pytest.fail("measured"))
     monkeypatch.setattr(work_precision, "reference", lambda *_, **__: pytest.fail("measured"))
     assert main(["chart", "work-precision", *arguments]) == 2
     assert words in capsys.readouterr().err

@@ -124,8 +124,8 @@ from warpcloth.run import recorders
 
 append = recorders.File.append
 
-def killed(self, *given):
-    append(self, *given)
+def killed(self, *given, **named):
+    append(self, *given, **named)
     if self.frames == 26:
         os.kill(os.getpid(), int(sys.argv[1]))
 

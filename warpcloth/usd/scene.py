@@ -350,7 +350,7 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     Raises:
         FileNotFoundError: The folder does not exist.
         ValueError: The path has another ending or is the stage that the scene was read from, or the scene has no terms,
-            one that does not fit its mesh, or colliders.
+            one that does not fit its mesh, colliders, or a contact.
         OSError: The file could not be written.
     """
     path = Path(os.path.abspath(followed(path)))
@@ -362,10 +362,9 @@ def write_scene(scene: Scene, path: FilePath) -> str:
         raise ValueError(f"path is {path}, the stage that the scene was read from; it must be another file")
     if not scene.terms:
         raise ValueError("scene.terms is empty; a scene in a stage must have one or more")
-    if scene.colliders:
-        raise ValueError(
-            f"the scene has {len(scene.colliders)} colliders, which a stage cannot hold yet; write it as a Python file"
-        )
+    if scene.colliders or scene.contact is not None:
+        found = f"{len(scene.colliders)} colliders" if scene.colliders else "a contact"
+        raise ValueError(f"the scene has {found}, which a stage cannot hold yet; write it as a Python file")
     for term in scene.terms:
         term.elements(scene.mesh, scene.positions)  # or reading would refuse what was written
     up_axis = scene.stage.up_axis if scene.stage else scene.up_axis
