@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..base.turns import in_turn
+from ..base.turns import TURN, in_turn
 from ..core.capture import on_host
 from ..kernels.copy import take_vertices
 
@@ -154,6 +154,10 @@ class _DeviceCopy:
         self._stream.record_event(self._copied)
 
     def take(self):
-        wp.synchronize_event(self._copied)
+        try:
+            wp.synchronize_event(self._copied)
+        except RuntimeError:  # while another thread records a graph Warp waits for no event
+            with TURN:
+                wp.synchronize_event(self._copied)
         seconds = 1e-3 * wp.get_event_elapsed_time(self._began, self._ended, synchronize=False)
         return *(np.array(each) for each in self._host.numpy()), seconds
