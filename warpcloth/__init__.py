@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # the table below, as type checkers read it
     from .scene.colliders import Contact as Contact
     from .scene.colliders import Plane as Plane
     from .scene.colliders import Sphere as Sphere
+    from .scene.mesh_collider import MeshCollider as MeshCollider
     from .scene.scene import Pins as Pins
     from .scene.scene import Scene as Scene
     from .solvers import *  # noqa: F403
@@ -77,6 +78,7 @@ _MODULES = {
     "Contact": "scene.colliders",
     "Plane": "scene.colliders",
     "Sphere": "scene.colliders",
+    "MeshCollider": "scene.mesh_collider",
     "Pins": "scene.scene",
     "Scene": "scene.scene",
     "Force": "terms.loads",

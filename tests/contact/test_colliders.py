@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 import warpcloth as wc
@@ -24,6 +25,7 @@ SHAPES = {
     "box": wc.Box(size=(0.2, 0.1, 0.3), position=(0.25, -0.25, 0.25), rotation=TILTED),
     "thin box": wc.Box(size=(0.3, 0.001, 0.3), position=(0.25, -0.1, 0.25)),
 }
+CUBE = trimesh.creation.box((0.2, 0.1, 0.3))
 each_shape = pytest.mark.parametrize("shape", SHAPES)
 SOLVERS = {
     "explicit": wc.Explicit(substeps=40),
@@ -324,6 +326,18 @@ REFUSED = {
     "distance": (lambda: wc.Contact(distance=0.0), "contact.distance is 0.0"),
     "stiffness": (lambda: wc.Contact(stiffness=0.0), "contact.stiffness is 0.0; it must be above 0"),
     "weightless": (lambda: falling([wc.Plane()], gravity=(0, 0, 0)), "contact.stiffness has no default without gravity"),
+    "points": (lambda: wc.MeshCollider(np.full((3, 3), np.nan), [[0, 1, 2]]), "MeshCollider.points[0, 0] is nan"),
+    "no points": (lambda: wc.MeshCollider(np.zeros((0, 3)), [[0, 1, 2]]), "MeshCollider.points has shape (0, 3)"),
+    "index": (
+        lambda: wc.MeshCollider(np.eye(3), [[0, 1, 3]], name="ball"),
+        "ball.triangles[0] is [0, 1, 3]; it must be indices",
+    ),
+    "no triangles": (lambda: wc.MeshCollider(np.eye(3), np.zeros((0, 3), int)), "MeshCollider.triangles: has shape (0, 3)"),
+    "flat triangle": (lambda: wc.MeshCollider(np.tile(np.eye(3)[:1], (3, 1)), [[0, 1, 2]]), "it must be higher than 1e-07"),
+    "inside a mesh": (
+        lambda: falling([wc.MeshCollider(CUBE.vertices, CUBE.faces, position=(0.2, 0.05, 0.2))]),
+        "inside the collider MeshCollider",
+    ),
     "hard friction": (
         lambda: falling([wc.Plane(friction=0.1)], contact=wc.Contact(stiffness=np.inf)),
         "Plane has friction 0.1 and contact.stiffness is infinite",
@@ -354,6 +368,21 @@ def test_refused_in_a_sentence(declare, message):
     with pytest.raises(ValueError) as error:
         declare()
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("weld", (True, False))
+def test_distances_to_a_mesh_are_those_to_its_box(weld):
+    """Signed, about faces, edges and corners; seams do not open it. An open one has no inside."""
+    box = SHAPES["box"]
+    cube = CUBE if weld else CUBE.copy()
+    if not weld:
+        cube.unmerge_vertices()
+    mesh = wc.MeshCollider(cube.vertices, cube.faces, position=box.position, rotation=box.rotation)
+    points = box.position + np.random.default_rng(0).uniform(-0.3, 0.3, size=(500, 3))
+    assert mesh.closed
+    np.testing.assert_allclose(mesh.distances(points), box.distances(points), atol=1e-12)
+    sheet = replace(mesh, triangles=cube.faces[1:])
+    assert not sheet.closed and sheet.distances(points).min() > 0.0
 
 
 def test_the_default_stiffness_is_said():

@@ -111,7 +111,7 @@ class Collider:
     def distances(self, points: np.ndarray, frame: int = 0) -> np.ndarray:
         """Signed distances (…,) [m] of points (…, 3) [m] to the surface at a frame, below 0 inside."""
         pose, (half, radius) = self.poses[min(frame, len(self.poses) - 1)], self.core
-        local = _turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
+        local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
         if np.isinf(half[0]):
             return local[..., 1]
         away = np.abs(local) - half
@@ -237,7 +237,7 @@ def _product(p, q):
     return np.column_stack([vector, p[:, 3] * q[3] - u @ v])
 
 
-def _turned(q, vectors):
+def turned(q, vectors):
     """Vectors (…, 3) turned by a quaternion."""
     t = 2.0 * np.cross(q[:3], vectors)
     return vectors + q[3] * t + np.cross(q[:3], t)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..scene.colliders import Box, Capsule, Plane, Sphere
+from ..scene.mesh_collider import MeshCollider
 from .layers import bind_material
 from .modules import Gf, Tf, Usd, UsdGeom, UsdShade
 
@@ -11,7 +12,7 @@ _SPREAD = 4.0  # of a plane, in sizes of the cloth
 
 
 def define_colliders(layer, colliders, mesh):
-    """Defines a Sphere, Capsule, Cube or Plane for each collider in a layer of :func:`.layers.scene_layer`, with its motion.
+    """Defines a prim for each collider, such as a Sphere, in a layer of :func:`.layers.scene_layer`, with its motion.
 
     Args:
         layer: The layer.
@@ -37,6 +38,8 @@ def define_colliders(layer, colliders, mesh):
 
 def _define(stage, path, collider, mesh):
     """The primitive about the origin, its axis along y."""
+    if isinstance(collider, MeshCollider):
+        return _define_mesh(stage, path, collider)
     _half, radius = collider.core
     if isinstance(collider, Sphere):
         gprim = UsdGeom.Sphere.Define(stage, path)
@@ -59,6 +62,20 @@ def _define(stage, path, collider, mesh):
     else:
         raise ValueError(f"the collider {collider.label} is a {type(collider).__name__}, which has no primitive in USD")
     gprim.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(gprim, Usd.TimeCode.Default()))
+    return gprim
+
+
+def _define_mesh(stage, path, collider):
+    """Its triangles, with a time sample of the points a frame where they deform."""
+    gprim, frames = UsdGeom.Mesh.Define(stage, path), collider.frames
+    gprim.CreateFaceVertexCountsAttr(np.full(len(collider.triangles), 3, np.int32))
+    gprim.CreateFaceVertexIndicesAttr(collider.triangles.ravel())
+    gprim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    gprim.CreateDoubleSidedAttr(not collider.closed)
+    for frame, points in enumerate(frames):
+        time = frame if len(frames) > 1 else Usd.TimeCode.Default()
+        gprim.CreatePointsAttr().Set(points.astype(np.float32), time)
+        gprim.CreateExtentAttr().Set(np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float32), time)
     return gprim
 
 

@@ -1,0 +1,162 @@
+"""Triangle meshes as colliders."""
+
+from dataclasses import MISSING, dataclass
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from ..base.checks import numeric
+from ..base.turns import in_turn
+from ..base.types import Converted, default
+from ..kernels import nearest
+from ..mesh.mesh import Mesh
+from .colliders import Collider, turned
+
+
+@dataclass(frozen=True, eq=False)
+class MeshCollider(Collider):
+    """A triangle mesh.
+
+    If its triangles close it is the solid that their fronts look away from. Otherwise it is a sheet without thickness, which is
+    touched from both sides. Vertices that are at one position at all frames count as one, so that seams do not open it.
+
+    Attributes:
+        points: Its vertices, (n, 3) [m], or at the frames 0 … F−1 of the scene, (F, n, 3), in the frame of ``position`` and
+            ``rotation``. Between frames they move linearly; after the last they stand still.
+        triangles: Vertices of each triangle (T, 3), counter-clockwise from the front.
+
+    Raises:
+        ValueError: If a value breaks a rule.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+        >>> tetrahedron = wc.MeshCollider(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], friction=0.3)
+        >>> tetrahedron.closed, tetrahedron.distances([[0.1, 0.1, -0.5], [0.1, 0.1, 0.05]]).tolist()
+        (True, [0.5, -0.05])
+    """
+
+    points: Converted[ArrayLike, np.ndarray] = default(MISSING)
+    triangles: Converted[ArrayLike, np.ndarray] = default(MISSING)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        points = numeric(f"{self.label}.points", self.points, "have shape (n, 3) or (F, n, 3)")
+        if points.ndim not in (2, 3) or points.shape[-1] != 3 or not points.size:
+            raise ValueError(f"{self.label}.points has shape {points.shape}; it must be (n, 3) or (F, n, 3), F and n 1 or more")
+        bad = np.argwhere(~np.isfinite(points))
+        if len(bad):
+            index = ", ".join(map(str, bad[0]))
+            raise ValueError(f"{self.label}.points[{index}] is {points[tuple(bad[0])]}; it must be finite")
+        try:
+            mesh = Mesh(points if points.ndim == 2 else points[0], self.triangles)
+        except ValueError as error:
+            raise ValueError(f"{self.label}.{error}") from None
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "triangles", mesh.triangles)
+
+    @property
+    def frames(self) -> np.ndarray:
+        """Its vertices at each keyframe that deforms it, (F, n, 3), F = 1 if nothing does."""
+        return self.points.reshape(-1, *self.points.shape[-2:])
+
+    @property
+    def core(self) -> tuple[np.ndarray, float]:
+        raise ValueError(f"the collider {self.label} is a mesh, which no solver takes yet")
+
+    @property
+    def moves(self) -> bool:
+        return super().moves or len(self.frames) > 1
+
+    @cached_property
+    def _welded(self) -> np.ndarray:
+        """The triangles with one index for each position."""
+        rows = np.ascontiguousarray(self.frames.transpose(1, 0, 2).reshape(self.frames.shape[1], -1) + 0.0)
+        _, index = np.unique(rows.view(np.dtype((np.void, rows.shape[1] * rows.itemsize))).ravel(), return_inverse=True)
+        return index.ravel()[self.triangles]
+
+    @cached_property
+    def closed(self) -> bool:
+        """Whether it has an inside: each side of a triangle is that of as many others in the other direction."""
+        sides = self._welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        forth, back = (np.sort(each @ [sides.max() + 1, 1]) for each in (sides, sides[:, ::-1]))
+        return np.array_equal(forth, back)
+
+    def distances(self, points: np.ndarray, frame: int = 0) -> np.ndarray:
+        """Distances (…,) [m] of points (…, 3) [m] to the surface at a frame, below 0 inside of a closed one.
+
+        Of triangles that are as near to within float32 it may take either.
+        """
+        pose = self.poses[min(frame, len(self.poses) - 1)]
+        points = np.asarray(points, dtype=np.float64)
+        local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3]).reshape(-1, 3)
+        vertices = self.frames[min(frame, len(self.frames) - 1)]
+        faces = nearest_faces(local, vertices, self.triangles)
+        weights = _nearest_weights(local, vertices[self.triangles[faces]])
+        away = local - np.einsum("kc,kci->ki", weights, vertices[self.triangles[faces]])
+        found = np.linalg.norm(away, axis=1)
+        if self.closed:
+            found = found * np.sign(np.einsum("ki,ki->k", away, self._normals(vertices, faces, weights)))
+        return found.reshape(points.shape[:-1])
+
+    def _normals(self, vertices, faces, weights):
+        """The normals of the face, the side or the corner where the nearest points of faces (k,) are, (k, 3).
+
+        Those of sides and corners are the sums over the triangles about them by their angles (Bærentzen and Aanæs 2005,
+        *Signed distance computation using the angle weighted pseudonormal*).
+        """
+        corners = vertices[self.triangles]
+        ahead, behind = (np.roll(corners, shift, axis=1) - corners for shift in (-1, 1))
+        cross = np.cross(ahead, behind)
+        size = np.linalg.norm(cross, axis=2)
+        angles = np.arctan2(size, np.einsum("tci,tci->tc", ahead, behind))
+        flat = cross[:, 0] / np.maximum(size[:, :1], 1e-300)
+        at_corners = np.zeros((self._welded.max() + 1, 3))
+        np.add.at(at_corners, self._welded, angles[..., None] * flat[:, None])
+        sides = np.sort(np.stack([np.roll(self._welded, -1, axis=1), np.roll(self._welded, 1, axis=1)], axis=2), axis=2)
+        _, side = np.unique(sides @ [len(at_corners), 1], return_inverse=True)
+        side = side.reshape(-1, 3)  # of each triangle that opposite to each corner
+        at_sides = np.zeros((side.max() + 1, 3))
+        np.add.at(at_sides, side, np.repeat(flat[:, None], 3, axis=1))
+        zero = weights == 0.0
+        at_corner, at_side = zero.sum(axis=1) == 2, zero.sum(axis=1) == 1
+        found = flat[faces]
+        found[at_side] = at_sides[side[faces[at_side], np.argmax(zero[at_side], axis=1)]]
+        found[at_corner] = at_corners[self._welded[faces[at_corner], np.argmin(zero[at_corner], axis=1)]]
+        return found
+
+
+@in_turn
+def nearest_faces(points, vertices, triangles):
+    """The triangle that is nearest to each of points (k, 3), to within float32, (k,)."""
+    centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    scale = 1.0 / max(np.abs(vertices - centre).max(), np.abs(points - centre).max(initial=0.0))
+    with wp.ScopedDevice("cpu"):
+        mesh = wp.Mesh(wp.array((vertices - centre) * scale, dtype=wp.vec3), wp.array(triangles.ravel(), dtype=wp.int32))
+        out = wp.zeros(len(points), dtype=wp.int32)
+        local = wp.array((points - centre) * scale, dtype=wp.vec3)
+        wp.launch(nearest.faces(), len(points), inputs=[mesh.id, local], outputs=[out])
+        return out.numpy()
+
+
+def _nearest_weights(points, corners):
+    """Barycentric coordinates (k, 3) of the points of triangles (k, 3, 3) that are nearest to points (k, 3)."""
+    a, b, c = corners.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    size = np.maximum(np.einsum("ki,ki->k", normal, normal), 1e-300)
+    parts = [np.einsum("ki,ki->k", np.cross(q - p, points - p), normal) / size for p, q in ((b, c), (c, a), (a, b))]
+    found = np.stack(parts, axis=1)
+    outside = (found < 0.0).any(axis=1)
+    best = np.full(len(points), np.inf)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        p, along = corners[:, i], corners[:, j] - corners[:, i]
+        t = np.einsum("ki,ki->k", points - p, along) / np.maximum(np.einsum("ki,ki->k", along, along), 1e-300)
+        t = np.clip(t, 0.0, 1.0)
+        distance = np.linalg.norm(p + t[:, None] * along - points, axis=1)
+        nearer = outside & (distance < best)
+        best[nearer] = distance[nearer]
+        found[nearer] = 0.0
+        found[nearer, i], found[nearer, j] = 1.0 - t[nearer], t[nearer]
+    return found
