@@ -124,8 +124,9 @@ def keyframed_position(dtype):
 def move_pins(dtype):
     """Kernel over (copies, pins): puts the pinned vertices where the keyframes say they are h later.
 
-    Counted in whole steps of this h, in each copy by itself, ``steps_per_frame`` of them to a keyframe. x is set,
-    v = (x − x before)/h.
+    Counted in whole steps of this h, in each copy by itself, ``steps_per_frame`` of them to a keyframe. x is set, and
+    v = (x − x before)/h. Pins that hold some ``axes`` move along these; what was before is then that of the keyframes too,
+    because a step may have moved x from where it was.
     """
     vec3, _ = types(dtype)
     position = keyframed_position(dtype)
@@ -135,6 +136,7 @@ def move_pins(dtype):
         # elements
         pins: wp.array(dtype=wp.int32),
         keyframes: wp.array2d(dtype=vec3),
+        axes: wp.array(dtype=vec3),
         # state in
         step: wp.array(dtype=wp.int32),
         # parameters
@@ -143,80 +145,22 @@ def move_pins(dtype):
         h: dtype,
         # in and out
         x: wp.array(dtype=vec3),
-        # out
         v: wp.array(dtype=vec3),
     ):
         copy, p = wp.tid()
         i = copy * per_copy + pins[p]
         after = position(keyframes, p, step[copy] + 1, steps_per_frame)
-        v[i] = (after - x[i]) / h
-        x[i] = after
+        if axes:
+            before = position(keyframes, p, wp.max(step[copy], 0), steps_per_frame)
+            for axis in range(3):
+                if axes[p][axis] > dtype(0.0):
+                    v[i][axis] = (after[axis] - before[axis]) / h
+                    x[i][axis] = after[axis]
+        else:
+            v[i] = (after - x[i]) / h
+            x[i] = after
 
     return move
-
-
-@cache
-def guide_pins(dtype):
-    """Kernel over (copies, pins): :func:`move_pins` for pins that hold some axes, whose v = (x − x h earlier)/h along these.
-
-    Both positions are those of the keyframes, because a step may have moved x from where it was.
-    """
-    vec3, _ = types(dtype)
-    position = keyframed_position(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def guide(
-        # elements
-        pins: wp.array(dtype=wp.int32),
-        keyframes: wp.array2d(dtype=vec3),
-        axes: wp.array(dtype=vec3),
-        # state in
-        step: wp.array(dtype=wp.int32),
-        # parameters
-        steps_per_frame: int,
-        per_copy: int,
-        h: dtype,
-        # in and out
-        x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-    ):
-        copy, p = wp.tid()
-        i = copy * per_copy + pins[p]
-        after = position(keyframes, p, step[copy] + 1, steps_per_frame)
-        before = position(keyframes, p, wp.max(step[copy], 0), steps_per_frame)
-        for axis in range(3):
-            if axes[p][axis] > dtype(0.0):
-                v[i][axis] = (after[axis] - before[axis]) / h
-                x[i][axis] = after[axis]
-
-    return guide
-
-
-@cache
-def note_guided(dtype):
-    """Kernel over (copies, pins): move = h v along the axes that pins hold, after :func:`note_move`."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def note(
-        # elements
-        pins: wp.array(dtype=wp.int32),
-        axes: wp.array(dtype=vec3),
-        # state in
-        v: wp.array(dtype=vec3),
-        # parameters
-        per_copy: int,
-        h: dtype,
-        # in and out
-        move: wp.array(dtype=vec3),
-    ):
-        copy, p = wp.tid()
-        i = copy * per_copy + pins[p]
-        for axis in range(3):
-            if axes[p][axis] > dtype(0.0):
-                move[i][axis] = h * v[i][axis]
-
-    return note
 
 
 @cache
@@ -295,13 +239,14 @@ def finish_midpoint(dtype):
 
 @cache
 def note_move(dtype):
-    """Kernel over vertices, after a correction d: move += d, which makes it x₁ − x₀; of pins h v is that."""
+    """Kernel over vertices, after a correction d: move += d, which makes it x₁ − x₀; h v along axes that pins hold."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def note(
         # elements
         inverse_mass: wp.array(dtype=dtype),
+        mobility: wp.array(dtype=vec3),
         # state in
         correction: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -311,10 +256,16 @@ def note_move(dtype):
         move: wp.array(dtype=vec3),
     ):
         i = wp.tid()
+        held = h * v[i]
         if inverse_mass[i] > dtype(0.0):
-            move[i] = move[i] + correction[i]
+            free = move[i] + correction[i]
+            if mobility:
+                for axis in range(3):
+                    if mobility[i][axis] == dtype(0.0):
+                        free[axis] = held[axis]
+            move[i] = free
         else:
-            move[i] = h * v[i]
+            move[i] = held
 
     return note
 

@@ -158,12 +158,9 @@ class BDF2(Euler):
 
     def launch_finish(self, correction):
         super().launch_finish(correction)
-        stepper, model = self.stepper, self.stepper.model
-        self._launch(kernels.note_move, [correction, stepper.state.v, stepper.h], [self.move])
-        if model.pin_axes is not None:
-            given = [model.pins, model.pin_axes, stepper.state.v, model.per_copy, stepper.h]
-            note = model.kernel(kernels.note_guided, model.dtype)
-            model.launch(note, (model.copies, len(model.pins)), given, [self.move])
+        stepper = self.stepper
+        given = [stepper.model.mobility, correction, stepper.state.v, stepper.h]
+        self._launch(kernels.note_move, given, [self.move])
 
 
 def _roots(half, product):

@@ -111,9 +111,9 @@ class Stepper:
                 model.launch(add_one, model.copies, [], [count])
             return
         dim = (model.copies, len(pins))
-        partly = model.pin_axes is not None  # then they are those of the model, for its steps are not divided
-        move = model.kernel(kernels.guide_pins if partly else kernels.move_pins, model.dtype)
-        given = [pins, keyframes, *[model.pin_axes] * partly, count, parts * self.steps_per_frame, model.per_copy]
+        move = model.kernel(kernels.move_pins, model.dtype)
+        # Pins that hold some axes are all those of the model, for its steps are not divided.
+        given = [pins, keyframes, model.pin_axes, count, parts * self.steps_per_frame, model.per_copy]
         model.launch(move, dim, [*given, self.h / parts], [x, v])
         model.launch(add_one, model.copies, [], [count])
 
