@@ -16,7 +16,8 @@ class StageMesh:
         mesh: Rest shape in the stage's world space [m]; vertex i is point i of a Mesh prim.
         path: The file.
         prim: Path of the prim.
-        transform: (4, 4) float64; row vectors: x = [p, 1]·transform, from the prim's own space and units to world space [m].
+        transform: (4, 4) float64; row vectors: x = [p, 1]·transform, from the prim's own space and units to world space [m],
+            at the first time code where it is animated.
         meters_per_unit: Metres in one unit of the stage; USD says 0.01 where the stage does not.
         up_axis: "Y" or "Z".
         fps: Frames per second, None where the stage does not say.

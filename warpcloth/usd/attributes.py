@@ -16,8 +16,12 @@ the scene. Standard names are read where they stand, in the units of the stage; 
 
 What else a stage says:
 
-- Rest shape: the default points. Animated points: the cloth starts at the first frame's, and pinned vertices follow them.
-- Pins: all GeomSubsets of points in the family "pins", together.
+An attribute may also be on the Xform above the cloth, where Blender puts the properties of an object. Those of the cloth
+itself are taken first.
+
+- Rest shape: the default points, where the transform puts them at the first frame. Animated points: the cloth starts at the
+  first frame's. Pinned vertices follow animated points and transforms.
+- Pins: `warpcloth:pins`, `primvars:pins`, and the GeomSubsets of :func:`.stage.pinned_points`, together.
 - Frames per second: the stage's framesPerSecond, else its timeCodesPerSecond. Duration: `warpcloth:duration`, else the
   whole frames from start to end time code, else 1 s.
 - Gravity: `warpcloth:gravity`, else the PhysicsScene's, else 9.81 m/s² down the stage's up axis.
@@ -41,8 +45,8 @@ class Attribute:
         field: Field of `Scene`, `Pins` ("pins.…"), a term ("terms.…") or `Mesh` ("mesh.…"); in brackets what a field is
             computed from.
         name: Name of the attribute; <name> is any name for a term.
-        location: Where it stands: "cloth", the prim; "body", it or the nearest prim above with PhysicsDeformableBodyAPI;
-            "material", the physics material bound to it; "physics scene".
+        location: Where it is: "cloth", the prim or the Xform above it; "body", the prim or the nearest one above with
+            PhysicsDeformableBodyAPI; "material", the physics material bound to it; "physics scene".
         type_names: Types that it may have, of any precision; the first for one value, the last for several.
         kilograms, metres: Powers of kilogramsPerUnit and metersPerUnit that make it SI.
     """
@@ -79,6 +83,9 @@ ATTRIBUTES = (
     Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", ("double3[]",)),
     # The axes that the pins hold, such as "xz", or one text for each pin, those of lower index first.
     Attribute("pins.axes", "warpcloth:pins:axes", "cloth", ("token", "token[]")),
+    # A selection or indices. The others are pinned too.
+    Attribute("pins.vertices", "warpcloth:pins", "cloth", ("string", "int[]")),
+    Attribute("(pin weights)", "primvars:pins", "cloth", ("float[]",)),
     # Loads; a value that has time samples is that of keyframes, a sample for each frame.
     Attribute("loads.type", "warpcloth:loads:<name>:type", "cloth", ("token",)),
     Attribute("loads.name", "warpcloth:loads:<name>:name", "cloth", ("string",)),  # as that of a term
@@ -150,9 +157,9 @@ class Values:
     def __init__(self, stage, cloth):
         self.kilograms = UsdPhysics.GetStageKilogramsPerUnit(stage)
         self.metres = UsdGeom.GetStageMetersPerUnit(stage)
-        self.locations = {"cloth": cloth, "body": _body(cloth)}
-        self.locations["material"] = UsdShade.MaterialBindingAPI(cloth).ComputeBoundMaterial("physics")[0].GetPrim()
-        names = [attribute.GetName() for attribute in cloth.GetAuthoredPropertiesInNamespace("warpcloth")]
+        self.locations = {"cloth": holders(cloth), "body": [_body(cloth)]}
+        self.locations["material"] = [UsdShade.MaterialBindingAPI(cloth).ComputeBoundMaterial("physics")[0].GetPrim()]
+        names = [each.GetName() for prim in holders(cloth) for each in prim.GetAuthoredPropertiesInNamespace("warpcloth")]
         # In the order of the prim's properties, which is that of their names where nothing else is said.
         self.terms, self.loads = (
             list(dict.fromkeys(name.split(":")[2] for name in names if name.startswith(f"{namespace}:")))
@@ -173,13 +180,13 @@ class Values:
             ValueError: An attribute has another type than its row.
         """
         for row in attributes():
-            prim = self.locations.get(row.location) if row.field == field else None
-            attribute = prim and prim.GetAttribute(row.name.replace("<name>", str(key)))
-            if attribute and attribute.HasAuthoredValue():
-                if _kind(attribute.GetTypeName()) not in [_kind(type_name) for type_name in row.types]:
-                    types = " or ".join(str(type_name) for type_name in row.types)
-                    raise ValueError(f"{attribute.GetName()} has type {attribute.GetTypeName()}, must be {types}")
-                yield row, attribute
+            for prim in self.locations.get(row.location, ()) if row.field == field else ():
+                attribute = prim and prim.GetAttribute(row.name.replace("<name>", str(key)))
+                if attribute and attribute.HasAuthoredValue():
+                    if _kind(attribute.GetTypeName()) not in [_kind(type_name) for type_name in row.types]:
+                        types = " or ".join(str(type_name) for type_name in row.types)
+                        raise ValueError(f"{attribute.GetName()} has type {attribute.GetTypeName()}, must be {types}")
+                    yield row, attribute
 
     def get(self, field, key=None):
         """The value of a field as a number, text, tuple of texts or array; None where nothing is said."""
@@ -233,6 +240,12 @@ def _rank(type_name):
 def has_api(prim, name):
     """Whether an API schema is applied, by name: the deformable ones need not be registered."""
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+
+
+def holders(prim):
+    """The prims whose attributes are those of a shape: itself and, if that is an Xform, the prim above it."""
+    parent = prim.GetParent()
+    return [prim, parent] if parent.IsA(UsdGeom.Xform) else [prim]
 
 
 def _body(cloth):

@@ -17,7 +17,7 @@ from .stage import (
     local_to_metres,
     moving_space,
     open_stage,
-    pins_of,
+    pinned_points,
     placed,
     refuse_moving_topology,
 )
@@ -35,7 +35,7 @@ class DrawnPrim:
         triangles: (T, 3) int32; empty for curves.
         edges: (E, 2) int32, the segments of curves; empty for a mesh.
         radius: Of the curves [m].
-        pins: Points in GeomSubsets of the family "pins" (p,) int32.
+        pins: Pinned points (p,).
         points: Function that gives the points (n, 3) [m] in world space at a time code.
         codes: Time codes of the samples of its points or, of points that stand still, of its space.
     """
@@ -175,7 +175,7 @@ def _drawn(prim, path, cloth, codes):
         else:
             triangles, edges = np.empty((0, 3), np.int32), curve_edges(prim, len(start)).astype(np.int32)
             radius = _radius(prim, start, edges, local_to_metres(prim, where, first))
-        pins = _pinned(prim, len(start)) if solid is None else np.empty(0, np.int32)
+        pins = pinned_points(prim, len(start)) if solid is None else np.empty(0, np.int32)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     return DrawnPrim(
@@ -229,11 +229,3 @@ def _radius(prim, points, edges, transform):
         return 0.5 * float(widths.mean()) * abs(np.linalg.det(transform[:3, :3])) ** (1 / 3)
     lengths = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
     return 0.5 * CURVE_WIDTH * float(lengths.mean()) if len(lengths) else 0.0
-
-
-def _pinned(prim, count):
-    """Points in the GeomSubsets of the family "pins" (p,)."""
-    subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.point, "pins")
-    names = {subset.GetPrim().GetName() for subset in subsets}
-    found = [points for name, points in pins_of(prim, None, count).items() if name in names]
-    return np.unique(np.concatenate([np.empty(0, np.int32), *found]))

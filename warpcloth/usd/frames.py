@@ -13,6 +13,7 @@ from ..mesh.sequences import Sequence
 from .layers import files_of_stage
 from .modules import Sdf, UsdGeom
 from .stage import (
+    carried,
     curve_vertices,
     find_prim,
     first_points,
@@ -55,7 +56,8 @@ class FrameSequence:
     deleted reading goes on for as long as USD holds it. A frame with another number of values than the first one, or of points
     with other faces than the prim has, raises a ValueError.
 
-    Points of a prim whose transform is animated are taken where that puts them at their own time codes.
+    Points of a prim whose transform is animated are taken where that puts them at their own time codes. The velocities of that
+    space, along its way since the frame before, are added to those of the prim.
 
     Attributes:
         shape: (frames, n, 3); of a primvar (frames, n), or where it is uniform (frames, faces of the prim).
@@ -77,8 +79,7 @@ class FrameSequence:
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is no stage, the prim cannot be told, or the attribute is not animated or of another type; velocities
-                are asked of a prim whose transform is animated.
+            ValueError: It is no stage, the prim cannot be told, or the attribute is not animated or of another type.
         """
         if attribute not in _VECTORS and not str(attribute).startswith("primvars:"):
             raise ValueError(f'attribute is {attribute!r}; it must be "points", "velocities" or a primvar, "primvars:<name>"')
@@ -102,10 +103,10 @@ class FrameSequence:
         if not vectors and self._attribute.GetTypeName() != Sdf.ValueTypeNames.FloatArray:
             raise ValueError(f"{where}: {attribute} has type {self._attribute.GetTypeName()}, must be float[]")
         self.times = (self.time_codes - self.time_codes[0]) / self._stage.GetTimeCodesPerSecond()
-        # Velocities in a moving space would need those of that space too; nobody has asked for it yet.
-        self._moving = found if attribute == "points" and moving_space(found) else None
+        self._moving = found if vectors and moving_space(found) else None
         self._transform = np.eye(4) if self._moving or not vectors else local_to_metres(found, where)
-        if attribute != "points":
+        self._is_velocity = attribute == "velocities"
+        if self._is_velocity:
             self._transform[3, :3] = 0.0
         self._scale = 1.0 if vectors else scale
         self._faces = []  # what is sampled of the faces, and has to stay as it is
@@ -172,11 +173,27 @@ class FrameSequence:
         Returns:
             np.ndarray: (n, 3) [m] or [m/s].
         """
-        transform = self._transform
-        if self._moving:
-            code = self.time_codes[frame]
-            transform = local_to_metres(self._moving, f"{self._where}, time code {code:g}", code)
-        return placed(self._values(frame).astype(np.float64), transform)
+        values = self._values(frame).astype(np.float64)
+        if not self._moving:
+            return placed(values, self._transform)
+        now = self._space(frame)
+        if not self._is_velocity:
+            return placed(values, now)
+        return values @ now[:3, :3] + self._velocities_of_space(frame, now)
+
+    def _space(self, frame):
+        """The transform (4, 4) of a moving space at a frame."""
+        code = self.time_codes[frame]
+        return local_to_metres(self._moving, f"{self._where}, time code {code:g}", code)
+
+    def _velocities_of_space(self, frame, now):
+        """Velocities (n, 3) [m/s] of the points of a moving space."""
+        if frame == 0:
+            return 0.0
+        with self._located():
+            points = array_of(UsdGeom.PointBased(self._moving).GetPointsAttr(), (3,), time=self.time_codes[frame])
+        points = points if self._points is None else points[self._points]
+        return carried(points, self._space(frame - 1), now) / (self.times[frame] - self.times[frame - 1])
 
     def _read(self, frame):
         if self.ndim == 3:

@@ -6,7 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from .modules import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
-from .stage import VERTEX_PRIMVAR, find_prim, open_stage, read_stage_mesh, triangles_of_faces
+from .stage import (
+    VERTEX_PRIMVAR,
+    find_prim,
+    local_to_metres,
+    moving_space,
+    open_stage,
+    read_stage_mesh,
+    triangles_of_faces,
+)
 from .targets import SAMPLED, Target
 from .values import array_of
 
@@ -204,8 +212,9 @@ def over_layer(source, prim, mesh, primvars, history):
         history: Types of the primvars of the history of a run, likewise.
 
     Returns:
-        The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, and real paths of all files of the
-        artist's stage.
+        The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, real paths of all files of the
+        artist's stage, and a function that gives the transform of the prim, as in `StageMesh`, at a time code of that stage, or
+        None where it stands still.
 
     Raises:
         ValueError: As `read_stage_mesh` and `artist_prim`; a primvar of the artist has another type than float[].
@@ -232,7 +241,14 @@ def over_layer(source, prim, mesh, primvars, history):
     for name in _BLOCKED:
         _block(artist, over, name)
     declare_primvars(layer, artist, target, surroundings.path)
-    return layer, target, root_metadata(stage), surroundings, files_of_stage(stage)
+    transform_at = None
+    if moving_space(artist):
+
+        def transform_at(code):
+            prim = stage.GetPrimAtPath(surroundings.prim)  # the function keeps the stage
+            return local_to_metres(prim, f"{surroundings.path}, prim {surroundings.prim}, time code {code:g}", code)
+
+    return layer, target, root_metadata(stage), surroundings, files_of_stage(stage), transform_at
 
 
 def artist_prim(surroundings, mesh):

@@ -11,15 +11,27 @@ from ..base.limits import MOST_FRAMES
 from ..base.types import FilePath
 from ..mesh.mesh import Mesh
 from ..mesh.parts import Part
+from ..mesh.selection import distinct_vertices
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
 from ..terms.loads import LOADS
-from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of
+from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, holders, kind_of
 from .chunks import export
 from .layers import scene_layer
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics
-from .stage import find_prim, first_points, followed, open_stage, read_stage_mesh
-from .values import array_of, refuse_unknown, sentences, shown, time_codes_of, value_of
+from .stage import (
+    find_prim,
+    first_points,
+    followed,
+    local_to_metres,
+    moving_space,
+    open_stage,
+    pinned_points,
+    placed,
+    read_stage_mesh,
+    space_codes,
+)
+from .values import array_of, refuse_unknown, sentences, time_codes_of, value_of
 
 _SHEAR = "physics:surfaceShearStiffness"
 _THICKNESS = 1e-3  # [m], what the proposal says where there is none
@@ -60,7 +72,7 @@ def _scene(stage, cloth, surroundings):
     duration = _duration(stage, values, fps)
     density, masses, terms = _density(values, mesh), values.get("masses"), _terms(values, mesh)
     _refuse_missing(density is not None or masses is not None, len(terms) > 0)
-    vertices = _pinned(cloth, surroundings)
+    vertices = _pinned(values, cloth, surroundings)
     positions, keyframes = _motion(values, cloth, surroundings, vertices, round(duration * fps), fps)
     if positions is not None and np.array_equal(positions, rest):
         positions = None
@@ -107,7 +119,10 @@ def _cloth_prim(stage, path, prim):
             found
             for found in stage.Traverse(Usd.TraverseInstanceProxies())
             if found.IsA(UsdGeom.PointBased)
-            and (found.GetAuthoredPropertiesInNamespace("warpcloth") or has_api(found, "PhysicsSurfaceDeformableSimAPI"))
+            and (
+                any(each.GetAuthoredPropertiesInNamespace("warpcloth") for each in holders(found))
+                or has_api(found, "PhysicsSurfaceDeformableSimAPI")
+            )
         ]
         prim = cloths[0].GetPath() if len(cloths) == 1 else None
     return find_prim(stage, path, prim)
@@ -185,7 +200,7 @@ def _terms(values, mesh):
         stretch, bend = values.get("(stretch stiffness)"), values.get("(bend stiffness)")
         terms += [] if stretch is None else [Spring(pairs="edges", stiffness=float(stretch))]
         terms += [] if bend is None else [QuadraticBending(stiffness=float(bend))]
-        shear = terms and values.locations["material"].GetAttribute(_SHEAR)
+        shear = terms and values.locations["material"][0].GetAttribute(_SHEAR)
         if shear and shear.HasAuthoredValue() and shear.Get():
             warnings.warn(f"{shear.GetPath()} is not read; the springs of the edges resist shear too", stacklevel=2)
     return terms
@@ -226,7 +241,7 @@ def _load(values, key, surroundings, frames, fps):
     attribute = next((found for _, found in values.authored(f"loads.{quantity}", key)), None)
     if attribute is not None and attribute.GetNumTimeSamples():
         most = max(frames, attribute.GetNumTimeSamples() - 1)
-        codes = list(_codes(attribute, surroundings, most, fps))
+        codes = list(_codes(time_codes_of(attribute), surroundings, most, fps))
         given["keyframes"] = [_value_at(attribute, code) for code in codes]
     else:
         given[quantity] = values.get(f"loads.{quantity}", key)
@@ -248,28 +263,29 @@ def _value_at(attribute, code):
     return value
 
 
-def _pinned(cloth, surroundings):
-    """Sorted vertices of all GeomSubsets of points in the family "pins"."""
-    subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(cloth), familyName="pins")
-    for subset in subsets:
-        kind = subset.GetElementTypeAttr().Get()
-        if kind != UsdGeom.Tokens.point:  # that of faces is the default
-            name = subset.GetPrim().GetName()
-            raise ValueError(f"GeomSubset {name}: elementType is {shown(str(kind))}, must be 'point' for pins")
-    pins = [surroundings.pins[subset.GetPrim().GetName()] for subset in subsets]
-    return np.unique(np.concatenate([np.empty(0, np.int32), *pins]))
+def _pinned(values, cloth, surroundings):
+    """Sorted vertices that the stage pins, (p,) int32."""
+    selection, shown_by = values.get("pins.vertices"), surroundings.point_vertices
+    count = len(surroundings.mesh.points) if shown_by is None else len(shown_by)
+    points = pinned_points(cloth, count)
+    vertices = points if shown_by is None else shown_by[points]
+    if selection is not None:
+        vertices = np.append(vertices, distinct_vertices("warpcloth:pins", selection, surroundings.mesh))
+    return np.unique(vertices).astype(np.int32)
 
 
 def _motion(values, cloth, surroundings, vertices, frames, fps):
-    """Reads animated points: the positions at the start (n, 3), and keyframes (F, p, 3) of the pinned vertices; or None."""
-    animated = UsdGeom.PointBased(cloth).GetPointsAttr()
-    own = next(values.authored("pins.keyframes"), None)
+    """Reads the motion of points: positions at the start (n, 3), and keyframes (F, p, 3) of the pinned vertices; or None.
+
+    Points move if they have time samples, and with an animated transform.
+    """
+    animated, own = UsdGeom.PointBased(cloth).GetPointsAttr(), next(values.authored("pins.keyframes"), None)
     positions = keyframes = None
     if animated.GetNumTimeSamples():
-        positions = next(_frames(animated, surroundings, 0, fps))
-        if len(vertices) and own is None:
-            keyframes = np.array([points[vertices] for points in _frames(animated, surroundings, frames, fps)])
-            keyframes = None if (keyframes == keyframes[0]).all() else keyframes
+        positions = next(_frames(cloth, surroundings, 0, fps))
+    if len(vertices) and own is None and (animated.GetNumTimeSamples() or moving_space(cloth)):
+        keyframes = np.array([points[vertices] for points in _frames(cloth, surroundings, frames, fps)])
+        keyframes = None if (keyframes == keyframes[0]).all() else keyframes
     if own is not None:
         # Pins of a scene that was written have a sample for each frame, even after the last frame.
         most = max(frames, len(own[1].GetTimeSamples()) - 1)
@@ -280,34 +296,43 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
     return positions, keyframes
 
 
-def _frames(attribute, surroundings, frames, fps):
-    """Animated points of a prim, frame by frame, as positions of the mesh (n, 3) [m] in world space."""
-    count = len(surroundings.mesh.points)
-    shown = np.arange(count)
+def _frames(cloth, surroundings, frames, fps):
+    """Moving points of a prim, frame by frame, as positions of the mesh (n, 3) [m] in world space."""
+    attribute, moving, rest = UsdGeom.PointBased(cloth).GetPointsAttr(), moving_space(cloth), surroundings.mesh.points
+    count, first = len(rest), np.arange(len(rest))
     if surroundings.point_vertices is not None:
-        shown, count = first_points(surroundings.point_vertices), len(surroundings.point_vertices)
-    for value in _samples(attribute, surroundings, frames, fps):
-        if len(value) != count:
-            raise ValueError(f"points has {len(value)} points at a time sample, must have {count} as at rest")
-        yield value.astype(np.float64)[shown] @ surroundings.transform[:3, :3] + surroundings.transform[3, :3]
+        first, count = first_points(surroundings.point_vertices), len(surroundings.point_vertices)
+    samples, transform = time_codes_of(attribute), surroundings.transform
+    at_rest = (rest - transform[3, :3]) @ np.linalg.inv(transform[:3, :3])
+    for code in _codes([*samples, *space_codes(cloth)], surroundings, frames, fps):
+        points = at_rest
+        if samples:
+            points = _vectors_at(attribute, code)
+            if len(points) != count:
+                raise ValueError(f"points has {len(points)} points at a time sample, must have {count} as at rest")
+            points = points[first]
+        yield placed(points, local_to_metres(cloth, f"time code {code:g}", code) if moving else transform)
 
 
 def _samples(attribute, surroundings, frames, fps):
     """Values of an attribute of vectors at frames 0, 1, …, up to a number of frames and no further than its last sample."""
-    for code in _codes(attribute, surroundings, frames, fps):
-        value = array_of(attribute, (3,), time=code)
-        if value is None:
-            raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
-        refuse_unknown(attribute.GetName(), value, f" at time code {code:g}")
-        yield value
+    return (_vectors_at(attribute, code) for code in _codes(time_codes_of(attribute), surroundings, frames, fps))
 
 
-def _codes(attribute, surroundings, frames, fps):
-    """Time codes of frames 0, 1, …, up to a number of frames and no further than the last sample of an attribute."""
+def _vectors_at(attribute, code):
+    """The vectors (…, 3) float64 of an attribute at a time code."""
+    value = array_of(attribute, (3,), time=code)
+    if value is None:
+        raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
+    refuse_unknown(attribute.GetName(), value, f" at time code {code:g}")
+    return value.astype(np.float64)
+
+
+def _codes(samples, surroundings, frames, fps):
+    """Time codes of frames 0, 1, …, up to a number of frames and no further than the last of some samples."""
     rate = surroundings.time_codes_per_second / fps
     start = surroundings.start or 0.0
-    samples = time_codes_of(attribute)
-    last = np.ceil((samples[-1] - start) / rate * (1 - 1e-9)) if samples else 0
+    last = np.ceil((max(samples) - start) / rate * (1 - 1e-9)) if samples else 0
     return (start + frame * rate for frame in range(int(np.clip(last, 0, frames)) + 1))
 
 
@@ -328,7 +353,7 @@ def _gravity(stage, values, up_axis):
     scenes = [prim for prim in stage.Traverse() if prim.IsA(UsdPhysics.Scene)]
     if len(scenes) > 1:
         raise ValueError(f"the stage has {len(scenes)} PhysicsScenes, must have one or warpcloth:gravity on the cloth")
-    values.locations["physics scene"] = scenes[0] if scenes else None
+    values.locations["physics scene"] = scenes
     direction, magnitude = values.get("(gravity direction)"), values.get("(gravity magnitude)")
     if direction is None or not direction.any():
         direction = np.array(DOWN[up_axis])

@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 
+from ..base.checks import shown
 from ..base.types import FilePath
 from ..mesh.mesh import Mesh
 from ..mesh.stage_mesh import StageMesh
@@ -55,8 +56,8 @@ def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = 
         prim: Path or name of the prim; may be left out where the stage has one mesh (or no mesh and one curves prim),
             and for a result of `AnimationWriter`, which names its own.
         kind: `Mesh` or `Surface`.
-        time: Time code at which the transform is taken, which may be animated then, and the points without a warning where
-            they have no default.
+        time: Time code at which an animated transform is taken, by default the stage's start, and the points without a
+            warning where they have no default.
 
     Returns:
         StageMesh: The mesh and its surroundings.
@@ -64,8 +65,8 @@ def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is not a USD stage, has invalid units, rates or times, or has no mesh or several; the prim is
-            missing, is not a mesh or refers to a missing file; its transform is animated or cannot be inverted, its topology
-            changes, or its points and topology do not make a valid `Mesh`.
+            missing, is not a mesh or refers to a missing file; its transform cannot be inverted, its topology changes, or its
+            points and topology do not make a valid `Mesh`.
     """
     with sentences(path):
         return _stage_mesh(open_stage(path), path, prim, kind, time)
@@ -75,7 +76,10 @@ def _stage_mesh(stage, path, prim, kind, time):
     found = find_prim(stage, path, prim)
     check_composed(found, path)
     where = f"{path}, prim {found.GetPath()}"
-    transform = local_to_metres(found, where, time)
+    layer = stage.GetRootLayer()
+    start = stage.GetStartTimeCode() if layer.HasStartTimeCode() else None
+    moving = moving_space(found) is not None
+    transform = local_to_metres(found, where, (start or 0.0) if time is None and moving else time)
     point_vertices = corner_coordinates = None
     up_axis = str(UsdGeom.GetStageUpAxis(stage))
     try:
@@ -97,7 +101,6 @@ def _stage_mesh(stage, path, prim, kind, time):
         pins = pins_of(found, point_vertices, len(points))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
-    layer = stage.GetRootLayer()
     rate = layer.framesPerSecond if layer.HasFramesPerSecond() else layer.timeCodesPerSecond
     return StageMesh(
         mesh=mesh,
@@ -108,7 +111,7 @@ def _stage_mesh(stage, path, prim, kind, time):
         up_axis=up_axis,
         fps=rate if layer.HasFramesPerSecond() or layer.HasTimeCodesPerSecond() else None,
         time_codes_per_second=stage.GetTimeCodesPerSecond(),
-        start=stage.GetStartTimeCode() if layer.HasStartTimeCode() else None,
+        start=start,
         pins=pins,
         point_vertices=point_vertices,
         corner_coordinates=corner_coordinates,
@@ -176,7 +179,8 @@ def find_prim(stage, path, prim=None):
     Args:
         stage: The stage to search.
         path: Its file, for messages.
-        prim: Path or name of the prim, or None for the only one or the one that an earlier run animated.
+        prim: Path or name of the prim, or of the Xform above it; or None for the only one or the one that an earlier run
+            animated.
 
     Returns:
         Usd.Prim: A Mesh, or linear BasisCurves.
@@ -193,17 +197,22 @@ def find_prim(stage, path, prim=None):
     if prim is None:
         candidates = meshes or curves
     else:
-        candidates = [p for p in meshes + curves if str(prim) in (str(p.GetPath()), p.GetName())]
+        candidates = [p for p in meshes + curves if _called(p, prim)]
+        candidates = candidates or [p for p in meshes + curves if _called(p.GetParent(), prim)]
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
         raise ValueError(f"{path}: has several meshes, name one of them as prim: {_listed(candidates)}")
     if prim is None:
         raise ValueError(f"{path}: has no Mesh prim, only {_listed(prims, types=True) or 'an empty stage'}")
-    other = next((p for p in prims if str(prim) in (str(p.GetPath()), p.GetName())), None)
+    other = next((p for p in prims if _called(p, prim)), None)
     if other:
         raise ValueError(f"{path}, prim {other.GetPath()}: is {other.GetTypeName() or 'untyped'}, must be a Mesh prim")
     raise ValueError(f"{path}, prim {prim}: there is no such prim, only {_listed(meshes + curves) or 'others, no Mesh'}")
+
+
+def _called(prim, name):
+    return str(name) in (str(prim.GetPath()), prim.GetName())
 
 
 def _listed(prims, types=False, most=12):
@@ -223,6 +232,20 @@ def moving_space(prim):
             break
         ancestor = ancestor.GetParent()
     return None
+
+
+def space_codes(prim):
+    """Time codes of the samples of the transforms of a prim and of those above it, sorted."""
+    codes, ancestor = set(), prim
+    while ancestor and not ancestor.IsPseudoRoot():
+        xformable = UsdGeom.Xformable(ancestor)
+        if xformable:
+            for operation in xformable.GetOrderedXformOps():
+                codes.update(time_codes_of(operation.GetAttr()))
+            if xformable.GetResetXformStack():
+                break
+        ancestor = ancestor.GetParent()
+    return sorted(codes)
 
 
 def local_to_metres(prim, where, time=None):
@@ -260,6 +283,11 @@ def placed(points, transform):
         with np.errstate(invalid="ignore"):
             points = points @ transform[:3, :3]
     return points + transform[3, :3]
+
+
+def carried(points, before, now):
+    """Ways (P, 3) [m] along which a moving space carries points (P, 3) of its own, from one transform (4, 4) to the next."""
+    return points @ (now - before)[:3, :3] + (now - before)[3, :3]
 
 
 def curve_vertices(prim, count):
@@ -418,6 +446,44 @@ def _texture_coordinates(prim, count, corners):
     at_vertices = np.zeros((count, 2))
     at_vertices[corners] = st
     return (at_vertices, None) if np.array_equal(at_vertices[corners], st) else (None, st)
+
+
+def pinned_points(prim, count):
+    """Points (p,) that a prim pins: those of GeomSubsets in the family "pins" or of that name, and those of `primvars:pins`.
+
+    A subset of faces pins their corners. The primvar, a vertex group in Blender, pins points whose weight is a half or more.
+
+    Args:
+        prim: A Mesh, or BasisCurves.
+        count: Number of its points.
+
+    Raises:
+        ValueError: A subset is not one of points or faces; the primvar has not one number for each point, or changes.
+    """
+    pinned = np.zeros(count, dtype=bool)
+    for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
+        name, kind = subset.GetPrim().GetName(), subset.GetElementTypeAttr().Get()
+        if "pins" not in (name, subset.GetFamilyNameAttr().Get()):
+            continue
+        if kind == UsdGeom.Tokens.point:
+            pinned[pins_of(prim, None, count)[name]] = True
+        elif kind == UsdGeom.Tokens.face and prim.IsA(UsdGeom.Mesh):
+            mesh, faces = UsdGeom.Mesh(prim), topology(subset.GetIndicesAttr())
+            counts, corners = topology(mesh.GetFaceVertexCountsAttr()), topology(mesh.GetFaceVertexIndicesAttr())
+            refuse_outside(f"GeomSubset {name}: indices", faces, len(counts), "face")
+            pinned[corners[np.isin(np.repeat(np.arange(len(counts)), counts), faces)]] = True
+        else:
+            raise ValueError(f"GeomSubset {name}: elementType is {shown(str(kind))}, must be 'point' or 'face' for pins")
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("pins")
+    if primvar and primvar.HasAuthoredValue():
+        codes = [Usd.TimeCode.EarliestTime(), *primvar.GetTimeSamples()]
+        weights = [np.array(primvar.ComputeFlattened(code)) for code in codes]
+        if weights[0].dtype.kind not in "biuf" or weights[0].shape != (count,):
+            raise ValueError(f"primvars:pins has shape {weights[0].shape}, must have a number for each of {count} points")
+        if any(not np.array_equal(each, weights[0]) for each in weights):
+            raise ValueError("primvars:pins changes over time, must have one value")
+        pinned |= weights[0] >= 0.5
+    return np.flatnonzero(pinned)
 
 
 def pins_of(prim, point_vertices, count):

@@ -12,7 +12,7 @@ from ..scene.colliders import Collider
 from .chunks import ChunkWriter, check_scene
 from .gprims import define_colliders
 from .layers import artist_prim, define_lines, over_layer, scene_layer
-from .stage import read_stage_mesh
+from .stage import carried, read_stage_mesh
 from .targets import Interpolation, check_primvars
 
 
@@ -82,7 +82,7 @@ class AnimationWriter(ChunkWriter):
         check_scene(fps, up_axis)
         primvars, history = dict(primvars or {}), dict(history or {})
         check_primvars(primvars | dict.fromkeys(history, "vertex"), mesh)
-        self._start, files, refit = 0.0, (), None
+        self._start, self._moving_space, files, refit = 0.0, None, (), None
         if source is None:
             rest, target, root_metadata = scene_layer(mesh, pins, up_axis, prim or "Cloth")
             target = replace(target, primvars=primvars, history=history)
@@ -94,10 +94,12 @@ class AnimationWriter(ChunkWriter):
             for name, given in (("pins", pins), ("lines", lines)):
                 if given:
                     raise ValueError(f"{name}: a source has its own, and a layer over it writes none; leave them out")
-            rest, target, root_metadata, stage, files = over_layer(source, prim, mesh, primvars, history)
+            rest, target, root_metadata, stage, files, transform_at = over_layer(source, prim, mesh, primvars, history)
             targets = [target]
             if stage.start is not None:
                 self._start = stage.start * fps / stage.time_codes_per_second
+            if transform_at:
+                self._moving_space = _MovingSpace(transform_at, stage, fps)
 
             def refit():
                 artist_prim(read_stage_mesh(source, stage.prim, time=0.0), mesh)
@@ -127,9 +129,39 @@ class AnimationWriter(ChunkWriter):
         self._check_open()
         vectors = {"points": self._checked("points", points), "velocities": self._checked("velocities", velocities)}
         values = [(self._checked_primvars(primvars), None, history), *[({},)] * (len(self._targets) - 1)]
+        targets = self._targets
+        if self._moving_space:
+            transform, vectors["velocities"] = self._moving_space.at(self.frames, **vectors)
+            targets = [replace(targets[0], transform=transform)]
         samples = {
             f"{target.prim}.{name}": value
-            for target, own in zip(self._targets, values, strict=True)
+            for target, own in zip(targets, values, strict=True)
             for name, value in target.samples(vectors, *own).items()
         }
         self._append(self._start + self.frames, samples)
+
+
+class _MovingSpace:
+    """The space of an artist's prim whose transform is animated, frame by frame.
+
+    Args:
+        transform_at: The transform (4, 4) at a time code.
+        stage: The `StageMesh`.
+        fps: Frames per second.
+    """
+
+    def __init__(self, transform_at, stage, fps):
+        self._transform_at, self._fps = transform_at, fps
+        self._first, self._rate = stage.start or 0.0, stage.time_codes_per_second / fps
+
+    def at(self, frame, points, velocities):
+        """The transform (4, 4) at a frame, and velocities (n, 3) [m/s] relative to the space that carries the points there.
+
+        The velocity of the space is that of the way since the frame before, as that of moving pins.
+        """
+        now = self._transform_at(self._first + frame * self._rate)
+        if frame == 0:
+            return now, velocities
+        before = self._transform_at(self._first + (frame - 1) * self._rate)
+        local = (points - now[3, :3]) @ np.linalg.inv(now[:3, :3])
+        return now, velocities - self._fps * carried(local, before, now)
