@@ -199,7 +199,7 @@ def _add_completers(parser, files):
 
 def solvers():
     """Returns the options of each solver by its name: by option the words that it takes, or ()."""
-    found, loaded = list_solvers(), sys.modules.get("warpcloth.solvers")
+    found, loaded = dict(list_solvers()), sys.modules.get("warpcloth.solvers")
     for name, record in loaded.SOLVERS.items() if loaded else ():  # those of extensions too
         found.setdefault(name, dict.fromkeys((field.name for field in fields(record)), ()) | words_of(record))
     return found

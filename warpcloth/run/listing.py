@@ -5,6 +5,7 @@ Nothing here loads Warp, so that help and the completion of a shell answer at on
 
 import ast
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[1]
@@ -59,6 +60,7 @@ def _defaults(arguments):
     return tuple(name.arg if value is None else f"{name.arg}={ast.unparse(value)}" for name, value in pairs)
 
 
+@cache
 def list_solvers():
     """Returns the options of each solver of this package by its name: by option the words that it takes, or ()."""
     folder, classes = _PACKAGE / "solvers", {}
@@ -68,6 +70,7 @@ def list_solvers():
     return {_assigned(record, "name"): _options(record, classes) for record in records}
 
 
+@cache
 def list_failures():
     """Returns the names of the charts of failures, in their order."""
     return tuple(map(ast.literal_eval, _value(ast.parse((_PACKAGE / "lab" / "failures.py").read_bytes()), "FAILURES").keys))
