@@ -266,30 +266,6 @@ def polar3(A: Any):
 
 
 @wp.func
-def eigh3(C: Any):
-    """w, V of a symmetric 3×3 C = V diag(w) Vᵀ, w descending, det V = 1; the lower triangle of C is not read."""
-    half = C.dtype(0.5)
-    one = C.dtype(1.0)
-    B, scale = scaled3(wp.matrix_from_rows(C[0], wp.vector(C[0, 1], C[1, 1], C[1, 2]), wp.vector(C[0, 2], C[1, 2], C[2, 2])))
-    v, side = separated_eigenvector(B)
-    v1, v2 = complement(v)
-    w1 = B * v1
-    w2 = B * v2
-    a = wp.dot(v1, w1)
-    b = wp.dot(v2, w2)
-    f = a - b
-    g = C.dtype(2.0) * wp.dot(v1, w2)
-    difference = wp.sqrt(f * f + g * g)
-    cos, sin = half_angle(f, g, difference, epsilon(one) * epsilon(one))
-    V = frame(v, cos * v1 + sin * v2, cos * v2 - sin * v1, side)
-    high = half * (a + b + difference)
-    low = half * (a + b - difference)
-    # Largest or smallest, but for rounding.
-    x = wp.dot(v, B * v)
-    return scale * wp.vector(wp.max(x, high), wp.max(wp.min(x, high), low), wp.min(x, low)), V
-
-
-@wp.func
 def scaled2(A: Any):
     """As :func:`scaled3`, of 2×2."""
     size = wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])))

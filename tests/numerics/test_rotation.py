@@ -7,7 +7,6 @@ import warp as wp
 import warpcloth as wc
 from support import matrices
 from support.matrices import CLASSES, angle, determinant, orthogonality, reconstruction, reference, samples, times
-from warpcloth.kernels import decompose, rotation
 
 COUNT = 100_000
 # 17 ε and 45 ε. Ten to twenty operations, each rounded by ε/2, lie between a matrix and a number of the result.
@@ -79,25 +78,6 @@ def test_3x2_and_2x2(name, precision, device):
         assert reconstruction(A, R, P) <= bound and orthogonality(R) <= bound and np.array_equal(P, P.mT)
         if square:
             assert determinant(R, 1) <= bound
-
-
-def test_symmetric_eigenvalues(precision, device):
-    """Of symmetric matrices from all classes: w descending, V a rotation, as of NumPy; only the upper triangle is read."""
-    rng = np.random.default_rng(5)
-    A = np.concatenate([samples(name, rng, COUNT // 10, precision) for name in CLASSES])
-    upper = np.triu(A)
-    C = upper + np.triu(A, 1).mT
-    types = (wp.types.vector(3, WARP[precision]), wp.types.matrix((3, 3), WARP[precision]))
-    w, V = (wp.empty(len(A), dtype=dtype, device=device) for dtype in types)
-    decompose.launch(decompose.into_two, rotation.eigh3, on(device, upper), [w, V])
-    w, V = numpy([w, V])
-    bound = BOUND[precision]
-    assert reconstruction(C, times(V, w), V.mT) <= bound
-    assert max(orthogonality(V), determinant(V, 1)) <= bound
-    assert (np.diff(w, axis=1) <= 0).all()
-    expected = np.linalg.eigvalsh(C.astype(np.float64))[:, ::-1]
-    size = np.abs(expected).max(axis=1, keepdims=True)
-    assert (np.abs(w - expected) / np.where(size > 0, size, 1)).max() <= bound
 
 
 def least_rotations(v, u):

@@ -1,7 +1,6 @@
 """Fields of an analysis in few numbers, and their files: CSV and JSON."""
 
 import csv
-import json
 import math
 import shutil
 import tempfile
@@ -10,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.outputs import TEXT, Output
+from ..base.texts import json_text
 
 PERCENTILES = (0, 1, 5, 25, 50, 75, 95, 99, 100)
 
@@ -219,17 +219,4 @@ class JsonWriter(Output):
 
 
 def _json(value):
-    return json.dumps(_strict(value), allow_nan=False, ensure_ascii=False)
-
-
-def _strict(value):
-    """``value`` with what JSON does not have as null or a text."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {str(key): _strict(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_strict(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else str(value)
-    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)
+    return json_text(value, nan=None, ensure_ascii=False)

@@ -1,11 +1,14 @@
 """Values that are written as texts, on the command line and in axes of charts: numbers, words and ``name=value``."""
 
 import inspect
+import json
 import math
 import types
 import typing
 from dataclasses import fields
 from functools import cache
+
+import numpy as np
 
 from .checks import number
 from .renamed import new_name
@@ -143,3 +146,27 @@ def kinds_of_parameter(parameter):
 
 def allowed(names):
     return f"allowed are {', '.join(names)}" if names else "it takes none"
+
+
+def json_text(value, nan="nan", **options):
+    """Returns ``value`` as JSON, with infinite numbers, which JSON does not have, as "inf" and "-inf", and NaN as ``nan``.
+
+    Args:
+        value: Dictionaries, lists, arrays, numbers and texts; anything else is written as its text.
+        nan: None to write null.
+        options: As of `json.dumps`.
+    """
+    return json.dumps(_strict(value, nan), allow_nan=False, **options)
+
+
+def _strict(value, nan):
+    """``value`` in types that JSON has."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {key: _strict(item, nan) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(item, nan) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return nan if math.isnan(value) else str(value)
+    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)

@@ -7,8 +7,9 @@ from pathlib import Path
 from ..base.checks import choice
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
-from ..base.texts import convert
-from .terminal import Progress, aligned, check_writable, frames_folder_of, json_text, location
+from ..base.texts import convert, json_text
+from .options import values_of
+from .terminal import Progress, aligned, check_writable, frames_folder_of, location
 
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays in .npz or .npy.
@@ -58,14 +59,6 @@ def add_arguments(parser):
         metavar="NAME",
         help="the value to show as colour, such as stretch_1, or none (default: the first that is measured)",
     )
-    add(
-        "--range",
-        type=float,
-        nargs=2,
-        metavar=("LOW", "HIGH"),
-        help="values at the ends of the colour scale (default: from the 1st to the 99th percentile)",
-    )
-    add("--up-axis", choices=("Y", "Z"), help="up axis, if the input does not say (default: Y)")
     add("--curves", action="store_true", help="draw the principal directions as curves in the stage and in stills")
     add("--csv", metavar="FILE", help="write a table: percentiles of each measure in each frame, and where its extremes are")
     add("--report", metavar="FILE", help="write the table of --csv as JSON, with a list of what could not be measured")
@@ -75,16 +68,11 @@ def add_arguments(parser):
     add("--azimuth", type=float, metavar="DEGREES", help="azimuth of the camera of --still (default: -38)")
     add("--elevation", type=float, metavar="DEGREES", help="elevation of the camera of --still (default: 24)")
     add("--both-sides", action="store_true", help="also show the opposite side of the cloth in each still")
-    add(
-        "--colormap",
-        metavar="NAME",
-        help="a colormap of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
-    )
     add("--still-frames", type=float, nargs="+", metavar="FRAME", help="frames to show with --still (default: the last)")
 
 
 def add_measuring(parser):
-    """Adds the options that say what an animation is measured against, and how."""
+    """Adds the options that say what an animation is measured against, how, and how that is coloured."""
     add = parser.add_argument
     add("--prim", help="path or name of the mesh, if the file has several")
     add("--fps", type=float, help="frames per second (default: that of the input); rates need it")
@@ -117,6 +105,20 @@ def add_measuring(parser):
         metavar="M",
         help="membrane for energy and stress, with --stiffness: neo-hookean (default), stvk or corotated",
     )
+    add(
+        "--range",
+        dest="colour_range",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="values at the ends of the colour scale (default: from the 1st to the 99th percentile of all frames)",
+    )
+    add(
+        "--colormap",
+        metavar="NAME",
+        help="a colormap of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
+    )
+    add("--up-axis", choices=("Y", "Z"), help="up axis, if the input does not say (default: Y)")
     add("--stiffness", type=float, metavar="K", help="stiffness of the material, Young's modulus times thickness [N/m]")
     add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material (default: 0)")
 
@@ -128,10 +130,9 @@ def analyze(arguments):
     if arguments.measure == ["help"]:
         print(_listed(MEASURES))
         return 0
-    files = {name: getattr(arguments, name) for name in ("output", "csv", "report", "npz", "plot", "still")}
+    files = values_of(arguments, "output", "csv", "report", "npz", "plot", "still")
     check_apart(files.values(), [arguments.rest])
-    for path in filter(None, files.values()):
-        check_writable(path)
+    check_writable(*files.values())
     if arguments.output:
         frames_folder_of(arguments)  # refuses an ending that is none
     started = time.perf_counter()
@@ -142,20 +143,12 @@ def analyze(arguments):
         found = write_report(
             analyzer,
             usd=arguments.output,
-            csv=arguments.csv,
             json=arguments.report,
-            npz=arguments.npz,
-            plot=arguments.plot,
             stills=stills,
-            colour=arguments.colour,
-            colour_range=arguments.range,
-            curves=arguments.curves,
-            single_file=arguments.single_file,
-            up_axis=arguments.up_axis,
-            progress=progress,
             view=view,
-            both_sides=arguments.both_sides,
-            colormap=arguments.colormap,
+            progress=progress,
+            **values_of(arguments, "csv", "npz", "plot", "colour", "colour_range", "colormap", "curves", "both_sides"),
+            **values_of(arguments, "single_file", "up_axis"),
         )
     facts = {
         "input": arguments.input,
@@ -201,10 +194,8 @@ def _analyzer(arguments):
         sequence,
         rest,
         measures="all" if arguments.measure == ["all"] else arguments.measure,
-        pairs=arguments.pairs,
-        every=arguments.every,
         device=find_device(arguments.device),
-        dtype=arguments.dtype,
+        **values_of(arguments, "pairs", "every", "dtype"),
         **measuring_of(arguments),
     )
 
@@ -214,8 +205,8 @@ def measuring_of(arguments):
     directions = arguments.directions
     if directions is not None and directions != "st":
         directions = [convert("--directions", number, (float,)) for number in directions.split(",")]
-    given = {name: getattr(arguments, name) for name in ("reference", "lag", "neighbourhood", "rates")}
-    return {**given, "directions": directions, "material": _material(arguments)}
+    others = values_of(arguments, "reference", "lag", "neighbourhood", "rates")
+    return {**others, "directions": directions, "material": _material(arguments)}
 
 
 def _material(arguments):
@@ -253,16 +244,16 @@ def _stills(arguments, analyzer):
 
 def _view(arguments):
     """Returns the view of the stills, or None without stills."""
-    given = {name: value for name in ("azimuth", "elevation") if (value := getattr(arguments, name)) is not None}
+    angles = {name: value for name, value in values_of(arguments, "azimuth", "elevation").items() if value is not None}
     if arguments.still is None:
-        for name in (*given, *(["both-sides"] if arguments.both_sides else [])):
+        for name in (*angles, *(["both-sides"] if arguments.both_sides else [])):
             raise ValueError(f"--{name} is given without --still, which writes the pictures")
         if arguments.colormap is not None and arguments.output is None:
             raise ValueError("--colormap is given without --still and -o, which have colours")
         return None
     from ..chart import View
 
-    return View(**given)
+    return View(**angles)
 
 
 def _extremes(extremes):

@@ -5,10 +5,10 @@ from datetime import datetime, timezone
 from ..base.checks import whole
 from ..base.outputs import Output, check_apart
 from ..base.quiet import find_device
-from ..base.texts import assignments, options
+from ..base.texts import assignments, json_text, options
 from .options import DEFAULT, add_scene, add_solver, add_values
 from .setup import named_scene, solver_setup
-from .terminal import Interrupted, aligned, check_writable, json_text, open_bar, say
+from .terminal import Interrupted, aligned, check_writable, open_bar, say
 
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the

@@ -5,13 +5,13 @@ from collections import Counter
 
 from ..base.checks import number, whole
 from ..base.quiet import find_device
-from ..base.texts import assignments
+from ..base.texts import assignments, json_text
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
 from .options import HelpFormatter, add_import, add_scene, solvers
 from .setup import named_scene
-from .terminal import DTYPES, add_dask, check_outputs, json_text, measuring
+from .terminal import DTYPES, add_dask, check_outputs, measuring
 
 TEXT = "Draw charts of accuracy against time, of stability, and of failures."
 DIAGRAMS = ("time", "solver", "physics", "spectrum")

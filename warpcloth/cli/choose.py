@@ -4,10 +4,10 @@ import shlex
 import sys
 
 from ..base.quiet import find_device
-from ..base.texts import assignments, fraction, milliseconds
+from ..base.texts import assignments, fraction, json_text, milliseconds
 from .options import add_scene
 from .setup import named_scene
-from .terminal import Interrupted, Settings, add_dask, executing, json_text
+from .terminal import Interrupted, Settings, add_dask, executing
 
 EPILOG = """\
 --tolerance finds the cheapest setting with at most this error, --budget the most accurate setting within this time, and both

@@ -7,8 +7,10 @@ import numpy as np
 from ..base.checks import whole
 from ..base.outputs import check_apart, write_table
 from ..base.quiet import find_device
+from ..base.texts import json_text
 from ..picture.figures import PICTURES, check_path
-from .terminal import Progress, check_writable, json_text
+from .options import values_of
+from .terminal import Progress, check_writable
 
 _SHOWN = 8  # frames or exclusions of each that the summary names
 
@@ -49,7 +51,7 @@ def compare(arguments):
     a, b = (_open(arguments, name, opened) for name in ("a", "b"))
     check_apart([arguments.csv, arguments.plot], [*a.files, *b.files, arguments.rest_a, arguments.rest_b])
     with closing(Progress()) as progress:
-        axes = {name: getattr(arguments, name) for name in ("up_axis", "up_axis_a", "up_axis_b")}
+        axes = values_of(arguments, "up_axis", "up_axis_a", "up_axis_b")
         found = compare(a, b, frames=arguments.frames, device=device, progress=progress, **axes)
     columns = _columns(found)
     if arguments.csv:
@@ -70,8 +72,7 @@ def compare(arguments):
 def _check_outputs(arguments):
     if arguments.plot:
         check_path(arguments.plot, PICTURES)
-    for output in filter(None, (arguments.csv, arguments.plot)):
-        check_writable(output)
+    check_writable(arguments.csv, arguments.plot)
 
 
 def _open(arguments, name, opened):

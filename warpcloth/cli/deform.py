@@ -12,10 +12,10 @@ from ..base.checks import whole
 from ..base.limits import refuse_memory
 from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
-from ..base.texts import convert
-from .options import add_values
+from ..base.texts import convert, json_text
+from .options import add_values, values_of
 from .setup import named_scene
-from .terminal import Progress, check_writable, frames_folder_of, json_text, location
+from .terminal import Progress, check_writable, frames_folder_of, location
 
 _FRAMES, _FPS = 24, 24.0
 
@@ -145,7 +145,7 @@ def deform(arguments):
     frames = len(given["pins"].keyframes) - 1
     check_writable(arguments.output)
     device = find_device(arguments.device)
-    options = {option: getattr(arguments, option) for option in ("weights", "energy", "iterations", "tolerance", "dtype")}
+    options = values_of(arguments, "weights", "energy", "iterations", "tolerance", "dtype")
     progress = Progress(frames, first="factorising")
     with progress.of(arguments.output):
         found = deform(

@@ -3,7 +3,8 @@
 import numpy as np
 
 from ..base.outputs import TEXT, Output, check_apart, write_table
-from .terminal import check_writable, json_text
+from ..base.texts import json_text
+from .terminal import check_writable
 
 EPILOG = """\
 --csv and --report record energies [J] and the reaction forces of pins [N] in every frame. The table of --csv has the sum of the
@@ -15,8 +16,8 @@ def record_of(arguments):
     """The words for what a run must record; refuses files that cannot be written."""
     files = [path for path in (arguments.csv, arguments.report) if path]
     check_apart([arguments.output, arguments.film, *files])
+    check_writable(*files)
     for path in files:
-        check_writable(path)
         Output(path, "x").discard()
     return ("energies", "reactions") if files else ()
 

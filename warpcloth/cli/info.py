@@ -6,10 +6,10 @@ import warnings
 from dataclasses import asdict
 
 from ..base.quiet import find_device
-from ..base.texts import fraction
+from ..base.texts import fraction, json_text
 from .setup import EPILOG as EPILOG
 from .setup import Chosen, fewest_below, hint_of, named_scene, solver_facts, solver_line, solver_setup
-from .terminal import Progress, json_text
+from .terminal import Progress
 
 
 def info(arguments):

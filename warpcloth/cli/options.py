@@ -14,9 +14,9 @@ from functools import partial
 
 from ..base.extensions import load_extension, load_installed
 from ..base.outputs import STAGE_ENDINGS
-from ..base.texts import WORDS, kinds_of_parameter, parameters_of, words_of
+from ..base.texts import WORDS, json_text, kinds_of_parameter, parameters_of, words_of
 from ..run.listing import folders, list_scenes, list_solvers
-from .terminal import aligned, json_text
+from .terminal import aligned
 
 _HELP = "help"
 DEFAULT = "newton"  # solver
@@ -122,6 +122,11 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         for action in first:
             self._prog += f" {self._format_args(action, action.dest.upper())}"
         super().add_usage(usage, [action for action in actions if action not in first], groups, prefix)
+
+
+def values_of(arguments, *names):
+    """Returns the options of these names as keyword arguments."""
+    return {name: getattr(arguments, name) for name in names}
 
 
 def add_solver(parser, text):

@@ -7,8 +7,10 @@ from pathlib import Path
 from ..base.limits import shown_bytes
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
+from ..base.texts import json_text
 from .analyze import add_measuring, measuring_of
-from .terminal import check_writable, json_text, open_bar
+from .options import values_of
+from .terminal import check_writable, open_bar
 
 SIZE = (1280, 720)
 EPILOG = """\
@@ -36,18 +38,6 @@ def add_arguments(parser):
     add("--size", type=size, default=SIZE, metavar="WxH", help="width and height in pixels (default: 1280x720)")
     add("--samples", type=int, default=4, metavar="N", help="rays through each pixel (default: 4)")
     add("--colour", metavar="NAME", help="show a measured value as colour, such as stretch_1 (default: plain cloth)")
-    add(
-        "--range",
-        type=float,
-        nargs=2,
-        metavar=("LOW", "HIGH"),
-        help="values at the ends of the colour scale (default: from the 1st to the 99th percentile of all frames)",
-    )
-    add(
-        "--colormap",
-        metavar="NAME",
-        help="a colormap of matplotlib (default: viridis, or coolwarm around the undeformed value)",
-    )
     add("--azimuth", type=float, default=-38.0, metavar="DEGREES", help="angle of the camera about the vertical (default: -38)")
     add(
         "--elevation",
@@ -60,7 +50,6 @@ def add_arguments(parser):
     add("--ground", type=float, metavar="HEIGHT", help="height of the ground [m] (default: the lowest point of the motion)")
     add("--no-ground", action="store_true", help="draw no ground")
     add("--time", action="store_true", help="write the time into a corner")
-    add("--up-axis", choices=("Y", "Z"), help="up axis, if FILE does not say (default: Y)")
     add_measuring(parser)
 
 
@@ -92,7 +81,7 @@ def render(arguments):
         raise ValueError("--ground and --no-ground are given; give one of them")
     measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
     if arguments.colour is None:
-        for name in (*measuring, *(["range"] if arguments.range else []), *(["colormap"] if arguments.colormap else [])):
+        for name in (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else [])):
             raise ValueError(f"--{name} is given without --colour, the name of what is measured")
     check_drawing(arguments.output, files, arguments.size)
     device = find_device(arguments.device)
@@ -102,25 +91,11 @@ def render(arguments):
         files,
         arguments.output,
         mesh=rest,
-        prim=arguments.prim,
-        fps=arguments.fps,
-        up_axis=arguments.up_axis,
-        frame=arguments.frame,
-        frames=arguments.frames,
-        every=arguments.every,
-        speed=arguments.speed,
-        size=arguments.size,
-        samples=arguments.samples,
-        colour=arguments.colour,
-        colour_range=arguments.range,
-        colormap=arguments.colormap,
         measuring=measuring,
-        azimuth=arguments.azimuth,
-        elevation=arguments.elevation,
-        zoom=arguments.zoom,
         ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
-        time=arguments.time,
         device=device.alias,
+        **values_of(arguments, "prim", "fps", "up_axis", "frame", "frames", "every", "speed", "size", "samples", "time"),
+        **values_of(arguments, "colour", "colour_range", "colormap", "azimuth", "elevation", "zoom"),
     )
     facts = {
         "input": files,

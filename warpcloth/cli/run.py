@@ -5,12 +5,13 @@ import statistics
 
 from ..base.interrupts import Interrupted
 from ..base.quiet import find_device
+from ..base.texts import json_text
 from .history_files import EPILOG as OF_HISTORY
 from .history_files import record_of, write_history
 from .render import check_drawing, draw_film
 from .setup import EPILOG as OF_STEPS
 from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
-from .terminal import Progress, check_writable, frames_folder_of, json_text, location, say
+from .terminal import Progress, check_writable, frames_folder_of, location, say
 
 EPILOG = f"{OF_STEPS}\n{OF_HISTORY}"
 

@@ -4,10 +4,10 @@ from collections import Counter
 
 from ..base.checks import number, whole
 from ..base.quiet import find_device
-from ..base.texts import assignments, convert, options
+from ..base.texts import assignments, convert, json_text, options
 from ..lab.axes import ACCURACY, AXES, FIXED, SEED
 from .options import add_scene
-from .terminal import DTYPES, check_outputs, json_text, measuring
+from .terminal import DTYPES, check_outputs, measuring
 
 _COUNT = 9
 

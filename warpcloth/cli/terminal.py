@@ -1,16 +1,12 @@
 """Parts that all commands use: device, progress and results on a terminal, where results go, and what measurements run on."""
 
 import contextlib
-import json
-import math
 import os
 import shutil
 import sys
 import tempfile
 import unicodedata
 from pathlib import Path
-
-import numpy as np
 
 from ..base.checks import whole
 from ..base.interrupts import Interrupted
@@ -39,14 +35,15 @@ def location(facts):
     return f"{facts['file']}, with its frames in {folder}\n                {together}"
 
 
-def check_writable(output):
-    """Finds out before the first frame, and not after ten, that a folder cannot be written."""
-    folder = os.path.dirname(os.path.realpath(output))  # of a link the folder of the file that it stands for
-    try:
-        if os.path.isdir(folder):
-            tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise ValueError(f"output = {output}: the folder {folder} cannot be written ({error.strerror})") from None
+def check_writable(*outputs):
+    """Finds out before the first frame, and not after ten, that the folder of an output cannot be written; None is no file."""
+    for output in filter(None, outputs):
+        folder = os.path.dirname(os.path.realpath(output))  # of a link the folder of the file that it stands for
+        try:
+            if os.path.isdir(folder):
+                tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise ValueError(f"output = {output}: the folder {folder} cannot be written ({error.strerror})") from None
 
 
 def check_outputs(arguments, inputs=()):
@@ -64,8 +61,7 @@ def check_outputs(arguments, inputs=()):
         check_path(arguments.output, PICTURES)
     if arguments.csv:
         Output(arguments.csv, "x").discard()
-    for output in filter(None, (arguments.output, arguments.csv)):
-        check_writable(output)
+    check_writable(arguments.output, arguments.csv)
 
 
 def open_bar(total, text, counts):
@@ -216,23 +212,6 @@ def aligned(rows, right=()):
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     pads = [str.rjust if column in right else str.ljust for column in range(len(widths))]
     return ["  ".join(pad(text, width) for pad, text, width in zip(pads, row, widths, strict=True)).rstrip() for row in rows]
-
-
-def json_text(facts):
-    return json.dumps(_plain(facts), allow_nan=False)
-
-
-def _plain(value):
-    """``value`` with numbers that JSON does not have as texts: "inf", "nan"."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)
 
 
 def show_warning(message, category, filename, lineno, file=None, line=None):

@@ -1,9 +1,33 @@
 """The explicit step in plain form: the gradient, then v += h(g − M⁻¹∇U), x += h v. Tests compare faster backends with it."""
 
+from typing import NamedTuple
+
 from ..kernels import explicit_step as kernels
 from ..model.damping import dissipations
 from ..terms.refresh import STEP, Moment
 from .gradient import Gradient
+
+
+class StepRecord(NamedTuple):
+    """How explicit steps are taken.
+
+    Attributes:
+        backend: ``"core"``, ``"blocks"`` or ``"gather"``.
+        threads: Threads of the CPU that share the steps of one cloth.
+        lanes: Threads of a GPU that take one vertex.
+        block: Threads of the block that takes a copy through several steps in one launch, or 0.
+        pairs: Labels of the quadratic terms that are taken by the entries of their matrix.
+        compensated: Whether x is moved on by compensated summation.
+        packed: Whether its residual is packed into four bytes.
+    """
+
+    backend: str
+    threads: int = 1
+    lanes: int = 1
+    block: int = 0
+    pairs: tuple[str, ...] = ()
+    compensated: bool = False
+    packed: bool = False
 
 
 class ExplicitStep:
@@ -22,10 +46,11 @@ class ExplicitStep:
 
     Attributes:
         residual: Position residual of compensated summation (N,) [m], or None.
+        record: :class:`StepRecord`.
     """
 
     def __init__(self, model, state, h, symplectic, count, compensated=False):
-        self.model, self.state = model, state
+        self.model, self.state, self.record = model, state, StepRecord("core", compensated=compensated)
         self.residual = model.vectors() if compensated else None
         self._pins = model.pins, model.keyframes, count
         self._gradient, self._elastic = model.vectors(), Gradient(model, corrected=compensated)

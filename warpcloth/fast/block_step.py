@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 import warp as wp
 
+from ..core.explicit_step import StepRecord
 from ..core.gradient import Gradient
 from ..kernels.fast import block_step as kernels
 from ..kernels.fast.term_facts import TermFacts
 from ..terms.refresh import STEP, Moment
 from .block_layout import block_layout
 from .quadratic_pairs import as_pairs
-from .step_record import StepRecord
 from .structs import chained, int32_array
 
 
@@ -47,7 +47,7 @@ class BlockStep:
 
     Attributes:
         residual: Position residual of compensated summation (N,) [m], or None.
-        record: :class:`warpcloth.fast.step_record.StepRecord`.
+        record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
     def __init__(self, model, state, h, symplectic, count, compensated=False, window=None):

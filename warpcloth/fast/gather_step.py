@@ -2,11 +2,11 @@
 
 import warp as wp
 
+from ..core.explicit_step import StepRecord
 from ..kernels.fast import gather_step as kernels
 from ..terms.refresh import EVALUATION, STEP, Moment
 from .compensation import packed_unit
 from .gather_layout import gathered, lanes_of
-from .step_record import StepRecord
 from .structs import chained
 
 # Threads of a block that is a copy; of 1024 vertices 256 threads take 2.1 times as long, 1024 1.2 times (H200).
@@ -33,7 +33,7 @@ class GatherStep:
 
     Attributes:
         residual: Position residual of compensated summation (N,), vectors [m] or packed; or None.
-        record: :class:`warpcloth.fast.step_record.StepRecord`.
+        record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
     def __init__(self, model, state, h, symplectic, count, compensated=False):

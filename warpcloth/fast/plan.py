@@ -19,7 +19,6 @@ from .gather_corrections import GatherSweeps
 from .gather_gradient import GatherGradient
 from .gather_step import GatherStep
 from .scatter_corrections import ScatterSweeps
-from .step_record import StepRecord
 from .subdomains import SubdomainSteps
 
 BACKENDS = ("auto", "core", "blocks", "gather")
@@ -34,7 +33,7 @@ class Plan:
 
     Attributes:
         model, backend: As given.
-        record: The :class:`warpcloth.fast.step_record.StepRecord` of the explicit steps, or None before they are made.
+        record: The :class:`warpcloth.core.explicit_step.StepRecord` of the explicit steps, or None before they are made.
     """
 
     def __init__(self, model, backend):
@@ -59,16 +58,12 @@ class Plan:
             ValueError: If threads cannot share the steps; it names the term.
         """
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
-        if not self.model.uniform and pool.threads == 1:
-            return ExplicitStep(*given)
         if pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
             steps = SubdomainSteps(*given, pool)
-        elif self.backend == "core":
-            self.record = StepRecord("core", compensated=given[-1])
-            return ExplicitStep(*given)
         else:
-            steps = {"blocks": BlockStep, "gather": GatherStep}[self.backend](*given)
+            backend = self.backend if self.model.uniform else "core"
+            steps = {"core": ExplicitStep, "blocks": BlockStep, "gather": GatherStep}[backend](*given)
         self.record = steps.record
         return steps
 

@@ -30,7 +30,7 @@ class SubdomainSteps:
 
     Attributes:
         residual: Position residual of compensated summation (N,) [m], or None.
-        record: :class:`warpcloth.fast.step_record.StepRecord`.
+        record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
     def __init__(self, model, state, h, symplectic, count, compensated, pool):
