@@ -1,9 +1,10 @@
-"""Factories of kernels for the forces of multipliers and for the work of pins and loads."""
+"""Factories of kernels for the forces of multipliers and for the work of pins, loads and colliders."""
 
 from functools import cache
 
 import warp as wp
 
+from .colliders import of_pose, step_poses
 from .local import local_coordinate
 from .project import multiplier_type
 from .term import Term
@@ -104,6 +105,18 @@ def past(dtype):
 
 
 @cache
+def wide_dot(dtype):
+    """The device function (a, b) → a·b in double precision."""
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def product(a: vec3, b: vec3):
+        return wp.float64(a[0]) * wp.float64(b[0]) + wp.float64(a[1]) * wp.float64(b[1]) + wp.float64(a[2]) * wp.float64(b[2])
+
+    return product
+
+
+@cache
 def add_work(dtype):
     """Kernel over vertices, after a step: work of loads += f·Δx, of pins += (½(∇U₀ + ∇U₁) − m g − f)·Δx along held axes.
 
@@ -112,10 +125,7 @@ def add_work(dtype):
     before where ``share`` is ½, for steps that take it at their end.
     """
     vec3, _ = types(dtype)
-
-    @wp.func
-    def product(a: vec3, b: vec3):
-        return wp.float64(a[0]) * wp.float64(b[0]) + wp.float64(a[1]) * wp.float64(b[1]) + wp.float64(a[2]) * wp.float64(b[2])
+    product = wide_dot(dtype)
 
     @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
     def add(
@@ -147,5 +157,88 @@ def add_work(dtype):
             of_pins[i] = of_pins[i] + product(pull, wp.cw_mul(held[i], move))
             before.gradient[i] = gradient[i]
         before.x[i] = x[i]
+
+    return add
+
+
+@cache
+def half_way(dtype):
+    """Kernel over vertices: out = ½(a + b)."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
+    def half_way_between(
+        # state in
+        a: wp.array(dtype=vec3),
+        b: wp.array(dtype=vec3),
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        out[i] = dtype(0.5) * (a[i] + b[i])
+
+    return half_way_between
+
+
+@cache
+def pulls(dtype):
+    """The struct of ∂U/∂x of contact and friction with a collider, and of friction alone, which may be None."""
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Pulls:
+        all: wp.array(dtype=vec3)
+        friction: wp.array(dtype=vec3)
+
+    return Pulls
+
+
+@cache
+def add_collider_work(dtype, at_end: bool):
+    """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
+
+    ∇U is that of contact and friction, ∇H that of friction alone; δ is the move of the collider's material at the vertex. Both
+    are those at the position x_step where the step takes its forces. Where that is ``at_end``, the mean of the products there
+    and where the step began is taken, as the trapezoidal rule has it; ∇U and ∇H are then kept for the next step.
+    """
+    vec3, _ = types(dtype)
+    to_local, to_space = of_pose(dtype)
+    product = wide_dot(dtype)
+
+    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}.{at_end}", enable_backward=False)
+    def add(
+        # state in
+        x_before: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        x_step: wp.array(dtype=vec3),
+        now: pulls(dtype),
+        poses: step_poses(dtype),
+        # parameters
+        collider: int,
+        per_copy: int,
+        # in and out
+        before: pulls(dtype),
+        of_collider: wp.array(dtype=wp.float64),
+        against_friction: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        X = to_local(poses.at[copy, collider], x_step[i])
+        move = to_space(poses.after[copy, collider], X) - to_space(poses.before[copy, collider], X)
+        slip = x[i] - x_before[i]
+        work = product(now.all[i], move)
+        rubbed = wp.float64(0.0)
+        if now.friction.shape[0] > 0:
+            rubbed = product(now.friction[i], slip - move)
+        if wp.static(at_end):
+            X = to_local(poses.before[copy, collider], x_before[i])
+            move = to_space(poses.after[copy, collider], X) - to_space(poses.before[copy, collider], X)
+            work = wp.float64(0.5) * (work + product(before.all[i], move))
+            before.all[i] = now.all[i]
+            if now.friction.shape[0] > 0:
+                rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], slip - move))
+                before.friction[i] = now.friction[i]
+        of_collider[i] = of_collider[i] - work
+        against_friction[i] = against_friction[i] + rubbed
 
     return add

@@ -1,4 +1,4 @@
-"""The history of a run as files: energies and reactions at pins, frame by frame."""
+"""The history of a run as files: energies and forces at pins and colliders, frame by frame."""
 
 import numpy as np
 
@@ -7,8 +7,9 @@ from ..base.texts import json_text
 from .terminal import check_writable
 
 EPILOG = """\
---csv and --report record energies [J] and the reaction forces of pins [N] in every frame. The table of --csv has the sum of the
-reactions; the JSON of --report has the reaction of each pin. An unknown value is an empty cell in the table, and null in JSON.
+--csv and --report record energies [J], the reaction forces of pins and the forces of the cloth on each collider [N] in every
+frame. The table of --csv has the sum of the reactions; the JSON of --report has the reaction of each pin. An unknown value is
+an empty cell in the table, and null in JSON.
 """
 
 
@@ -24,16 +25,28 @@ def record_of(arguments):
 
 def write_history(arguments, scene, animation):
     """Writes the table and the report of a run that recorded both."""
-    energies, reactions = animation.energies, animation.reactions
+    energies, reactions, forces = animation.energies, animation.reactions, animation.collider_forces or {}
     if arguments.csv:
-        columns = ["frame", "time", *energies, *(f"reaction {axis}" for axis in "xyz")]
-        numbers = np.column_stack([animation.times, *energies.values(), reactions.sum(axis=1)])
-        write_table(arguments.csv, columns, ([frame, *row] for frame, row in enumerate(_known(numbers))))
+        vectors = {"reaction": reactions.sum(axis=1), **{f"force on {name}": values for name, values in forces.items()}}
+        vectors |= {f"friction on {name}": values for name, values in (animation.friction_forces or {}).items()}
+        columns = ["frame", "time", *energies, *(f"{name} {axis}" for name in vectors for axis in "xyz")]
+        numbers = [animation.times, *energies.values(), *vectors.values()]
+        if forces:
+            columns, numbers = [*columns, "cut short"], [*numbers, animation.cuts]
+        rows = _known(np.column_stack(numbers))
+        write_table(arguments.csv, columns, ([frame, *row] for frame, row in enumerate(rows)))
     if arguments.report:
         found = {"scene": scene.name, "times": _known(animation.times), "pins": scene.pins.vertices.tolist()}
-        found |= {"energies": {name: _known(values) for name, values in energies.items()}, "reactions": _known(reactions)}
+        found |= {"energies": _by_name(energies), "reactions": _known(reactions)}
+        if forces:
+            found |= {"collider_forces": _by_name(forces), "friction_forces": _by_name(animation.friction_forces)}
+            found["cuts"] = _known(animation.cuts)
         with Output(arguments.report, "x", **TEXT) as output:
             output.file.write(json_text(found) + "\n")
+
+
+def _by_name(found):
+    return {name: _known(values) for name, values in found.items()}
 
 
 def _known(values):

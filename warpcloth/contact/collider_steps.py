@@ -33,27 +33,36 @@ class ColliderSteps:
 
     Attributes:
         terms: The elements of the model, those of contact as steps take them.
+        bounded: Whether contact is that of explicit steps.
+        part: As given.
+        x_before: Positions where the step began, (N,) [m].
+        poses: Those of the step, a :func:`warpcloth.kernels.colliders.step_poses`.
+        shapes: A :func:`warpcloth.kernels.colliders.shapes`.
+        anchors: Those of friction on each collider that has it, by its index.
+        least: Distance below which no vertex ends a step [m].
+        steps_per_frame: As given.
         steps: Steps that the colliders have made, (B,) int32.
         cut: How often a vertex was cut short, in all steps, (B,) int64.
     """
 
     def __init__(self, model, state, h, steps_per_frame, part):
-        self.model, self.h, device = model, h, model.device
+        self.model, self.h, self.part, device = model, h, part, model.device
+        self.steps_per_frame = steps_per_frame
         declared = model.colliders
         pose_type, self._anchor_type = kernels.pose_types(model.dtype)
-        self._shapes = kernels.shapes(model.dtype)()
-        self._shapes.core, self._shapes.radius = declared.core, declared.radius
-        self._dim, self._poses = (model.copies, len(declared.radius)), kernels.step_poses(model.dtype)()
+        self.shapes = kernels.shapes(model.dtype)()
+        self.shapes.core, self.shapes.radius = declared.core, declared.radius
+        self._dim, self.poses = (model.copies, len(declared.radius)), kernels.step_poses(model.dtype)()
         for name in ("before", "at", "after"):
-            setattr(self._poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
-        self._x_before = model.vectors()
+            setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
+        self.x_before = model.vectors()
         self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device))
         self.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
-        self._anchors = []
-        self._least = FLOOR * declared.distance
+        self.anchors = {}
+        self.least = FLOOR * declared.distance
         # Of midpoint forces are those half-way, of others at the end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
-        self._bounded = part == 0.0
+        self.bounded = part == 0.0
         self._move, self._count = model.kernel(kernels.move_colliders, model.dtype), model.kernel(count_step)
         self._filter = model.kernel(kernels.filter_step, model.dtype)
         self.terms = []
@@ -67,40 +76,40 @@ class ColliderSteps:
         first = all(each.refresh is None or each.collider is None for each in self.terms)
         if elements.term is FRICTION:
             anchors = state.add(f"anchors on collider {c}", wp.zeros(model.count, dtype=self._anchor_type, device=model.device))
-            self._anchors.append(anchors)
-            kernel = model.kernel(kernels.anchor_vertices, model.dtype, self._bounded)
+            self.anchors[c] = anchors
+            kernel = model.kernel(kernels.anchor_vertices, model.dtype, self.bounded)
             launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
-        elif declared.moves[c] or not (self._bounded or declared.half_space[c]):
+        elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
             launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype), c, state.v)
         else:
             launch = None
-        term = elements.term.bounded if self._bounded else elements.term
+        term = elements.term.bounded if self.bounded else elements.term
         refresh = Refresh(STEP, partial(self._refresh, first, launch))
         return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=refresh)
 
     def _refresh(self, first, launch, model, elements, moment):
         """Where a step begins: by the first of the terms for all of them, then for each."""
         if first:
-            model.launch(self._move, self._dim, self._given, [self._poses])
-            wp.copy(self._x_before, moment.x)
+            model.launch(self._move, self._dim, self._given, [self.poses])
+            wp.copy(self.x_before, moment.x)
         if launch is not None:
             launch(model, elements)
 
     def _pose_elements(self, kernel, c, v, model, elements):
-        given = [elements.stencil, self._shapes, *model.free_gravity, self._x_before, v, self._poses]
-        given += [c, elements.per_copy, self._least, 0.0 if self._bounded else self.h]
+        given = [elements.stencil, self.shapes, *model.free_gravity, self.x_before, v, self.poses]
+        given += [c, elements.per_copy, self.least, 0.0 if self.bounded else self.h]
         model.launch(kernel, elements.count, given, [elements.rest])
 
     def _anchor(self, kernel, c, anchors, friction, model, elements):
-        given = [elements.stencil, self._shapes, self._x_before, self._poses]
+        given = [elements.stencil, self.shapes, self.x_before, self.poses]
         given += [c, elements.per_copy, model.colliders.distance, friction]
         model.launch(kernel, elements.count, given, [anchors, elements.rest])
 
     def launch_end(self, x, v, move=None):
         """Cuts the step short of vertices that would end in a collider or cross one, in x, v and ``move`` (N,)."""
         model = self.model
-        given = [model.inverse_mass, self._shapes, self._x_before, self._poses]
-        given += [model.per_copy, self._least, LANDING * model.colliders.distance, self.h]
+        given = [model.inverse_mass, self.shapes, self.x_before, self.poses]
+        given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
         model.launch(self._filter, model.count, given, [x, v, move, self.cut])
         model.launch(self._count, model.copies, [], [self.steps])
 
@@ -112,5 +121,5 @@ class ColliderSteps:
 
     def start_again(self):
         """Forgets the steps that an integrator made to find its past."""
-        for array in (self.steps, self.cut, *self._anchors):
+        for array in (self.steps, self.cut, *self.anchors.values()):
             array.zero_()

@@ -67,9 +67,10 @@ class DeviceElements:
         return values[:, 0] if values.size and (values == values[:, :1]).all() else None
 
     def with_unit_stiffness(self):
-        """Returns these elements with a stiffness of 1, or 0 where it is 0."""
+        """Returns these elements with a stiffness of 1, or 0 where it is 0; of contact with 1/A."""
         stiffness = host_values(self.stiffness)
-        ones = keep((stiffness > 0.0).astype(stiffness.dtype), self.stiffness.dtype, self.stiffness.device)
+        ones = (stiffness > 0.0) / (1.0 if self.collider is None else host_values(self.rest)[:, -1])  # A is last
+        ones = keep(ones.astype(stiffness.dtype), self.stiffness.dtype, self.stiffness.device)
         return replace(self, stiffness=ones, hard=False)
 
     def weighed(self, factor):

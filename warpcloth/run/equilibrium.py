@@ -1,6 +1,7 @@
 """Static equilibria: where the energy of a scene and of its weight is least, without inertia."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..numerics.minimise import Minimiser
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
 from ..terms.refresh import Moment
-from .history import Evaluation, checked_record
+from .history import Evaluation, checked_record, collider_names
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
@@ -39,6 +40,7 @@ class Equilibrium(NamedTuple):
         energies: With ``record="energies"``, by name [J]: of each term, ``"gravity"`` since the start, and the ``"work of
             loads"`` that are constant.
         reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (p, 3) [N].
+        collider_forces: With ``record="reactions"``, the force of the cloth on each collider by its name, (3,) [N].
     """
 
     points: np.ndarray
@@ -48,6 +50,7 @@ class Equilibrium(NamedTuple):
     stable: bool = False
     energies: dict[str, float] | None = None
     reactions: np.ndarray | None = None
+    collider_forces: dict[str, np.ndarray] | None = None
 
 
 @in_turn
@@ -65,8 +68,10 @@ def equilibrium(
 
     Pins with keyframes end at the last keyframe; all others stay where they start. Loads have the values of their last
     keyframes, and pressure, which follows the cloth, is that of the shape found: its forces are kept while the cloth settles
-    and taken anew until they balance; ``stable`` and ``lowest_eigenvalue`` are of these forces. Colliders must stand still
-    and be without friction, with which there is more than one rest shape.
+    and taken anew until they balance; ``stable`` and ``lowest_eigenvalue`` are of these forces. Colliders stand where their
+    last keyframe has them, and free vertices must start outside of them there; how they came there has no effect. With friction
+    there are many rest shapes, and the motion decides among them, so colliders must be without: to find one, run the scene with
+    damping until it rests.
 
     Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
     the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
@@ -92,7 +97,8 @@ def equilibrium(
         :class:`Equilibrium`.
 
     Raises:
-        ValueError: If an argument breaks a rule, a stiffness is infinite, or a collider moves or has friction.
+        ValueError: If an argument breaks a rule, a stiffness is infinite, a collider has friction, or a free vertex starts
+            inside of one as it stands last.
 
     Examples:
         >>> import warpcloth as wc
@@ -107,11 +113,8 @@ def equilibrium(
     whole("load_steps", load_steps, 1)
     whole("iterations", iterations, 1)
     choice("linear", linear, ("factorised", "cg"))
-    record = checked_record(record, scene)
-    for collider in scene.colliders:
-        if collider.moves or collider.friction:
-            has = "moves" if collider.moves else f"has friction {collider.friction:g}"
-            raise ValueError(f"the collider {collider.label} {has}; for a rest shape it must stand still and have none")
+    record = checked_record(record)
+    scene = _with_colliders_at_rest(scene)
     model = scene.build(device=device, dtype=dtype)
     refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
     base = wp.clone(model.positions)
@@ -141,7 +144,7 @@ def equilibrium(
     if result is Result.STALLED:
         message = message.replace(result.value, began)
     status = Status(result, residual=residual, message=message, measure=RESIDUAL.measure, unit=unit)
-    energies = reactions = None
+    energies = reactions = forces = None
     if record:
         evaluation = Evaluation(model, forces="reactions" in record)
         if "energies" in record:
@@ -149,7 +152,26 @@ def equilibrium(
         if "reactions" in record:
             evaluation.launch(base)
             reactions = evaluation.reactions()[0]
-    return Equilibrium(np.array(base.numpy()), status, descent.used, lowest, result in SETTLED, energies, reactions)
+            if evaluation.pulls:
+                forces = dict(zip(collider_names(scene), evaluation.pulls.sums(1)[0, :, 0], strict=True))
+    recorded = energies, reactions, forces
+    return Equilibrium(np.array(base.numpy()), status, descent.used, lowest, result in SETTLED, *recorded)
+
+
+def _with_colliders_at_rest(scene):
+    """The scene with moving colliders where their last keyframe has them; refuses friction."""
+    for collider in scene.colliders:
+        if collider.friction:
+            raise ValueError(
+                f"the collider {collider.label} has friction {collider.friction:g}, with which there are many rest shapes and "
+                "the motion decides among them; set it to 0, or run the scene with damping until it rests"
+            )
+    if not any(collider.moves for collider in scene.colliders):
+        return scene
+    try:
+        return replace(scene, colliders=[collider.at_last() for collider in scene.colliders])
+    except ValueError as error:
+        raise ValueError(f"where the last keyframe has the colliders, {error}; move the cloth, or run the scene") from None
 
 
 class _Descent:

@@ -1,4 +1,4 @@
-"""The history of a run: energies, work and the reactions at pins, frame by frame, where they are asked for."""
+"""The history of a run: energies, work and the forces at pins and colliders, frame by frame, where they are asked for."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -9,11 +9,14 @@ import warp as wp
 
 from ..base.checks import shown
 from ..base.turns import in_turn
+from ..contact.collider_work import ColliderWork
+from ..contact.present import ColliderPulls, PresentContact
 from ..core.capture import Segment
 from ..core.energy import Energy
 from ..core.sums import Sums
 from ..fast.plan import plan
 from ..kernels import work as kernels
+from ..kernels.terms.friction import FRICTION
 from ..model.damping import dissipations
 from ..scene.scene import Scene
 from ..terms.refresh import STEP, Moment
@@ -21,67 +24,103 @@ from ..terms.refresh import STEP, Moment
 RECORDS = ("energies", "reactions")
 
 
-def checked_record(record: Any, scene: Scene) -> tuple[str, ...]:
+def checked_record(record: Any) -> tuple[str, ...]:
     """Returns what to record, each word once, in the order of :data:`RECORDS`.
 
     Raises:
-        ValueError: If a word is another, or the scene has colliders, whose work and reactions are not recorded.
+        ValueError: If a word is another.
     """
     words = (record,) if isinstance(record, str) else record if isinstance(record, Iterable) else (record,)
     words = tuple(words)
     for word in words:
         if word not in RECORDS:
             raise ValueError(f"record is {shown(word)}; it must be some of {', '.join(map(repr, RECORDS))}")
-    if words and scene.colliders:
-        raise ValueError(f"record is {shown(record)}; the work of colliders is not recorded yet, leave them or record out")
     return tuple(word for word in RECORDS if word in words)
 
 
-def energy_names(scene):
+def energy_names(scene: Scene) -> list[str]:
     """Names of the energies and works that a run of a scene records; of terms their labels, numbered where one is taken."""
+    moved = any(collider.moves for collider in scene.colliders)
     others = ["kinetic", "gravity", *["work of pins"] * scene.pins.moves, *["work of loads"] * bool(scene.loads)]
+    others += ["work of colliders"] * moved + ["heat of friction"] * len(scene.rubbing[:1])
+    return _numbered((term.label for term in (*scene.terms, *scene.contact_terms)), others) + others
+
+
+def collider_names(scene: Scene) -> list[str]:
+    """Names of the colliders of a scene: their labels, numbered where one is taken."""
+    return _numbered(collider.label for collider in scene.colliders)
+
+
+def _numbered(labels, taken=()):
     found = []
-    for term in scene.terms:
-        name, number = term.label, 1
-        while name in found or name in others:
+    for label in labels:
+        name, number = label, 1
+        while name in found or name in taken:
             number += 1
-            name = f"{term.label} {number}"
+            name = f"{label} {number}"
         found.append(name)
-    return found + others
+    return found
 
 
 class Evaluation:
-    """Energies of a model and the forces of its pins, at any positions.
+    """Energies of a model and the forces at its pins and colliders, at any positions.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         h: Step over which damping is taken [s], or None without motion.
-        pull: Function that adds the gradient of the forces of hard terms to an array (N,) [N], or None.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper` whose colliders and multipliers it takes; None for colliders
+            where they start, and no hard terms.
         forces: Whether it finds forces.
+
+    Attributes:
+        names: Names of the energies.
+        names_of_friction: Those of them that friction stores.
+        hidden: Whether some forces are those of multipliers.
+        gradient: ∂U/∂x of the last :meth:`launch`, (N,) [N].
+        pulls: :class:`warpcloth.contact.present.ColliderPulls` of it, or None without colliders.
+
+    Raises:
+        ValueError: If a term is hard and the solver has no multipliers.
     """
 
-    def __init__(self, model, h=None, pull=None, forces=True):
-        self.model, self._h, self._pull = model, h, pull
+    def __init__(self, model, h=None, stepper=None, forces=True):
+        self.model, self._h, self._pull, self.pulls = model, h, None, None
+        shares = [] if stepper is None or model.colliders is None else stepper.shares
+        self._present = PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
+        self._terms = self._present.terms
+        self.hidden = forces and stepper is not None and any(elements.hard for elements in model.terms)
         self._pins, self._held = model.in_model(model.scene.pins.vertices), model.scene.pins.held
         self._mass = model.mass.numpy().astype(np.float64).reshape(model.copies, -1)
         self._gravity = model.gravity.numpy().astype(np.float64)[:, None]
         self._start, self._energies = self._host(model.positions), None
         self.names = energy_names(model.scene)
+        of_terms = zip(self.names, model.terms, strict=False)  # those of terms are first
+        self.names_of_friction = [name for name, each in of_terms if each.term is FRICTION]
         if not forces:
             return
         self.gradient = model.vectors()
-        soft = tuple(elements for elements in model.terms if not elements.hard)
+        if self.hidden:
+            self._pull = stepper.constraint_forces()
+        if model.colliders is not None:
+            self.pulls = ColliderPulls(model, self._terms, stepper and stepper.constraint_forces)
+        soft = tuple(elements for elements in self._terms if not elements.hard and elements.collider is None)
         self._elastic = plan(model).gradient(terms=soft) if soft else None
         self._damped = dissipations(model, h) if h else []
         if self._damped:
             self._dissipative = plan(model).gradient(corrected=True, terms=self._damped)
             self._before, self._move = model.vectors(), model.vectors()
             self._back = model.kernel(kernels.step_back, model.dtype)
+        self._add = model.kernel(kernels.add_scaled, model.dtype) if self.pulls else None
 
     def launch(self, x, v=None):
         """Launches ∂U/∂x at x into ``gradient`` (N,) [N], with the damping at velocities v and the pull of hard terms."""
         model = self.model
         self.gradient.zero_()
+        if self.pulls:
+            self._present.launch(x, v)
+            self.pulls.launch(x)
+            for found in self.pulls.found if not self.pulls.hard else ():  # else they come with all hard terms
+                model.launch(self._add, model.count, [found.all, 1.0], [self.gradient])
         if self._elastic:
             self._elastic.add(x, self.gradient)
         if self._damped:
@@ -103,7 +142,8 @@ class Evaluation:
         model, found = self.model, {}
         if self._energies is None:
             sums = Sums(model)
-            self._energies = [None if each.hard else Energy(model, sums, terms=(each,)) for each in model.terms]
+            self._energies = [None if each.hard else Energy(model, sums, terms=(each,)) for each in self._terms]
+        self._present.launch(x, v)
         for label, energy in zip(self.names, self._energies, strict=False):  # those of terms are first
             total = model.scalars()
             if energy is not None:  # a hard term stores none
@@ -133,12 +173,23 @@ class Evaluation:
         return array.numpy().astype(np.float64).reshape(*self._mass.shape, 3)
 
 
+def _kept(name):
+    """The attribute of the rows of one name, which a run that goes on sets."""
+
+    def get(history):
+        return np.array(history._rows[name])
+
+    def keep(history, rows):
+        history._rows[name] = list(rows)
+
+    return property(get, keep)
+
+
 class History:
     """Wraps a stepper and records energies and reactions after each frame, without changing its state.
 
-    Work that depends on the path, that of moving pins and of loads that change or follow the cloth, is summed in every step,
-    and steps are then launched one by one; frames stay equal to the bit. What holds or drives the cloth besides pins and loads,
-    such as colliders, adds its reactions and its work in :meth:`_note`.
+    Work that depends on the path, that of moving pins and colliders, of loads that change or follow the cloth, and against
+    friction, is summed in every step, and steps are then launched one by one; frames stay equal to the bit.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
@@ -149,27 +200,37 @@ class History:
         names: Names of the energies.
         energies: Of each frame that was kept, (F, B, K) [J].
         reactions: Of each frame that was kept, (F, B, p, 3) [N].
-        totals: Work of pins, without their kinetic energy, and of loads in the last frame that was kept, (2, B) [J].
+        forces: On the colliders, and of these the part of friction, of each frame that was kept, (F, B, C, 2, 3) [N].
+        cuts: The share of the moves in each frame that was kept which colliders cut short, (F, B).
+        totals: Work of pins, without their kinetic energy, of loads, of colliders and against friction in the last frame that
+            was kept, (4, B) [J].
 
     Raises:
         ValueError: If a term is hard and the solver has no multipliers.
     """
 
-    carried = ("energies", "reactions", "totals")  # from frame to frame
+    energies, reactions, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
 
     @in_turn
     def __init__(self, stepper, model, record):
-        self._stepper, self.model, self._record = stepper, model, record
+        self._stepper, self.model, self._record, scene = stepper, model, record, model.scene
         changing = model.loads is not None and model.loads.constant is None
-        self._moving, self._driven = ("energies" in record and each for each in (model.scene.pins.moves, changing))
-        forces = "reactions" in record or self._moving
-        self._hidden = forces and any(elements.hard for elements in model.terms)
-        self._evaluation = Evaluation(model, stepper.h, stepper.constraint_forces() if self._hidden else None, forces)
-        self._found, self._rows, self._frame = deque(), {name: [] for name in RECORDS}, 0
+        rubbed = bool(scene.rubbing)
+        touched = rubbed or any(collider.moves for collider in scene.colliders)
+        asked = "energies" in record
+        self._moving, self._driven, self._rubbed, self._touched = (
+            asked and each for each in (scene.pins.moves, changing, rubbed, touched)
+        )
+        forces = "reactions" in record or self._moving or self._touched
+        self._evaluation = Evaluation(model, stepper.h, stepper, forces)
+        self._found, self._frame = deque(), 0
+        of_colliders = [*["forces"] * ("reactions" in record), "cuts"] if scene.colliders else []
+        self._rows = {name: [] for name in (*record, *of_colliders)}
+        self.carried = (*self._rows, "totals")  # from frame to frame
         self.names = self._evaluation.names
-        self._total, self._each_step = np.zeros((2, model.copies)), None
+        self._total, self._each_step, self._cut = np.zeros((4, model.copies)), None, np.zeros(model.copies)
         x, v = stepper.state
-        if self._moving or self._driven:
+        if self._moving or self._driven or self._touched:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
         self._note()
@@ -179,16 +240,26 @@ class History:
         model, evaluation = self.model, self._evaluation
         self._before = before = kernels.past(model.dtype)()
         before.x, before.gradient, before.force = (model.vectors() for _ in range(3))
-        self._works = [wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2)]
+        self._works = [wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(4)]
         held, gradient = (evaluation.mask(), evaluation.gradient) if self._moving else (None, None)
         force, kernel = None if model.loads is None else model.loads.force, model.kernel(kernels.add_work, model.dtype)
         share = 0.5 if self._stepper.loads_at_end else 0.0
+        self._touches = []
+        for stepper, first, end in self._stepper.shares if self._touched else ():
+            vertices = slice(first * model.per_copy, end * model.per_copy)
+            sums = [work[vertices] for work in self._works[2:]]
+            given = stepper.model.terms, stepper.state.x, *sums, stepper.constraint_forces
+            touches = ColliderWork(stepper.colliders, *given)
+            self._touches.append((touches, vertices))
 
         def launch():
-            if self._moving:
-                evaluation.launch(x, v)
-            given = [model.mass, model.gravity, held, x, gradient, force, model.per_copy, share]
-            model.launch(kernel, model.count, given, [before, *self._works])
+            for touches, _vertices in self._touches:
+                touches.launch()
+            if self._moving or self._driven:
+                if self._moving:
+                    evaluation.launch(x, v)
+                given = [model.mass, model.gravity, held, x, gradient, force, model.per_copy, share]
+                model.launch(kernel, model.count, given, [before, *self._works[:2]])
 
         return Segment(model.device, launch)
 
@@ -199,9 +270,11 @@ class History:
         if loads is not None:
             loads.launch(self.model, Moment(x, ahead=self._frame))
             wp.copy(before.force, loads.force)
-        if self._moving:
+        if self._moving or self._touched:
             self._evaluation.launch(x, v)
             wp.copy(before.gradient, self._evaluation.gradient)
+        for touches, vertices in self._touches:
+            touches.begin(self._evaluation.pulls.found, vertices)
 
     def __getattr__(self, name):
         return getattr(self._stepper, name)
@@ -230,14 +303,24 @@ class History:
                 energies["work of pins"] = self._total[0] + evaluation.kinetic_of_pins(v) - self._kinetic
             if self._driven:
                 energies["work of loads"] = self._total[1].copy()
+            energies["work of colliders"] = self._total[2].copy()
+            if self._rubbed:
+                stored = sum(energies[name] for name in evaluation.names_of_friction)
+                energies["heat of friction"] = self._total[3] - stored
             found["energies"] = np.stack([energies[name] for name in self.names], axis=-1)
         if "reactions" in self._record:
             if loads is not None:
                 loads.launch(self.model, Moment(x, ahead=self._frame))
             evaluation.launch(x, v)
             found["reactions"] = evaluation.reactions()
-            if self._hidden and not self._frame:  # multipliers are those of a step
-                found["reactions"][:] = np.nan
+            if evaluation.pulls:
+                found["forces"] = evaluation.pulls.sums(self.model.copies)
+            if evaluation.hidden and not self._frame:  # multipliers are those of a step
+                for name in ("reactions", *["forces"] * bool(evaluation.pulls and evaluation.pulls.hard)):
+                    found[name][:] = np.nan
+        if self.model.colliders is not None:
+            before, self._cut = self._cut, self._stepper.cut * self._frame  # of as many steps in each frame
+            found["cuts"] = self._cut - before
         self._found.append((found, self._total.copy()))
 
     def keep(self, alive):
@@ -252,28 +335,21 @@ class History:
         """Goes on from the frame kept last, to which the stepper was set."""
         self._found.clear()
         self._total, self._frame = np.array(self.totals), max(map(len, self._rows.values())) - 1
+        self._cut = self._stepper.cut * self._frame
 
     def by_name(self):
-        """Returns energies by name, (F,) or (F, B) [J], and reactions, (F, p, 3) or (F, B, p, 3) [N], or None."""
-        one = self.model.copies == 1
-        energies = np.moveaxis(self.energies, -1, 0) if "energies" in self._record else None
-        reactions = self.reactions if "reactions" in self._record else None
-        if energies is not None:
-            energies = {name: row[:, 0] if one else row for name, row in zip(self.names, energies, strict=True)}
-        return energies, reactions[:, 0] if one and reactions is not None else reactions
-
-    @property
-    def energies(self):
-        return np.array(self._rows["energies"])
-
-    @energies.setter
-    def energies(self, rows):
-        self._rows["energies"] = list(rows)
-
-    @property
-    def reactions(self):
-        return np.array(self._rows["reactions"])
-
-    @reactions.setter
-    def reactions(self, rows):
-        self._rows["reactions"] = list(rows)
+        """Returns the fields of the animation that it fills, by name; rows are (F, …), or (F, B, …) of several copies."""
+        one, found = self.model.copies == 1, {}
+        rows = {name: getattr(self, name)[:, 0] if one else getattr(self, name) for name in self._rows}
+        if "energies" in rows:
+            found["energies"] = dict(zip(self.names, np.moveaxis(rows["energies"], -1, 0), strict=True))
+        if "reactions" in rows:
+            found["reactions"] = rows["reactions"]
+        if "forces" in rows:
+            names = collider_names(self.model.scene)
+            of_all, of_friction = np.moveaxis(rows["forces"], (-3, -2), (1, 0))
+            found["collider_forces"] = dict(zip(names, of_all, strict=True))
+            found["friction_forces"] = {names[c]: of_friction[c] for c in self.model.scene.rubbing}
+        if "cuts" in rows:
+            found["cuts"] = rows["cuts"]
+        return found

@@ -7,16 +7,16 @@ import numpy as np
 from ..scene.lines import lines_of
 from ..usd import AnimationWriter, FrameSequence
 from .checkpoint import NAME, Checkpoint
-from .history import energy_names
+from .history import collider_names, energy_names
 
 REACTION = "reaction"  # name of the primvar
 
 
-def primvar_names(names):
-    """Names of primvars for energies, such as energies:work_of_pins, by the names of these."""
+def primvar_names(names, kind="energies"):
+    """Names of primvars of a kind, such as energies:work_of_pins, by the names of what they hold."""
     found = {}
     for name in names:
-        key = before = "energies:" + (re.sub(r"\W", "_", name, flags=re.ASCII) or "_")
+        key = before = f"{kind}:" + (re.sub(r"\W", "_", name, flags=re.ASCII) or "_")
         number = 1
         while key in found.values():
             number += 1
@@ -77,7 +77,10 @@ class File:
         self._facts, self._found, self.checkpoint, self._ended = facts, None, None, False
         self._energies = primvar_names(energy_names(scene)) if "energies" in record else {}
         self._pins, self._vertices = scene.pins.vertices, len(scene.mesh.points)
+        self._rubbing, names = scene.rubbing, collider_names(scene) if "reactions" in record else []
+        self._forces = [list(primvar_names(names, kind).values()) for kind in ("collider_forces", "friction_forces")]
         history = dict.fromkeys(self._energies.values(), "double") | ({REACTION: "float3[]"} if "reactions" in record else {})
+        history |= dict.fromkeys((*self._forces[0], *(self._forces[1][c] for c in self._rubbing if names)), "double3")
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
@@ -146,6 +149,10 @@ class File:
         if "reactions" in recorded:
             found[REACTION] = np.zeros((self._vertices, 3))
             found[REACTION][self._pins] = recorded["reactions"][0]
+        if "forces" in recorded:
+            of_all, of_friction = np.moveaxis(recorded["forces"][0], 1, 0)
+            found |= dict(zip(self._forces[0], of_all, strict=True))
+            found |= {self._forces[1][c]: of_friction[c] for c in self._rubbing}
         return found
 
     def finish(self):

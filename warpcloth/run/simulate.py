@@ -49,11 +49,17 @@ class Animation:
             its good frames.
         output: Path of the USD file, or None.
         scene: The :class:`warpcloth.Scene` of the run, or None.
-        energies: With ``record="energies"``, by name and (frames+1,) or (frames+1, B) [J]: of each term under its label,
-            ``"kinetic"``, ``"gravity"`` (0 at the start), and where there are any ``"work of pins"`` that move and ``"work of
-            loads"``. A copy that diverged is NaN from then on.
+        energies: With ``record="energies"``, by name and (frames+1,) or (frames+1, B) [J]: of each term under its label, of
+            ``"contact with Ball"`` and ``"friction on Ball"`` for a collider of that name, ``"kinetic"``, ``"gravity"`` (0 at
+            the start), and where there are any ``"work of pins"`` that move, ``"work of loads"``, ``"work of colliders"`` that
+            move, and ``"heat of friction"``. A copy that diverged is NaN from then on.
         reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (frames+1, p,
             3) or (frames+1, B, p, 3) [N], in the order of ``scene.pins.vertices``.
+        collider_forces: With ``record="reactions"``, the force of the cloth on each collider, friction included, by the name
+            of the collider and (frames+1, 3) or (frames+1, B, 3) [N].
+        friction_forces: Likewise the part of friction, of colliders that have it.
+        cuts: With a record, the share of the moves of free vertices in each frame that was cut short, (frames+1,) or
+            (frames+1, B); see ``cut``.
         cut: The share of the moves of free vertices, of all steps, that were cut short because they would have ended in a
             collider or crossed one; with B > 1 copies one value per copy, (B,).
     """
@@ -69,6 +75,9 @@ class Animation:
     energies: dict[str, np.ndarray] | None = None
     reactions: np.ndarray | None = None
     cut: float | np.ndarray = 0.0
+    collider_forces: dict[str, np.ndarray] | None = None
+    friction_forces: dict[str, np.ndarray] | None = None
+    cuts: np.ndarray | None = None
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
@@ -114,8 +123,8 @@ def simulate(
         resume: Whether to continue the interrupted run to ``output`` after its last finished chunk of frames. The result equals
             that of an uninterrupted run bit for bit. All arguments but ``frames`` and ``single_file`` must be the same.
         record: ``"energies"``, ``"reactions"`` or both, to have them in each frame of the :class:`Animation`, and as primvars
-            of ``output``. The motion is the same to the bit. Work of moving pins and of loads that change is summed in every
-            step, which takes more time.
+            of ``output``. The motion is the same to the bit. Work of moving pins and colliders, of loads that change, and
+            against friction is summed in every step, which takes more time.
 
     Returns:
         :class:`Animation`. A run that diverges ends with its last good frame, and ``status`` says so. With several copies the
@@ -141,7 +150,7 @@ def simulate(
     whole("frames", frames, 1, MOST_FRAMES)
     whole("copies", copies, 1)
     choice("dtype", dtype, tuple(DTYPES))
-    record = checked_record(record, scene)
+    record = checked_record(record)
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
     if resume and output is None:
@@ -181,9 +190,8 @@ def simulate(
     status = watch.status(solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
-    recorded = history.by_name() if history else (None, None)
-    rest = output, scene, *recorded, of_copies(stepper.cut)
-    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), *rest)
+    recorded = {"output": output, "scene": scene, "cut": of_copies(stepper.cut), **(history.by_name() if history else {})}
+    return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)
 
 
 @in_turn

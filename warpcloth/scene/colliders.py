@@ -1,7 +1,7 @@
 """Colliders: what cloth touches, standing or moved as rigid bodies, and how it touches them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,6 +96,11 @@ class Collider:
     def moves(self) -> bool:
         """Whether it has more than one keyframe."""
         return len(self.poses) > 1
+
+    def at_last(self) -> "Collider":
+        """This collider where its last keyframe has it, standing."""
+        position, rotation = np.atleast_2d(self.position)[-1], np.atleast_2d(self.rotation)[-1]
+        return replace(self, position=position, rotation=rotation)
 
     @property
     def poses(self) -> np.ndarray:

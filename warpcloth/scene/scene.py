@@ -251,6 +251,11 @@ class Scene:
                 found.append(VertexFriction(name=f"friction on {collider.label}", **given))
         return tuple(found)
 
+    @property
+    def rubbing(self) -> list[int]:
+        """Indices of the colliders that have friction."""
+        return [c for c, collider in enumerate(self.colliders) if collider.friction]
+
     def refuse_inside(self, positions: np.ndarray, copy: str = "") -> None:
         """Refuses free vertices that start inside a collider, at ``positions`` (n, 3) [m].
 

@@ -122,8 +122,16 @@ class Stepper:
         """Whether steps take the forces of loads at their end, not in the middle or where they begin."""
         return self.integrator is not None and self.integrator.part != 0.5
 
-    def constraint_forces(self):
-        """Makes what adds −f, f the forces of all hard terms by their multipliers in the last step, to an array (N,) [N].
+    @property
+    def shares(self):
+        """The steppers that share the batch, each with its first copy and the one after its last."""
+        return [(self, 0, self.model.copies)]
+
+    def constraint_forces(self, collider=None):
+        """Makes what adds −f, f the forces of hard terms by their multipliers in the last step, to an array (N,) [N].
+
+        Args:
+            collider: Index of the collider whose contact it is of, or None for all hard terms.
 
         Returns:
             A function of the array, which launches it.

@@ -48,8 +48,12 @@ class ThreadedStepper(Stepper):
     def loads_at_end(self):
         return self.parts[0].loads_at_end
 
-    def constraint_forces(self):
-        n, launches = self.model.per_copy, [part.constraint_forces() for part in self.parts]
+    @property
+    def shares(self):
+        return [(part, *copies) for part, copies in zip(self.parts, self._copies, strict=True)]
+
+    def constraint_forces(self, collider=None):
+        n, launches = self.model.per_copy, [part.constraint_forces(collider) for part in self.parts]
 
         def launch(out):
             for of_part, (first, end) in zip(launches, self._copies, strict=True):

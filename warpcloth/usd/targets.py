@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from .modules import Sdf, Vt
+from .modules import Gf, Sdf, Vt
 from .stage import VERTEX_PRIMVAR
 
 Interpolation = Literal["vertex", "uniform"]
@@ -29,8 +29,8 @@ class Target:
         face_triangles: Number of triangles of each face of the prim (F,), a hole 0, or None where each has one.
         vectors: Names of the vectors that are sampled, of `SAMPLED`; curves are drawn as tubes, which need no normals.
         primvars: Interpolation of each sampled primvar, "vertex" or "uniform", by name.
-        history: Type of each further primvar that is sampled, by name: "float3[]" of vertices, or "double" of the whole cloth,
-            in SI and in world space whatever the prim is in.
+        history: Type of each further primvar that is sampled, by name: "float3[]" of vertices, or "double" or "double3" of the
+            whole cloth, in SI and in world space whatever the prim is in.
         coloured: Name of the primvar that a sampled displayColor shows, or None: no colours are sampled.
     """
 
@@ -62,7 +62,7 @@ class Target:
                 Sdf.AttributeSpec(prim, name, self.attributes[name])
             if name.startswith("primvars:"):
                 shown = self.coloured if name == DISPLAY_COLOUR else name.removeprefix("primvars:")
-                of_history = "constant" if self.history.get(shown) == "double" else "vertex"
+                of_history = "constant" if self.history.get(shown) in ("double", "double3") else "vertex"
                 prim.attributes[name].SetInfo("interpolation", self.primvars.get(shown, of_history))
 
     def samples(self, vectors, primvars=None, colours=None, history=None):
@@ -73,7 +73,7 @@ class Target:
             primvars: Values by name, (n,) or, where uniform, one for each triangle (T,). NaN is a value that is not known: a
                 face has the mean of the others.
             colours: (n, 3) or (T, 3), as the primvar that they show; a face has the mean over its triangles with a value.
-            history: Values by name, (n, 3) or a number. NaN is a value that is not known.
+            history: Values by name, (n, 3), (3,) or a number. NaN is a value that is not known.
 
         Returns:
             dict: An array of pxr for each of `attributes`.
@@ -84,6 +84,8 @@ class Target:
         for name, value in (history or {}).items():
             if self.history[name] == "double":
                 own[f"primvars:{name}"] = float(value)
+            elif self.history[name] == "double3":
+                own[f"primvars:{name}"] = Gf.Vec3d(*map(float, value))
             else:
                 value = value if self.point_vertices is None else value[self.point_vertices]
                 own[f"primvars:{name}"] = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(value, dtype=np.float32))

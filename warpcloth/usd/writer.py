@@ -70,8 +70,8 @@ class AnimationWriter(ChunkWriter):
             lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth;
                 `lines.lines_of` finds those of a scene. Not allowed with a source.
             colliders: Drawn as gprims under /World/Colliders, with their motion; a layer over a source has none.
-            history: Type of each primvar of the history of a run, by name: "float3[]", a vector for each vertex, or "double", a
-                number of the whole cloth.
+            history: Type of each primvar of the history of a run, by name: "float3[]", a vector for each vertex, or "double3"
+                or "double", a vector or a number of the whole cloth.
 
         Raises:
             FileNotFoundError: The output's folder or the source does not exist.
@@ -120,7 +120,7 @@ class AnimationWriter(ChunkWriter):
             points: (n, 3) [m], world space.
             velocities: (n, 3) [m/s].
             primvars: Values by name of all primvars that were declared, (n,) or, where uniform, (T,).
-            history: Values by name of all that `history` declared, (n, 3) or a number, in SI and in world space.
+            history: Values by name of all that `history` declared, (n, 3), (3,) or a number, in SI and in world space.
 
         Raises:
             ValueError: Other primvars than declared, a wrong shape, or a value that is not finite as float32, with the

@@ -1,0 +1,198 @@
+"""Forces on colliders, works and heat against known answers and balances."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.cli import main
+
+BOTH = ("energies", "reactions")
+G, DENSITY, R = 9.81, 0.15, 1e-3
+SOLVERS = {
+    "explicit": wc.Explicit(substeps=80),
+    "newton": wc.Newton(substeps=2, tolerance=1e-11),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=2, tolerance=1e-10, iterations=500),
+    "xpbd": wc.XPBD(substeps=2, iterations=300),
+    "admm": wc.ADMM(substeps=2, tolerance=1e-13, iterations=3000),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=2, tolerance=1e-11, iterations=100, linear="factorised"),
+}
+
+
+def total(energies):
+    """Constant but for what integrators lose: all energies and heat, less the works."""
+    return sum(-values if name.startswith("work") else values for name, values in energies.items())
+
+
+def slope(degrees, friction, **fields):
+    """A sheet at rest on a slope, pressed in by its weight; the normal, and the direction down the slope."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    grid = wc.Mesh.grid(3, 3, size=0.1)
+    mesh = wc.Mesh((grid.points + np.array([0.0, R * (1.0 - 0.1 * c), 0.0])) @ turn.T, grid.triangles)
+    plane = wc.Plane(normal=turn[:, 1], friction=friction, name="slope")
+    terms = [wc.Spring(stiffness=1000.0)]
+    scene = wc.Scene(mesh, density=DENSITY, terms=terms, colliders=[plane], **{"duration": 0.1, **fields})
+    return scene, turn[:, 1], turn[:, 0]
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_plane_bears_the_weight(name, device):
+    scene, _normal, _down = slope(0.0, 0.0)
+    run = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64", record=BOTH)
+    weight = [0.0, -G * scene.vertex_masses.sum(), 0.0]
+    np.testing.assert_allclose(run.collider_forces["slope"], np.tile(weight, (7, 1)), rtol=0.0, atol=1e-13)
+    rest = wc.equilibrium(scene, device=device, record=BOTH)
+    np.testing.assert_allclose(rest.collider_forces["slope"], weight, rtol=0.0, atol=1e-9)
+    depth = 0.1 * R
+    assert rest.energies["contact with slope"] == pytest.approx(0.5 * depth * G * scene.vertex_masses.sum(), rel=1e-6)
+    assert run.friction_forces == {} and (run.cuts == 0.0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in SOLVERS if name != "constrained dynamics"])
+def test_a_slope_bears_the_weight_and_slides_by_friction(name, device):
+    """N = mg cos θ and μN up the slope; the heat is μN times the way, less what the anchors store."""
+    scene, normal, down = slope(30.0, 0.3)
+    run = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64", record=BOTH)
+    weight = G * scene.vertex_masses.sum()
+    pressed, rubbed = weight * np.sqrt(0.75), 0.3 * weight * np.sqrt(0.75)
+    forces, friction = run.collider_forces["slope"][2:], run.friction_forces["slope"][2:]
+    np.testing.assert_allclose(forces @ normal, -pressed, rtol=1e-6)
+    np.testing.assert_allclose(friction @ down, rubbed, rtol=1e-6)
+    np.testing.assert_allclose(friction @ normal, 0.0, atol=1e-9)
+    way = ((run.points[1:] - run.points[0]) @ down).mean(axis=1)
+    stored = run.energies["friction on slope"]
+    heat = run.energies["heat of friction"]
+    np.testing.assert_allclose(np.diff(heat[1:] + stored[1:]), rubbed * np.diff(way), rtol=1e-4)
+
+
+def pushed(friction):
+    """A sheet that is held all round, and a ball that rises into it faster and faster, drifts and turns."""
+    k = np.arange(12)
+    ball = wc.Sphere(
+        radius=0.1,
+        position=np.stack([0.25 + 0.002 * k, 0.0015 * k**1.5 - 0.106, 0.23 + 0.0 * k], axis=1),
+        rotation=np.stack([0.0 * k, np.sin(0.01 * k), 0.0 * k, np.cos(0.01 * k)], axis=1),
+        friction=friction,
+        name="ball",
+    )
+    return wc.Scene(
+        wc.Mesh.grid(6, 6, size=0.5),
+        density=1.0,
+        terms=[wc.Spring(stiffness=4.0), wc.QuadraticBending(stiffness=1e-5)],
+        pins="boundary",
+        gravity=(0.0, -1.0, 0.0),
+        colliders=[ball],
+        contact=wc.Contact(distance=6e-3, stiffness=2e4),
+    )
+
+
+# The factor by which the error of the balance falls with half the step.
+ORDERS = {
+    "explicit": (wc.Explicit(substeps=1), 2),
+    "newton": (wc.Newton(substeps=1, tolerance=1e-9), 2),
+    "newton midpoint": (wc.Newton(substeps=1, integrator="midpoint", tolerance=1e-9), 4),
+    "newton bdf2": (wc.Newton(substeps=1, integrator="bdf2", tolerance=1e-9), 4),
+    "xpbd": (wc.XPBD(substeps=1, iterations=60), 2),
+}
+
+
+@pytest.mark.parametrize("name", ORDERS)
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_work_of_a_ball_is_the_change_of_energy_to_the_order_of_the_scheme(name, friction, device):
+    """With friction too, of which the heat is counted; below 1e-4 of the work midpoint has no order any more."""
+    solver, order = ORDERS[name]
+    gaps = []
+    for substeps in (32, 64):
+        run = wc.simulate(
+            pushed(friction), replace(solver, substeps=substeps), device=device, dtype="float64", frames=11, record=BOTH
+        )
+        sums = total(run.energies)
+        gaps.append(np.abs(sums - sums[0]).max())
+    work = np.abs(run.energies["work of colliders"]).max()
+    assert gaps[1] < max(gaps[0] / (0.85 * order), 1e-4 * work)
+    assert gaps[1] < 0.05 * work and work > 5e-3
+    assert not friction or run.energies["heat of friction"][-1] > 0.1 * work
+    assert run.cut == 0.0
+
+
+def test_forces_of_an_implicit_step_balance_its_momentum(device):
+    """Of pins and a ball together, where the ball takes no friction, which is of another N than that of the step."""
+    scene = pushed(0.0)
+    solver = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised")
+    run = wc.simulate(scene, solver, device=device, dtype="float64", frames=11, record="reactions")
+    momentum = (scene.vertex_masses[:, None] * run.velocities).sum(axis=1)
+    expected = np.diff(momentum, axis=0) * scene.fps - scene.vertex_masses.sum() * scene.gravity
+    found = run.reactions.sum(axis=1) - run.collider_forces["ball"]
+    np.testing.assert_allclose(found[1:], expected, atol=1e-9)
+    assert np.abs(run.collider_forces["ball"]).max() > 0.1
+
+
+def test_hard_contact_bears_the_weight_by_its_multipliers(device):
+    scene, _normal, _down = slope(0.0, 0.0, contact=wc.Contact(distance=R, stiffness=np.inf), duration=0.4)
+    run = wc.simulate(scene, SOLVERS["xpbd"], device=device, dtype="float64", record="reactions")
+    forces = run.collider_forces["slope"]
+    assert np.isnan(forces[0]).all()
+    np.testing.assert_allclose(forces[-1], [0.0, -G * scene.vertex_masses.sum(), 0.0], rtol=0.0, atol=1e-12)
+    with pytest.raises(ValueError, match="PBD has no multipliers"):
+        wc.simulate(scene, wc.PBD(substeps=2), device=device, record="reactions")
+
+
+def test_copies_have_forces_of_their_own(device):
+    """And of two balls of one name, of which the second is far away; threads leave them as they are."""
+    scene, solver = pushed(0.4), wc.Newton(substeps=4)
+    far = wc.Sphere(radius=0.1, position=(0.0, 5.0, 0.0), name="ball")
+    scene = replace(scene, colliders=[*scene.colliders, far])
+    run = {"device": device, "dtype": "float64", "frames": 4, "record": BOTH}
+    alone = wc.simulate(scene, solver, **run)
+    runs = [wc.simulate(scene, solver, copies=2, **run, threads=threads) for threads in ((1, 2) if device == "cpu" else (1,))]
+    for batch in runs:
+        assert list(batch.collider_forces) == ["ball", "ball 2"] and list(batch.friction_forces) == ["ball"]
+        assert (batch.collider_forces["ball 2"] == 0.0).all()
+        for copy in (0, 1):
+            np.testing.assert_allclose(batch.collider_forces["ball"][:, copy], alone.collider_forces["ball"], atol=1e-9)
+            for name, values in batch.energies.items():
+                np.testing.assert_allclose(values[:, copy], alone.energies[name], rtol=0.0, atol=1e-9, err_msg=name)
+        assert batch.cuts.shape == (5, 2)
+    assert list(alone.energies) == [
+        *("Spring", "QuadraticBending", "contact with ball", "friction on ball", "contact with ball 2"),
+        *("kinetic", "gravity", "work of colliders", "heat of friction"),
+    ]
+
+
+def test_an_equilibrium_has_moved_colliders_where_they_stand_last(device):
+    """As it has pins and loads; cloth must start outside of them there."""
+    scene = pushed(0.0)
+    last = replace(scene, colliders=[scene.colliders[0].at_last()], positions=scene.positions + np.array([0.0, 0.1, 0.0]))
+    moved = replace(scene, positions=last.positions, gravity=(0.0, -9.81, 0.0))
+    rests = [wc.equilibrium(each, device=device, record=BOTH) for each in (moved, replace(moved, colliders=last.colliders))]
+    assert (rests[0].points == rests[1].points).all() and rests[0].stable
+    weight = 9.81 * scene.vertex_masses.sum()
+    borne = rests[0].reactions.sum(axis=0) - rests[0].collider_forces["ball"]
+    np.testing.assert_allclose(borne, [0.0, weight, 0.0], atol=1e-6)
+    with pytest.raises(ValueError, match=r"^where the last keyframe has the colliders, vertex \d+ starts .* inside"):
+        wc.equilibrium(scene)
+
+
+def test_a_run_writes_them(tmp_path, monkeypatch, capsys, device):
+    """In the table and the report, and as primvars of the cloth."""
+    from pxr import Usd, UsdGeom
+
+    monkeypatch.chdir(tmp_path)
+    options = "-p n=4 duration=0.1 -s substeps=2 --frames 4 -o a.usda --csv a.csv --report a.json --dtype float64".split()
+    assert main(["run", "incline", "--solver", "newton", *options, "--device", device]) == 0
+    assert "cut short     0 %" in capsys.readouterr().out
+    header, *rows = (line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines())
+    table = {name: np.array([float(row[k] or "nan") for row in rows]) for k, name in enumerate(header)}
+    assert header[-7:] == [f"{what} on slope {axis}" for what in ("force", "friction") for axis in "xyz"] + ["cut short"]
+    stage = Usd.Stage.Open("a.usda")
+    cloth = next(UsdGeom.PrimvarsAPI(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    for what, kind in (("force", "collider_forces"), ("friction", "friction_forces")):
+        primvar = cloth.GetPrimvar(f"{kind}:slope")
+        assert primvar.GetInterpolation() == "constant"
+        found = np.array([primvar.Get(frame) for frame in range(5)])
+        np.testing.assert_allclose(found, np.stack([table[f"{what} on slope {axis}"] for axis in "xyz"], axis=1), atol=1e-8)
+    heat = [cloth.GetPrimvar("energies:heat_of_friction").Get(frame) for frame in range(5)]
+    np.testing.assert_allclose(heat, table["heat of friction"], rtol=1e-6, atol=1e-12)
+    assert table["force on slope y"][-1] < -0.01

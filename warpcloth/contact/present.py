@@ -1,0 +1,129 @@
+"""Contact and friction at the present state of a solver: the energies that they store, and the forces on each collider."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from ..core.gradient import Gradient
+from ..kernels import colliders as kernels
+from ..kernels.terms.friction import FRICTION
+from ..kernels.work import pulls
+
+
+class PresentContact:
+    """The elements of a model with the colliders where they are now, and the anchors that the next step would take.
+
+    Those of a step are not at hand: they may be half-way or of the start of the step, and are then not of one state.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        parts: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of all copies, and the first copy and the one after
+            the last that each has; none for the colliders where they start.
+
+    Attributes:
+        terms: The elements of all terms, those of contact and friction with rest states of their own.
+    """
+
+    def __init__(self, model, parts=()):
+        self.model, self._parts, self._launches = model, parts, []
+        self.terms = model.terms
+        if not parts:
+            return
+        declared, steps = model.colliders, parts[0][0]
+        pose_type, self._anchor_type = kernels.pose_types(model.dtype)
+        self._dim, self._steps = (model.copies, len(declared.radius)), model.scalars(wp.int32)
+        self._poses, self._moved = (kernels.step_poses(model.dtype)() for _ in range(2))
+        self._poses.at, after = (wp.zeros(self._dim, dtype=pose_type, device=model.device) for _ in range(2))
+        self._poses.before = self._poses.after = self._moved.before = self._moved.at = self._poses.at
+        self._moved.after = after  # of the next step, which nothing reads
+        self._given = [declared.keyframes, declared.firsts, self._steps, steps.steps_per_frame, 0]
+        self._move, self._shapes, self._least = model.kernel(kernels.move_colliders, model.dtype), steps.shapes, steps.least
+        self.terms = tuple(elements if elements.collider is None else self._own(elements, steps) for elements in model.terms)
+
+    def _own(self, elements, steps):
+        model, c = self.model, elements.collider
+        term = elements.term.bounded if steps.bounded else elements.term
+        own = replace(elements, term=term, rest=wp.clone(elements.rest))
+        if elements.term is FRICTION:
+            anchors = wp.zeros(model.count, dtype=self._anchor_type, device=model.device)
+            kernel = model.kernel(kernels.anchor_vertices, model.dtype, steps.bounded)
+            self._launches.append(partial(self._anchor, kernel, own, anchors))
+        elif model.colliders.moves[c]:
+            self._launches.append(partial(self._pose, model.kernel(kernels.pose_collider, model.dtype), own))
+        return own
+
+    def launch(self, x, v):
+        """Sets the rest states to those of positions x and velocities v, (N,)."""
+        if not self._launches:
+            return
+        for steps, first, end in self._parts:
+            wp.copy(self._steps, steps.steps, first, 0, end - first)
+        self.model.launch(self._move, self._dim, self._given, [self._moved])
+        for launch in self._launches:
+            launch(x, v)
+
+    def _pose(self, kernel, own, x, v):
+        given = [own.stencil, self._shapes, *self.model.free_gravity, x, v, self._poses]
+        given += [own.collider, own.per_copy, self._least, 0.0]
+        self.model.launch(kernel, own.count, given, [own.rest])
+
+    def _anchor(self, kernel, own, anchors, x, v):
+        model, c, n = self.model, own.collider, self.model.per_copy
+        for steps, first, end in self._parts:
+            wp.copy(anchors, steps.anchors[c], first * n, 0, (end - first) * n)
+        given = [own.stencil, self._shapes, x, self._poses]
+        given += [c, own.per_copy, model.colliders.distance, float(model.colliders.friction[c])]
+        model.launch(kernel, own.count, given, [anchors, own.rest])
+
+
+class ColliderPulls:
+    """∂U/∂x of contact and friction with each collider, with which the cloth pulls at it.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        terms: Elements, of which it takes those of colliders that are not hard.
+        hard: Function of an index that makes what adds ∂U/∂x of hard contact with that collider to an array (N,) by its
+            multipliers, or None.
+
+    Attributes:
+        found: A :func:`warpcloth.kernels.work.pulls` of each collider.
+        hard: Whether contact is hard.
+    """
+
+    def __init__(self, model, terms, hard=None):
+        self.found, self._adds, self.hard = [], [], any(each.hard for each in terms if each.collider is not None)
+        for c in range(len(model.scene.colliders)):
+            mine = [elements for elements in terms if elements.collider == c]
+            friction = tuple(elements for elements in mine if elements.term.name == FRICTION.name)
+            contact = tuple(elements for elements in mine if elements not in friction)
+            found = pulls(model.dtype)()
+            found.all = model.vectors()
+            if friction:
+                found.friction = model.vectors()
+            add = None if self.hard else Gradient(model, terms=contact)
+            hidden = hard(c) if hard and self.hard else None
+            self.found.append(found)
+            self._adds.append((add, Gradient(model, terms=friction) if friction else None, hidden))
+
+    def launch(self, x):
+        """Finds them at x (N,)."""
+        for found, (contact, friction, hidden) in zip(self.found, self._adds, strict=True):
+            found.all.zero_()
+            if contact is not None:
+                contact.add(x, found.all)
+            if hidden is not None:
+                hidden(found.all)
+            if friction is not None:
+                friction.add(x, found.all)
+                found.friction.zero_()
+                friction.add(x, found.friction)
+
+    def sums(self, copies):
+        """The forces of the cloth on the colliders, and of them the part of friction, (B, C, 2, 3) [N]."""
+
+        def of(array):
+            return array.numpy().astype(np.float64).reshape(copies, -1, 3).sum(axis=1) if array else np.zeros((copies, 3))
+
+        return np.stack([np.stack([of(each.all), of(each.friction)], axis=1) for each in self.found], axis=1)
