@@ -95,7 +95,7 @@ def scatter(term: Term, dtype, source: LocalSource):
 
 @cache
 def gather(term: Term, dtype, source: LocalSource):
-    """Kernel over vertices: out += Dᵀz in a fixed order, by :func:`warpcloth.model.incidences.incidences_of`."""
+    """Kernel over vertices: out += Dᵀz in a fixed order, by :func:`warpcloth.model.elements.incidences_of`."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     share_of, z_of, left_out = to_corner(term, dtype), source.z_of, source.left_out

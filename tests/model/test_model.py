@@ -16,8 +16,8 @@ import warpcloth as wc
 from support.energies import DECLARED, energy_and_gradient
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import RowSums, Sums
+from warpcloth.model.elements import incidences_of
 from warpcloth.model.host_values import host_values
-from warpcloth.model.incidences import incidences_of
 from warpcloth.model.precision import DTYPES
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS as KINDS

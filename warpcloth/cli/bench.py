@@ -8,7 +8,7 @@ from ..base.quiet import find_device
 from ..base.texts import assignments, json_text, options
 from .options import DEFAULT, add_scene, add_solver, add_values
 from .setup import named_scene, solver_setup
-from .terminal import Interrupted, aligned, check_writable, open_bar, say
+from .terminal import Bar, Interrupted, aligned, check_writable, say
 
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
@@ -144,21 +144,13 @@ def _interrupted(run):
     return f"interrupted after {len(run.rows)} of {run.total} rows, which are printed"
 
 
-class _Rows:
+class _Rows(Bar):
     """Counts rows on a terminal."""
-
-    def __init__(self):
-        self.bar = None
 
     def __call__(self, done, total):
         if done == 0:
-            self.bar = open_bar(total, "measuring", "{n_fmt} of {total_fmt} rows")
-        elif self.bar is not None:
-            self.bar.update(done - self.bar.n)
-
-    def close(self):
-        if self.bar is not None:
-            self.bar.close()
+            self.open(total, "measuring", "{n_fmt} of {total_fmt} rows")
+        self.move(done)
 
 
 def _write(arguments, run, device):

@@ -10,7 +10,7 @@ from ..base.quiet import find_device
 from ..base.texts import json_text
 from .analyze import add_measuring, measuring_of
 from .options import values_of
-from .terminal import check_writable, open_bar
+from .terminal import Bar, check_writable
 
 SIZE = (1280, 720)
 EPILOG = """\
@@ -133,23 +133,18 @@ def draw_film(source, output, **options):
     return progress.pictures
 
 
-class _Drawing:
+class _Drawing(Bar):
     """Counts the pictures of a film, and shows them on a terminal."""
 
     def __init__(self):
-        self.pictures, self._bar = 0, open_bar(None, "reading", "")
+        self.pictures = 0
+        self.open(None, "reading", "")
 
     def __call__(self, done, total):
         self.pictures = done
         if done == 0:
-            self.close()
-            self._bar = open_bar(total, "drawing", "{n_fmt} of {total_fmt} pictures, {remaining} left")
-        elif self._bar is not None:
-            self._bar.update()
-
-    def close(self):
-        if self._bar is not None:
-            self._bar.close()
+            self.open(total, "drawing", "{n_fmt} of {total_fmt} pictures, {remaining} left")
+        self.move(done)
 
 
 def _summary(facts):

@@ -64,17 +64,34 @@ def check_outputs(arguments, inputs=()):
     check_writable(arguments.output, arguments.csv)
 
 
-def open_bar(total, text, counts):
-    """A bar of tqdm on a terminal, elsewhere None; ``counts`` is what stands after it."""
-    if not sys.stderr.isatty():
-        return None
-    from tqdm import tqdm
+class Bar:
+    """A bar of tqdm on a terminal, and nothing elsewhere."""
 
-    # tqdm hides the bar on a terminal that does not know its size.
-    size = shutil.get_terminal_size()
-    shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
-    form = "{desc}{percentage:3.0f}%|{bar}| " + counts
-    return tqdm(total=total, desc=f"{text}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
+    bar = None
+
+    def open(self, total, text, counts):
+        """Shows another bar; ``counts`` is what stands after it."""
+        self.close()
+        if not sys.stderr.isatty():
+            return
+        from tqdm import tqdm
+
+        # tqdm hides the bar on a terminal that does not know its size.
+        size = shutil.get_terminal_size()
+        shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
+        form = "{desc}{percentage:3.0f}%|{bar}| " + counts
+        self.bar = tqdm(total=total, desc=f"{text}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
+
+    def move(self, done, note=None):
+        """Moves the bar on to so many that are done; ``note`` is shown after the counts."""
+        if self.bar is not None:
+            if note is not None:
+                self.bar.set_postfix_str(note, refresh=False)
+            self.bar.update(done - self.bar.n)
+
+    def close(self):
+        if self.bar is not None:
+            self.bar.close()
 
 
 def add_dask(parser):
@@ -119,33 +136,23 @@ def measuring(arguments, device):
         progress.close()
 
 
-class Settings:
+class Settings(Bar):
     """Counts the settings of a sweep, with the time that is left, on a terminal; before them, how far the reference is."""
 
     def __init__(self):
-        self.done, self.total, self.substeps, self.bar = 0, None, None, None
+        self.done, self.total, self.substeps = 0, None, None
 
     def watch(self, substeps, frame, frames):
         if substeps != self.substeps:
-            self.close()
-            text = f"reference by {substeps} steps a frame"
-            self.bar, self.substeps = open_bar(frames, text, "{n_fmt} of {total_fmt} frames, {remaining} left"), substeps
-        if self.bar is not None:
-            self.bar.update(frame - self.bar.n)
+            self.open(frames, f"reference by {substeps} steps a frame", "{n_fmt} of {total_fmt} frames, {remaining} left")
+            self.substeps = substeps
+        self.move(frame)
 
     def __call__(self, done, total, seconds):
         if total != self.total:
-            self.close()
-            self.bar = open_bar(total, "measuring", "{n_fmt} of {total_fmt} settings{postfix}")
+            self.open(total, "measuring", "{n_fmt} of {total_fmt} settings{postfix}")
         self.done, self.total = done, total
-        if self.bar is not None:
-            if seconds is not None:
-                self.bar.set_postfix_str(f"{seconds // 60:.0f}:{seconds % 60:02.0f} left", refresh=False)
-            self.bar.update(done - self.bar.n)
-
-    def close(self):
-        if self.bar is not None:
-            self.bar.close()
+        self.move(done, None if seconds is None else f"{seconds // 60:.0f}:{seconds % 60:02.0f} left")
 
     def interrupted(self):
         """Says how many settings are kept."""
@@ -154,12 +161,12 @@ class Settings:
         return f"interrupted after {self.done} of {self.total} settings, which are kept; the same command goes on from there"
 
 
-class Progress:
+class Progress(Bar):
     """Counts frames, and shows them on a terminal."""
 
     def __init__(self, frames=None, hint=None, first="compiling"):
         self.frame, self.frames, self.hint, self.closed = None, frames, hint, False
-        self.bar = open_bar(frames, first, "{n_fmt} of {total_fmt} frames{postfix}, {remaining} left")
+        self.open(frames, first, "{n_fmt} of {total_fmt} frames{postfix}, {remaining} left")
 
     def __call__(self, frame, frames):
         begins = frame == 0 or frame > (self.frame or 0) + 1  # later than 0 begins a run that is resumed
@@ -176,13 +183,11 @@ class Progress:
             self.bar.initial = self.bar.n = frame
         else:
             elapsed = self.bar.format_dict["elapsed"]
-            self.bar.set_postfix_str(f"{elapsed / (frame - self.bar.initial):.3g} s each", refresh=False)
-            self.bar.update()
+            self.move(frame, f"{elapsed / (frame - self.bar.initial):.3g} s each")
 
     def close(self):
         self.closed = True
-        if self.bar is not None:
-            self.bar.close()
+        super().close()
 
     @contextlib.contextmanager
     def of(self, output):

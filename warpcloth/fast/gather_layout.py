@@ -5,8 +5,8 @@ import warp as wp
 
 from ..kernels.fast.gather_corrections import slot_rows
 from ..kernels.fast.term_facts import TermFacts
+from ..model.elements import incidences_of
 from ..model.host_values import host_values
-from ..model.incidences import incidences_of
 from .quadratic_pairs import matrix_entries
 from .structs import int32_array
 

@@ -11,7 +11,6 @@ from ..kernels.term import Term
 from ..terms.refresh import Refresh
 from .csr_cells import Cells, SparseCells, rigid_cells, sparse_cells
 from .host_values import host_values, keep, part, release, reordered, repeat
-from .incidences import incidences_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +126,20 @@ class DeviceElements:
         stencil, device = host_values(self.stencil).ravel(), self.stencil.device
         found = incidences_of(stencil, int(stencil.max()) + 1)
         return tuple(wp.array(each.astype(np.int32), dtype=wp.int32, device=device) for each in found)
+
+
+def incidences_of(vertices, count):
+    """The elements of each vertex, one vertex after another.
+
+    Args:
+        vertices: (E·K,) the corners of elements, one element after another.
+        count: Vertices, N.
+
+    Returns:
+        (offsets (N+1,), codes (E·K,)): vertex i has the codes from offsets[i] to offsets[i+1], K·element + corner, in order.
+    """
+    codes = np.argsort(vertices, kind="stable")
+    return np.searchsorted(vertices[codes], np.arange(count + 1)), codes
 
 
 def elements_on(model, term, positions, vary):
