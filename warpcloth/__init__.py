@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from .base import interrupts as interrupts  # first: it handles interrupts while the other modules load, which takes a second
+from .base.collector import collector_paused
 from .base.extensions import load_installed
 from .base.quiet import prepare_warp
 
@@ -91,15 +92,16 @@ _CATALOGUES = ("solvers", "terms")
 if not TYPE_CHECKING:  # a type checker would find every name in it, those misspelt too
 
     def __getattr__(name):
-        if name == "__all__":
-            value = [*_MODULES, *(public for room in _CATALOGUES for public in _from(room, "__all__"))]
-        elif name.startswith("__"):  # Python and its tools ask every module for these
+        if name.startswith("__") and name != "__all__":  # Python and its tools ask every module for these
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        else:
-            import_module(".usd", __name__)  # whatever is used may be given a stage
-            value = _find(name)
-            prepare_warp()
-            load_installed()
+        with collector_paused():
+            if name == "__all__":
+                value = [*_MODULES, *(public for room in _CATALOGUES for public in _from(room, "__all__"))]
+            else:
+                import_module(".usd", __name__)  # whatever is used may be given a stage
+                value = _find(name)
+                prepare_warp()
+                load_installed()
         return globals().setdefault(name, value)
 
 

@@ -12,6 +12,7 @@ at once before it runs a command. No other part of the package defers an import 
 
 import argparse
 import contextlib
+import gc
 import re
 import sys
 import traceback
@@ -54,6 +55,7 @@ def main(argv=None):
             debug = arguments.debug
             with interrupts.loading():
                 from .. import simulate  # noqa: F401  loads Warp, which takes most of the time
+            gc.freeze()  # what is loaded stays to the end, so it is not looked through for garbage there either
             if options.asks_for_help(arguments):
                 return options.show_help(arguments)
             return arguments.command(arguments)

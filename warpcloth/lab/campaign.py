@@ -4,17 +4,15 @@ import contextlib
 import json
 import multiprocessing
 import os
-import signal
 import sys
-import threading
 import time
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from ..base.digest import source_digest
-from ..base.extensions import extensions, load_extension
-from ..base.quiet import initialise_warp
+from ..base.extensions import extensions
 from .measurements import run
+from .worker import begin
 
 _HEAD = b'{"key": "'  # of a line of results
 # One thread a process: more would take the cores of the others, and Warp's CPU kernels use one as it is.
@@ -170,7 +168,7 @@ def environment(values):
 def _processes(workers):
     """Fresh processes, each with one thread for arithmetic."""
     context = multiprocessing.get_context("spawn")
-    with environment(_ONE_THREAD), ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(_own(),)) as pool:
+    with environment(_ONE_THREAD), ProcessPoolExecutor(workers, context, initializer=begin, initargs=(_own(),)) as pool:
         try:
             yield pool
         except BaseException:
@@ -182,23 +180,6 @@ def _own():
     """Returns the extensions that a process must load; those of a script it has by running that again."""
     script = getattr(sys.modules["__main__"], "__file__", None)
     return [name for name in extensions() if name != script]
-
-
-def _begin(modules):
-    """In each process: loads extensions. An interruption ends it without a word, as the first process says what there is.
-
-    It also ends when that was killed, which leaves it waiting for ever.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
-    initialise_warp()
-    for module in modules:
-        load_extension(module)
-
-
-def _end_with(parent):
-    parent.join()
-    os._exit(1)
 
 
 def kept_store(name, executor=None):
