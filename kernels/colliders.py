@@ -287,13 +287,37 @@ def anchor_vertices(dtype, bounded: bool):
     return anchor
 
 
+@wp.struct
+class FilterNotes:
+    """What the filter notes: how often it cut, (copies,), and the first that is inside each collider, (copies, colliders).
+
+    Where something is inside, ``inside`` is FIRST − ((step·n + vertex)(C + 1) + other), of n vertices and C colliders: other is
+    the collider that held it back last, or C for a vertex that is not free. 0 where nothing is.
+    """
+
+    cut: wp.array(dtype=wp.int64)
+    inside: wp.array2d(dtype=wp.int64)
+
+
+FIRST = wp.constant(wp.int64(2**62))
+
+
+@wp.func
+def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex: int, per_copy: int, other: int):
+    """Notes that a vertex of a copy is inside a collider; of several the first in time, then in number, remains."""
+    count = wp.int64(notes.inside.shape[1])
+    key = wp.int64(step) * wp.int64(per_copy) + wp.int64(vertex)
+    wp.atomic_max(notes.inside, copy, collider, FIRST - (key * (count + wp.int64(1)) + wp.int64(other)))
+
+
 @cache
 def filter_step(dtype):
     """Kernel over vertices, at the end of a step: no free vertex is inside a collider, and none has crossed its surface.
 
     In the frame of a collider a vertex moves along a segment from where it was when the step began, of which :func:`kept_part`
     remains. A vertex that would come nearer than ``least`` stops where it is nearer than ``landing``, at most. What is cut off
-    x is also cut off v, over h, and off ``move``, which may be None. ``cut`` counts the vertices of each copy that were cut.
+    x is also cut off v, over h, and off ``move``, which may be None. ``notes`` counts the vertices of each copy that were cut,
+    and has the free ones that colliders leave no way out, and the others that enter one.
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
@@ -307,6 +331,7 @@ def filter_step(dtype):
         # state in
         x_before: wp.array(dtype=vec3),
         poses: step_poses(dtype),
+        step: wp.array(dtype=wp.int32),
         # parameters
         per_copy: int,
         least: dtype,
@@ -316,15 +341,17 @@ def filter_step(dtype):
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
-        cut: wp.array(dtype=wp.int64),
+        notes: FilterNotes,
     ):
         i = wp.tid()
+        copy = i // per_copy
+        x0 = x_before[i]
+        end = x[i]
+        rounding = dtype(8.0) * epsilon(least) * wp.max(wp.abs(end))
         if inverse_mass[i] > dtype(0.0):
-            copy = i // per_copy
-            x0 = x_before[i]
-            end = x[i]
-            rounded = least + dtype(8.0) * epsilon(least) * wp.max(wp.abs(end))
+            rounded = least + rounding
             cuts = wp.int32(0)
+            last = wp.int32(0)
             rounds = wp.int32(0)
             while rounds <= cuts and rounds < ROUNDS:  # another one after each that has cut
                 rounds += 1
@@ -336,12 +363,26 @@ def filter_step(dtype):
                         t = kept(X, way, shape.core[c], shape.radius[c], rounded + landing)
                         end = to_space(poses.after[copy, c], X + t * way)
                         cuts = rounds
+                        last = c
             if cuts > 0:
                 change = end - x[i]
                 x[i] = end
                 v[i] = v[i] + change / h
                 if move:
                     move[i] = move[i] + change
-                wp.atomic_add(cut, copy, wp.int64(1))
+                wp.atomic_add(notes.cut, copy, wp.int64(1))
+            if cuts == ROUNDS:
+                for c in range(shape.radius.shape[0]):
+                    d, _n = local_gap_of(to_local(poses.after[copy, c], end), shape.core[c], shape.radius[c])
+                    if d <= dtype(0.0):
+                        note_inside(notes, copy, c, step[copy], i - copy * per_copy, per_copy, last)
+        else:
+            for c in range(shape.radius.shape[0]):
+                X = to_local(poses.before[copy, c], x0)
+                way = to_local(poses.after[copy, c], end) - X
+                d, _n = local_gap_of(X, shape.core[c], shape.radius[c])
+                deep = -wp.max(rounding, dtype(8.0) * epsilon(least) * wp.max(wp.abs(X)))  # what moves along may touch
+                if d > deep and kept(X, way, shape.core[c], shape.radius[c], deep) < dtype(1.0):
+                    note_inside(notes, copy, c, step[copy], i - copy * per_copy, per_copy, shape.radius.shape[0])
 
     return filter_vertices

@@ -453,3 +453,52 @@ def test_a_resumed_run_has_its_anchors(name, tmp_path):
     for part in ("energies", "collider_forces", "friction_forces"):
         found, expected = getattr(resumed, part), getattr(whole, part)
         assert found.keys() == expected.keys() and all((found[name] == expected[name]).all() for name in found)
+
+
+def closing(between):
+    """A sheet of which one side is pinned, and two plates that close on what is ``between`` them: 'pins' or 'free'."""
+    grid = wc.Mesh.grid(4, 4, size=0.3)
+    middle = 0.0 if between == "pins" else 0.3
+    rise = np.minimum(np.arange(9) * 0.01, 0.05)
+    plates = [
+        wc.Box(size=(0.1, 0.1, 0.5), position=[(middle, -0.09 + up, 0.15) for up in rise], name="lower"),
+        wc.Box(size=(0.1, 0.1, 0.5), position=[(middle, 0.09 - up, 0.15) for up in rise], name="upper"),
+    ]
+    return wc.Scene(
+        grid,
+        density=0.15,
+        terms=[wc.Spring(stiffness=100.0)],
+        pins=[0, 4, 8, 12] if between == "pins" else None,
+        gravity=(0.0, 0.0, 0.0),
+        colliders=plates if between == "free" else plates[:1],
+        contact=wc.Contact(stiffness=1e4),
+        duration=8.0 / 60.0,
+    )
+
+
+@pytest.mark.parametrize("name", ("explicit", "newton"))
+@pytest.mark.parametrize("between", ("pins", "free"))
+def test_what_has_nowhere_to_go_is_named(name, between, device):
+    """The plates are 0.04 m away, less 0.01 m a frame: they touch the sheet where frame 4 ends."""
+    solver = wc.Explicit(substeps=80) if name == "explicit" else wc.Newton(substeps=4)
+    run = wc.simulate(closing(between), solver, device=device, copies=2)
+    found = [(each.frame, each.collider, each.other, each.copy) for each in run.inside]
+    if between == "pins":
+        assert found == [(5, "lower", None, copy) for copy in (0, 1)]
+        assert run.inside[0].vertex == 0
+        assert str(run.inside[0]) == "lower comes over vertex 0, which is not free to move, in frame 5"
+    else:
+        assert {frozenset(each[1:3]) for each in found} == {frozenset(("lower", "upper"))}
+        assert {each[0] for each in found} <= {4, 5} and {each[3] for each in found} == {0, 1}
+        assert "is caught between" in str(run.inside[0])
+    assert wc.simulate(falling(list(SHAPES.values())[:1]), wc.Newton(substeps=1), device=device).inside == ()
+
+
+def test_pins_that_pass_through_are_named(device):
+    """A thin plate, which the pins cross from one step to the next."""
+    grid = wc.Mesh.grid(3, 3, size=0.2)
+    ends = np.stack([grid.points[[0, 1, 2]] - [0.0, 0.02 * k, 0.0] for k in range(5)])
+    plate = wc.Box(size=(1.0, 1e-4, 1.0), position=(0.0, -0.05, 0.0), name="plate")
+    scene = wc.Scene(grid, density=0.15, terms=[wc.Spring(stiffness=50.0)], pins=wc.Pins([0, 1, 2], ends), colliders=[plate])
+    run = wc.simulate(scene, wc.Newton(substeps=1), device=device, frames=4)
+    assert run.inside == ((0, 3, "plate", None, 0),)

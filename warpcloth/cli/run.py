@@ -66,7 +66,7 @@ def run(arguments):
             "seconds_per_frame": statistics.median(animation.timings["frames"]),
             "compile_seconds": setup.seconds + animation.timings["compile"],
             "worst_strain": animation.worst_strain,
-            **({"cut": animation.cut} if scene.colliders else {}),
+            **({"cut": animation.cut, "inside": [each._asdict() for each in animation.inside]} if scene.colliders else {}),
             "residual": status.residual,
             "residual_measure": status.measure,
             "residual_unit": status.unit,
@@ -80,7 +80,7 @@ def run(arguments):
             "csv": arguments.csv,
             "report": arguments.report,
         }
-        print(json_text(facts) if arguments.json else _summary(facts))
+        print(json_text(facts) if arguments.json else _summary(facts, animation.inside))
         if status.ok:
             return 0
         return say(f"{status.message}; the last good frame is {status.frame}, in {arguments.output}", 1)
@@ -100,7 +100,7 @@ def _own_output(scene, resume):
     return output
 
 
-def _summary(facts):
+def _summary(facts, inside):
     from ..core.status import digits
 
     threads, measured = facts["threads"], facts["residual_measure"] is not None
@@ -113,6 +113,7 @@ def _summary(facts):
             f"  compiling     {facts['compile_seconds']:.3g} s",
             f"  worst strain  {100.0 * facts['worst_strain']:.3g} %",
             *cut,
+            *(f"  inside        {each}" for each in inside),
             f"  residual      {residual}",
             f"  solver        {solver_line(facts)}",
             f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),

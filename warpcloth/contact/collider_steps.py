@@ -42,7 +42,6 @@ class ColliderSteps:
         least: Distance below which no vertex ends a step [m].
         steps_per_frame: As given.
         steps: Steps that the colliders have made, (B,) int32.
-        cut: How often a vertex was cut short, in all steps, (B,) int64.
     """
 
     def __init__(self, model, state, h, steps_per_frame, part):
@@ -57,7 +56,9 @@ class ColliderSteps:
             setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
         self.x_before = model.vectors()
         self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device))
-        self.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
+        self._notes = kernels.FilterNotes()
+        self._notes.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
+        self._notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
         self.anchors = {}
         self.least = FLOOR * declared.distance
         # Of midpoint forces are those half-way, of others at the end.
@@ -108,18 +109,29 @@ class ColliderSteps:
     def launch_end(self, x, v, move=None):
         """Cuts the step short of vertices that would end in a collider or cross one, in x, v and ``move`` (N,)."""
         model = self.model
-        given = [model.inverse_mass, self.shapes, self.x_before, self.poses]
+        given = [model.inverse_mass, self.shapes, self.x_before, self.poses, self.steps]
         given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
-        model.launch(self._filter, model.count, given, [x, v, move, self.cut])
+        model.launch(self._filter, model.count, given, [x, v, move, self._notes])
         model.launch(self._count, model.copies, [], [self.steps])
 
     @property
     def share(self):
         """The share of the moves of free vertices in all steps that were cut short, (B,)."""
         free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
-        return self.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
+        return self._notes.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
+
+    def inside(self):
+        """The first vertex that ended a step inside each collider: tuples of its copy, collider, step, index, and the collider
+        that held it back, or None for a vertex that is not free."""
+        colliders, found = self._dim[1], []
+        for (copy, c), value in np.ndenumerate(self._notes.inside.numpy()):
+            if value:
+                rest, other = divmod(int(kernels.FIRST) - int(value), colliders + 1)
+                step, vertex = divmod(rest, self.model.per_copy)
+                found.append((copy, c, step, vertex, other if other < colliders else None))
+        return found
 
     def start_again(self):
         """Forgets the steps that an integrator made to find its past."""
-        for array in (self.steps, self.cut, *self.anchors.values()):
+        for array in (self.steps, self._notes.cut, self._notes.inside, *self.anchors.values()):
             array.zero_()

@@ -27,7 +27,7 @@ class Reset:
         model, state = self.model, self.stepper.state
         names = [name for name in state.arrays if name not in ("x", "v")]
         carried, starts = ([arrays.get(name) for name in names] for arrays in (state.arrays, state.starts))
-        words = [wp.types.type_size_in_bytes(array.dtype) // 4 for array in carried]
+        words = [wp.types.type_size_in_bytes(array.dtype) // 4 * (array.size // len(array)) for array in carried]
         per_vertex = [len(array) == model.count and model.per_copy > 1 for array in carried]
         words = [count if each else -count for count, each in zip(words, per_vertex, strict=True)]
         self._given = [

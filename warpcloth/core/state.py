@@ -20,7 +20,7 @@ class State:
         shares: States of the threads' shares of the batch, whose x and v are views of those of this state.
 
     Attributes:
-        arrays: All arrays on the device by name, with N or B entries, ``"x"`` and ``"v"`` among them.
+        arrays: All arrays on the device by name, with N or B rows, ``"x"`` and ``"v"`` among them.
         starts: Values at the start, for those arrays that neither start at 0 nor have their start in the model.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).

@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -24,13 +24,38 @@ from ..solvers.step import Step
 from ..usd import FrameSequence
 from .checkpoint import facts_of
 from .frames_ahead import state_of
-from .history import History, checked_record
+from .history import History, checked_record, collider_names
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
 
 # Limits on the frames that a CUDA device computes ahead: their bytes on host and device each, their share of the free memory of
 # the device, and their number.
 AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
+
+
+class Inside(NamedTuple):
+    """A vertex that ended a step inside a collider: where all that could move it was prescribed.
+
+    Attributes:
+        vertex: Its index in the mesh.
+        frame: The frame in which, or before which, it came in.
+        collider: Name of the collider.
+        other: Name of the collider that held it back from there, of a free vertex between the two; None for a vertex that is
+            not free, because pins or locked axes hold it.
+        copy: Index of its copy.
+    """
+
+    vertex: int
+    frame: int
+    collider: str
+    other: str | None = None
+    copy: int = 0
+
+    def __str__(self) -> str:
+        where = f"in frame {self.frame}" + (f" of copy {self.copy}" if self.copy else "")
+        if self.other is None:
+            return f"{self.collider} comes over vertex {self.vertex}, which is not free to move, {where}"
+        return f"vertex {self.vertex} is caught between {self.collider} and {self.other} {where}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,6 +87,8 @@ class Animation:
             (frames+1, B); see ``cut``.
         cut: The share of the moves of free vertices, of all steps, that were cut short because they would have ended in a
             collider or crossed one; with B > 1 copies one value per copy, (B,).
+        inside: The first vertex that each collider contains, if any, a tuple of :class:`Inside`: one that is not free, over
+            which the collider moves or which moves through it, or a free one between two colliders that close.
     """
 
     points: np.ndarray | FrameSequence
@@ -78,6 +105,7 @@ class Animation:
     collider_forces: dict[str, np.ndarray] | None = None
     friction_forces: dict[str, np.ndarray] | None = None
     cuts: np.ndarray | None = None
+    inside: tuple[Inside, ...] = ()
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
@@ -190,8 +218,26 @@ def simulate(
     status = watch.status(solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
-    recorded = {"output": output, "scene": scene, "cut": of_copies(stepper.cut), **(history.by_name() if history else {})}
+    recorded = {
+        "output": output,
+        "scene": scene,
+        "cut": of_copies(stepper.cut),
+        "inside": _inside(stepper),
+        **(history.by_name() if history else {}),
+    }
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)
+
+
+@in_turn
+def _inside(stepper):
+    """The :class:`Inside` of each collider and copy."""
+    model, found = stepper.model, []
+    for copy, collider, step, vertex, other in stepper.inside:
+        names = collider_names(model.scene)
+        vertex = int(vertex if model.order is None else model.order[vertex])
+        frame = int(step) // stepper.steps_per_frame + 1
+        found.append(Inside(vertex, frame, names[collider], None if other is None else names[other], copy))
+    return tuple(sorted(found, key=lambda each: each.frame))
 
 
 @in_turn

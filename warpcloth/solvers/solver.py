@@ -98,6 +98,11 @@ class Stepper:
         """The share of the moves of free vertices that contact with colliders cut short so far, (B,)."""
         return np.zeros(self.model.copies) if self.colliders is None else self.colliders.share
 
+    @property
+    def inside(self):
+        """What :meth:`warpcloth.contact.collider_steps.ColliderSteps.inside` says of the steps so far, a list."""
+        return [] if self.colliders is None else self.colliders.inside()
+
     def launch_pins(self, parts=1):
         """Moves the pins that have keyframes on by h/``parts``, the same in all calls."""
         self.launch_pins_of(self.model.pins, self.model.keyframes, self.count, *self.state, parts)

@@ -65,6 +65,11 @@ class ThreadedStepper(Stepper):
     def cut(self):
         return np.concatenate([part.cut for part in self.parts])
 
+    @property
+    def inside(self):
+        found = zip(self.parts, self._copies, strict=True)
+        return [(first + copy, *rest) for part, (first, _end) in found for copy, *rest in part.inside]
+
     def step(self):
         self.pool.run([part.step for part in self.parts])
 
