@@ -1,6 +1,7 @@
 """Colliders: their shapes and motion, the energies of contact and friction, and that no step ends inside or crosses one."""
 
 import importlib
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import trimesh
 import warp as wp
 
 import warpcloth as wc
+from warpcloth.cli import main
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
@@ -494,11 +496,26 @@ def test_what_has_nowhere_to_go_is_named(name, between, device):
     assert wc.simulate(falling(list(SHAPES.values())[:1]), wc.Newton(substeps=1), device=device).inside == ()
 
 
-def test_pins_that_pass_through_are_named(device):
-    """A thin plate, which the pins cross from one step to the next."""
+SINKING = """
+import numpy as np
+import warpcloth as wc
+
+def scene():
     grid = wc.Mesh.grid(3, 3, size=0.2)
     ends = np.stack([grid.points[[0, 1, 2]] - [0.0, 0.02 * k, 0.0] for k in range(5)])
     plate = wc.Box(size=(1.0, 1e-4, 1.0), position=(0.0, -0.05, 0.0), name="plate")
-    scene = wc.Scene(grid, density=0.15, terms=[wc.Spring(stiffness=50.0)], pins=wc.Pins([0, 1, 2], ends), colliders=[plate])
-    run = wc.simulate(scene, wc.Newton(substeps=1), device=device, frames=4)
-    assert run.inside == ((0, 3, "plate", None, 0),)
+    pins, terms = wc.Pins([0, 1, 2], ends), [wc.Spring(stiffness=50.0)]
+    return wc.Scene(grid, density=0.15, terms=terms, pins=pins, colliders=[plate], duration=0.1)
+"""
+
+
+def test_pins_that_pass_through_are_named(device, tmp_path, monkeypatch, capsys):
+    """A thin plate, which the pins cross from one step to the next; the command line says so too."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sinking.py").write_text(SINKING)
+    command = ["run", "sinking.py", "-s", "substeps=1", "--solver", "newton", "--frames", "4", "--device", device]
+    assert main([*command, "-o", "a.usda"]) == 0
+    assert "inside        plate comes over vertex 0, which is not free to move, in frame 3" in capsys.readouterr().out
+    assert main([*command, "-o", "b.usda", "--json"]) == 0
+    expected = {"vertex": 0, "frame": 3, "collider": "plate", "other": None, "copy": 0}
+    assert json.loads(capsys.readouterr().out)["inside"] == [expected]
