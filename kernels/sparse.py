@@ -30,10 +30,7 @@ def share_energy(y: Any, rest: Any):
 
 @wp.func
 def share_gradient(y: Any, rest: Any):
-    g = wp.matrix(shape=(1, 3), dtype=rest.dtype)
-    for i in range(3):
-        g[0, i] = rest[i]
-    return g
+    return wp.matrix_from_rows(wp.vector(rest[0], rest[1], rest[2]))
 
 
 @wp.func

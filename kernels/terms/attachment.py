@@ -17,9 +17,7 @@ def rest_state(points, stencil):
 
 @wp.func
 def weight(rest: Any, i: int):
-    w = wp.vector(length=1, dtype=rest.dtype)
-    w[0] = rest.dtype(1.0)
-    return w
+    return wp.vector(rest.dtype(1.0), length=1)
 
 
 @wp.func
@@ -29,9 +27,7 @@ def measure(rest: Any):
 
 @wp.func
 def project(y: Any, rest: Any):
-    p = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    p[0] = rest
-    return p
+    return wp.matrix_from_rows(rest)
 
 
 @wp.func

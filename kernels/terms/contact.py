@@ -163,9 +163,7 @@ def energy(y: Any, rest: Any):
 @wp.func
 def gradient(y: Any, rest: Any):
     d, n = gap(y, rest)
-    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    g[0] = slope(d, rest[11]) * n
-    return g
+    return wp.matrix_from_rows(slope(d, rest[11]) * n)
 
 
 @wp.func
@@ -236,9 +234,7 @@ def constraint_bend(d: Any, r: Any):
 @wp.func
 def constraint_gradient(y: Any, rest: Any):
     d, n = gap(y, rest)
-    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    g[0] = constraint_slope(d, rest[11]) * n
-    return g
+    return wp.matrix_from_rows(constraint_slope(d, rest[11]) * n)
 
 
 @wp.func
@@ -251,9 +247,7 @@ def constraint_hessian(y: Any, rest: Any):
 def stiffening(y: Any, rest: Any, tension: Any):
     """Of a pressure, tension < 0, the half along n; a pull on the curvature of a collider is left out, as none lasts."""
     d, n = gap(y, rest)
-    rows = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    rows[0] = wp.sqrt(wp.max(tension * constraint_bend(d, rest[11]), y.dtype(0.0))) * n
-    return rows
+    return wp.matrix_from_rows(wp.sqrt(wp.max(tension * constraint_bend(d, rest[11]), y.dtype(0.0))) * n)
 
 
 @wp.func
@@ -266,9 +260,7 @@ def bounded_energy(y: Any, rest: Any):
 @wp.func
 def bounded_gradient(y: Any, rest: Any):
     d, n = gap(y, rest)
-    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    g[0] = -wp.max(rest[11] - d, y.dtype(0.0)) * n
-    return g
+    return wp.matrix_from_rows(-wp.max(rest[11] - d, y.dtype(0.0)) * n)
 
 
 @wp.func

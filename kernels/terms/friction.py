@@ -47,9 +47,7 @@ def energy(y: Any, rest: Any):
 def gradient(y: Any, rest: Any):
     u = slip(y, rest)
     l = wp.length(u)
-    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    g[0] = wp.where(l > rest[6], rest[6] / wp.max(l, rest[6]), y.dtype(1.0)) * u
-    return g
+    return wp.matrix_from_rows(wp.where(l > rest[6], rest[6] / wp.max(l, rest[6]), y.dtype(1.0)) * u)
 
 
 @wp.func

@@ -37,9 +37,7 @@ def rest_state(points, stencil):
 
 @wp.func
 def weight(rest: Any, i: int):
-    w = wp.vector(length=1, dtype=rest.dtype)
-    w[0] = rest[i]
-    return w
+    return wp.vector(rest[i], length=1)
 
 
 @wp.func
@@ -76,9 +74,7 @@ damped_length = spring.damped_length
 @wp.func
 def length_of(rest: Any):
     """s̄ as the rest state of a spring."""
-    s = wp.vector(length=1, dtype=rest.dtype)
-    s[0] = rest[5]
-    return s
+    return wp.vector(rest[5], length=1)
 
 
 @wp.func

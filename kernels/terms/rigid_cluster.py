@@ -32,10 +32,7 @@ def measure(rest: Any):
 @wp.func
 def target(rest: Any):
     """t as a matrix of the shape of y."""
-    t = wp.matrix(shape=(1, 3), dtype=rest.dtype)
-    for i in range(3):
-        t[0, i] = rest[i]
-    return t
+    return wp.matrix_from_rows(wp.vector(rest[0], rest[1], rest[2]))
 
 
 @wp.func

@@ -29,9 +29,7 @@ def max_lengths(points, stencil, rest):
 
 @wp.func
 def weight(rest: Any, i: int):
-    w = wp.vector(length=1, dtype=rest.dtype)
-    w[0] = rest.dtype(2 * i - 1)
-    return w
+    return wp.vector(rest.dtype(2 * i - 1), length=1)
 
 
 @wp.func

@@ -26,9 +26,7 @@ def rest_state(points, stencil, least=-np.inf, most=np.inf):
 @wp.func
 def nearest_length(y: Any, rest: Any):
     """c, as the rest state of a spring."""
-    c = wp.vector(length=1, dtype=rest.dtype)
-    c[0] = wp.min(wp.max(wp.length(y[0]), rest[0]), rest[1])
-    return c
+    return wp.vector(wp.min(wp.max(wp.length(y[0]), rest[0]), rest[1]), length=1)
 
 
 @wp.func
