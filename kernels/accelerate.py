@@ -181,9 +181,7 @@ def accept(dtype):
     ):
         i = wp.tid()
         copy = i // per_copy
-        chosen = plain[i]
-        if energy[copy] <= plain_energy[copy]:
-            chosen = accelerated[i]
+        chosen = wp.where(energy[copy] <= plain_energy[copy], accelerated[i], plain[i])
         s[slot[0], i] = chosen - d[i]
         d[i] = chosen
 

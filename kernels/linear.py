@@ -33,9 +33,7 @@ def set_inertia(dtype):
         values: wp.array(dtype=mat33),
     ):
         i = wp.tid()
-        entry = dtype(1.0)
-        if inverse_mass[i] > dtype(0.0):
-            entry = scale * mass[i]
+        entry = wp.where(inverse_mass[i] > dtype(0.0), scale * mass[i], dtype(1.0))
         values[diagonal[i]] = entry * wp.identity(n=3, dtype=dtype)
 
     return set_diagonal

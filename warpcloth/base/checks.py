@@ -51,16 +51,21 @@ def choice(name: str, value: object, allowed: Collection[str]) -> None:
         raise ValueError(f"{name} is {shown(value)}; it must be one of {', '.join(map(repr, allowed))}")
 
 
+def as_array(value: object) -> np.ndarray:
+    """``value`` as NumPy reads it; what is no array, such as rows of different lengths, as None."""
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError):
+        return np.asarray(None)
+
+
 def numeric(name: str, value: object, rule: str) -> np.ndarray:
     """``value`` as a read-only float64 array of its own.
 
     Raises:
         ValueError: If it is no number and no array of numbers, which texts and truth values are not.
     """
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError):  # rows of different lengths
-        array = np.asarray(None)
+    array = as_array(value)
     if array.dtype.kind not in "iuf" and array.size:
         raise ValueError(f"{name} is {shown(value)}, which is not numeric; it must {rule}")
     array = np.array(array, dtype=np.float64)

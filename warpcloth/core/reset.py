@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..base.checks import array, shown
+from ..base.checks import array, as_array, shown
 from ..kernels import step as kernels
 from ..model.precision import cast
 from .capture import Mirror
@@ -77,10 +77,7 @@ class Reset:
             if mask.dtype is not wp.bool or mask.shape != (B,) or not mask.is_contiguous:
                 raise ValueError(f"mask is {_kind(mask)}; on the device it must be a contiguous array ({B},) of wp.bool")
             return mask
-        try:
-            values = np.ones(B, dtype=bool) if mask is None else np.asarray(_host(mask))
-        except ValueError:  # rows of different lengths
-            values = np.empty(())
+        values = np.ones(B, dtype=bool) if mask is None else as_array(_host(mask))
         if values.dtype != bool or values.shape != (B,):
             raise ValueError(f"mask is {shown(mask)}; it must be an array ({B},) of truth values, one for each copy")
         return self._buffered("mask", wp.bool, B, values)

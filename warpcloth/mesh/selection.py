@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from ..base.checks import shown
+from ..base.checks import as_array, shown
 
 # Points often come from float32 files, and 0.1 from a text: nearer than this share of the mesh's size is equal.
 _EQUAL = 1e-6
@@ -60,13 +60,11 @@ def distinct_vertices(name, vertices, mesh):
     if isinstance(vertices, str):
         return select(mesh, vertices)
     n = len(mesh.points)
-    try:
-        found = np.asarray(vertices)
-    except ValueError:  # rows of different lengths
-        raise ValueError(f"{name} is {shown(vertices)}; it must be a list of whole numbers") from None
+    found = as_array(vertices)
     found = found.astype(np.int32) if found.size == 0 else found
     if found.ndim != 1 or found.dtype.kind not in "iu":
-        raise ValueError(f"{name} has shape {found.shape} and type {found.dtype}; it must be a list of whole numbers")
+        given = f"has shape {found.shape} and type {found.dtype}" if found.dtype != object else f"is {shown(vertices)}"
+        raise ValueError(f"{name} {given}; it must be a list of whole numbers")
     for k in np.flatnonzero((found < 0) | (found >= n))[:1]:
         raise ValueError(f"{name}[{k}] is {found[k]}; it must lie in 0 … {n - 1}")
     values, counts = np.unique(found, return_counts=True)

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..base.checks import choice, numeric, refuse, shown
+from ..base.checks import as_array, choice, numeric, refuse, shown
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..kernels import arap_cells as cells
@@ -187,10 +187,7 @@ class _Batch:
         inner = getattr(A.dtype, "_shape_", ()) if self.warp else ()
         self.typed = len(inner) == len(shapes[0])  # items, not numbers
         if not self.warp:
-            try:
-                A = np.asarray(A)
-            except ValueError:  # rows of different lengths
-                A = np.asarray(None)
+            A = as_array(A)
             A = A.astype(np.float64) if A.dtype.kind in "iu" else A
         scalar = _TYPES.get(A.dtype) if not self.warp else A.dtype._wp_scalar_type_ if self.typed else A.dtype
         shape, split = (*A.shape, *inner), -len(shapes[0])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import array, number, refuse, shown
+from ..base.checks import array, as_array, number, refuse, shown
 from ..base.types import Converted, Precision, UpAxis, default
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
@@ -358,10 +358,7 @@ def _checked_axes(free_axes, n):
     """Truth values (n, 3), or None."""
     if free_axes is None:
         return None
-    try:
-        found = np.array(free_axes)
-    except ValueError:  # rows of different lengths
-        found = np.empty(())
+    found = as_array(free_axes).copy()
     if found.dtype != bool or found.shape != (n, 3):
         given = f"has shape {found.shape}" if found.dtype == bool else f"is {shown(free_axes)}"
         raise ValueError(f"free_axes {given}; it must be an array ({n}, 3) of truth values, one for each axis of each vertex")

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..base.checks import numeric, refuse, shown
+from ..base.checks import as_array, numeric, refuse, shown
 from ..kernels.term import Term
 from ..mesh.mesh import Mesh
 from .refresh import Refresh
@@ -223,10 +223,7 @@ def own_indices(name, given):
     Raises:
         ValueError: If they are not a list of whole numbers.
     """
-    try:
-        found = np.asarray(given)
-    except ValueError:  # rows of different lengths
-        found = np.asarray(None)
+    found = as_array(given)
     found = found.astype(np.int32) if found.size == 0 else found
     if found.ndim != 1 or found.dtype.kind not in "iu":
         raise ValueError(f"{name} is {shown(given)}; it must be a list of whole numbers")
@@ -242,10 +239,7 @@ def own_stencil(label, parameter, given, vertices, count):
     Raises:
         ValueError: If the shape is another, or an element names a vertex twice or one outside [0, ``count``).
     """
-    try:
-        stencil = np.asarray(given)
-    except ValueError:  # rows of different lengths
-        stencil = np.asarray(None)
+    stencil = as_array(given)
     if vertices == 1 and stencil.ndim == 1:
         stencil = stencil[:, None]
     if stencil.dtype.kind not in "iu" and stencil.size:
