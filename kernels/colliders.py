@@ -155,8 +155,8 @@ def pose_collider(dtype):
     """Kernel over the elements of contact with one collider, at the start of a step: rest states with its pose, or a plane.
 
     A vertex whose prediction, x + h v + h² g, crosses the collider has contact with the half-space behind the plane that
-    touches the collider where it meets it: beyond a thin collider there would be no force that leads back. Other rest states
-    are written where they change.
+    touches the collider where it meets it: beyond a thin collider there would be no force that leads back. Where h is 0, as of
+    explicit steps, nothing is predicted. Other rest states are written where they change.
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
@@ -187,7 +187,7 @@ def pose_collider(dtype):
         pose = poses.at[copy, collider]
         core = shape.core[collider]
         radius = shape.radius[collider]
-        if wp.isfinite(core[0]):
+        if wp.isfinite(core[0]) and h > dtype(0.0):
             X = to_local(poses.before[copy, collider], x[i])
             ahead = x[i] + h * (v[i] + h * gravity[i // per_gravity])
             way = to_local(poses.after[copy, collider], ahead) - X
@@ -311,17 +311,99 @@ def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex:
 
 
 @cache
-def filter_step(dtype):
-    """Kernel over vertices, at the end of a step: no free vertex is inside a collider, and none has crossed its surface.
+def outside(dtype):
+    """The device function (x, end, …) → where a free vertex ends that moves from x to ``end``, and whether it was cut short.
 
-    In the frame of a collider a vertex moves along a segment from where it was when the step began, of which :func:`kept_part`
-    remains. A vertex that would come nearer than ``least`` stops where it is nearer than ``landing``, at most. What is cut off
-    x is also cut off v, over h, and off ``move``, which may be None. ``notes`` counts the vertices of each copy that were cut,
-    and has the free ones that colliders leave no way out, and the others that enter one.
+    In the frame of a collider it moves along a segment, of which :func:`kept_part` remains. A vertex that would come nearer
+    than ``least`` stops where it is nearer than ``landing`` beyond, at most. ``notes`` counts it, and has it if colliders leave
+    no way out.
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
     kept = kept_part(dtype)
+
+    @wp.func
+    def end_outside(
+        x: vec3,
+        end: vec3,
+        i: int,
+        step: int,
+        shape: shapes(dtype),
+        poses: step_poses(dtype),
+        per_copy: int,
+        least: dtype,
+        landing: dtype,
+        notes: FilterNotes,
+    ):
+        copy = i // per_copy
+        rounded = least + dtype(8.0) * epsilon(least) * wp.max(wp.abs(end))
+        cuts = wp.int32(0)
+        last = wp.int32(0)
+        rounds = wp.int32(0)
+        while rounds <= cuts and rounds < ROUNDS:  # another one after each that has cut
+            rounds += 1
+            for c in range(shape.radius.shape[0]):
+                X = to_local(poses.before[copy, c], x)
+                way = to_local(poses.after[copy, c], end) - X
+                t = kept(X, way, shape.core[c], shape.radius[c], rounded)
+                if t < dtype(1.0):
+                    t = kept(X, way, shape.core[c], shape.radius[c], rounded + landing)
+                    end = to_space(poses.after[copy, c], X + t * way)
+                    cuts = rounds
+                    last = c
+        if cuts > 0:
+            wp.atomic_add(notes.cut, copy, wp.int64(1))
+        if cuts == ROUNDS:
+            for c in range(shape.radius.shape[0]):
+                d, _n = local_gap_of(to_local(poses.after[copy, c], end), shape.core[c], shape.radius[c])
+                if d <= dtype(0.0):
+                    note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, last)
+        return end, cuts > 0
+
+    return end_outside
+
+
+@cache
+def entry(dtype):
+    """The device function (x, end, …) that notes a vertex that is not free and enters a collider from x to ``end``."""
+    vec3, _ = types(dtype)
+    to_local, _to_space = of_pose(dtype)
+    kept = kept_part(dtype)
+
+    @wp.func
+    def note_entry(
+        x: vec3,
+        end: vec3,
+        i: int,
+        step: int,
+        shape: shapes(dtype),
+        poses: step_poses(dtype),
+        per_copy: int,
+        least: dtype,
+        notes: FilterNotes,
+    ):
+        copy = i // per_copy
+        rounding = dtype(8.0) * epsilon(least)
+        for c in range(shape.radius.shape[0]):
+            X = to_local(poses.before[copy, c], x)
+            way = to_local(poses.after[copy, c], end) - X
+            d, _n = local_gap_of(X, shape.core[c], shape.radius[c])
+            deep = -rounding * wp.max(wp.max(wp.abs(end)), wp.max(wp.abs(X)))  # what moves along may touch
+            if d > deep and kept(X, way, shape.core[c], shape.radius[c], deep) < dtype(1.0):
+                note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, shape.radius.shape[0])
+
+    return note_entry
+
+
+@cache
+def filter_step(dtype):
+    """Kernel over vertices, at the end of a step: no free vertex is inside a collider, and none has crossed its surface.
+
+    What :func:`outside` cuts off x is also cut off v, over h, and off ``move``, which may be None. Others are noted by
+    :func:`entry`.
+    """
+    vec3, _ = types(dtype)
+    end_outside, note_entry = outside(dtype), entry(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def filter_vertices(
@@ -344,45 +426,45 @@ def filter_step(dtype):
         notes: FilterNotes,
     ):
         i = wp.tid()
-        copy = i // per_copy
-        x0 = x_before[i]
-        end = x[i]
-        rounding = dtype(8.0) * epsilon(least) * wp.max(wp.abs(end))
+        now = step[i // per_copy]
         if inverse_mass[i] > dtype(0.0):
-            rounded = least + rounding
-            cuts = wp.int32(0)
-            last = wp.int32(0)
-            rounds = wp.int32(0)
-            while rounds <= cuts and rounds < ROUNDS:  # another one after each that has cut
-                rounds += 1
-                for c in range(shape.radius.shape[0]):
-                    X = to_local(poses.before[copy, c], x0)
-                    way = to_local(poses.after[copy, c], end) - X
-                    t = kept(X, way, shape.core[c], shape.radius[c], rounded)
-                    if t < dtype(1.0):
-                        t = kept(X, way, shape.core[c], shape.radius[c], rounded + landing)
-                        end = to_space(poses.after[copy, c], X + t * way)
-                        cuts = rounds
-                        last = c
-            if cuts > 0:
+            end, short = end_outside(x_before[i], x[i], i, now, shape, poses, per_copy, least, landing, notes)
+            if short:
                 change = end - x[i]
                 x[i] = end
                 v[i] = v[i] + change / h
                 if move:
                     move[i] = move[i] + change
-                wp.atomic_add(notes.cut, copy, wp.int64(1))
-            if cuts == ROUNDS:
-                for c in range(shape.radius.shape[0]):
-                    d, _n = local_gap_of(to_local(poses.after[copy, c], end), shape.core[c], shape.radius[c])
-                    if d <= dtype(0.0):
-                        note_inside(notes, copy, c, step[copy], i - copy * per_copy, per_copy, last)
         else:
-            for c in range(shape.radius.shape[0]):
-                X = to_local(poses.before[copy, c], x0)
-                way = to_local(poses.after[copy, c], end) - X
-                d, _n = local_gap_of(X, shape.core[c], shape.radius[c])
-                deep = -wp.max(rounding, dtype(8.0) * epsilon(least) * wp.max(wp.abs(X)))  # what moves along may touch
-                if d > deep and kept(X, way, shape.core[c], shape.radius[c], deep) < dtype(1.0):
-                    note_inside(notes, copy, c, step[copy], i - copy * per_copy, per_copy, shape.radius.shape[0])
+            note_entry(x_before[i], x[i], i, now, shape, poses, per_copy, least, notes)
 
     return filter_vertices
+
+
+@cache
+def note_fixed(dtype):
+    """Kernel over vertices that are not free, of all copies: :func:`entry` of each, from where the step began."""
+    vec3, _ = types(dtype)
+    note_entry = entry(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def note(
+        # elements
+        fixed: wp.array(dtype=wp.int32),
+        shape: shapes(dtype),
+        # state in
+        x_before: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        poses: step_poses(dtype),
+        step: wp.array(dtype=wp.int32),
+        # parameters
+        per_copy: int,
+        least: dtype,
+        # in and out
+        notes: FilterNotes,
+    ):
+        p = wp.tid()
+        i = fixed[p]
+        note_entry(x_before[p], x[i], i, step[i // per_copy], shape, poses, per_copy, least, notes)
+
+    return note

@@ -12,19 +12,30 @@ from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..vectors import types
 from .block_forces import add_block_forces
+from .contact_guard import guard_struct, in_ball, touching_step
 from .term_facts import TermFacts, chain_of
 
 
 @cache
-def block_step(parts: tuple[TermFacts, ...], dtype, symplectic: bool, flags: str, compensated: bool = False):
+def block_step(
+    parts: tuple[TermFacts, ...],
+    dtype,
+    symplectic: bool,
+    flags: str,
+    compensated: bool = False,
+    guarded: bool = False,
+    moving: bool = False,
+):
     """Kernel over copies, each block by block: v, x after a step, a = g − ∇U/m.
 
     ``gradient`` is that of other terms, and 0 afterwards. ``flags`` are those of the compiler, on the CPU. ``compensated`` is
-    as in :func:`.explicit_step.kick_and_drift`, for terms without damping, and takes forces at x + residual.
+    as in :func:`.explicit_step.kick_and_drift`, for terms without damping, and takes forces at x + residual. ``guarded`` is for
+    contact with colliders, see :mod:`.contact_guard`, and ``moving`` if some move.
     """
     vec3, _ = types(dtype)
     add, step = add_block_forces(parts, dtype, compensated), kick_and_drift(dtype, symplectic, compensated)
     vector, number, whole, put = load(vec3), load(dtype), load(wp.int32), store(vec3)
+    clear, touch = in_ball(dtype, moving), touching_step(dtype, symplectic)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
     def step_blocks(
@@ -33,6 +44,7 @@ def block_step(parts: tuple[TermFacts, ...], dtype, symplectic: bool, flags: str
         vertices: wp.array(dtype=wp.int32),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
+        guard: guard_struct(dtype),
         # parameters
         h: dtype,
         # in and out, the first two scratch
@@ -47,6 +59,9 @@ def block_step(parts: tuple[TermFacts, ...], dtype, symplectic: bool, flags: str
         g = gravity[copy]
         blocks = (vertices.shape[0] - 1) // gravity.shape[0]
         b = copy * blocks
+        now = wp.int32(0)
+        if wp.static(guarded):
+            now = guard.steps[copy]
         last = b + blocks
         while b < last:
             if wp.static(compensated):
@@ -55,6 +70,28 @@ def block_step(parts: tuple[TermFacts, ...], dtype, symplectic: bool, flags: str
                 add(chain, b, x, v, h, y, dy, gradient)
             i = whole(vertices, b)
             end = whole(vertices, b + 1)
+            if wp.static(guarded):
+                near = wp.int32(0)
+                j = i
+                while j < end:  # to be vectorised
+                    w = number(inverse_mass, j)
+                    before = vector(x, j)
+                    position, more, velocity = step(before, vec3(), vector(v, j), g - w * vector(gradient, j), h)
+                    near += 1 - clear(guard, j, now, before, position)
+                    j += 1
+                while near > 0 and i < end:
+                    w = number(inverse_mass, i)
+                    if w > dtype(0.0):
+                        before = vector(x, i)
+                        speed = vector(v, i)
+                        a = g - w * vector(gradient, i)
+                        position, more, velocity = step(before, vec3(), speed, a, h)
+                        if clear(guard, i, now, before, position) == 0:
+                            position, velocity = touch(guard, i, w, before, speed, a, h)
+                        put(x, i, position)
+                        put(v, i, velocity)
+                    put(gradient, i, vec3())
+                    i += 1
             while i < end:
                 w = number(inverse_mass, i)
                 before = vector(x, i)
@@ -70,5 +107,7 @@ def block_step(parts: tuple[TermFacts, ...], dtype, symplectic: bool, flags: str
                 put(gradient, i, vec3())
                 i += 1
             b += 1
+        if wp.static(guarded and not moving):
+            guard.steps[copy] = now + 1
 
     return step_blocks

@@ -7,16 +7,19 @@ import warp as wp
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..vectors import types
+from .contact_guard import guard_struct, in_ball, touching_step
 from .gather_forces import move_of, sum_at_vertices
 from .packed_residual import pack_residual
 from .term_facts import TermFacts, chain_of
 
 
 @cache
-def gather_vertex(parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: int = 1, residual_type=None):
+def gather_vertex(
+    parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: int = 1, residual_type=None, guarded=False, moving=False
+):
     """The device function by which ``lanes`` threads set x, v of a vertex after a step, a = g − ∇U/m, in other arrays.
 
-    ``residual_type`` is that of :func:`gather_step`.
+    ``residual_type``, ``guarded`` and ``moving`` are those of :func:`gather_step`.
     """
     vec3, _ = types(dtype)
     compensated, packed, stored = residual_type is not None, residual_type is wp.int32, residual_type or vec3
@@ -24,6 +27,7 @@ def gather_vertex(parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: 
     step = kick_and_drift(dtype, symplectic, compensated)
     vector, number, put = load(vec3), load(dtype), store(vec3)
     residual_of, put_residual = move_of(dtype, stored), store(stored)
+    clear, touch = in_ball(dtype, moving), touching_step(dtype, symplectic)
 
     @wp.func
     def gather_one(
@@ -31,6 +35,7 @@ def gather_vertex(parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: 
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         g: vec3,
+        guard: guard_struct(dtype),
         h: dtype,
         unit: dtype,
         x: wp.array(dtype=vec3),
@@ -54,7 +59,18 @@ def gather_vertex(parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: 
         if wp.static(compensated):
             rest = residual_of(residual, i, unit)
         if w > dtype(0.0):
-            position, rest, velocity = step(position, rest, velocity, g - w * total, h)
+            a = g - w * total
+            if wp.static(guarded):
+                before = position
+                speed = velocity
+                now = wp.int32(0)
+                if wp.static(moving):
+                    now = guard.steps[i // guard.per_copy]
+                position, rest, velocity = step(before, rest, speed, a, h)
+                if thread == i * lanes and clear(guard, i, now, before, position) == 0:
+                    position, velocity = touch(guard, i, w, before, speed, a, h)
+            else:
+                position, rest, velocity = step(position, rest, velocity, a, h)
         if thread == i * lanes:
             put(x_after, i, position)
             put(v_after, i, velocity)
@@ -62,24 +78,35 @@ def gather_vertex(parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: 
                 put_residual(residual_after, i, pack_residual(rest, unit))
             elif wp.static(compensated):
                 put_residual(residual_after, i, rest)
+            if wp.static(guarded and not moving):
+                if i % guard.per_copy == 0:
+                    guard.steps[i // guard.per_copy] += 1
 
     return gather_one
 
 
 @cache
 def gather_step(
-    parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, alone: bool, lanes: int = 1, residual_type=None
+    parts: tuple[TermFacts, ...],
+    dtype,
+    symplectic: bool,
+    fast: bool,
+    alone: bool,
+    lanes: int = 1,
+    residual_type=None,
+    guarded: bool = False,
+    moving: bool = False,
 ):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
     Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN
     stays. ``alone`` is for one copy. ``residual_type`` is None, or for terms without damping, in float32, the type of the
     residual of :func:`.explicit_step.kick_and_drift`: vectors, with a ``unit`` of 1, or int32 as :mod:`.packed_residual` packs
-    them in units of ``unit``.
+    them in units of ``unit``. ``guarded`` is for contact with colliders, see :mod:`.contact_guard`, ``moving`` if some move.
     """
     vec3, _ = types(dtype)
     stored = residual_type or vec3
-    gather_one = gather_vertex(parts, dtype, symplectic, lanes, residual_type)
+    gather_one = gather_vertex(parts, dtype, symplectic, lanes, residual_type, guarded, moving)
     # Rows of bending one after another in a loop take 1.3 times as long with compensated positions, else as long (H200, 512²).
     options = {"fast_math": fast, "max_unroll": 32 if residual_type else 16}
 
@@ -90,6 +117,7 @@ def gather_step(
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
         per_copy: int,
+        guard: guard_struct(dtype),
         # state in
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -106,7 +134,7 @@ def gather_step(
         copy = 0
         if wp.static(not alone):
             copy = thread // (lanes * per_copy)  # a tenth of the instructions of a step of springs
-        gather_one(thread, chain, inverse_mass, gravity[copy], h, unit, x, v, residual, x_after, v_after, residual_after)
+        gather_one(thread, chain, inverse_mass, gravity[copy], guard, h, unit, x, v, residual, x_after, v_after, residual_after)
 
     return step_vertices
 
@@ -120,13 +148,16 @@ def wait_for_block(): ...
 
 
 @cache
-def gather_steps_of_copies(parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, threads: int):
+def gather_steps_of_copies(
+    parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, threads: int, guarded: bool = False
+):
     """Kernel over (copies, threads): x, v after several steps. A copy is a block of ``threads``, which wait for one another.
 
     x_other and v_other are where every other step ends; where nothing is damped v may be v_other.
     """
     vec3, _ = types(dtype)
-    gather_one, vector, put = gather_vertex(parts, dtype, symplectic), load(vec3), store(vec3)
+    gather_one = gather_vertex(parts, dtype, symplectic, guarded=guarded)
+    vector, put = load(vec3), store(vec3)
     threads = wp.constant(threads)
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=threads, module_options={"fast_math": fast})
@@ -136,6 +167,7 @@ def gather_steps_of_copies(parts: tuple[TermFacts, ...], dtype, symplectic: bool
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
         per_copy: int,
+        guard: guard_struct(dtype),
         # parameters
         h: dtype,
         steps: int,
@@ -153,13 +185,13 @@ def gather_steps_of_copies(parts: tuple[TermFacts, ...], dtype, symplectic: bool
         while left > 0:
             i = first
             while i < end:
-                gather_one(i, chain, inverse_mass, g, h, h, x, v, x, x_other, v_other, x)
+                gather_one(i, chain, inverse_mass, g, guard, h, h, x, v, x, x_other, v_other, x)
                 i += threads
             wait_for_block()
             i = first
             while i < end:
                 if left > 1:
-                    gather_one(i, chain, inverse_mass, g, h, h, x_other, v_other, x, x, v, x)
+                    gather_one(i, chain, inverse_mass, g, guard, h, h, x_other, v_other, x, x, v, x)
                 else:  # the last of an odd number
                     put(x, i, vector(x_other, i))
                     put(v, i, vector(v_other, i))

@@ -91,6 +91,51 @@ def test_explicit_steps_are_those_of_the_core(name, backend, scheme, dtype, devi
     assert np.abs(x - expected[0]).max() < steps * stepper.h * tolerance
 
 
+def draped(moving):
+    """A sheet that slides off a ball onto a floor, or off a ball that moves and a box that turns."""
+    center = np.array([0.5, -0.301, 0.5]) + 0.01 * np.arange(9 if moving else 1)[:, None] * [1.0, 0.0, 0.0]
+    ball = wc.Sphere(radius=0.3, position=center, friction=0.3)
+    turns = [(0.0, 0.0, np.sin(0.02 * k), np.cos(0.02 * k)) for k in range(9)]
+    box = wc.Box(size=(0.2, 0.1, 0.2), position=(0.2, -0.2, 0.2), rotation=turns, friction=0.2)
+    mesh = wc.Mesh.grid(7, 7)
+    other = box if moving else wc.Plane(position=(0.0, -0.05, 0.0))
+    terms = [replace(SPRINGS, damping=0.01), wc.QuadraticBending(stiffness=1e-3)]
+    scene = wc.Scene(mesh, density=0.15, terms=terms, velocities=[0.3, -1.0, 0.0] + 0.0 * mesh.points, fps=24.0, duration=1.0)
+    return replace(scene, colliders=[ball, other])
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("backend", ["blocks", "gather"], indirect=True)
+def test_contact_in_explicit_steps_is_that_of_the_core(moving, backend, device):
+    """Anchors of friction and cuts too; also where positions are set in between. To follow contact changes no bit, and
+    has terms of contact as the core has them.
+    """
+    model = draped(moving).build(device=device, dtype="float64", copies=2)
+    steppers = [ExplicitStepper(wc.Explicit(substeps=60), model, each) for each in (backend, "core", backend)]
+    steppers[2].follow_contact()
+    assert [stepper.plan.guard is None for stepper in steppers] == [False, True, False]
+    for _ in range(2):
+        for _ in range(3):
+            steppers[0].frame()
+            steppers[1].frame()
+            for _ in range(60):
+                steppers[2].step()
+        one, core, followed = (stepper.state.to_host() for stepper in steppers)
+        assert core["vertices cut short"].all() and (core["anchors on collider 0"][:, 3] > 0.0).any()
+        assert all(np.array_equal(one[name], followed[name]) for name in one)
+        for name in ("vertices cut short", "steps of colliders"):
+            assert np.array_equal(one[name], core[name])
+        # Contact of 1.5e4 Pa/m and friction multiply rounding by some 1e4 in these 180 steps.
+        assert np.abs(one["x"] - core["x"]).max() < 1e-10
+        assert np.abs(one["anchors on collider 0"] - core["anchors on collider 0"])[:, 3].max() < 1e-10
+        for followed_, expected in zip(steppers[2].model.terms, steppers[1].model.terms, strict=True):
+            if expected.collider is not None:
+                np.testing.assert_allclose(followed_.rest.numpy(), expected.rest.numpy(), rtol=0.0, atol=1e-10)
+        for stepper in steppers:
+            stepper.reset()
+            stepper.state.x.assign(model.positions.numpy() + np.array([0.05, 1e-4, 0.05]))
+
+
 def record(scene, device, backend="auto", threads=1):
     """How explicit steps of a scene are taken."""
     model = scene.build(device=device, threads=threads)

@@ -38,9 +38,10 @@ class ColliderSteps:
         x_before: Positions where the step began, (N,) [m].
         poses: Those of the step, a :func:`warpcloth.kernels.colliders.step_poses`.
         shapes: A :func:`warpcloth.kernels.colliders.shapes`.
-        anchors: Those of friction on each collider that has it, by its index.
+        anchors: Those of friction on each collider that has it, by its index; rows of ``anchor_rows`` (C, N).
         least: Distance below which no vertex ends a step [m].
         steps_per_frame: As given.
+        notes: :class:`warpcloth.kernels.colliders.FilterNotes`.
         steps: Steps that the colliders have made, (B,) int32.
     """
 
@@ -56,10 +57,12 @@ class ColliderSteps:
             setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
         self.x_before = model.vectors()
         self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device))
-        self._notes = kernels.FilterNotes()
-        self._notes.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
-        self._notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
-        self.anchors = {}
+        self.notes = kernels.FilterNotes()
+        self.notes.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
+        self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
+        self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
+        self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
+        self._spare = None
         self.least = FLOOR * declared.distance
         # Of midpoint forces are those half-way, of others at the end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
@@ -76,8 +79,7 @@ class ColliderSteps:
         model, declared = self.model, self.model.colliders
         first = all(each.refresh is None or each.collider is None for each in self.terms)
         if elements.term is FRICTION:
-            anchors = state.add(f"anchors on collider {c}", wp.zeros(model.count, dtype=self._anchor_type, device=model.device))
-            self.anchors[c] = anchors
+            anchors = self.anchors[c] = state.add(f"anchors on collider {c}", self.anchor_rows[c])
             kernel = model.kernel(kernels.anchor_vertices, model.dtype, self.bounded)
             launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
         elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
@@ -91,7 +93,7 @@ class ColliderSteps:
     def _refresh(self, first, launch, model, elements, moment):
         """Where a step begins: by the first of the terms for all of them, then for each."""
         if first:
-            model.launch(self._move, self._dim, self._given, [self.poses])
+            self.launch_move()
             wp.copy(self.x_before, moment.x)
         if launch is not None:
             launch(model, elements)
@@ -102,29 +104,49 @@ class ColliderSteps:
         model.launch(kernel, elements.count, given, [elements.rest])
 
     def _anchor(self, kernel, c, anchors, friction, model, elements):
+        if self._spare is not None:
+            wp.copy(self._spare, anchors)
+            anchors = self._spare
         given = [elements.stencil, self.shapes, self.x_before, self.poses]
         given += [c, elements.per_copy, model.colliders.distance, friction]
         model.launch(kernel, elements.count, given, [anchors, elements.rest])
+
+    def leave_anchors(self):
+        """Lets refreshed terms read anchors only, for steps that move these themselves."""
+        self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
+
+    def launch_move(self):
+        """Launches the poses of the step that begins."""
+        self.model.launch(self._move, self._dim, self._given, [self.poses])
+
+    def launch_count(self):
+        """Launches what counts a step."""
+        self.model.launch(self._count, self.model.copies, [], [self.steps])
+
+    @property
+    def drift(self):
+        """By how much the surface of a collider moves on in a step, at most [m]."""
+        return max(collider.most_move for collider in self.model.scene.colliders) / self.steps_per_frame
 
     def launch_end(self, x, v, move=None):
         """Cuts the step short of vertices that would end in a collider or cross one, in x, v and ``move`` (N,)."""
         model = self.model
         given = [model.inverse_mass, self.shapes, self.x_before, self.poses, self.steps]
         given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
-        model.launch(self._filter, model.count, given, [x, v, move, self._notes])
-        model.launch(self._count, model.copies, [], [self.steps])
+        model.launch(self._filter, model.count, given, [x, v, move, self.notes])
+        self.launch_count()
 
     @property
     def share(self):
         """The share of the moves of free vertices in all steps that were cut short, (B,)."""
         free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
-        return self._notes.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
+        return self.notes.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
 
     def inside(self):
         """The first vertex that ended a step inside each collider: tuples of its copy, collider, step, index, and the collider
         that held it back, or None for a vertex that is not free."""
         colliders, found = self._dim[1], []
-        for (copy, c), value in np.ndenumerate(self._notes.inside.numpy()):
+        for (copy, c), value in np.ndenumerate(self.notes.inside.numpy()):
             if value:
                 rest, other = divmod(int(kernels.FIRST) - int(value), colliders + 1)
                 step, vertex = divmod(rest, self.model.per_copy)
@@ -133,5 +155,5 @@ class ColliderSteps:
 
     def start_again(self):
         """Forgets the steps that an integrator made to find its past."""
-        for array in (self.steps, self._notes.cut, self._notes.inside, *self.anchors.values()):
+        for array in (self.steps, self.notes.cut, self.notes.inside, *self.anchors.values()):
             array.zero_()

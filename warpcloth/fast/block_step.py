@@ -8,6 +8,7 @@ import warp as wp
 from ..core.explicit_step import StepRecord
 from ..core.gradient import Gradient
 from ..kernels.fast import block_step as kernels
+from ..kernels.fast.contact_guard import guard_struct
 from ..kernels.fast.term_facts import TermFacts
 from ..terms.refresh import STEP, Moment
 from .block_layout import block_layout
@@ -43,6 +44,7 @@ class BlockStep:
         symplectic: Whether x moves on by the v after the step.
         count: Steps that moved pins have made (B,) int32, or None.
         compensated: Whether x is moved on by compensated summation.
+        guard: The :class:`warpcloth.fast.contact_guard.ContactGuard` of a model with colliders.
         window: The :class:`Window` of the vertices of ``state``, if these are not all of the model.
 
     Attributes:
@@ -50,9 +52,9 @@ class BlockStep:
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
-    def __init__(self, model, state, h, symplectic, count, compensated=False, window=None):
-        self.model, self.state = model, state
-        window = window or Window(model.terms, model.inverse_mass, model.pins, model.keyframes)
+    def __init__(self, model, state, h, symplectic, count, compensated=False, guard=None, window=None):
+        self.model, self.state, self._guard = model, state, guard
+        window = window or Window(guard.terms if guard else model.terms, model.inverse_mass, model.pins, model.keyframes)
         self._pins = window.pins, window.keyframes, count
         refreshed, others = ([each for each in window.terms if (each.refresh is not None) == apart] for apart in (True, False))
         self._refreshed, self._gradient = Gradient(model, terms=refreshed), wp.zeros_like(state[0])
@@ -64,20 +66,26 @@ class BlockStep:
         parts = [TermFacts(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
         # Contracted as on CUDA, where a product is added without being rounded: springs then take 0.8 of the time.
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
-        self._kernel = model.kernel(kernels.block_step, tuple(parts), model.dtype, symplectic, flags, compensated)
+        guarded = guard is not None, guard is not None and guard.moving
+        self._kernel = model.kernel(kernels.block_step, tuple(parts), model.dtype, symplectic, flags, compensated, *guarded)
         self.residual = wp.zeros_like(state[0]) if compensated else None
         self._arrays = arrays  # whose memory the structs do not keep
         scratch = [
             wp.zeros(size, dtype=model.dtype, device=model.device) for size in (numbers, numbers * (compensated or any(damped)))
         ]
         chain = chained(parts, arrays, model.dtype)
-        self._given = [chain, int32_array(vertices, model.device), window.inverse_mass, model.gravity, h, *scratch]
+        self._given = [chain, int32_array(vertices, model.device), window.inverse_mass, model.gravity]
+        self._given += [guard.data if guard else guard_struct(model.dtype)(), h, *scratch]
 
     def launch(self, steps, move_pins):
         """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
+            if self._guard:
+                self._guard.launch_start(x)
             model.refresh(STEP, Moment(x), self._refreshed.terms)
             self._refreshed.add(x, self._gradient)
             model.launch(self._kernel, model.copies, self._given, [self._gradient, x, v, self.residual])
             move_pins(*self._pins, x, v)
+            if self._guard:
+                self._guard.launch_end(x)

@@ -4,6 +4,7 @@ import warp as wp
 
 from ..core.explicit_step import StepRecord
 from ..kernels.fast import gather_step as kernels
+from ..kernels.fast.contact_guard import guard_struct
 from ..terms.refresh import EVALUATION, STEP, Moment
 from .compensation import packed_unit
 from .gather_layout import gathered, lanes_of
@@ -30,21 +31,23 @@ class GatherStep:
         symplectic: Whether x moves on by the v after the step.
         count: Steps that moved pins have made (B,) int32, or None.
         compensated: Whether x is moved on by compensated summation.
+        guard: The :class:`warpcloth.fast.contact_guard.ContactGuard` of a model with colliders.
 
     Attributes:
         residual: Position residual of compensated summation (N,), vectors [m] or packed; or None.
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
-    def __init__(self, model, state, h, symplectic, count, compensated=False):
-        self.model, self._pins = model, (model.pins, model.keyframes, count)
+    def __init__(self, model, state, h, symplectic, count, compensated=False, guard=None):
+        model = model if guard is None else model.with_terms(guard.terms)
+        self.model, self._pins, self._guard = model, (model.pins, model.keyframes, count), guard
         self._found = [gathered(model, elements, elements.damping is not None) for elements in model.terms]
         parts = [part for part, _arrays in self._found]
         fast = model.device.is_cuda and model.dtype is wp.float32
         key = (tuple(parts), model.dtype, symplectic, fast)
         unit = packed_unit(model) if compensated else None
         residual_type = None if not compensated else wp.int32 if unit else model.vec3
-        self._lanes, self._block = lanes_of(model), 0 if compensated else block_of(model, parts)
+        self._lanes, self._block = lanes_of(model), 0 if compensated or (guard and guard.moving) else block_of(model, parts)
         self.record = StepRecord(
             "gather",
             lanes=self._lanes,
@@ -54,31 +57,39 @@ class GatherStep:
             packed=unit is not None,
         )
         if self._block:
-            self._kernel = model.kernel(kernels.gather_steps_of_copies, *key, self._block)
+            self._kernel = model.kernel(kernels.gather_steps_of_copies, *key, self._block, guard is not None)
         else:
-            self._kernel = model.kernel(kernels.gather_step, *key, model.copies == 1, self._lanes, residual_type)
+            more = model.copies == 1, self._lanes, residual_type, guard is not None, guard is not None and guard.moving
+            self._kernel = model.kernel(kernels.gather_step, *key, *more)
         chain = chained(parts, [arrays for _part, arrays in self._found], model.dtype)
         (x, v), damped = state, any(part.damped for part in parts)
         self.residual, other = (
             wp.zeros(model.count, dtype=residual_type, device=model.device) if compensated else None for _ in range(2)
         )
         self._states = [(x, v, self.residual), (model.vectors(), model.vectors() if damped else v, other)]
-        self._given, self._h = [chain, model.inverse_mass, model.gravity, model.per_copy], h
+        data = guard.data if guard else guard_struct(model.dtype)()
+        self._given, self._h = [chain, model.inverse_mass, model.gravity, model.per_copy, data], h
         self._unit = unit or 1.0
 
     def launch(self, steps, move_pins):
         """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
         model = self.model
-        if self._block:  # and nothing has to come after a step
+        if self._block:  # and nothing has to come between steps
+            if self._guard:
+                self._guard.launch_start(self._states[0][0])
             dim, states = (model.copies, self._block), [*self._states[0][:2], *self._states[1][:2]]
             model.launch(self._kernel, dim, [*self._given, self._h, steps], states, block_dim=self._block)
             return
         for step in range(steps):
             before, after = self._states[step % 2], self._states[1 - step % 2]
+            if self._guard:
+                self._guard.launch_start(before[0])
             for when in (STEP, EVALUATION):
                 model.refresh(when, Moment(before[0]))
             model.launch(self._kernel, model.count * self._lanes, [*self._given, *before, self._h, self._unit], [*after])
             move_pins(*self._pins, *after[:2])
+            if self._guard:
+                self._guard.launch_end(after[0])
         if steps % 2:
             for array, last in zip(*self._states, strict=True):
                 if array is not last:

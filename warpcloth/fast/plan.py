@@ -15,6 +15,7 @@ from ..core.gradient import Gradient
 from ..core.jacobi_sweeps import JacobiSweeps
 from .block_step import BlockStep
 from .compensation import needs_compensation
+from .contact_guard import ContactGuard
 from .gather_corrections import GatherSweeps
 from .gather_gradient import GatherGradient
 from .gather_step import GatherStep
@@ -34,17 +35,18 @@ class Plan:
     Attributes:
         model, backend: As given.
         record: The :class:`warpcloth.core.explicit_step.StepRecord` of the explicit steps, or None before they are made.
+        guard: The :class:`warpcloth.fast.contact_guard.ContactGuard` by which they take contact themselves, or None.
     """
 
     def __init__(self, model, backend):
-        self.model, self.backend, self.record = model, backend, None
+        self.model, self.backend, self.record, self.guard = model, backend, None, None
 
     def gradient(self, corrected=False, terms=None):
         """Returns a :class:`warpcloth.core.gradient.Gradient`, or a faster class with the same methods."""
         of_backend = {"core": Gradient, "blocks": Gradient, "gather": GatherGradient}
         return of_backend[self.backend](self.model, corrected, terms)
 
-    def explicit_step(self, state, h, symplectic, count, pool):
+    def explicit_step(self, state, h, symplectic, count, pool, colliders=None):
         """Returns a :class:`warpcloth.core.explicit_step.ExplicitStep`, or a faster class with the same methods.
 
         Args:
@@ -53,6 +55,8 @@ class Plan:
             symplectic: Whether x is updated with v after the step.
             count: Steps that moved pins have made (B,) int32, or None.
             pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares them.
+            colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of a model that has some, for faster classes
+                to take contact themselves, or None to leave it to the terms and to the end of each step.
 
         Raises:
             ValueError: If threads cannot share the steps; it names the term.
@@ -63,6 +67,9 @@ class Plan:
             steps = SubdomainSteps(*given, pool)
         else:
             backend = self.backend if self.model.uniform else "core"
+            if colliders is not None and backend != "core":
+                self.guard = ContactGuard(self.model, colliders)
+                given = *given, self.guard
             steps = {"core": ExplicitStep, "blocks": BlockStep, "gather": GatherStep}[backend](*given)
         self.record = steps.record
         return steps

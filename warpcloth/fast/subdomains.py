@@ -94,7 +94,7 @@ class _Subdomain:
         self._count = None if count is None else wp.clone(count)
         window = self._window(terms, vertices)
         self.moves_pins = window.pins is not None
-        self.steps = BlockStep(model, (x, v), h, symplectic, self._count, len(state) > 2, window)
+        self.steps = BlockStep(model, (x, v), h, symplectic, self._count, len(state) > 2, window=window)
         self._state = [x, v] if self.steps.residual is None else [x, v, self.steps.residual]
 
     def _window(self, terms, vertices):

@@ -248,6 +248,7 @@ class History:
         for stepper, first, end in self._stepper.shares if self._touched else ():
             vertices = slice(first * model.per_copy, end * model.per_copy)
             sums = [work[vertices] for work in self._works[2:]]
+            stepper.follow_contact()
             given = stepper.model.terms, stepper.state.x, *sums, stepper.constraint_forces
             touches = ColliderWork(stepper.colliders, *given)
             self._touches.append((touches, vertices))

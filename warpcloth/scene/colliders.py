@@ -103,6 +103,15 @@ class Collider:
         return replace(self, position=position, rotation=rotation)
 
     @property
+    def most_move(self) -> float:
+        """By how much a point of its surface moves in a frame, at most [m]; infinite for a plane that turns."""
+        poses = self.poses
+        turns = 2.0 * np.arccos(np.clip(np.einsum("fi,fi->f", poses[1:, 3:], poses[:-1, 3:]), -1.0, 1.0))
+        turned = np.zeros_like(turns)  # rounding turns by 1e-8, and planes have no end
+        turned[turns > 1e-7] = turns[turns > 1e-7] * (np.linalg.norm(self.core[0]) + self.core[1])
+        return float((np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + turned).max(initial=0.0))
+
+    @property
     def poses(self) -> np.ndarray:
         """Position and quaternion (x, y, z, w) of the frame in which :attr:`core` is, (F, 7), F = 1 if it stands."""
         rotations = _product(np.atleast_2d(self.rotation), _from_y(self.up))

@@ -250,9 +250,14 @@ class ExplicitStepper(LaunchedStepper):
         super().__init__(options, model, None)
         symplectic = options.scheme == "symplectic"
         self.plan = plan(self.model, backend)
-        self._steps = self.plan.explicit_step(tuple(self.state), self.h, symplectic, self.count, self.pool)
+        self._steps = self.plan.explicit_step(tuple(self.state), self.h, symplectic, self.count, self.pool, self.colliders)
         self.state.add("position residual", self._steps.residual)
         self.record((lambda: self.launch_steps(1), 1))
 
+    def follow_contact(self):
+        if self.plan.guard is not None:
+            self.plan.guard.follow()
+            self.record((lambda: self.launch_steps(1), 1))
+
     def launch_steps(self, steps):
-        self._steps.launch(steps, self.launch_end_of)
+        self._steps.launch(steps, self.launch_end_of if self.plan.guard is None else self.launch_pins_of)

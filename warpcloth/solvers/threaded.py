@@ -61,6 +61,10 @@ class ThreadedStepper(Stepper):
 
         return launch
 
+    def follow_contact(self):
+        for part in self.parts:
+            part.follow_contact()
+
     @property
     def cut(self):
         return np.concatenate([part.cut for part in self.parts])

@@ -1,0 +1,130 @@
+"""Factories of contact with colliders inside an explicit step, behind a clearance: a ball about each vertex without colliders.
+
+A step that begins and ends in the ball of a vertex feels no collider. Another takes contact, friction and the filter as the
+core does, and finds the ball anew. Balls need no state: wherever a vertex is set to, it is in its ball or not.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ..colliders import FilterNotes, local_gap_of, of_pose, outside, pose_types, shapes, step_poses, turned_by
+from ..explicit_step import kick_and_drift
+from ..memory import load, store
+from ..rotation import epsilon
+from ..vectors import types
+
+
+@cache
+def guard_struct(dtype):
+    """The struct of contact of vertices with C colliders.
+
+    ``stiffness`` is kA (C, N) [N/m], ``friction`` μ (C,). ``balls`` have a center and a radius, infinite for pins, of the
+    colliders before step ``found`` (N,), from which the surface of none moves on by more than ``drift`` a step [m].
+    """
+    _pose, anchor_type = pose_types(dtype)
+
+    @wp.struct
+    class Guard:
+        shape: shapes(dtype)
+        poses: step_poses(dtype)
+        stiffness: wp.array2d(dtype=dtype)
+        friction: wp.array(dtype=dtype)
+        anchors: wp.array2d(dtype=anchor_type)
+        balls: wp.array(dtype=wp.types.vector(4, dtype))
+        found: wp.array(dtype=wp.int32)
+        steps: wp.array(dtype=wp.int32)
+        notes: FilterNotes
+        per_copy: int
+        distance: dtype
+        least: dtype
+        landing: dtype
+        drift: dtype
+
+    return Guard
+
+
+@cache
+def in_ball(dtype, moving: bool):
+    """The device function (guard, i, step, before, after) → 1 if a step begins and ends in the ball of vertex i, else 0."""
+    vec3, _ = types(dtype)
+    ball_of, step_of = load(wp.types.vector(4, dtype)), load(wp.int32)
+
+    @wp.func
+    def clear(guard: guard_struct(dtype), i: int, step: int, before: vec3, after: vec3):
+        ball = ball_of(guard.balls, i)
+        radius = ball[3]
+        if wp.static(moving):
+            radius -= guard.drift * dtype(wp.abs(step - step_of(guard.found, i)) + 1)
+        center = vec3(ball[0], ball[1], ball[2])
+        begin = before - center
+        end = after - center
+        far = radius * wp.abs(radius)
+        return wp.where(wp.dot(begin, begin) <= far, wp.where(wp.dot(end, end) <= far, wp.int32(1), wp.int32(0)), wp.int32(0))
+
+    return clear
+
+
+@cache
+def touching_step(dtype, symplectic: bool):
+    """The device function (guard, i, w, x, v, a, h) → x, v of vertex i after a step, a = g − ∇U/m of all but contact.
+
+    As the core has it: see :func:`..colliders.anchor_vertices`, ``bounded``, and :func:`..colliders.outside`.
+    """
+    vec3, _ = types(dtype)
+    _pose, anchor_type = pose_types(dtype)
+    to_local, _to_space = of_pose(dtype)
+    end_outside, step, ball_type = outside(dtype), kick_and_drift(dtype, symplectic), wp.types.vector(4, dtype)
+    put = store(ball_type)
+
+    @wp.func
+    def touch(guard: guard_struct(dtype), i: int, w: dtype, x: vec3, v: vec3, a: vec3, h: dtype):
+        copy = i // guard.per_copy
+        force = vec3()
+        held = wp.int32(0)
+        for c in range(guard.shape.radius.shape[0]):
+            pose = guard.poses.before[copy, c]
+            X = to_local(pose, x)
+            d, n = local_gap_of(X, guard.shape.core[c], guard.shape.radius[c])
+            depth = wp.max(guard.distance - d, dtype(0.0))
+            most = guard.friction[c] * depth
+            slip = vec3()
+            if depth > dtype(0.0):
+                pull = depth * n
+                if most > dtype(0.0):
+                    held = 1
+                    anchor = guard.anchors[c, i]
+                    if anchor[3] > dtype(0.0):
+                        slip = X - vec3(anchor[0], anchor[1], anchor[2])
+                        slip = slip - wp.dot(n, slip) * n
+                        l = wp.length(slip)
+                        slip = wp.where(l > anchor[3], anchor[3] / wp.max(l, anchor[3]), dtype(1.0)) * slip
+                    l = wp.length(slip)
+                    pull -= wp.where(l > most, most / wp.max(l, most), dtype(1.0)) * slip
+                force += guard.stiffness[c, i] * turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], pull)
+            if guard.friction[c] > dtype(0.0):
+                found = anchor_type()  # without contact 0, whatever the ball was
+                if most > dtype(0.0):
+                    X = X - slip
+                    found = anchor_type(X[0], X[1], X[2], most)
+                guard.anchors[c, i] = found
+        after, _rest, velocity = step(x, vec3(), v, a + w * force, h)
+        now = guard.steps[copy]
+        end, short = end_outside(
+            x, after, i, now, guard.shape, guard.poses, guard.per_copy, guard.least, guard.landing, guard.notes
+        )
+        if short:
+            velocity += (end - after) / h
+        radius = dtype(-1.0)  # the anchor of what is held is let go in a step of its own
+        if held == 0:
+            radius = dtype(wp.inf)
+            for c in range(guard.shape.radius.shape[0]):
+                X = to_local(guard.poses.after[copy, c], end)
+                d, _n = local_gap_of(X, guard.shape.core[c], guard.shape.radius[c])
+                radius = wp.min(radius, d)
+            radius -= guard.distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(end))
+        put(guard.balls, i, ball_type(end[0], end[1], end[2], radius))
+        guard.found[i] = now + 1
+        return end, velocity
+
+    return touch

@@ -1,0 +1,81 @@
+"""Contact with colliders inside the kernels of explicit steps."""
+
+import numpy as np
+import warp as wp
+
+from ..contact.collider_steps import LANDING
+from ..kernels.colliders import note_fixed
+from ..kernels.copy import copy_chosen
+from ..kernels.fast import contact_guard as kernels
+from ..model.host_values import host_values
+from ..terms.refresh import STEP, Moment
+from .structs import int32_array
+
+
+class ContactGuard:
+    """What a step needs of colliders, see :mod:`warpcloth.kernels.fast.contact_guard`.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`, whose terms of contact it takes from the kernels of a step.
+        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`.
+
+    Attributes:
+        data: The struct of a step.
+        terms: The elements that are left.
+        moving: Whether a collider moves, or a pin.
+        followed: Whether terms of contact are refreshed where a step begins, for those who read them.
+    """
+
+    def __init__(self, model, colliders):
+        self.model, self.colliders, declared = model, colliders, model.colliders
+        self.terms = tuple(elements for elements in model.terms if elements.collider is None)
+        self.moving, self.followed = any(declared.moves) or model.pins is not None, False
+        fixed = np.flatnonzero(model.inverse_mass.numpy() == 0.0) if self.moving else []
+        self._fixed, self._numbers = (int32_array(each, model.device) for each in (fixed, np.arange(len(fixed))))
+        self._fixed_before = wp.zeros(len(fixed), dtype=model.vec3, device=model.device)
+        self._copy, self._note = model.kernel(copy_chosen, model.dtype), model.kernel(note_fixed, model.dtype)
+        self._contact = [elements for elements in model.terms if elements.collider is not None]
+        stiffness = np.zeros((len(declared.moves), model.count))
+        for elements in self._contact:
+            areas = elements.rest.numpy()[:, -1]
+            stiffness[elements.collider, host_values(elements.stencil)[:, 0]] = host_values(elements.stiffness) * areas
+        balls = np.zeros((model.count, 4))
+        balls[:, 3] = np.where(model.inverse_mass.numpy() > 0.0, -1.0, np.inf)
+        data = self.data = kernels.guard_struct(model.dtype)()
+        self._kept = {  # whose memory the struct does not keep
+            "stiffness": model.array(stiffness, model.dtype),
+            "friction": model.array(declared.friction, model.dtype),
+            "anchors": colliders.anchor_rows,
+            "balls": model.array(balls, wp.types.vector(4, model.dtype)),
+            "found": wp.zeros(model.count, dtype=wp.int32, device=model.device),
+            "steps": colliders.steps,
+        }
+        for name, array in self._kept.items():
+            setattr(data, name, array)
+        data.shape, data.poses, data.notes, data.per_copy = colliders.shapes, colliders.poses, colliders.notes, model.per_copy
+        data.distance, data.least, data.drift = declared.distance, colliders.least, colliders.drift
+        data.landing = LANDING * declared.distance
+        colliders.launch_move()
+
+    def follow(self):
+        """Makes steps refresh the terms of contact as well."""
+        self.followed = True
+        self.colliders.leave_anchors()
+
+    def launch_start(self, x):
+        """Launches what moves colliders on, where a step begins from x (N,)."""
+        if self.followed:
+            self.model.refresh(STEP, Moment(x), self._contact)
+        elif self.moving:
+            self.colliders.launch_move()
+        if len(self._fixed):
+            self.model.launch(self._copy, len(self._fixed), [self._fixed, self._numbers, x], [self._fixed_before])
+
+    def launch_end(self, x):
+        """Launches, where pins have moved on, what notes those inside colliders, and counts the step if kernels do not."""
+        colliders, model = self.colliders, self.model
+        if len(self._fixed):
+            given = [self._fixed, colliders.shapes, self._fixed_before, x, colliders.poses, colliders.steps]
+            model.launch(self._note, len(self._fixed), [*given, model.per_copy, colliders.least], [colliders.notes])
+        if self.moving:
+            colliders.launch_count()
