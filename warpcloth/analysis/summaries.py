@@ -88,7 +88,7 @@ def summarise(name, unit, values, positions, weights, *, frame, reference, time)
         excluded=total - len(values),
         mean=mean,
         area_mean=_weighted_mean(values, weights),
-        percentiles=_percentiles(values),
+        percentiles=percentiles(values),
         smallest=smallest,
         smallest_at=_position(positions, smallest),
         largest=largest,
@@ -108,7 +108,7 @@ def _weighted_mean(values, weights):
         return float(np.where(weights > 0.0, values, 0.0) @ weights / total)  # 0·∞ is no share
 
 
-def _percentiles(values):
+def percentiles(values):
     """`PERCENTILES` of values without NaN, as NumPy interpolates; next to an infinite value that value."""
     if not len(values):
         return (math.nan,) * len(PERCENTILES)

@@ -111,8 +111,12 @@ def range_over(summaries, neutral=None):
     Returns:
         tuple: (low, high), of which low is below high also where all values are equal, or where there are none.
     """
-    rows = np.array([summary.percentiles for summary in summaries], dtype=np.float64).reshape(-1, 9)
-    ends = rows[:, [1, -2]]
+    return range_of([summary.percentiles for summary in summaries], neutral)
+
+
+def range_of(rows, neutral=None):
+    """`range_over` of the percentiles themselves, (9,) of each frame."""
+    ends = np.array(rows, dtype=np.float64).reshape(-1, 9)[:, [1, -2]]
     ends = ends[np.isfinite(ends)]
     if not len(ends):
         ends = np.array([neutral or 0.0])

@@ -1,14 +1,12 @@
 """Colours of a cloth by what is measured on it, on one scale for all frames."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
 from ..analysis.analysis import Analyzer
 from ..analysis.measures import MEASURES, scalars
-from ..analysis.summaries import summarise
+from ..analysis.summaries import PERCENTILES, percentiles
 from ..base.checks import shown
-from .colour import Scale, range_over
+from .colour import Scale, range_of
 
 
 def scalar_names(measure):
@@ -21,27 +19,6 @@ def neutral_of(measure):
     return measure.neutral if len(measure.shape) < 2 else None
 
 
-def measure_of(scalar, on="triangle"):
-    """Name of the measure that a scalar belongs to, such as stretch of stretch_1.
-
-    Raises:
-        ValueError: There is none.
-    """
-    listed = {name: measure.name for measure in MEASURES[on].values() for name in scalar_names(measure)}
-    if scalar not in listed:
-        raise ValueError(f"colour is {shown(scalar)}; it must be one of {', '.join(listed)}")
-    return listed[scalar]
-
-
-def summaries_of(analyzer, name, measure):
-    """Yields the summary of a scalar in each row of an analysis."""
-    for sample in analyzer.of(measure.name):
-        numbers = scalars(measure, sample.values[measure.name])[name]
-        positions = np.zeros((len(numbers), 3))
-        about = {"frame": sample.frame, "reference": sample.reference, "time": sample.time}
-        yield summarise(name, measure.unit, numbers, positions, analyzer.areas, **about)
-
-
 def scale_of(analyzers, name, measure, given=None, colormap=None):
     """One scale for all rows of some analyses.
 
@@ -49,7 +26,7 @@ def scale_of(analyzers, name, measure, given=None, colormap=None):
         analyzers: List of :class:`warpcloth.Analyzer`.
         name: The scalar.
         measure: The :class:`warpcloth.analysis.measures.Measure` that has it.
-        given: (low, high), or None for those of :func:`range_over`.
+        given: (low, high), or None for those of :func:`warpcloth.chart.range_over`.
         colormap: Of matplotlib, or None.
 
     Returns:
@@ -57,7 +34,9 @@ def scale_of(analyzers, name, measure, given=None, colormap=None):
     """
     neutral = neutral_of(measure)
     if given is None:
-        given = range_over((row for each in analyzers for row in summaries_of(each, name, measure)), neutral)
+        rows = (sample.values[measure.name] for each in analyzers for sample in each.of(measure.name))
+        found = (scalars(measure, row)[name].astype(np.float64) for row in rows)
+        given = range_of([percentiles(values[~np.isnan(values)]) for values in found], neutral)
     return Scale(*given, neutral, colormap)
 
 
@@ -65,20 +44,24 @@ class MeasuredScalar:
     """The values of a scalar on the cloths of a subject.
 
     Args:
-        analyzers: A :class:`warpcloth.Analyzer` for each cloth.
-        name: The scalar.
+        subject: The :class:`Subject`.
+        name: The scalar, such as "stretch_1".
+        rest: The rest shape, or None for that of the subject.
+        device: A Warp device.
+        options: More of :class:`warpcloth.Analyzer`, by name.
 
     Raises:
-        ValueError: None of the measures of an analyzer has it.
+        ValueError: There is no such scalar, it cannot be measured, or the cloth has no triangles.
     """
 
-    def __init__(self, analyzers, name):
-        listed = {scalar: measure for measure in analyzers[0].measures for scalar in scalar_names(measure)}
+    def __init__(self, subject, name, rest, device, options):
+        measures = MEASURES["triangle" if options.get("neighbourhood") is None else "vertex"].values()
+        listed = {scalar: measure for measure in measures for scalar in scalar_names(measure)}
         if name not in listed:
             raise ValueError(f"colour is {shown(name)}; it must be one of {', '.join(listed)}")
-        self.name, self.measure = name, listed[name]
-        self.analyzers = [each.of(self.measure.name) for each in analyzers]
-        self.unit = self.measure.unit
+        self.name, self.measure, self.unit = name, listed[name], listed[name].unit
+        chosen = {"measures": self.measure.name, "device": device}
+        self.analyzers = [Analyzer(each, rest, **chosen, **options) for each in subject.sequences()]
 
     def scale(self, others, given, colormap):
         """The scale for these values and those of others."""
@@ -127,27 +110,9 @@ class GivenScalar:
         if given is None:
             rows = (np.asarray(row, dtype=np.float64) for one in (self, *others) for row in one.values)
             finite = [row for row in (row[np.isfinite(row)] for row in rows) if row.size]
-            ends = [np.percentile(row, [0, 1, 5, 25, 50, 75, 95, 99, 100]) for row in finite]
-            given = range_over([SimpleNamespace(percentiles=each) for each in ends])
+            given = range_of([np.percentile(row, PERCENTILES) for row in finite])
         return Scale(*given, None, colormap)
 
     def rows(self, frames):
         for frame in frames:
             yield np.asarray(self.values[frame], dtype=np.float64)
-
-
-def analyzers_of(subject, scalar, rest, device, options):
-    """An analyzer of a scalar for each cloth of a subject.
-
-    Args:
-        subject: The :class:`Subject`.
-        scalar: Name, such as "stretch_1".
-        rest: The rest shape, or None for that of the subject.
-        device: A Warp device.
-        options: More of :class:`warpcloth.Analyzer`, by name.
-
-    Raises:
-        ValueError: There is no such scalar, it cannot be measured, or the cloth has no triangles.
-    """
-    measure = measure_of(scalar, "triangle" if options.get("neighbourhood") is None else "vertex")
-    return [Analyzer(each, rest, measures=measure, device=device, **options) for each in subject.sequences()]

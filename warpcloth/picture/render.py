@@ -19,7 +19,7 @@ from ..mesh.mesh import Mesh
 from .camera import Camera
 from .colour import check_colormap
 from .films import SHORTEST, STILL, check_film, check_times, open_film
-from .measured import GivenScalar, MeasuredScalar, analyzers_of
+from .measured import GivenScalar, MeasuredScalar
 from .overlay import Overlay
 from .raycast import BACKGROUND, RayCaster
 from .subjects import located, subject_of
@@ -266,8 +266,7 @@ def _colours(subjects, colour, given, colormap, rest, device, measuring):
     if colour is None:
         return None, None
     if isinstance(colour, str):
-        options = dict(measuring or {})
-        values = [MeasuredScalar(analyzers_of(each, colour, rest, device, options), colour) for each in subjects]
+        values = [MeasuredScalar(each, colour, rest, device, measuring or {}) for each in subjects]
     else:
         if isinstance(colour, Mapping) and len(colour) != 1:
             raise ValueError(f"colour has {len(colour)} entries; it must be one text with its values")
