@@ -10,7 +10,7 @@ import warp as wp
 import warpcloth as wc
 from support.energies import damping_forces
 from support.setups import SOLVERS, allocations, square
-from support.sheets import SPRINGS, TERMS, N, declared
+from support.sheets import FEW, SPRINGS, TERMS, N, declared, precisions
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
 from warpcloth.fast import block_layout, gather_layout, gather_step
@@ -67,10 +67,11 @@ def backend(request, device, monkeypatch):
     return name
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("scheme", ["symplectic", "forward"])
 @pytest.mark.parametrize("backend", BACKENDS, indirect=True)
-@pytest.mark.parametrize("name", TERMS)
+@pytest.mark.parametrize(
+    ("name", "dtype", "scheme"),
+    [*[(*each, "symplectic") for each in precisions(TERMS)], *[(name, "float64", "forward") for name in FEW]],
+)
 def test_explicit_steps_are_those_of_the_core(name, backend, scheme, dtype, device):
     """And those of the core are forces, and the update in NumPy."""
     scene, steps = declared(TERMS[name], fps=250.0), 5
@@ -170,8 +171,7 @@ def test_the_plan_takes_the_fast_backend_of_the_device(device):
     assert record(scene, device, "core") == found._replace(backend="core", lanes=1, pairs=())
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("name", TERMS)
+@pytest.mark.parametrize(("name", "dtype"), precisions(TERMS))
 def test_gradients_are_those_of_the_core(name, dtype, device):
     """At x, and at x + d."""
     model = declared(TERMS[name]).build(device=device, dtype=dtype)
@@ -308,17 +308,11 @@ PROJECTED = {name: terms for name, terms in TERMS.items() if name not in ("St. V
 PROJECTED["corotated"] = [wc.CorotatedMembrane(stiffness=100.0)]
 
 
-@pytest.mark.parametrize(
-    ("options", "dtype"),
-    [
-        pytest.param(options, dtype, id=f"{name}-{dtype}")
-        for name, options in SWEEPS.items()
-        for dtype in (("float32", "float64") if name in ("plain", "multipliers") else ("float32",))
-    ],
-)
-@pytest.mark.parametrize("name", PROJECTED)
-def test_jacobi_sweeps_are_those_of_the_core(name, options, dtype, device):
+@pytest.mark.parametrize("options", SWEEPS)
+@pytest.mark.parametrize(("name", "dtype"), precisions(PROJECTED))
+def test_jacobi_sweeps_are_those_of_the_core(name, dtype, options, device):
     """d and λ, whether sweeps run one by one, which copies what they leave in other arrays back, or in pairs."""
+    options = SWEEPS[options]
     scene, steps, h, found = declared(PROJECTED[name]), 3, 0.02, {}
     moves = np.random.default_rng(7).normal(scale=0.01, size=(2 * N, 3))
     for backend, pairs in (("core", False), ("blocks", False), ("gather", False), ("gather", True)):

@@ -58,7 +58,7 @@ def test_newton_converges_to_the_same_motion(device):
     hanging, frames = scene("hanging"), 8
     coarse, fine = (run(hanging, wc.Explicit(substeps=substeps), device, frames=frames) for substeps in (512, 1024))
     limit = 2.0 * fine - coarse
-    newton = [run(hanging, wc.Newton(substeps=32 * 2**i, tolerance=1e-8), device, frames=frames) for i in range(4)]
+    newton = [run(hanging, wc.Newton(substeps=32 * 2**i, tolerance=1e-8), device, frames=frames) for i in range(3)]
     apart = [distance(points, limit) for points in newton]
     print(f"to the explicit limit {apart}, orders {orders(apart)}")
     assert np.abs(orders(apart) - 1.0).max() < 0.1
@@ -69,8 +69,8 @@ def test_newton_converges_to_the_same_motion(device):
 def test_both_methods_meet_over_the_whole_second(device):
     """Explicit and implicit within 1 % of the side; the centre of mass where four other programs have it, to 1 cm."""
     hanging = scene("hanging")
-    explicit = run(hanging, wc.Explicit(substeps=512), device)
-    newton = run(hanging, wc.Newton(substeps=128), device)
+    explicit = run(hanging, wc.Explicit(substeps=256), device)
+    newton = run(hanging, wc.Newton(substeps=64), device)
     apart = distance(explicit, newton)
     x, y, z = explicit[-1].mean(axis=0)
     print(f"distance {apart:.5f} m, centre of mass {-z:.4f} m beyond, {-y:.4f} m below")
@@ -290,10 +290,10 @@ def test_every_solver_runs_every_scene(name, solver, device, tmp_path):
         ):
             wc.simulate(declared, QUICK[solver], device=device, frames=3)
         return
-    kept = wc.simulate(declared, QUICK[solver], device=device, frames=3)
-    written = wc.simulate(declared, QUICK[solver], output=str(tmp_path / "out.usdc"), device=device, frames=3)
+    kept = wc.simulate(declared, QUICK[solver], device=device, frames=2)
+    written = wc.simulate(declared, QUICK[solver], output=str(tmp_path / "out.usdc"), device=device, frames=2)
     assert kept.status.ok and written.status.ok, (kept.status, written.status)
-    assert kept.points.shape == written.points.shape == (4, len(declared.mesh.points), 3)
+    assert kept.points.shape == written.points.shape == (3, len(declared.mesh.points), 3)
     # A stage has its own units and place, so a point goes there and back through float32.
     scale = np.abs(kept.points).max()
     assert np.abs(kept.points - np.asarray(written.points)).max() <= 4 * np.finfo(np.float32).eps * scale

@@ -100,7 +100,7 @@ def test_it_ends_where_newton_does(stabilisation, linear, device):
 
     With the line search at 1e-6 of the residual, near √ε, for it compares values of φ; a vertex has eight springs and more.
     """
-    declared = swinging(16)
+    declared = swinging(8)
     _, newton = after(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)
     searching = stabilisation == "line-search"
     tolerance = 1e-6 if searching else 1e-12
@@ -115,7 +115,7 @@ def test_it_ends_where_newton_does(stabilisation, linear, device):
 
 def test_unsafe_iterations_do_not_converge_and_safe_ones_do(device):
     """Without −λ∂²C more iterations overshoot across springs in tension; each safeguard takes 2 to 3 % of the iterations."""
-    declared = swinging(16)
+    declared = swinging(8)
     stepper, _ = after(declared, constrained(stabilisation="none", iterations=100, tolerance=1e-3), device)
     assert stepper.results == [Result.ITERATIONS_USED_UP] and stepper.residual[0] > 1.0
     for stabilisation in SAFEGUARDS:
@@ -342,8 +342,9 @@ def test_a_mass_hangs_as_long_as_the_material_says(substeps, iterations, options
     """mg/k for any iterations and step."""
     k, m = 500.0, 0.1
     solver = constrained(substeps=substeps, iterations=iterations, **options)
-    # ω²h² is 0.056 at least, so that each step takes 5 % of the energy of what oscillates.
-    _, x = after(hanging_mass(k, m, 0.0), solver, device, steps=800 * substeps)
+    # A step leaves 1/√(1 + ω²h²) of an oscillation, which begins with an amplitude of mg/k.
+    steps = int(np.ceil(2.0 * np.log(1e10) / np.log1p(k / m / (60.0 * substeps) ** 2)))
+    _, x = after(hanging_mass(k, m, 0.0), solver, device, steps=steps)
     assert -1 - x[1, 1] == pytest.approx(m * 9.81 / k, rel=1e-9)
 
 
@@ -396,7 +397,7 @@ def test_springs_without_direction(stiffness, linear, device):
 
 
 def test_what_is_not_finite_is_said(device):
-    declared = swinging(16)
+    declared = swinging(8)
     wrong = declared.velocities.copy()
     wrong[40] = 1e200
     for linear in ("cg", "factorised"):

@@ -34,6 +34,13 @@ TERMS = {
         wc.Attachment(vertices=[3], stiffness=10.0),
     ],
 }
+# A kernel of a backend is compiled for its terms, options and precision, which takes most of the time of its tests.
+FEW = ("nothing", "springs", "several")
+
+
+def precisions(names):
+    """Names of terms and precisions to test: all in float64, which tells more errors from rounding, and a few in float32."""
+    return [(name, "float64") for name in names] + [(name, "float32") for name in names if name in FEW]
 
 
 def declared(terms, **scene):
