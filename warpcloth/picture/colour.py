@@ -81,17 +81,16 @@ class Scale:
         """
         return to_linear(self.srgb(values))
 
-    def legend(self, measure, unit, stops=9):
+    def legend(self, measure, unit):
         """The scale as a dictionary of numbers and texts, for the metadata of a file; colours are linear Rec. 709.
 
         Args:
             measure: Name of what is coloured.
             unit: Its unit.
-            stops: Number of values, evenly from low to high, that have their colours beside them.
         """
-        values = np.linspace(self.low, self.high, stops)
-        if self.neutral is not None and stops % 2:
-            values[stops // 2] = self.neutral
+        values = np.linspace(self.low, self.high, 9)
+        if self.neutral is not None:
+            values[4] = self.neutral
         facts = {"measure": measure, "unit": unit, "map": self.map, "low": self.low, "high": self.high}
         if self.neutral is not None:
             facts["neutral"] = float(self.neutral)

@@ -8,6 +8,7 @@ from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..core.thread_pool import ThreadPool
 from ..kernels import develop, render, shading
+from ..model.elements import incidences_of
 from ..model.threads import cores, threads_on
 from .patterns import disc, pixel_samples
 
@@ -47,7 +48,6 @@ class RayCaster:
         sun_angle: Angle that the sun fills [°], which makes its shadows soft.
         contrast: How much of the light and shadow is seen where an image has colours, from 0 to 1: 0 shows the colours alone.
         background: Linear Rec. 709.
-        ground_colour: Linear Rec. 709, where the sun and all of the sky reach the ground.
 
     Attributes:
         left_out: After :meth:`image`, how many triangles, lines and balls it does not show: those with a point that is not
@@ -70,7 +70,6 @@ class RayCaster:
         sun_angle=5.0,
         contrast=0.6,
         background=BACKGROUND,
-        ground_colour=GROUND,
     ):
         for name, value, most in (("width", width, 16384), ("height", height, 16384), ("samples", samples, 1024)):
             whole(name, value, 1, most)
@@ -85,10 +84,7 @@ class RayCaster:
         self._size = int(width), int(height)
         self._ground, self._up = ground, np.array(_UP[up_axis])
         self._contrast = contrast
-        self._background, self._ground_colour = (
-            array("background", background, (3,)),
-            array("ground_colour", ground_colour, (3,)),
-        )
+        self._background = array("background", background, (3,))
         self._device = find_device(device)
         self._pool = ThreadPool(cores(self._device) if threads is None else threads_on(self._device, threads))
         self._allocate(samples, sun_angle)
@@ -106,10 +102,9 @@ class RayCaster:
             tubes += [shape.lines + offset, np.stack([shape.balls, shape.balls], axis=1) + offset]
             radii += [np.full(len(shape.lines), shape.radius), np.full(len(shape.balls), shape.ball_radius)]
         self._tubes, self._radii = np.concatenate(tubes, dtype=np.int32), np.concatenate(radii)
-        smooth = np.repeat([int(s.smooth) for s in shapes], [len(s.triangles) for s in shapes]).astype(np.int32)
+        smooth = np.repeat([int(s.smooth) for s in shapes], [len(s.triangles) for s in shapes])
         flat = self._triangles.ravel()
-        starts = np.searchsorted(np.sort(flat), np.arange(len(self._points) + 1)).astype(np.int32)
-        corners = np.argsort(flat, kind="stable").astype(np.int32)
+        starts, corners = incidences_of(flat, len(self._points))
         pixels = self._size[0] * self._size[1]
         with wp.ScopedDevice(self._device):
             g = self._geometry = render.Geometry()
@@ -118,7 +113,7 @@ class RayCaster:
             g.normals = wp.zeros(len(flat), dtype=wp.vec3)
             g.ends = wp.array(self._tubes, dtype=wp.vec2i)
             g.radii = wp.zeros(len(self._radii), dtype=wp.float32)
-            self._smoothing = [wp.array(a, dtype=wp.int32) for a in (smooth, starts, corners)]
+            self._smoothing = [wp.array(a.astype(np.int32), dtype=wp.int32) for a in (smooth, starts, corners)]
             self._faces = [wp.zeros(len(self._triangles), dtype=wp.vec3), wp.zeros(len(flat), dtype=wp.float32)]
             self._bounds = [wp.zeros(len(self._radii), dtype=wp.vec3) for _ in range(2)]
             layers = self._layers = render.Layers()
@@ -216,7 +211,7 @@ class RayCaster:
         light.has_ground = int(self._ground is not None)
         if self._ground is not None:
             light.ground = float((self._ground - np.dot(camera.target, self._up)) / unit)
-        light.ground_colour, light.background = wp.vec3(*self._ground_colour), wp.vec3(*self._background)
+        light.ground_colour, light.background = wp.vec3(*GROUND), wp.vec3(*self._background)
         return light
 
     def _set_positions(self, points, camera, unit):

@@ -198,19 +198,15 @@ def _reader(frames, mesh):
 def _of_animation(animation, scene, copy, azimuth):
     """The frames of a run; of a batch all cloths side by side, or one."""
     points, lines = animation.points, lines_of(scene)
-    if points.ndim == 3:
-        if copy is not None:
-            raise ValueError(f"copy is {shown(copy)}; the animation is of one cloth, so that it must be None")
-        return replace(
-            _of_frames(scene.name, scene.mesh, points, animation.times, scene.pins.vertices, lines), up_axis=scene.up_axis
-        )
-    batch = points.shape[1]
+    if points.ndim == 3 and copy is not None:
+        raise ValueError(f"copy is {shown(copy)}; the animation is of one cloth, so that it must be None")
     if copy is not None:
-        whole("copy", copy, 0, batch - 1)
-        return replace(
-            _of_frames(scene.name, scene.mesh, points[:, copy], animation.times, scene.pins.vertices, lines),
-            up_axis=scene.up_axis,
-        )
+        whole("copy", copy, 0, points.shape[1] - 1)
+        points = points[:, copy]
+    if points.ndim == 3:
+        found = _of_frames(scene.name, scene.mesh, points, animation.times, scene.pins.vertices, lines)
+        return replace(found, up_axis=scene.up_axis)
+    batch = points.shape[1]
     offsets = _side_by_side(points, azimuth, scene.up_axis)
     count = len(scene.mesh.points)
     shapes = [_cloth(scene.mesh, scene.positions, scene.pins.vertices), *_strings(scene.mesh, lines)]
