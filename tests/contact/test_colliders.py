@@ -361,7 +361,6 @@ REFUSED = {
         "the collider Plane has friction 0.1, with which there are many rest shapes and the motion decides among them; set it "
         "to 0, or run the scene with damping until it rests",
     ),
-    "stage": (lambda: wc.usd.write_scene(falling([wc.Plane()]), "a.usda"), "1 colliders, which a stage cannot hold yet"),
 }
 
 

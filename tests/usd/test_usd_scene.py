@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 import warpcloth as wc
@@ -153,8 +154,40 @@ def loads():
     return wc.Scene(sheet, density=0.1, terms=[wc.Spring(stiffness=1.0)], pins=[0], loads=loads, duration=1 / 30)
 
 
+def colliders():
+    """Each kind, standing, moved, turned about an axis of its own and deformed, with numbers that float32 cannot hold."""
+    cube, random = trimesh.creation.box((0.3, 0.2, 0.1)), np.random.default_rng(1)
+    turns = random.normal(size=(4, 4))
+    turns /= np.linalg.norm(turns, axis=1)[:, None]
+    moves = random.normal(size=(4, 3)) / 3 + np.array([0, -5, 0])
+    return wc.Scene(
+        mesh(),
+        density=0.1,
+        terms=[wc.Spring(stiffness=1.0)],
+        colliders=[
+            wc.Plane(normal=(0.1, 1, 0.3), position=(0, -1 / 3, 0), friction=0.3),
+            wc.Plane(position=(0, -1, 0), rotation=(0.0998, 0, 0, 0.995)),
+            wc.Sphere(radius=1 / 7, position=moves, name="my ball"),
+            wc.Sphere(radius=0.5, position=(0, -9, 0), name="Sphere"),
+            wc.Capsule(radius=0.1, length=1 / 3, axis=(1, 2, 3), position=(3, 1 / 3, 0), rotation=turns),
+            wc.Box(size=(0.1, 1 / 3, 0.7), position=(5, 0, 0), rotation=turns[0], friction=0.5, name="/root/Box"),
+            wc.MeshCollider(cube.vertices / 3, cube.faces, position=moves, rotation=turns, friction=1 / 3),
+            wc.MeshCollider([cube.vertices + np.array([0, -9 - k / 3, 0]) for k in range(3)], cube.faces),
+            wc.MeshCollider(np.float32(cube.vertices), cube.faces[1:], position=(9, 9, 9)),
+        ],
+        contact=wc.Contact(distance=2e-3),
+        duration=4 / 60,
+    )
+
+
+def contact_alone():
+    return wc.Scene(mesh(), density=0.1, terms=[SPRING], contact=wc.Contact(stiffness=math.inf))
+
+
 SCENES = [
     loads,
+    colliders,
+    contact_alone,
     rollers,
     symmetry,
     every_term,
@@ -196,8 +229,16 @@ def assert_same_scene(read, scene):
             one = one.astype(np.float32).astype(np.float64)
         assert_same(one, other, field.name)
     for field in fields(scene):
-        if field.name not in ("mesh", "terms", "pins", "stage", "loads"):
+        if field.name not in ("mesh", "terms", "pins", "stage", "loads", "colliders", "contact"):
             assert_same(getattr(scene, field.name), getattr(read, field.name), field.name)
+    assert scene.contact is read.contact is None or vars(scene.contact) == vars(read.contact)
+    assert [type(collider) for collider in read.colliders] == [type(collider) for collider in scene.colliders]
+    for one, other in zip(scene.colliders, read.colliders, strict=True):
+        assert (one.name, one.friction) == (other.name, other.friction)
+        assert_same(one.poses, other.poses, one.label)  # an axis is a part of the rotation
+        for field in ("points", "triangles") if isinstance(one, wc.MeshCollider) else ("core",):
+            for value, found in zip(getattr(one, field), getattr(other, field), strict=True):
+                assert_same(value, found, f"{one.label}.{field}")
     assert [type(load) for load in read.loads] == [type(load) for load in scene.loads]
     for one, other in zip(scene.loads, read.loads, strict=True):
         assert one.name == other.name
@@ -252,10 +293,10 @@ def test_the_comparison_can_fail():
 
 def test_every_field_has_a_row():
     known = {row.field for row in attributes()}
-    # The prim, other rows, other rows, a GeomSubset, the file, the stage's rate
-    elsewhere = {"mesh", "terms", "loads", "pins", "stage", "fps"}
-    refused = {"colliders", "contact"}
-    assert {field.name for field in fields(wc.Scene)} <= known | elsewhere | refused
+    # The prim, other rows, other rows, a GeomSubset, the file, the stage's rate, other rows, other prims
+    elsewhere = {"mesh", "terms", "loads", "pins", "stage", "fps", "contact", "colliders"}
+    assert {field.name for field in fields(wc.Scene)} <= known | elsewhere
+    assert {f"contact.{field.name}" for field in fields(wc.Contact)} <= known
     for term in TERMS.values():
         assert {f"terms.{field.name}" for field in fields(term)} <= known
     for load in LOADS.values():  # keyframes are samples

@@ -115,7 +115,9 @@ class Collider:
     def poses(self) -> np.ndarray:
         """Position and quaternion (x, y, z, w) of the frame in which :attr:`core` is, (F, 7), F = 1 if it stands."""
         rotations = _product(np.atleast_2d(self.rotation), _from_y(self.up))
-        rotations = rotations / np.linalg.norm(rotations, axis=1)[:, None]
+        lengths = np.linalg.norm(rotations, axis=1)
+        lengths[np.abs(lengths - 1.0) < 1e-15] = 1.0  # so that the poses of a pose are those
+        rotations = rotations / lengths[:, None]
         signs = np.sign(np.einsum("fi,fi->f", rotations[1:], rotations[:-1]))
         rotations[1:] *= np.cumprod(np.where(signs < 0.0, -1.0, 1.0))[:, None]  # the shorter way
         positions = np.atleast_2d(self.position)

@@ -46,7 +46,8 @@ class Attribute:
             computed from.
         name: Name of the attribute; <name> is any name for a term.
         location: Where it is: "cloth", the prim or the Xform above it; "body", the prim or the nearest one above with
-            PhysicsDeformableBodyAPI; "material", the physics material bound to it; "physics scene".
+            PhysicsDeformableBodyAPI; "material", the physics material bound to it; "collider", a collider or the Xform above
+            it; "its material", the physics material bound to a collider; "physics scene".
         type_names: Types that it may have, of any precision; the first for one value, the last for several.
         kilograms, metres: Powers of kilogramsPerUnit and metersPerUnit that make it SI.
     """
@@ -66,7 +67,7 @@ class Attribute:
     @property
     def infinite(self):
         """Whether it may be infinite: each term checks its own values, and USD uses −inf for the gravity of the earth."""
-        return self.field.startswith("terms.") or self.field == "(gravity magnitude)"
+        return self.field.startswith("terms.") or self.field in ("(gravity magnitude)", "contact.stiffness")
 
 
 ATTRIBUTES = (
@@ -83,6 +84,9 @@ ATTRIBUTES = (
     Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", ("double3[]",)),
     # The axes that the pins hold, such as "xz", or one text for each pin, those of lower index first.
     Attribute("pins.axes", "warpcloth:pins:axes", "cloth", ("token", "token[]")),
+    # How it touches colliders.
+    Attribute("contact.distance", "warpcloth:contact:distance", "cloth", ("double",)),
+    Attribute("contact.stiffness", "warpcloth:contact:stiffness", "cloth", ("double",)),
     # A selection or indices. The others are pinned too.
     Attribute("pins.vertices", "warpcloth:pins", "cloth", ("string", "int[]")),
     Attribute("(pin weights)", "primvars:pins", "cloth", ("float[]",)),
@@ -101,6 +105,15 @@ ATTRIBUTES = (
     Attribute("mesh.parts", "warpcloth:parts", "cloth", ("token[]",)),
     Attribute("mesh.part_sizes", "warpcloth:partSizes", "cloth", ("int[]",)),
     Attribute("mesh.part_grid_shapes", "warpcloth:partGridShapes", "cloth", ("int2[]",)),
+    # Colliders: whether it is one, or how a mesh is approximated; the points in double precision, used while they agree.
+    Attribute("(collides)", "warpcloth:collider", "collider", ("bool", "token")),
+    Attribute("colliders.name", "warpcloth:name", "collider", ("string",)),
+    Attribute("colliders.friction", "warpcloth:friction", "collider", ("double",)),
+    Attribute("colliders.points", "warpcloth:points", "collider", ("double3[]",)),
+    Attribute("(collides)", "physics:collisionEnabled", "collider", ("bool",)),
+    Attribute("(approximation)", "physics:approximation", "collider", ("token",)),
+    Attribute("colliders.friction", "physics:dynamicFriction", "its material", ("float",)),
+    Attribute("(static friction)", "physics:staticFriction", "its material", ("float",)),
     # Standard: UsdPhysics, and the AOUSD proposal for deformable bodies.
     Attribute("(total mass)", "physics:mass", "body", ("float",), kilograms=1),  # spread evenly
     Attribute("(mass per volume)", "physics:density", "body", ("float",), kilograms=1, metres=-3),
@@ -148,30 +161,39 @@ def attributes():
 
 
 class Values:
-    """The attributes of a cloth by their field, in SI.
+    """The attributes of a cloth, or of a collider, by their field, in SI.
+
+    Args:
+        stage: The stage.
+        prim: The prim of the cloth or collider.
+        kind: "cloth" or "collider".
 
     Raises:
         ValueError: A name in our namespace is not in the table.
     """
 
-    def __init__(self, stage, cloth):
+    def __init__(self, stage, prim, kind="cloth"):
         self.kilograms = UsdPhysics.GetStageKilogramsPerUnit(stage)
         self.metres = UsdGeom.GetStageMetersPerUnit(stage)
-        self.locations = {"cloth": holders(cloth), "body": [_body(cloth)]}
-        self.locations["material"] = [UsdShade.MaterialBindingAPI(cloth).ComputeBoundMaterial("physics")[0].GetPrim()]
-        names = [each.GetName() for prim in holders(cloth) for each in prim.GetAuthoredPropertiesInNamespace("warpcloth")]
+        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+        if kind == "cloth":
+            self.locations = {"cloth": holders(prim), "body": [_body(prim)], "material": [material]}
+        else:
+            self.locations = {"collider": holders(prim), "its material": [material]}
+        names = own_names(prim)
         # In the order of the prim's properties, which is that of their names where nothing else is said.
         self.terms, self.loads = (
             list(dict.fromkeys(name.split(":")[2] for name in names if name.startswith(f"{namespace}:")))
             for namespace in (TERMS_NAMESPACE, LOADS_NAMESPACE)
         )
-        known = {row.name.replace("<name>", key) for row in attributes() for key in (*self.terms, *self.loads, "")}
+        rows = [row for row in attributes() if row.location in self.locations]
+        known = {row.name.replace("<name>", key) for row in rows for key in (*self.terms, *self.loads, "")}
         unknown = sorted(set(names) - known)
         if unknown:
             for key in self.terms:  # whose type may be the reason
                 kind_of(self, key)
-            allowed = ", ".join(row.name for row in attributes() if row.name.startswith("warpcloth:"))
-            raise ValueError(f"{unknown[0]} is no attribute of a cloth, must be one of {allowed}")
+            allowed = ", ".join(row.name for row in rows if row.name.startswith("warpcloth:"))
+            raise ValueError(f"{unknown[0]} is no attribute of a {kind}, must be one of {allowed}")
 
     def authored(self, field, key=None):
         """The authored attributes of a field as (row, Usd.Attribute), those to be taken first at first.
@@ -202,7 +224,7 @@ class Values:
                 return tuple(value)
             value = np.array(value)[()]
             refuse_unknown(attribute.GetName(), np.asarray(value), infinite=row.infinite)
-            if row.location in ("body", "material") and value < 0:
+            if row.location in ("body", "material", "its material") and value < 0:
                 raise ValueError(f"{attribute.GetName()} is {value}, must be 0 or more")
             # UsdPhysics and the proposal say 0 for a mass, density or stiffness that is not given.
             if row.location not in ("body", "material") or value != 0:
@@ -246,6 +268,11 @@ def holders(prim):
     """The prims whose attributes are those of a shape: itself and, if that is an Xform, the prim above it."""
     parent = prim.GetParent()
     return [prim, parent] if parent.IsA(UsdGeom.Xform) else [prim]
+
+
+def own_names(prim):
+    """The names in our namespace that a shape has."""
+    return [each.GetName() for holder in holders(prim) for each in holder.GetAuthoredPropertiesInNamespace("warpcloth")]
 
 
 def _body(cloth):

@@ -9,6 +9,7 @@ import numpy as np
 
 from .layers import CURVE_WIDTH
 from .modules import Usd, UsdGeom
+from .solids import SOLIDS
 from .stage import (
     METADATA_KEY,
     curve_edges,
@@ -116,7 +117,7 @@ def _shown(stage):
             walk.PruneChildren()
             continue
         linear = prim.IsA(UsdGeom.BasisCurves) and UsdGeom.BasisCurves(prim).GetTypeAttr().Get() == UsdGeom.Tokens.linear
-        if not (linear or prim.IsA(UsdGeom.Mesh) or prim.GetTypeName() in _SOLIDS):
+        if not (linear or prim.IsA(UsdGeom.Mesh) or prim.GetTypeName() in SOLIDS):
             continue
         seen = UsdGeom.Imageable(prim)
         hidden = seen.ComputeVisibility(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.invisible
@@ -141,7 +142,7 @@ def _drawn(prim, path, cloth, codes):
     first = codes[0] if codes else Usd.TimeCode.Default()
     moving = moving_space(prim) is not None
     transform = None if moving else local_to_metres(prim, where)
-    solid = _SOLIDS[prim.GetTypeName()](prim) if prim.GetTypeName() in _SOLIDS else None
+    solid = SOLIDS[prim.GetTypeName()](prim) if prim.GetTypeName() in SOLIDS else None
     attribute = UsdGeom.PointBased(prim).GetPointsAttr() if solid is None else None
 
     def points(code, count=None):
@@ -181,45 +182,6 @@ def _drawn(prim, path, cloth, codes):
     return DrawnPrim(
         str(prim.GetPath()), cloth, len(start), triangles, edges, radius, pins, partial(points, count=len(start)), codes
     )
-
-
-def _solid(make, *sizes):
-    """Function that gives the surface of a solid from its prim, in the prim's own space.
-
-    Args:
-        make: Function of the module trimesh and of the sizes, which makes it along z.
-        sizes: Names of attributes.
-    """
-
-    def made(prim):
-        import trimesh
-
-        code = Usd.TimeCode.EarliestTime()
-        found = make(trimesh, *(float(prim.GetAttribute(name).Get(code)) for name in sizes))
-        axis = prim.GetAttribute("axis")
-        along = "XYZ".index(axis.Get() if axis and axis.Get() else "Z")
-        order = [0, 1, 2]
-        order[along], order[2] = 2, along
-        found.vertices = (found.vertices - found.bounds.mean(axis=0))[:, order]
-        return found
-
-    return made
-
-
-def _plane(trimesh, width, length):
-    corners = np.array([[0.0, 0.0, 0.0], [width, 0.0, 0.0], [width, length, 0.0], [0.0, length, 0.0]])
-    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
-
-
-# By the name of their type.
-_SOLIDS = {
-    "Cube": _solid(lambda trimesh, size: trimesh.creation.box((size, size, size)), "size"),
-    "Sphere": _solid(lambda trimesh, radius: trimesh.creation.icosphere(4, radius), "radius"),
-    "Cylinder": _solid(lambda trimesh, radius, height: trimesh.creation.cylinder(radius, height, 64), "radius", "height"),
-    "Capsule": _solid(lambda trimesh, radius, height: trimesh.creation.capsule(height, radius, (64, 64)), "radius", "height"),
-    "Cone": _solid(lambda trimesh, radius, height: trimesh.creation.cone(radius, height, 64), "radius", "height"),
-    "Plane": _solid(_plane, "width", "length"),
-}
 
 
 def _radius(prim, points, edges, transform):

@@ -1,11 +1,13 @@
-"""Colliders as geometric primitives of a stage."""
+"""Colliders written as prims of a stage, with their motion and what UsdPhysics says about them."""
 
 import numpy as np
 
 from ..scene.colliders import Box, Capsule, Plane, Sphere
 from ..scene.mesh_collider import MeshCollider
+from .attributes import author
 from .layers import bind_material
-from .modules import Gf, Tf, Usd, UsdGeom, UsdShade
+from .modules import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from .targets import vertex_normals
 
 _COLOUR = (0.55, 0.55, 0.6)
 _SPREAD = 4.0  # of a plane, in sizes of the cloth
@@ -13,6 +15,8 @@ _SPREAD = 4.0  # of a plane, in sizes of the cloth
 
 def define_colliders(layer, colliders, mesh):
     """Defines a prim for each collider, such as a Sphere, in a layer of :func:`.layers.scene_layer`, with its motion.
+
+    `colliders.read_colliders` gives the same motion and shape again, bit for bit.
 
     Args:
         layer: The layer.
@@ -25,15 +29,21 @@ def define_colliders(layer, colliders, mesh):
     root = UsdGeom.Scope.Define(stage, "/World/Colliders").GetPath()
     material = UsdShade.Material.Get(stage, "/World/Looks/Cloth")
     for collider in colliders:
-        path = root.AppendChild(Tf.MakeValidIdentifier(collider.label))
-        number = 1
-        while stage.GetPrimAtPath(path):
-            number += 1
-            path = root.AppendChild(f"{Tf.MakeValidIdentifier(collider.label)}_{number}")
-        gprim = _define(stage, path, collider, mesh)
+        gprim = _define(stage, _free_path(stage, root, collider.label.rpartition("/")[2]), collider, mesh)
         gprim.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*_COLOUR)])
         bind_material(gprim.GetPrim(), material)
         _move(gprim, collider)
+        _add_physics(stage, gprim.GetPrim(), collider)
+
+
+def _free_path(stage, parent, name):
+    """A path below a prim by a name, counted where that is taken."""
+    name = Tf.MakeValidIdentifier(name)
+    path, number = parent.AppendChild(name), 1
+    while stage.GetPrimAtPath(path):
+        number += 1
+        path = parent.AppendChild(f"{name}_{number}")
+    return path
 
 
 def _define(stage, path, collider, mesh):
@@ -72,10 +82,15 @@ def _define_mesh(stage, path, collider):
     gprim.CreateFaceVertexIndicesAttr(collider.triangles.ravel())
     gprim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     gprim.CreateDoubleSidedAttr(not collider.closed)
-    for frame, points in enumerate(frames):
-        time = frame if len(frames) > 1 else Usd.TimeCode.Default()
+    gprim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    exact = np.array_equal(frames, frames.astype(np.float32))
+    times = [Usd.TimeCode.Default(), *(range(len(frames)) if len(frames) > 1 else ())]  # viewers want a shape at no time too
+    for time, points in zip(times, (frames[0], *frames), strict=False):
         gprim.CreatePointsAttr().Set(points.astype(np.float32), time)
+        gprim.CreateNormalsAttr().Set(vertex_normals(points, collider.triangles).astype(np.float32), time)
         gprim.CreateExtentAttr().Set(np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float32), time)
+        if not exact:
+            author(gprim.GetPrim(), "colliders.points", points, time=time)
     return gprim
 
 
@@ -89,4 +104,23 @@ def _move(gprim, collider):
         translate.Set(Gf.Vec3d(x, y, z), time)
         orient.Set(Gf.Quatd(w, *turn), time)
     if isinstance(collider, Box):
-        gprim.AddScaleOp().Set(Gf.Vec3f(*map(float, collider.size)))
+        gprim.AddScaleOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, collider.size)))
+
+
+def _add_physics(stage, prim, collider):
+    """That it is a collider, kinematic if it moves, its friction, and its name."""
+    UsdPhysics.CollisionAPI.Apply(prim)
+    if prim.IsA(UsdGeom.Mesh):
+        UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(UsdPhysics.Tokens.none)
+    if collider.moves:
+        UsdPhysics.RigidBodyAPI.Apply(prim).CreateKinematicEnabledAttr(True)
+    author(prim, "colliders.name", collider.name or "")
+    if collider.friction:
+        looks = stage.GetPrimAtPath("/World/Looks").GetPath()
+        material = UsdShade.Material.Define(stage, _free_path(stage, looks, f"{prim.GetName()}Physics"))
+        physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+        physics.CreateStaticFrictionAttr(float(collider.friction))
+        physics.CreateDynamicFrictionAttr(float(collider.friction))
+        UsdShade.MaterialBindingAPI(prim).Bind(material, materialPurpose="physics")
+        if collider.friction != float(np.float32(collider.friction)):
+            author(prim, "colliders.friction", collider.friction)

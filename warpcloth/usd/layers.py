@@ -19,7 +19,13 @@ from .targets import SAMPLED, Target
 from .values import array_of
 
 # Attributes of the artist's prim that would be used instead of ours, or beside ours with values of another motion.
-_BLOCKED = ("accelerations", "primvars:normals", "primvars:normals:indices")
+_BLOCKED = (
+    "accelerations",
+    "primvars:normals",
+    "primvars:normals:indices",
+    "primvars:skel:jointIndices",
+    "primvars:skel:jointWeights",
+)
 _COLOUR = (0.17, 0.35, 0.58)
 _LINE_COLOUR = (0.05, 0.05, 0.05)
 # Curves are drawn as tubes this thick, as a part of the mean edge length.

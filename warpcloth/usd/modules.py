@@ -9,7 +9,7 @@ from importlib import import_module
 
 from ..base.interrupts import deferred
 
-__all__ = ["Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade", "UsdUtils", "Vt"]
+__all__ = ["Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade", "UsdSkel", "UsdUtils", "Vt"]
 
 
 @cache
@@ -30,4 +30,4 @@ class _Module:
         return value
 
 
-Ar, Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt = map(_Module, __all__)
+Ar, Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdSkel, UsdUtils, Vt = map(_Module, __all__)

@@ -12,22 +12,27 @@ from ..base.types import FilePath
 from ..mesh.mesh import Mesh
 from ..mesh.parts import Part
 from ..mesh.selection import distinct_vertices
+from ..scene.colliders import Contact
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
 from ..terms.loads import LOADS
-from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, holders, kind_of
+from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of, own_names
 from .chunks import export
+from .colliders import is_collider, located, read_colliders
+from .gprims import define_colliders
 from .layers import scene_layer
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics
 from .stage import (
     find_prim,
     first_points,
     followed,
+    frame_codes,
     local_to_metres,
     moving_space,
     open_stage,
     pinned_points,
     placed,
+    posed,
     read_stage_mesh,
     space_codes,
 )
@@ -57,19 +62,26 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
         stage = open_stage(path)
         cloth = _cloth_prim(stage, path, prim)
         surroundings = read_stage_mesh(path, str(cloth.GetPath()))
-        try:
-            return _scene(stage, cloth, surroundings)
-        except ValueError as error:
-            raise ValueError(f"{path}, prim {cloth.GetPath()}: {error}") from error
+        where = f"{path}, prim {cloth.GetPath()}"
+        with located(where):
+            fps = surroundings.fps or surroundings.time_codes_per_second
+            duration = _duration(stage, Values(stage, cloth), fps)
+            first = surroundings.start or 0.0
+            # One frame more, because there is a keyframe of colliders after all steps.
+            stage = posed(stage, first, first + (duration + 1.0 / fps) * surroundings.time_codes_per_second)
+            cloth = stage.GetPrimAtPath(surroundings.prim)
+            scene = _scene(stage, cloth, surroundings, fps, duration)
+        colliders = read_colliders(stage, cloth, scene.stage, scene.frames, fps)
+        with located(where):
+            return replace(scene, colliders=colliders) if colliders else scene
 
 
-def _scene(stage, cloth, surroundings):
+def _scene(stage, cloth, surroundings, fps, duration):
+    """The scene without its colliders."""
     values = Values(stage, cloth)
     rest = surroundings.mesh.points
     surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
     mesh = surroundings.mesh
-    fps = surroundings.fps or surroundings.time_codes_per_second
-    duration = _duration(stage, values, fps)
     density, masses, terms = _density(values, mesh), values.get("masses"), _terms(values, mesh)
     _refuse_missing(density is not None or masses is not None, len(terms) > 0)
     vertices = _pinned(values, cloth, surroundings)
@@ -87,6 +99,7 @@ def _scene(stage, cloth, surroundings):
         pins=Pins(vertices, keyframes, values.get("pins.axes") or "xyz"),
         free_axes=_free_axes(values),
         loads=[_load(values, key, surroundings, round(duration * fps), fps) for key in values.loads],
+        contact=_contact(values),
         gravity=_gravity(stage, values, surroundings.up_axis),
         duration=duration,
         fps=fps,
@@ -119,10 +132,7 @@ def _cloth_prim(stage, path, prim):
             found
             for found in stage.Traverse(Usd.TraverseInstanceProxies())
             if found.IsA(UsdGeom.PointBased)
-            and (
-                any(each.GetAuthoredPropertiesInNamespace("warpcloth") for each in holders(found))
-                or has_api(found, "PhysicsSurfaceDeformableSimAPI")
-            )
+            and ((own_names(found) and not is_collider(found)) or has_api(found, "PhysicsSurfaceDeformableSimAPI"))
         ]
         prim = cloths[0].GetPath() if len(cloths) == 1 else None
     return find_prim(stage, path, prim)
@@ -241,7 +251,7 @@ def _load(values, key, surroundings, frames, fps):
     attribute = next((found for _, found in values.authored(f"loads.{quantity}", key)), None)
     if attribute is not None and attribute.GetNumTimeSamples():
         most = max(frames, attribute.GetNumTimeSamples() - 1)
-        codes = list(_codes(time_codes_of(attribute), surroundings, most, fps))
+        codes = list(frame_codes(time_codes_of(attribute), surroundings, most, fps))
         given["keyframes"] = [_value_at(attribute, code) for code in codes]
     else:
         given[quantity] = values.get(f"loads.{quantity}", key)
@@ -304,7 +314,7 @@ def _frames(cloth, surroundings, frames, fps):
         first, count = first_points(surroundings.point_vertices), len(surroundings.point_vertices)
     samples, transform = time_codes_of(attribute), surroundings.transform
     at_rest = (rest - transform[3, :3]) @ np.linalg.inv(transform[:3, :3])
-    for code in _codes([*samples, *space_codes(cloth)], surroundings, frames, fps):
+    for code in frame_codes([*samples, *space_codes(cloth)], surroundings, frames, fps):
         points = at_rest
         if samples:
             points = _vectors_at(attribute, code)
@@ -316,7 +326,7 @@ def _frames(cloth, surroundings, frames, fps):
 
 def _samples(attribute, surroundings, frames, fps):
     """Values of an attribute of vectors at frames 0, 1, …, up to a number of frames and no further than its last sample."""
-    return (_vectors_at(attribute, code) for code in _codes(time_codes_of(attribute), surroundings, frames, fps))
+    return (_vectors_at(attribute, code) for code in frame_codes(time_codes_of(attribute), surroundings, frames, fps))
 
 
 def _vectors_at(attribute, code):
@@ -328,14 +338,6 @@ def _vectors_at(attribute, code):
     return value.astype(np.float64)
 
 
-def _codes(samples, surroundings, frames, fps):
-    """Time codes of frames 0, 1, …, up to a number of frames and no further than the last of some samples."""
-    rate = surroundings.time_codes_per_second / fps
-    start = surroundings.start or 0.0
-    last = np.ceil((max(samples) - start) / rate * (1 - 1e-9)) if samples else 0
-    return (start + frame * rate for frame in range(int(np.clip(last, 0, frames)) + 1))
-
-
 def _free_axes(values):
     """Along which axes vertices may move, (n, 3) truth values, or None."""
     free_axes = values.get("free_axes")
@@ -344,6 +346,13 @@ def _free_axes(values):
     for i, axis in np.argwhere((free_axes != 0) & (free_axes != 1))[:1]:
         raise ValueError(f"warpcloth:freeAxes[{i}] has {free_axes[i, axis]}, must be 0 or 1 for each axis")
     return free_axes.astype(bool)
+
+
+def _contact(values):
+    """How it touches colliders, or None."""
+    given = {name: values.get(f"contact.{name}") for name in ("distance", "stiffness")}
+    given = {name: float(value) for name, value in given.items() if value is not None}
+    return Contact(**given) if given else None
 
 
 def _gravity(stage, values, up_axis):
@@ -375,7 +384,7 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     Raises:
         FileNotFoundError: The folder does not exist.
         ValueError: The path has another ending or is the stage that the scene was read from, or the scene has no terms,
-            one that does not fit its mesh, colliders, or a contact.
+            or one that does not fit its mesh.
         OSError: The file could not be written.
     """
     path = Path(os.path.abspath(followed(path)))
@@ -387,14 +396,12 @@ def write_scene(scene: Scene, path: FilePath) -> str:
         raise ValueError(f"path is {path}, the stage that the scene was read from; it must be another file")
     if not scene.terms:
         raise ValueError("scene.terms is empty; a scene in a stage must have one or more")
-    if scene.colliders or scene.contact is not None:
-        found = f"{len(scene.colliders)} colliders" if scene.colliders else "a contact"
-        raise ValueError(f"the scene has {found}, which a stage cannot hold yet; write it as a Python file")
     for term in scene.terms:
         term.elements(scene.mesh, scene.positions)  # or reading would refuse what was written
     up_axis = scene.stage.up_axis if scene.stage else scene.up_axis
     pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
     layer, target, _ = scene_layer(scene.mesh, pins, up_axis, "Cloth")
+    define_colliders(layer, scene.colliders, scene.mesh)
     stage = Usd.Stage.Open(layer)
     stage.SetTimeCodesPerSecond(scene.fps)
     stage.SetFramesPerSecond(scene.fps)
@@ -436,6 +443,10 @@ def _scene_values(scene):
     mesh = scene.mesh
     given = {"name": scene.name, "duration": scene.duration, "gravity": scene.gravity}
     given |= {"masses": scene.masses} if scene.density is None else {"density": scene.density}
+    if scene.contact is not None:
+        given["contact.distance"] = scene.contact.distance
+    if scene.contact is not None and scene.contact.stiffness is not None:
+        given["contact.stiffness"] = scene.contact.stiffness
     if not np.array_equal(scene.positions, mesh.points):
         given["positions"] = scene.positions
     if scene.velocities.any():

@@ -9,7 +9,7 @@ from ..base.checks import shown
 from ..base.types import FilePath
 from ..mesh.mesh import Mesh
 from ..mesh.stage_mesh import StageMesh
-from .modules import Sdf, Tf, Usd, UsdGeom
+from .modules import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdSkel
 from .values import (
     array_of,
     check_composed,
@@ -25,6 +25,8 @@ from .values import (
 
 # Where an animation keeps, in the root layer's customLayerData, the prim that it animates.
 METADATA_KEY = "warpcloth"
+# Metadata that USD reads from the root layer alone.
+_READ_FROM_ROOTS = ("startTimeCode", "endTimeCode", "metersPerUnit", "upAxis", "kilogramsPerUnit")
 # Primvar of curves: the mesh vertex of each curve point, for curves repeat the vertices where several of them meet.
 VERTEX_PRIMVAR = "warpcloth:vertex"
 
@@ -195,7 +197,7 @@ def find_prim(stage, path, prim=None):
         own = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY)
         prim = own.get("prim") if isinstance(own, dict) else None
     if prim is None:
-        candidates = meshes or curves
+        candidates = [p for p in meshes or curves if not p.HasAPI(UsdPhysics.CollisionAPI)] or meshes or curves
     else:
         candidates = [p for p in meshes + curves if _called(p, prim)]
         candidates = candidates or [p for p in meshes + curves if _called(p.GetParent(), prim)]
@@ -234,6 +236,50 @@ def moving_space(prim):
     return None
 
 
+def posed(stage, first, last):
+    """The stage, or if it has skinned characters a copy in memory in which their points move.
+
+    Args:
+        stage: The stage, which stays as it is.
+        first: Time code from which they move.
+        last: That up to which they move.
+    """
+    if not any(prim.IsA(UsdSkel.Root) for prim in stage.Traverse(Usd.TraverseInstanceProxies())):
+        return stage
+    root, own = Sdf.Layer.CreateAnonymous(".usda"), stage.GetRootLayer()
+    for name in ("timeCodesPerSecond", "framesPerSecond", *_READ_FROM_ROOTS):
+        if own.pseudoRoot.HasInfo(name):
+            root.pseudoRoot.SetInfo(name, own.pseudoRoot.GetInfo(name))
+    root.subLayerPaths = [own.identifier]
+    copy = Usd.Stage.Open(root)
+    while instances := [prim for prim in copy.Traverse() if prim.IsInstance() and _has_skeleton(prim)]:
+        for prim in instances:  # no points can be given to a part of an instance
+            prim.SetInstanceable(False)
+    for prim in list(copy.Traverse()):
+        if prim.IsA(UsdSkel.Root):
+            UsdSkel.BakeSkinning(UsdSkel.Root(prim), Gf.Interval(first, last))
+    return copy
+
+
+def _has_skeleton(prim):
+    return any(each.IsA(UsdSkel.Root) for each in Usd.PrimRange(prim, Usd.TraverseInstanceProxies()))
+
+
+def frame_codes(samples, surroundings, frames, fps):
+    """Time codes of frames 0, 1, …, up to a number of frames and no further than the last of some samples.
+
+    Args:
+        samples: Time codes.
+        surroundings: The `StageMesh` of the cloth.
+        frames: The last frame, at most.
+        fps: Frames per second.
+    """
+    rate = surroundings.time_codes_per_second / fps
+    start = surroundings.start or 0.0
+    last = np.ceil((max(samples) - start) / rate * (1 - 1e-9)) if samples else 0
+    return [start + frame * rate for frame in range(int(np.clip(last, 0, frames)) + 1)]
+
+
 def space_codes(prim):
     """Time codes of the samples of the transforms of a prim and of those above it, sorted."""
     codes, ancestor = set(), prim
@@ -253,7 +299,7 @@ def local_to_metres(prim, where, time=None):
 
     Args:
         prim: The prim.
-        where: File and prim, for messages.
+        where: File and prim, for messages; or nothing.
         time: Time code, or None where it must be the same at all of them.
 
     Returns:
@@ -262,16 +308,17 @@ def local_to_metres(prim, where, time=None):
     Raises:
         ValueError: The transform is animated and no time is given, or it projects, or cannot be inverted.
     """
+    where = f"{where}: " if where else ""
     moving = moving_space(prim) if time is None else None
     if moving:
-        raise ValueError(f"{where}: the transform of {moving.GetPath()} is animated, must be fixed for a cloth")
+        raise ValueError(f"{where}the transform of {moving.GetPath()} is animated, must be fixed for a cloth")
     # A transform of one sample stands still, and says nothing at the default time.
     code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(time)
     matrix = np.array(UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(code))
     if not np.isfinite(matrix).all() or (matrix[:, 3] != [0, 0, 0, 1]).any():
-        raise ValueError(f"{where}: the transform to world space is {matrix.tolist()}, must be affine and finite")
+        raise ValueError(f"{where}the transform to world space is {matrix.tolist()}, must be affine and finite")
     if not np.linalg.matrix_rank(matrix[:3, :3]) == 3:
-        raise ValueError(f"{where}: the transform to world space is {matrix.tolist()}, must be invertible")
+        raise ValueError(f"{where}the transform to world space is {matrix.tolist()}, must be invertible")
     matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(prim.GetStage())
     return matrix
 

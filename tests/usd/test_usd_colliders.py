@@ -1,0 +1,391 @@
+"""Colliders of stages that artists make: shapes, scales, motion, materials, and what cannot be one."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from support.usd_validation import validate
+from warpcloth.usd import read_scene, write_scene
+
+# A square of 1 m at a height of 2 m, in centimetres with z up, at 24 frames a second from time code 101 to 105.
+STAGE = """#usda 1.0
+(
+    metersPerUnit = 0.01
+    upAxis = "Z"
+    startTimeCode = 101
+    endTimeCode = 105
+    timeCodesPerSecond = 24
+    framesPerSecond = 24
+)
+def Mesh "Cloth"
+{
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 3, 2]
+    point3f[] points = [(0, 0, 200), (100, 0, 200), (0, 100, 200), (100, 100, 200)]
+    double warpcloth:density = 0.15
+    token warpcloth:terms:threads:type = "Spring"
+    double warpcloth:terms:threads:stiffness = 1000
+}
+"""
+COLLIDES = '(prepend apiSchemas = ["PhysicsCollisionAPI"])'
+TETRAHEDRON = """
+    int[] faceVertexCounts = [3, 3, 3, 3]
+    int[] faceVertexIndices = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
+    point3f[] points = [(0, 0, 0), (10, 0, 0), (0, 10, 0), (0, 0, 10)]
+"""
+
+
+INWARD = TETRAHEDRON.replace("0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3", "0, 1, 2, 0, 3, 1, 0, 2, 3, 1, 3, 2")
+
+
+def shape(kind, text="", name="Thing", meta=COLLIDES):
+    return f'def {kind} "{name}" {meta}\n{{\n{text}\n}}\n'
+
+
+def ops(**operations):
+    """Transforms, in the order given: (type, value or time samples)."""
+    lines = [f"{type_name} xformOp:{name}{value}" for name, (type_name, value) in operations.items()]
+    order = ", ".join(f'"xformOp:{name}"' for name in operations)
+    return "\n".join([*lines, f"uniform token[] xformOpOrder = [{order}]"])
+
+
+def at(x, y, z):
+    return ops(translate=("double3", f" = ({x}, {y}, {z})"))
+
+
+MOVING = ops(
+    translate=("double3", ".timeSamples = {101: (0, 0, 0), 105: (40, 0, 0)}"),
+    rotateZ=("float", ".timeSamples = {101: 0, 105: 80}"),
+)
+
+
+def scene_with(path, *texts):
+    path.write_text(STAGE + "".join(texts))
+    return read_scene(path)
+
+
+def collider_of(path, *texts):
+    (found,) = scene_with(path, *texts).colliders
+    return found
+
+
+def turned(collider, frame, points):
+    """Where points (p, 3) of the body of a collider are at a frame."""
+    pose = collider.poses[frame]
+    u, w = pose[3:6], pose[6]
+    t = 2.0 * np.cross(u, points)
+    return points + w * t + np.cross(u, t) + pose[:3]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "stage.usda"
+
+
+def test_solids_in_units_of_the_stage(path):
+    texts = [
+        shape("Sphere", "double radius = 20\n" + at(50, 0, 30)),
+        shape("Capsule", 'double radius = 5\ndouble height = 40\nuniform token axis = "X"\n' + at(0, 0, 9), "Rod"),
+        shape("Cube", "double size = 2\n" + ops(rotateZ=("float", " = 90"), scale=("float3", " = (10, 20, -30)")), "Brick"),
+        shape(
+            "Plane",
+            'uniform token axis = "X"\n' + ops(translate=("double3", " = (0, -200, 0)"), rotateZ=("float", " = 90")),
+            "Wall",
+        ),
+    ]
+    ball, rod, brick, wall = scene_with(path, *texts).colliders
+    assert [each.name for each in (ball, rod, brick, wall)] == ["/Thing", "/Rod", "/Brick", "/Wall"]
+    assert (type(ball), ball.radius, ball.position.tolist()) == (wc.Sphere, 0.2, [0.5, 0, 0.3])
+    assert (type(rod), rod.radius, rod.length, rod.axis.tolist()) == (wc.Capsule, 0.05, 0.4, [1, 0, 0])
+    assert isinstance(brick, wc.Box)
+    np.testing.assert_allclose(brick.distances(np.array([[0.4, 0, 0], [0, 0.2, 0], [0, 0, 0.6]])), [0.2, 0.1, 0.3])
+    assert isinstance(wall, wc.Plane)
+    np.testing.assert_allclose(wall.distances(np.array([[5.0, 0.3, 1], [2, -0.2, 0]])), [2.3, 1.8], atol=1e-12)
+
+
+@pytest.mark.parametrize(("sign", "height", "side"), [((1, 1, 1), 0, 1), ((-1, 1, 1), 0, 1), ((1, 1, -1), 300, -1)])
+def test_a_mirrored_plane_keeps_what_is_behind_it(path, sign, height, side):
+    text = ops(translate=("double3", f" = (0, 0, {height})"), scale=("float3", f" = {sign}"))
+    plane = collider_of(path, shape("Plane", 'uniform token axis = "Z"\n' + text))
+    assert isinstance(plane, wc.Plane)
+    np.testing.assert_allclose(plane.distances(np.array([[0.3, 0.2, 0.1]])), [(0.1 - 0.01 * height) * side])
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "volume"),
+    [
+        ("Sphere", "double radius = 10\n" + ops(scale=("float3", " = (1, 2, 3)")), 4 / 3 * np.pi * 6e-3),
+        ("Sphere", "double radius = 10\n" + ops(scale=("float3", " = (-1, 2, 3)")), 4 / 3 * np.pi * 6e-3),
+        ("Cylinder", 'double radius = 10\ndouble height = 20\nuniform token axis = "X"', np.pi * 2e-3),
+        ("Cone", 'double radius = 10\ndouble height = 30\nuniform token axis = "Y"', np.pi * 1e-3),
+        ("Mesh", TETRAHEDRON, 1e-3 / 6),
+        ("Mesh", 'uniform token orientation = "leftHanded"\n' + INWARD, 1e-3 / 6),
+        ("Mesh", ops(scale=("float3", " = (2, -3, 1)")) + TETRAHEDRON, 1e-3),
+    ],
+    ids=["ellipsoid", "mirrored ellipsoid", "cylinder", "cone", "mesh", "left-handed", "mirrored mesh"],
+)
+def test_other_solids_are_meshes_with_their_fronts_outside(path, kind, size, volume):
+    """The volume by the divergence theorem, which is negative if the front is inside; 1 % for the facets."""
+    mesh = collider_of(path, shape(kind, size))
+    assert isinstance(mesh, wc.MeshCollider) and mesh.closed
+    corners = turned(mesh, 0, mesh.points)[mesh.triangles]
+    found = np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert found == pytest.approx(volume, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [("Sphere", "double radius = 10"), ("Mesh", TETRAHEDRON), ("Plane", 'uniform token axis = "Z"')],
+    ids=["Sphere", "Mesh", "Plane"],
+)
+def test_colliders_follow_the_transforms_above_them(path, kind, text):
+    """10 cm along x and 20° about z a frame, also of a shape that is turned below them."""
+    below = ops(translate=("double3", " = (0, -20, 0)"), rotateX=("float", " = -90"))
+    found = collider_of(path, f'def Xform "Parent"\n{{\n{MOVING}\n{shape(kind, below + chr(10) + text)}}}\n')
+    assert found.moves and found.poses.shape == (5, 7)
+    for frame in range(5):
+        angle = np.radians(20.0 * frame)
+        at_frame = np.array([0.1 * frame + 0.2 * np.sin(angle), -0.2 * np.cos(angle), 0.0])
+        np.testing.assert_allclose(found.poses[frame, :3], at_frame, atol=1e-7)
+        if kind == "Plane":  # up is z, which is turned to y
+            normal = np.array([-np.sin(angle), np.cos(angle), 0.0])
+            np.testing.assert_allclose(found.distances(at_frame + 0.3 * normal, frame), 0.3)
+        if kind == "Mesh":
+            along = 0.1 * np.array([np.cos(angle), np.sin(angle), 0.0])
+            np.testing.assert_allclose(turned(found, frame, found.points[[1]]), [at_frame + along], atol=1e-7)
+    if kind == "Mesh":
+        assert found.points.shape == (4, 3)  # a body, which is not stored at each frame
+
+
+DEFORMING = {
+    "scale": ("Cube", "double size = 20\n" + ops(scale=("float3", ".timeSamples = {101: (1, 1, 1), 105: (1, 1, 3)}"))),
+    "size": ("Cube", "double size.timeSamples = {101: 20, 105: 60}"),
+    "points": (
+        "Mesh",
+        TETRAHEDRON.replace("points =", "points.timeSamples = {101:").rstrip()
+        + ", 105: [(0, 0, 0), (10, 0, 0), (0, 10, 0), (0, 0, 30)]}",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DEFORMING)
+def test_shapes_that_change_are_meshes_that_deform(path, case):
+    found = collider_of(path, shape(*DEFORMING[case]))
+    assert isinstance(found, wc.MeshCollider) and len(found.frames) == 5 and found.closed
+    tops = [turned(found, min(frame, len(found.poses) - 1), found.frames[frame])[:, 2].max() for frame in range(5)]
+    np.testing.assert_allclose(tops, 0.1 + 0.05 * np.arange(5), atol=1e-7)
+
+
+APPROXIMATED = {
+    "none": (wc.MeshCollider, 0),
+    "convexHull": (wc.MeshCollider, 0),
+    "boundingCube": (wc.Box, 0),
+    "boundingSphere": (wc.Sphere, 0),
+    "convexDecomposition": (wc.MeshCollider, 1),
+    "meshSimplification": (wc.MeshCollider, 1),
+    "sdf": (wc.MeshCollider, 1),
+}
+
+
+@pytest.mark.parametrize("by", ["physics", "own"])
+@pytest.mark.parametrize("approximation", APPROXIMATED)
+def test_approximations_of_a_mesh(path, approximation, by):
+    kind, said = APPROXIMATED[approximation]
+    own = f'string warpcloth:collider = "{approximation}"'
+    api = f'uniform token physics:approximation = "{approximation}"'
+    text, meta = (own, "") if by == "own" else (api, COLLIDES.replace('API"', 'API", "PhysicsMeshCollisionAPI"'))
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        found = collider_of(path, shape("Mesh", text + "\n" + at(100, 0, 0) + TETRAHEDRON, meta=meta))
+    assert isinstance(found, kind)
+    words = f"{path}, prim /Thing: its approximation {approximation} is taken as none"
+    assert [str(each.message).startswith(words) for each in warned] == [True] * said
+    distances = found.distances(np.array([[1.0, 0, 0], [1.1, 0, 0], [1, 0.1, 0], [1, 0, 0.1]]))
+    np.testing.assert_allclose(distances, 0.0, atol=1e-7)  # the corners are on each of them
+
+
+def test_a_mesh_that_faces_inwards_is_said(path):
+    """All but its inside is solid then: a cloth in a closed room."""
+    room = shape("Mesh", ops(translate=("double3", " = (-500, -500, -500)"), scale=("float3", " = (500, 500, 500)")) + INWARD)
+    with pytest.warns(UserWarning, match="prim /Thing: its triangles face inwards, so that what they enclose is free"):
+        assert collider_of(path, room).closed
+
+
+MATERIAL = """
+def Material "Rubber" (prepend apiSchemas = ["PhysicsMaterialAPI"])
+{{
+    {}
+}}
+"""
+BOUND = "rel material:binding:physics = </Rubber>"
+
+
+@pytest.mark.parametrize(
+    ("material", "own", "friction", "said"),
+    [
+        ("", "", 0.0, 0),
+        ("float physics:dynamicFriction = 0.25", "", 0.25, 0),
+        ("float physics:staticFriction = 0.5", "", 0.5, 0),
+        ("float physics:dynamicFriction = 0.25\nfloat physics:staticFriction = 0.5", "", 0.25, 1),
+        ("float physics:dynamicFriction = 0.5\nfloat physics:staticFriction = 0.5", "", 0.5, 0),
+        ("float physics:dynamicFriction = 0\nfloat physics:staticFriction = 0.5", "", 0.0, 1),
+        ("float physics:dynamicFriction = 0.25\nfloat physics:staticFriction = 0.5", "double warpcloth:friction = 0.3", 0.3, 0),
+    ],
+)
+def test_friction(path, material, own, friction, said):
+    """That of sliding, because a collider has one coefficient; ours first."""
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        found = collider_of(
+            path,
+            MATERIAL.format(material),
+            shape("Sphere", f"{BOUND}\n{own}", meta=COLLIDES.replace('API"', 'API", "MaterialBindingAPI"')),
+        )
+    assert found.friction == friction
+    assert ["its static friction 0.5 is not read" in str(each.message) for each in warned] == [True] * said
+
+
+@pytest.mark.parametrize(
+    ("api", "said"),
+    [
+        ("bool physics:kinematicEnabled = 1", 0),
+        ("bool physics:kinematicEnabled = 0", 1),
+        ("bool physics:rigidBodyEnabled = 0", 0),
+    ],
+)
+def test_a_rigid_body_that_forces_would_move_is_said(path, api, said):
+    body = f'def Xform "Body" (prepend apiSchemas = ["PhysicsRigidBodyAPI"])\n{{\n{api}\n{MOVING}\n{shape("Sphere")}}}\n'
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert collider_of(path, body).moves
+    assert ["prim /Body/Thing: is a rigid body that is not kinematic" in str(each.message) for each in warned] == [True] * said
+
+
+MARKED = "bool warpcloth:collider = {}"
+CHOSEN = {
+    "a shape": (shape("Sphere"), 1),
+    "without the mark": (shape("Sphere", meta=""), 0),
+    "turned off": (shape("Sphere", "bool physics:collisionEnabled = 0"), 0),
+    "our mark": (shape("Sphere", MARKED.format(1), meta=""), 1),
+    "our mark first": (shape("Sphere", MARKED.format(0)), 0),
+    "the mark of an object": (shape("Xform", MARKED.format(1) + "\n" + shape("Sphere", meta=""), "Object", ""), 1),
+    "a sample, as of a moving object": (
+        shape("Xform", "bool warpcloth:collider.timeSamples = {1: 1}\n" + shape("Sphere", meta=""), "Object", ""),
+        1,
+    ),
+    "a shape that is not its object": (
+        shape(
+            "Xform",
+            MARKED.format(1) + "\n" + shape("Sphere", MARKED.format(0), meta="") + shape("Cube", "", "Other", ""),
+            "Object",
+            "",
+        ),
+        1,
+    ),
+    "no child of it": (
+        shape(
+            "Xform",
+            MARKED.format(1) + "\n" + shape("Sphere", meta="") + shape("Xform", shape("Cube", meta=""), "Child", ""),
+            "Object",
+            "",
+        ),
+        1,
+    ),
+    "invisible": (shape("Sphere", 'token visibility = "invisible"\nuniform token purpose = "guide"'), 1),
+    "inactive": (shape("Sphere", meta=COLLIDES.replace("(", "(active = false\n")), 0),
+    "over": (shape("Sphere").replace("def", "over"), 0),
+    "class": (shape("Sphere").replace("def", "class"), 0),
+    "instance": (
+        shape("Xform", shape("Sphere"), "Proto", "").replace("def", "class", 1)
+        + shape("", name="One", meta="(instanceable = true\nprepend references = </Proto>)")
+        + shape("", name="Two", meta="(instanceable = true\nprepend references = </Proto>)"),
+        2,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHOSEN)
+def test_which_prims_are_colliders(path, case):
+    text, count = CHOSEN[case]
+    assert len(scene_with(path, text).colliders) == count
+
+
+REFUSED = {
+    "points": (
+        shape("Points", "point3f[] points = [(0, 0, 0)]"),
+        "prim /Thing: is Points, must be a Mesh or one of Cube, Sphere",
+    ),
+    "empty": (shape("Xform"), "prim /Thing: is Xform without a shape right below it, must be a shape to be a collider"),
+    "instancer": (
+        shape("PointInstancer", shape("Sphere"), "Many", ""),
+        "prim /Many: has a collider as a prototype, which must be",
+    ),
+    "zero scale": (
+        shape("Sphere", ops(scale=("float3", " = (1, 0, 1)"))),
+        "prim /Thing: the transform to world space is .*invertible",
+    ),
+    "zero scale later": (
+        shape("Sphere", ops(scale=("float3", ".timeSamples = {101: (1, 1, 1), 103: (0, 0, 0)}"))),
+        "prim /Thing: time code 103: the transform to world space is .*, must be invertible",
+    ),
+    "radius": (shape("Sphere", "double radius = 0"), "prim /Thing: radius is 0.0, must be above 0"),
+    "swelling plane": (
+        shape("Plane", ops(scale=("float3", ".timeSamples = {101: (1, 1, 1), 105: (2, 1, 1)}"))),
+        "prim /Thing: is a Plane whose scale changes over time, must keep it",
+    ),
+    "no points": (shape("Mesh"), "prim /Thing: has no points"),
+    "no faces": (shape("Mesh", "point3f[] points = [(0, 0, 0)]"), "prim /Thing: has no faces"),
+    "flat": (
+        shape("Mesh", TETRAHEDRON.replace("10", "0")),
+        "prim /Thing: has no triangle with an area, must have one to be a collider",
+    ),
+    "flat hull": (
+        shape("Mesh", 'token warpcloth:collider = "convexHull"' + TETRAHEDRON.replace("(0, 0, 10)", "(10, 10, 0)")),
+        "prim /Thing: its points are in a plane, must have a volume for a convexHull",
+    ),
+    "count": (
+        shape("Mesh", TETRAHEDRON + "point3f[] points.timeSamples = {101: [(0, 0, 0)], 102: [(0, 0, 0), (1, 1, 1)]}"),
+        "prim /Thing: points has 2 points at time code 102, must keep 1",
+    ),
+    "approximation": (
+        shape("Mesh", 'token warpcloth:collider = "round"' + TETRAHEDRON),
+        "prim /Thing: warpcloth:collider is 'round', must be one of none, boundingCube, boundingSphere, convexHull",
+    ),
+    "attribute": (
+        shape("Sphere", "double warpcloth:fricton = 1"),
+        "prim /Thing: warpcloth:fricton is no attribute of a collider, must be one of warpcloth:collider, .*warpcloth:friction",
+    ),
+    "friction": (shape("Sphere", "double warpcloth:friction = -1"), "prim /Thing: /Thing.friction is -1.0; it must be"),
+    "inside": (
+        shape("Sphere", "double radius = 90\n" + at(0, 0, 200)),
+        "prim /Cloth: vertex 0 starts 0.9 m inside the collider /Thing",
+    ),
+    "payload": (
+        'def Sphere "Thing" (prepend apiSchemas = ["PhysicsCollisionAPI"]\nprepend payload = @./missing.usda@)\n{\n}\n',
+        "prim /Thing: .*missing.usda.* must be there",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_a_collider_is_refused_with_its_path(path, case):
+    text, message = REFUSED[case]
+    with pytest.raises(ValueError, match=message) as caught:
+        scene_with(path, text)
+    assert str(caught.value).count(str(path)) == 1 + (case == "payload") and "\n" not in str(caught.value)
+
+
+def test_a_scene_with_colliders_runs_from_its_stage_to_the_same_bits(tmp_path):
+    colliders = [
+        wc.Sphere(radius=0.31, position=[(0.5, -0.35, 0.5), (0.5, -0.33, 0.5)], friction=0.3),
+        wc.Plane(normal=(0.1, 1.0, 0.0), position=(0, -0.07, 0)),
+    ]
+    scene = wc.Scene(wc.Mesh.grid(5, 5), density=0.15, terms=[wc.Spring(stiffness=100.0)], colliders=colliders, duration=1 / 10)
+    read = read_scene(write_scene(scene, tmp_path / "scene.usda"))
+    one = wc.simulate(scene, wc.Explicit(substeps=32), output=tmp_path / "one.usdc")
+    other = wc.simulate(read, wc.Explicit(substeps=32), output=tmp_path / "other.usdc")
+    np.testing.assert_array_equal(one.points, other.points)
+    assert one.points[-1, :, 1].min() < -0.02
+    assert validate(tmp_path / "one.usdc") == [] and validate(tmp_path / "other.usdc", read.stage.path) == []

@@ -1,0 +1,357 @@
+"""Colliders read from the prims of a stage."""
+
+import warnings
+from contextlib import contextmanager
+from functools import cached_property
+
+import numpy as np
+
+from ..mesh.mesh import FLATTEST
+from ..scene.colliders import Box, Capsule, Plane, Sphere
+from ..scene.mesh_collider import MeshCollider
+from .attributes import Values, holders
+from .modules import Usd, UsdGeom, UsdPhysics
+from .solids import SOLIDS
+from .stage import face_corners, frame_codes, local_to_metres, moving_space, placed, refuse_moving_topology, space_codes
+from .values import array_of, check_composed, refuse_unknown, time_codes_of, token_of, value_of
+
+# Approximations of a mesh that UsdPhysics has, and those that are taken as none: they make a mesh cheaper for rigid bodies, and
+# here it is taken as it is.
+_APPROXIMATIONS = ("none", "boundingCube", "boundingSphere", "convexHull")
+_TAKEN_AS_NONE = ("convexDecomposition", "meshSimplification", "sdf")
+_SIZES = ("size", "radius", "height")
+# Scales and angles of float32 and of products of them agree to this part.
+_SAME = 1e-5
+
+
+def read_colliders(stage, cloth, surroundings, frames, fps):
+    """The colliders of a stage, in the order of its prims.
+
+    A collider is a shape with PhysicsCollisionAPI or with `warpcloth:collider`, on itself or on the Xform above it. It does not
+    matter whether it is visible. Planes, spheres, capsules and cubes are those of the scene where their scale allows it. Others
+    are meshes of triangles, as are cylinders and cones, and those whose size changes.
+
+    Args:
+        stage: The stage, as it is posed.
+        cloth: The prim of the cloth, which is none of them.
+        surroundings: Its `StageMesh`.
+        frames: Frames of the scene.
+        fps: Frames per second.
+
+    Returns:
+        list: The `Collider` of each.
+
+    Raises:
+        ValueError: A prim cannot be a collider; the message has its path.
+    """
+    found = []
+    walk = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+    for prim in walk:
+        with located(f"{surroundings.path}, prim {prim.GetPath()}"):
+            if prim.IsA(UsdGeom.PointInstancer):
+                walk.PruneChildren()
+                if any(map(_collides, Usd.PrimRange(prim, Usd.TraverseInstanceProxies()))):
+                    raise ValueError("has a collider as a prototype, which must be instanced by references to be taken")
+            wanted = prim != cloth and _collides(prim)
+        if wanted:
+            check_composed(prim, surroundings.path)
+            with located(f"{surroundings.path}, prim {prim.GetPath()}"):
+                found.append(_Reader(stage, prim, surroundings, frames, fps).collider())
+    return found
+
+
+@contextmanager
+def located(where):
+    """Says where a ValueError arose."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def is_collider(prim):
+    """Whether a prim, or the Xform above it, is marked as a collider that is on."""
+    marks = [each.GetAttribute("warpcloth:collider") for each in holders(prim)]
+    own = next((each.Get(Usd.TimeCode.EarliestTime()) for each in marks if each and each.HasAuthoredValue()), None)
+    if own is not None:
+        return bool(own)
+    applied = [each for each in holders(prim) if each.HasAPI(UsdPhysics.CollisionAPI)]
+    enabled = applied and UsdPhysics.CollisionAPI(applied[0]).GetCollisionEnabledAttr().Get(Usd.TimeCode.EarliestTime())
+    return bool(enabled)
+
+
+def _collides(prim):
+    """Whether a prim is a shape that is a collider; refuses prims that are marked as colliders and are none."""
+    if prim.IsA(UsdGeom.Gprim):
+        return is_collider(prim)
+    own = prim.HasAPI(UsdPhysics.CollisionAPI) or prim.GetAttribute("warpcloth:collider").HasAuthoredValue()
+    if own and is_collider(prim) and not any(each.IsA(UsdGeom.Gprim) for each in _below(prim)):
+        kind = prim.GetTypeName() or "untyped"
+        raise ValueError(f"is {kind} without a shape right below it, must be a shape to be a collider")
+    return False
+
+
+def _below(prim):
+    return prim.GetFilteredChildren(Usd.TraverseInstanceProxies())
+
+
+class _Reader:
+    """A prim as a collider: its shape, at the time codes of the frames.
+
+    Args:
+        As those of :func:`read_colliders`, ``prim`` being that of the collider.
+    """
+
+    def __init__(self, stage, prim, surroundings, frames, fps):
+        self.prim, self.kind, self.path = prim, str(prim.GetTypeName()), surroundings.path
+        self.values = Values(stage, prim, "collider")
+        self.metres = surroundings.meters_per_unit
+        sampled = [] if self.kind == "Plane" else self._shape_codes
+        # One frame more than the scene has, so that all steps within it have a keyframe after them.
+        self.codes = frame_codes([*space_codes(prim), *sampled], surroundings, frames + 1, fps)
+
+    @cached_property
+    def _shape_codes(self):
+        """Time codes of the samples of the attributes that say the shape, if it changes."""
+        found = [self.prim.GetAttribute(name) for name in (*_SIZES, "points", "warpcloth:points")]
+        codes = [time_codes_of(each) for each in found if each]
+        return sorted({code for each in codes if len(each) > 1 for code in each})
+
+    def collider(self):
+        """The `Collider`."""
+        self._warn_of_dynamics()
+        given = {"friction": self._friction(), "name": self._name()}
+        size = None if self._shape_codes else self._size
+        pose = self._rigid
+        if pose is not None:
+            scale, positions, rotations = pose
+            given |= {"position": _alone(positions), "rotation": _alone(rotations)}
+            if self.kind == "Plane":
+                return Plane(normal=np.linalg.solve(scale, self._axis), **given)
+            diagonal = np.diagonal(scale)
+            straight = (np.abs(scale - np.diag(diagonal)) <= _SAME * np.abs(scale).max()).all()
+            lengths = np.abs(diagonal)
+            even, factor = straight and np.ptp(lengths) <= _SAME * lengths.max(), float(lengths[0])
+            if self.kind == "Sphere" and even and size is not None:
+                return Sphere(radius=factor * size["radius"], **given)
+            if self.kind == "Capsule" and even and size is not None:
+                radius, length = factor * size["radius"], factor * size["height"]
+                return (
+                    Capsule(radius=radius, length=length, axis=self._axis, **given)
+                    if length
+                    else Sphere(radius=radius, **given)
+                )
+            if self.kind == "Cube" and straight and size is not None:
+                return Box(size=lengths * size["size"], **given)
+        elif self.kind == "Plane":
+            raise ValueError("is a Plane whose scale changes over time, must keep it to be a collider")
+        return self._mesh(given)
+
+    def _warn_of_dynamics(self):
+        """Says that a rigid body does not move by forces."""
+        body = self.prim
+        while body and not body.HasAPI(UsdPhysics.RigidBodyAPI):
+            body = body.GetParent()
+        body = body and UsdPhysics.RigidBodyAPI(body)
+        if body and body.GetRigidBodyEnabledAttr().Get() and not body.GetKinematicEnabledAttr().Get():
+            self._warn("is a rigid body that is not kinematic; it is taken as one, which only its animation moves")
+
+    def _warn(self, text):
+        warnings.warn(f"{self.path}, prim {self.prim.GetPath()}: {text}", stacklevel=2)
+
+    def _friction(self):
+        """Our own coefficient, else the dynamic one of the material, else its static one."""
+        said, static = next(self.values.authored("colliders.friction"), None), self.values.get("(static friction)")
+        if said is None:
+            return float(static or 0.0)
+        friction = float(self.values.get("colliders.friction"))
+        if static is not None and said[0].location != "collider" and static != friction:
+            self._warn(f"its static friction {static:g} is not read; a collider has one friction, the dynamic {friction:g}")
+        return friction
+
+    def _name(self):
+        """Our own name, where empty that of the class, else the path."""
+        name = self.values.get("colliders.name")
+        return str(self.prim.GetPath()) if name is None else name or None
+
+    @property
+    def _axis(self):
+        """The axis of the shape (3,) in its own space."""
+        return np.eye(3)["XYZ".index(token_of(self.prim.GetAttribute("axis"), ("X", "Y", "Z")))]
+
+    @property
+    def _size(self):
+        """The sizes of a solid, at first."""
+        found = {}
+        for name in _SIZES:
+            attribute = self.prim.GetAttribute(name)
+            if attribute:
+                found[name] = value_of(attribute, Usd.TimeCode.EarliestTime())
+                refuse_unknown(name, np.array(found[name]))
+                if found[name] < 0 or (found[name] == 0 and (self.kind, name) != ("Capsule", "height")):
+                    raise ValueError(f"{name} is {found[name]}, must be above 0")
+        return found
+
+    @cached_property
+    def _transforms(self):
+        """The transform (4, 4) to metres at each frame, or one where the space stands still."""
+        if not moving_space(self.prim):
+            return [local_to_metres(self.prim, "")]
+        return [local_to_metres(self.prim, f"time code {code:g}", code) for code in self.codes]
+
+    @cached_property
+    def _rigid(self):
+        """Scale (3, 3), positions (F, 3) [m] and quaternions (F, 4), with x = p·scale, turned, + position; None if no such are.
+
+        Where the prim says them in this way, as those of `gprims` do, they are taken as they are.
+        """
+        said = self._said
+        if said is not None:
+            return said
+        linear = np.array([each[:3, :3] for each in self._transforms])
+        u, sizes, vt = np.linalg.svd(linear[0])
+        turn, scale = u @ vt, (u * sizes) @ u.T
+        if np.linalg.det(turn) < 0.0:
+            turn, scale = -turn, -scale
+        turns = np.linalg.solve(scale, linear)
+        errors = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3))
+        if errors.max() > _SAME or (np.linalg.det(turns) < 0.0).any():
+            return None
+        from scipy.spatial.transform import Rotation  # loaded late, as importing this package stays light
+
+        rotations = Rotation.from_matrix(turns.transpose(0, 2, 1)).as_quat()
+        return scale, np.array([each[3, :3] for each in self._transforms]), rotations
+
+    @property
+    def _said(self):
+        """As :attr:`_rigid`, of a prim in world space and metres that has translate, orient and scale, in this order."""
+        shape = UsdGeom.Xformable(self.prim)
+        operations = {each.GetOpType(): each for each in shape.GetOrderedXformOps()}
+        order = [UsdGeom.XformOp.TypeTranslate, UsdGeom.XformOp.TypeOrient, UsdGeom.XformOp.TypeScale]
+        if [*operations] != order[: len(operations)] or len(operations) < 2 or self.metres != 1.0:
+            return None
+        above = np.array(UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetParentToWorldTransform(self.prim))
+        if moving_space(self.prim.GetParent()) or not np.array_equal(above, np.eye(4)):
+            return None
+        scale = operations.get(order[2])
+        if len(operations) != len(shape.GetOrderedXformOps()) or (scale and scale.MightBeTimeVarying()):
+            return None
+        codes = self.codes if moving_space(self.prim) else [Usd.TimeCode.EarliestTime()]
+        positions = np.array([operations[order[0]].Get(code) for code in codes], dtype=np.float64)
+        turns = [operations[order[1]].Get(code) for code in codes]
+        rotations = np.array([[*each.GetImaginary(), each.GetReal()] for each in turns], dtype=np.float64)
+        sizes = np.array(scale.Get(Usd.TimeCode.EarliestTime()) if scale else (1, 1, 1), dtype=np.float64)
+        if not (sizes.all() and np.isfinite(positions).all() and (np.abs((rotations**2).sum(axis=1) - 1.0) < _SAME).all()):
+            return None  # for the general way to refuse
+        return np.diag(sizes), positions, rotations
+
+    def _mesh(self, given):
+        """A `MeshCollider`, or what approximates it."""
+        prim = self.prim
+        if not (prim.IsA(UsdGeom.Mesh) or self.kind in SOLIDS):
+            raise ValueError(f"is {self.kind}, must be a Mesh or one of {', '.join(SOLIDS)} to be a collider")
+        points, triangles = self._surface()
+        if self._rigid is not None:
+            scale = self._rigid[0]
+            points = points if np.array_equal(scale, np.eye(3)) else points @ scale
+            mirrored = np.linalg.det(scale) < 0.0
+        else:
+            count = len(self.codes)
+            points = np.broadcast_to(points, (count, *points.shape[-2:])) if points.ndim == 2 or len(points) == 1 else points
+            points = np.stack([placed(*pair) for pair in zip(points, self._transforms, strict=True)])
+            mirrored = np.linalg.det(self._transforms[0][:3, :3]) < 0.0
+        triangles = triangles[_with_area(points.reshape(-1, *points.shape[-2:])[0], triangles)]
+        triangles = triangles[:, ::-1] if mirrored else triangles
+        return self._approximated(points, triangles, given)
+
+    def _surface(self):
+        """Points (n, 3) or (F, n, 3) in the prim's own space, and triangles (T, 3) from the front there."""
+        codes = self.codes if self._shape_codes else [Usd.TimeCode.EarliestTime()]
+        if self.kind in SOLIDS:
+            self._size  # noqa: B018 (refuses sizes that are none)
+            solids = [SOLIDS[self.kind](self.prim, code) for code in codes]
+            return _alone(np.array([each.vertices for each in solids])), np.array(solids[0].faces)
+        refuse_moving_topology(self.prim)
+        points = [self._points_at(code) for code in codes]
+        for code, row in zip(codes, points, strict=True):
+            if len(row) != len(points[0]):
+                raise ValueError(f"points has {len(row)} points at time code {code:g}, must keep {len(points[0])}")
+        corners, triangles = face_corners(self.prim, len(points[0]))
+        return _alone(np.array(points)), corners[triangles]
+
+    def _points_at(self, code):
+        points = array_of(UsdGeom.PointBased(self.prim).GetPointsAttr(), (3,), time=code)
+        if points is None or not len(points):
+            raise ValueError("has no points" + ("" if self.codes == [code] else f" at time code {code}"))
+        refuse_unknown("points", points)
+        own = self.prim.GetAttribute("warpcloth:points")
+        exact = array_of(own, (3,), time=code) if own and own.HasAuthoredValue() else None
+        same = exact is not None and np.array_equal(exact.astype(np.float32), points.astype(np.float32))
+        return exact if same else points.astype(np.float64)
+
+    def _approximated(self, points, triangles, given):
+        """The collider that is asked for in the place of a mesh."""
+        own = self.values.get("(collides)")
+        wanted = own if isinstance(own, str) else self.values.get("(approximation)") or "none"
+        if wanted not in (*_APPROXIMATIONS, *_TAKEN_AS_NONE):
+            name = "warpcloth:collider" if isinstance(own, str) else "physics:approximation"
+            raise ValueError(f"{name} is {wanted!r}, must be one of {', '.join((*_APPROXIMATIONS, *_TAKEN_AS_NONE))}")
+        if wanted in _TAKEN_AS_NONE or (wanted != "none" and points.ndim == 3):
+            reason = "it deforms" if points.ndim == 3 else "it is not approximated in that way"
+            self._warn(f"its approximation {wanted} is taken as none, as {reason}: its triangles are the collider")
+            wanted = "none"
+        if wanted == "none":
+            found = MeshCollider(points=points, triangles=triangles, **given)
+            if found.closed and _volume(found.frames[0][triangles]) < 0.0:
+                self._warn("its triangles face inwards, so that what they enclose is free and all else is solid")
+            return found
+        import trimesh  # loaded late, as importing this package stays light
+
+        if wanted == "convexHull":
+            try:
+                hull = trimesh.convex.convex_hull(points)
+            except Exception:  # of the package that trimesh calls, which it does not name
+                raise ValueError("its points are in a plane, must have a volume for a convexHull") from None
+            return MeshCollider(points=np.array(hull.vertices), triangles=np.array(hull.faces), **given)
+        if wanted == "boundingCube":
+            low, high = points.min(axis=0), points.max(axis=0)
+            return Box(size=high - low, **given | self._shifted(0.5 * (low + high), given))
+        centre = _centre(trimesh, points)
+        radius = float(np.linalg.norm(points - centre, axis=1).max())
+        return Sphere(radius=radius, **given | self._shifted(centre, given))
+
+    def _shifted(self, centre, given):
+        """The positions of a point of the body, by name."""
+        from scipy.spatial.transform import Rotation
+
+        return {"position": given["position"] + Rotation.from_quat(given["rotation"]).apply(centre)}
+
+
+def _alone(values):
+    """Values of frames, or those of the only one."""
+    return values[0] if len(values) == 1 else values
+
+
+def _volume(corners):
+    """The volume that triangles (T, 3, 3) enclose, below 0 if their fronts are inside."""
+    corners = corners - corners[0, 0]
+    return np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+
+
+def _with_area(points, triangles):
+    """Which triangles (T,) have an area, as those of a `Mesh` must have."""
+    corners = points[triangles]
+    sides = corners - np.roll(corners, 1, axis=1)
+    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    found = doubled > FLATTEST * np.einsum("tki,tki->tk", sides, sides).max(axis=1)
+    if not found.any():
+        raise ValueError("has no triangle with an area, must have one to be a collider")
+    return found
+
+
+def _centre(trimesh, points):
+    """The centre (3,) of the smallest sphere about points."""
+    try:
+        return np.asarray(trimesh.nsphere.minimum_nsphere(points)[0])
+    except Exception:  # points in a plane, of which the package that trimesh calls makes no cells
+        return 0.5 * (points.min(axis=0) + points.max(axis=0))
