@@ -6,7 +6,7 @@ from ..base.checks import whole
 from ..base.outputs import Output, check_apart
 from ..base.quiet import find_device
 from ..base.texts import assignments, json_text, options
-from .options import DEFAULT, add_scene, add_solver, add_values
+from .options import DEFAULT, add_scene, add_solver, add_values, values_of
 from .setup import named_scene, solver_setup
 from .terminal import Bar, Interrupted, aligned, check_writable, say
 
@@ -106,13 +106,7 @@ def _benchmarks(arguments, device):
     from ..lab.measurements import SceneRef, Setup
     from ..solvers import SOLVERS
 
-    given = {
-        "device": str(device),
-        "dtype": arguments.dtype,
-        "frames": arguments.frames,
-        "copies": arguments.copies,
-        "threads": arguments.threads,
-    }
+    given = {"device": str(device), **values_of(arguments, "dtype", "frames", "copies", "threads")}
     if arguments.scene is None:
         _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which must stand before it")
         return standard(**given)

@@ -9,7 +9,7 @@ from ..base.texts import assignments, json_text
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
-from .options import HelpFormatter, add_import, add_scene, solvers
+from .options import HelpFormatter, add_import, add_scene, solvers, values_of
 from .setup import named_scene
 from .terminal import DTYPES, add_dask, check_outputs, measuring
 
@@ -153,9 +153,8 @@ def work_precision(arguments):
     device = find_device(arguments.device)
     _source, values, _scene = named_scene(arguments)
     given = {name: values[name] for name in assignments(arguments.p)}
-    options = {
-        name: getattr(arguments, name) for name in ("solvers", "frames", "dtype") if getattr(arguments, name) is not None
-    }
+    chosen = values_of(arguments, "solvers", "frames", "dtype")
+    options = {name: value for name, value in chosen.items() if value is not None}
     if arguments.diagram == "physics" and (set(options) & {"solvers", "frames"}):
         raise ValueError("the diagram physics is of equilibria; --solvers and --frames are for the others")
     elif arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):

@@ -5,7 +5,7 @@ import sys
 
 from ..base.quiet import find_device
 from ..base.texts import assignments, fraction, json_text, milliseconds
-from .options import add_scene
+from .options import add_scene, values_of
 from .setup import named_scene
 from .terminal import Interrupted, Settings, add_dask, executing
 
@@ -63,12 +63,9 @@ def choice_for(arguments, device):
                 SceneRef(arguments.scene, assignments(arguments.p), getattr(arguments, "pins", None)),
                 tolerance,
                 budget,
-                arguments.solvers,
-                arguments.frames,
-                str(device),
-                arguments.dtype,
-                arguments.limit,
+                device=str(device),
                 progress=progress,
+                **values_of(arguments, "solvers", "frames", "dtype", "limit"),
                 **executor,
             )
     except KeyboardInterrupt:

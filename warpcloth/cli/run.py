@@ -8,6 +8,7 @@ from ..base.quiet import find_device
 from ..base.texts import json_text
 from .history_files import EPILOG as OF_HISTORY
 from .history_files import record_of, write_history
+from .options import values_of
 from .render import check_drawing, draw_film
 from .setup import EPILOG as OF_STEPS
 from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
@@ -36,15 +37,11 @@ def run(arguments):
         animation = simulate(
             scene if setup.model is None else Built(scene, setup.model),
             setup.checked,
-            output=arguments.output,
             device=device,
-            dtype=arguments.dtype,
             frames=frames,
-            single_file=arguments.single_file,
-            resume=arguments.resume,
             progress=progress,
-            threads=arguments.threads,
             record=record,
+            **values_of(arguments, "output", "dtype", "single_file", "resume", "threads"),
         )
         progress.close()
         status = animation.status
@@ -72,13 +69,9 @@ def run(arguments):
             "residual_unit": status.unit,
             **solver_facts(arguments, setup, scene.fps),
             "device": str(device),
-            "dtype": arguments.dtype,
-            "threads": arguments.threads,
             "file": arguments.output,
             "frames_folder": frames_folder_of(arguments),
-            "film": arguments.film,
-            "csv": arguments.csv,
-            "report": arguments.report,
+            **values_of(arguments, "dtype", "threads", "film", "csv", "report"),
         }
         print(json_text(facts) if arguments.json else _summary(facts, animation.inside))
         if status.ok:

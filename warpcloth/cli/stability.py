@@ -6,7 +6,7 @@ from ..base.checks import number, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, json_text, options
 from ..lab.axes import ACCURACY, AXES, FIXED, SEED
-from .options import add_scene
+from .options import add_scene, values_of
 from .terminal import DTYPES, check_outputs, measuring
 
 _COUNT = 9
@@ -92,9 +92,9 @@ def chart(arguments):
     check_outputs(arguments, [arguments.scene])
     device = find_device(arguments.device)
     survey = _survey(arguments)
-    for name in ("limit", "accuracy"):
-        number(name, getattr(arguments, name), **({"above": 0.0} if name == "limit" else {"least": 0.0}))
-    given = {"device": str(device), "dtype": arguments.dtype, "limit": arguments.limit, "accuracy": arguments.accuracy}
+    number("limit", arguments.limit, above=0.0)
+    number("accuracy", arguments.accuracy, least=0.0)
+    given = {"device": str(device), **values_of(arguments, "dtype", "limit", "accuracy")}
     tasks = survey.tasks(reference=arguments.accuracy > 0.0, **given)
     with measuring(arguments, device) as run:
         store = kept_store("stability", run.get("executor"))
