@@ -9,10 +9,10 @@ import pytest
 
 from warpcloth.chart.failures import plot_failure
 from warpcloth.cli import main
-from warpcloth.lab import cotangents, isometry, locking, rank
+from warpcloth.lab import cotangents, friction, isometry, locking, rank, tunnelling
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.failures import COLUMNS, FAILURES, failure_chart, write_csv
-from warpcloth.lab.panels import point
+from warpcloth.lab.panels import Map, point
 
 pytestmark = pytest.mark.host
 EPS = np.finfo(np.float64).eps
@@ -236,6 +236,102 @@ def test_what_a_line_keeps_of_a_turn(charts):
     assert not of(charts["rank"]["rows"], "turn", "in one place")[1].any()
 
 
+# --- 15. Tunnelling.
+
+
+def shares(solver, filtered, step, speeds, device):
+    """Of each speed the share of the vertices that pass the wall, or with the filter that are cut [%]; and the series."""
+    points = tunnelling.measure(solver, filtered, [step], speeds, device)
+    assert [(p["x"], p["y"]) for p in points] == [(step, v) for v in speeds]
+    return [p["value"] for p in points], {p["series"] for p in points}
+
+
+def test_lines_of_tunnelling():
+    """r = 1 mm, ω = √(98 100)/s: ωr = .3132 m/s; the logarithm down to r/1000 holds √(2(2 + ln 500))/2 = 2.027 times that."""
+    (h,) = {panel.laws["v h = r"](2e-3) for panel in tunnelling.PANELS}
+    assert h == 0.5 and {panel.laws["v h = 2r"](2e-3) for panel in tunnelling.PANELS} == {1.0}
+    by_key = {panel.key: panel.laws for panel in tunnelling.PANELS}
+    for key, most in (("explicit, energy alone", 0.31321), ("newton, energy alone", 0.63481), ("newton, filter", 24.525)):
+        assert list(by_key[key].values())[2](1e-3) == pytest.approx(most, rel=1e-4)
+    assert len(by_key["pbd, filter"]) == 2 and len(by_key) == 12
+
+
+def test_contact_alone_passes_where_theory_says(device):
+    """Speeds of 0.9 and more than 1 or 2 times each line; of a step of 1 ms the energy is what gives way."""
+    assert shares("explicit", False, 1e-3, [0.28, 0.35], device) == ([0.0, 100.0], {"stays outside", "passes"})
+    few, some = shares("newton", False, 0.02, [0.045, 0.11], device)[0]
+    assert (few, some) == (0.0, 100.0)
+    assert 0.0 < shares("newton", False, 0.02, [0.075], device)[0][0] < 100.0  # by the phase
+    points = tunnelling.measure("explicit", False, [0.02], [1.0, 2.0], device)
+    assert all(p["value"] is None and p["series"] == "refused" and "stable below 0.0062958 s" in p["reason"] for p in points)
+
+
+def test_the_filter_cuts_what_theory_says(device):
+    """Explicit steps where the energy gives way, implicit ones where the minimiser of a step is nearer than r/1000."""
+    assert shares("explicit", True, 1e-3, [0.28, 0.35, 50.0], device) == ([0.0, 100.0, 100.0], {"stays outside"})
+    # The prediction is beyond the wall by up to v h, as the phase is: all are cut only above the line.
+    none, some = shares("newton", True, 1e-3, [20.0, 60.0], device)[0]
+    assert none == 0.0 and some > 50.0
+
+
+@pytest.fixture(scope="module")
+def tunnels(device):
+    """The chart of two steps and two speeds."""
+    with ThreadPoolExecutor(1) as executor, pytest.MonkeyPatch.context() as patch:
+        for name, values in (("STEPS", [2e-3, 1 / 24]), ("SPEEDS", [1.0, 100.0]), ("PHASES", [0.0, 0.5])):
+            patch.setattr(tunnelling, name, np.array(values))
+        return failure_chart("tunnelling", device, store=Store(), executor=executor)
+
+
+def test_no_solver_lets_a_sheet_pass(tunnels):
+    """At 1 and 100 m/s, of steps to 1/24 s."""
+    kept = [row for row in tunnels["rows"] if row["panel"].endswith("filter")]
+    assert len(kept) == 32 and {row["series"] for row in kept} == {"stays outside", "refused"}
+    assert {row["panel"] for row in kept if row["series"] == "refused"} == {"explicit, filter"}
+
+
+# --- 16. Friction.
+
+
+def test_laws_of_friction():
+    panels = {panel.key: panel for panel in friction.PANELS}
+    (slides,) = panels["acceleration"].laws.values()
+    assert [slides(30.0), slides(16.0)] == [pytest.approx(2.35629, rel=1e-5), 0.0]
+    anchored, smooth, huber = panels["creep"].laws.values()
+    assert [anchored(0.9), smooth(0.9), huber(0.9)] == pytest.approx([0.0, 0.68377, 0.9], rel=1e-4)  # [mm/s]
+    assert panels["newton"].laws["tan θ = μ"](16.699) == pytest.approx(0.3, rel=1e-4)
+    assert {panel.key for panel in friction.PANELS if isinstance(panel, Map)} == set(friction.TAKERS)
+    assert set(friction.TAKERS) == set(friction.SETTINGS)
+
+
+def test_kinds_of_motion():
+    """As IPC's smoothing creeps at tan θ = 0.9 μ; a swing of 1e-5 m/s is none; a speed gained within a third is a slide."""
+    assert friction.kind(0.684e-3, 0.0) == "creeps" and friction.kind(-0.684e-3, 0.0) == "creeps"
+    assert friction.kind(1e-5, 0.0) == "sticks" and friction.kind(1e-5, -1e-2) == "sticks"
+    assert friction.kind(0.01, 0.028) == "slides"
+
+
+slow = pytest.mark.slow
+
+
+@pytest.mark.parametrize("solver", [pytest.param(s, marks=[slow] * (s not in ("explicit", "xpbd"))) for s in friction.TAKERS])
+def test_sheets_stick_below_the_line_and_slide_above_it(solver, device):
+    """tan θ = 0.9 and 1.1 μ, and 30°. What iterations leave of a step is 1e-6 of gravity, or less."""
+    slopes = [*np.degrees(np.arctan([0.27, 0.33])).tolist(), 30.0]
+    points = friction.mapped(solver, 0.3, device, slopes)
+    assert [p["series"] for p in points[:3]] == ["sticks", "slides", "slides"]
+    x, a = of(points, "acceleration", solver)
+    law = [friction.acceleration(slope) for slope in x]
+    assert np.abs(a - law).max() < 1e-5 * 9.81 and law[0] == 0.0
+    ((_, creep),) = of(friction.sticking(solver, [0.9], device), "creep", solver).T
+    assert abs(creep) < (1e-2 if solver == "explicit" else 1e-6)  # [mm/s]; explicit steps swing
+
+
+def test_few_iterations_mistake_friction(device):
+    _x, found = of(friction.iterated("admm", [1, 300], device), "iterations", "admm")
+    assert abs(found[0] - 0.3) > 0.1 and found[1] == pytest.approx(0.3, abs=1e-3)
+
+
 # --- Tables, pictures, command.
 
 
@@ -272,6 +368,30 @@ def test_points_and_laws_are_drawn(name, charts, tmp_path, monkeypatch):
                 assert row["value"] in lines[row["series"]].get_ydata(orig=True)
         for series, law in panel.follows.items():
             assert lines[series].get_linewidth() == 0.0 and panel.laws[law](1.0) is not None
+
+
+def test_maps_are_drawn(tunnels, tmp_path, monkeypatch):
+    """A cell for each point, its lines, a cross where a sheet passes, and each key once."""
+    from matplotlib.figure import Figure
+
+    kept, saving = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (kept.append(self), saving(self, *a, **k)))
+    row = next(row for row in tunnels["rows"] if row["panel"] == "newton, filter")
+    passing = [{**each, "series": "passes"} if each is row else each for each in tunnels["rows"]]
+    plot_failure(tmp_path / "a.svg", {**tunnels, "rows": passing})
+    (figure,) = kept
+    for axes, panel in zip(figure.axes, tunnelling.PANELS, strict=False):
+        (cells,) = axes.collections
+        shown = [r["value"] for r in tunnels["rows"] if r["panel"] == panel.key]
+        assert cells.get_array().compressed().tolist() == sorted(v for v in shown if v is not None) or len(shown) == 4
+        assert len(axes.lines) == len(panel.laws) + (panel.key == "newton, filter")
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert words == [*tunnelling.LAWS, "a vertex passes the wall", "refused"]
+    of_friction = [point(s, k, x, 0.0, y=0.3) for s in friction.TAKERS for x, k in enumerate(friction.KINDS)]
+    of_friction += [point(panel.key, "xpbd", 0.5, 0.0) for panel in friction.PANELS if not isinstance(panel, Map)]
+    plot_failure(tmp_path / "b.svg", {"failure": "friction", "title": friction.TITLE, "rows": of_friction})
+    assert kept[1].axes[0].collections[0].get_array().tolist() == [[0.0, 1.0, 2.0]]
+    assert [text.get_text() for text in kept[1].legends[0].get_texts()] == ["tan θ = μ", *friction.KINDS]
 
 
 def test_a_point_without_a_value_is_left_out_and_said(charts, tmp_path, capsys, monkeypatch):

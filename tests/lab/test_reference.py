@@ -130,6 +130,24 @@ def test_errors_fall_with_the_order_of_the_method(scene, method, shared):
     assert np.abs(np.log2(found[0] / found[1]) - order).max() < 0.15
 
 
+def test_contact_has_a_reference(shared):
+    """A sheet that slides, once its anchors are stretched, by g(sin 30° − 0.3 cos 30°); others meet it, by first order."""
+    scene = SceneRef("incline", {"n": 3})
+    exact = reference(scene, 8, tolerance=1e-4)
+    down = np.array([np.sqrt(0.75), -0.5, 0.0])
+    along = ((exact.points - exact.points[0]) @ down).mean(axis=1)
+    assert exact.method == "Newton" and np.diff(along[3:], 2) * 60.0**2 == pytest.approx(2.35629, rel=1e-3)
+    for solver, options in (("explicit", {}), ("xpbd", {"integrator": "bdf2", "iterations": 20})):
+        results = [
+            measure(
+                asdict(scene), {"solver": solver, "options": {"substeps": s, **options}}, reference=exact.path, dtype="float64"
+            )
+            for s in (20, 80)
+        ]
+        coarse, fine = (result["error"] for result in results)
+        assert fine < 1e-3 and fine < 0.5 * coarse + exact.error
+
+
 @wp.func
 def spring_gradient_by_a_hundredth_too_large(y: Any, rest: Any):
     return y.dtype(1.01) * wp.static(SPRING.gradient)(y, rest)

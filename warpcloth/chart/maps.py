@@ -66,7 +66,7 @@ def plot_maps(path, survey, cells, accuracy=None):
     coordinates = [_coordinates(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
     shown = {}
     for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
-        axes.pcolormesh(*map(_edges, coordinates), _colours(rows), edgecolors="white", linewidth=0.4)
+        axes.pcolormesh(*map(edges, coordinates), _colours(rows), edgecolors="white", linewidth=0.4)
         _hatch(axes, coordinates, rows)
         for name, (dashes, _) in _STYLES.items():
             style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
@@ -107,7 +107,7 @@ def _ticks(name, values, at):
     return at[few], [f"{value:.3g}" for value in values[few]]
 
 
-def _edges(at):
+def edges(at):
     """Ends of cells about coordinates (n,), (n+1,)."""
     if len(at) == 1:
         return np.array([at[0] - 0.5, at[0] + 0.5])
@@ -131,7 +131,7 @@ def _hatch(axes, coordinates, rows):
     """Hatches the cells that are stable and inaccurate, in the colours of both."""
     from matplotlib.patches import Rectangle
 
-    across, up = map(_edges, coordinates)
+    across, up = map(edges, coordinates)
     for j, row in enumerate(rows):
         for i, cell in enumerate(row):
             if cell["verdict"] == "unsure":

@@ -1,17 +1,19 @@
-"""Panels of measured points with laws as lines, of one shape for all charts of failures."""
+"""Panels of measured points with laws as lines, for all charts of failures."""
 
 import math
 
 import numpy as np
 
+from ..lab.panels import Map
 from ..picture.figures import GREY, PICTURES, check_path, save
+from .panel_maps import add_keys, draw_map
 
 _MARKS = "os^DvPX*"
 _COLOURS = ("black", "tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purple", "tab:cyan", "tab:brown")
 
 
 def plot_panels(path, panels, rows, title):
-    """Draws points as markers and laws as lines.
+    """Draws points as markers, or as cells of maps, and laws as lines.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -27,15 +29,23 @@ def plot_panels(path, panels, rows, title):
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 
-    across = 2 if len(panels) == 4 else min(len(panels), 3)
+    across = 4 if len(panels) > 9 else 2 if len(panels) == 4 else min(len(panels), 3)
     down = math.ceil(len(panels) / across)
-    figure = Figure(figsize=(5.0 * across, 4.1 * down + 0.3), layout="constrained")
+    width, height = (3.8, 3.2) if any(isinstance(panel, Map) for panel in panels) else (5.0, 4.1)
+    figure = Figure(figsize=(width * across, height * down + 0.3), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
-    grid = figure.subplots(down, across, squeeze=False).ravel()
+    grid, maps, lines = figure.subplots(down, across, squeeze=False).ravel(), [], {}
     for axes, panel in zip(grid, panels, strict=False):
-        _draw(axes, panel, [row for row in rows if row["panel"] == panel.key])
+        of = [row for row in rows if row["panel"] == panel.key]
+        if isinstance(panel, Map):
+            maps.append((axes, panel, draw_map(axes, panel, of, lines)))
+        else:
+            _draw(axes, panel, of)
+        _label(axes, panel)
     for axes in grid[len(panels) :]:
         axes.remove()
+    if maps:
+        add_keys(figure, maps, lines)
     figure.suptitle(title, fontsize=10, color=GREY)
     save(figure, path)
 
@@ -64,9 +74,6 @@ def _draw(axes, panel, rows):
         axes.annotate(label, (x, 0.4), xycoords=("data", "axes fraction"), bbox=box, zorder=1, **style)
     if panel.limits:
         axes.set_ylim(panel.limits)
-    axes.set_title(panel.title, fontsize=9, loc="left", color=GREY)
-    axes.set_xlabel(panel.x, color=GREY, fontsize=9)
-    axes.set_ylabel(panel.y, color=GREY, fontsize=9)
     for axis, scale in zip((axes.xaxis, axes.yaxis), panel.scales, strict=True):
         low, high = axis.get_view_interval()
         if scale == "log" and high < 100.0 * low:  # its numbers, as there may be no power of ten
@@ -74,11 +81,17 @@ def _draw(axes, panel, rows):
             axis.set_minor_formatter("{x:g}")
             if high > 10.0 * low:
                 axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))  # more labels would overlap
-    axes.tick_params(which="both", colors=GREY, labelsize=8)
     axes.grid(True, which="major", linewidth=0.3, color="0.85")
+    axes.legend(fontsize=7, labelcolor=GREY, framealpha=0.85, edgecolor="none")
+
+
+def _label(axes, panel):
+    axes.set_title(panel.title, fontsize=9, loc="left", color=GREY)
+    axes.set_xlabel(panel.x, color=GREY, fontsize=9)
+    axes.set_ylabel(panel.y, color=GREY, fontsize=9)
+    axes.tick_params(which="both", colors=GREY, labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("0.7")
-    axes.legend(fontsize=7, labelcolor=GREY, framealpha=0.85, edgecolor="none")
 
 
 def _between(low, high, scale):

@@ -42,6 +42,8 @@ Failures:
   slivers      gradient and largest explicit step of thin triangles and of hinges folded flat
   cotangents   deformation with negative cotangent weights
   rank         rotations fitted to points in a plane, on a line or at one position
+  tunnelling   fast cloth against a thin collider, with and without the filter of contact
+  friction     cloth on slopes: where it sticks, creeps and slides
 In the chart, points are measured and lines are closed forms. Measurements are stored and reused.
 
   warpcloth chart failure slivers -o slivers.png --csv slivers.csv
@@ -104,7 +106,7 @@ def _add_failure(charts):
         charts,
         "failure",
         failure,
-        "Chart known failures of energies, edge weights and fitted rotations, and what theory predicts.",
+        "Chart known failures of energies, edge weights, fitted rotations and contact, and what theory predicts.",
         FAILURE_EPILOG,
     )
     sub.add_argument("failure", metavar="FAILURE", choices=names, help=f"the failure: one of {', '.join(names)}")
@@ -137,9 +139,11 @@ def _failure_summary(found):
         scales = [each if each > 1e-9 * size else size or 1.0 for each in (abs(row["expected"]) for row in followed)]
         apart = [abs(row["value"] - row["expected"]) / scale for row, scale in zip(followed, scales, strict=True)]
         met = f", {len(followed)} of them off their law by {max(apart):.1e} at most" if followed else ""
+        if "value" in panel:  # a map
+            met = "".join(f", {count} {series}" for series, count in Counter(row["series"] for row in points).items())
         lines.append(f"  {key:<13} {len(points)} points{met}: {panel['title']}")
     lines += [f"  no value      {row['series']}, {row['x']:.3g}: {row['reason']}" for row in found["rows"] if row["reason"]]
-    return "\n".join(lines)
+    return "\n".join(dict.fromkeys(lines))
 
 
 def work_precision(arguments):

@@ -8,6 +8,8 @@ from ..analysis.distances import surface_distances
 from ..base.checks import number, whole
 from ..run.simulate import simulate
 
+# Kinds of trials that leave something out.
+_LEFT_OUT = ("term", "collider", "friction", "all")
 # A cost that the whole scene itself changed by so much between its first and its last run says nothing.
 _STEADY = 0.25
 _FRAMES = 7  # at which surfaces of other resolutions are compared
@@ -18,8 +20,9 @@ class Trial:
     """A run of the scene with one thing changed, against the scene as it is.
 
     Attributes:
-        kind: "term", "terms" (all that do not matter by themselves), "precision", "step" or "resolution".
-        name: What was changed, such as "without QuadraticBending" or "n=64".
+        kind: "term", "collider" or "friction" of a collider, which are left out, "all" that do not matter by themselves,
+            "precision", "step" or "resolution".
+        name: The change, such as "without QuadraticBending", "without friction on ball" or "n=64".
         change: RMS distance of the results over vertices and frames, over the longest side of the cloth; of another resolution
             between the surfaces, both ways. NaN where there is no result.
         cost: Time of a frame over that of the scene as it is.
@@ -73,8 +76,8 @@ class Advice:
                 if step.matters
                 else f"half the step: {step.reason}"
             )
-        needless = [trial for trial in self.trials if trial.kind == "term" and trial.matters is False]
-        together = next((trial for trial in self.trials if trial.kind == "terms"), None)
+        needless = [trial for trial in self.trials if trial.kind in _LEFT_OUT[:-1] and trial.matters is False]
+        together = next((trial for trial in self.trials if trial.kind == "all"), None)
         redundant = together is not None and together.matters is not False
         for trial in needless:
             saved = f", and a frame takes {trial.cost:.2f} times as long" if self.steady else ""
@@ -102,7 +105,9 @@ class Advice:
 
 
 def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device="cpu", dtype="float32", progress=None):
-    """Leaves out each term of a scene in turn, and changes precision, step and resolution, over a short run.
+    """Leaves out each term, each collider and its friction in turn, and changes precision, step and resolution.
+
+    Each change is compared to the scene as it is over a short run.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
@@ -134,13 +139,9 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
     size = float(np.ptp(scene.mesh.points, axis=0).max())
     other = "float64" if dtype == "float32" else "float32"
     halved = replace(solver, dt=None, substeps=2 * solver.per_frame(scene.fps))
-    names = _names(scene.terms)
+    parts = _parts(scene)
     plans = [
-        *(
-            ("term", f"without {name}", {"changed": _without(scene, [term])})
-            for name, term in zip(names, scene.terms, strict=True)
-            if len(scene.terms) > 1
-        ),
+        *((kind, f"without {name}", {"changed": _without(scene, [(kind, k)])}) for (kind, k), name in parts.items()),
         ("precision", other, {"changed": scene, "dtype": other}),
         ("step", f"substeps={halved.substeps}", {"changed": scene, "solver": halved}),
         *(("resolution", name, {"changed": changed}) for name, changed in (resolutions or {}).items()),
@@ -150,25 +151,43 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         trials.append(_trial(kind, name, options, run, base, first, scene, size, tolerance, device))
         if progress is not None:
             progress(done, len(plans))
-        if done == len(scene.terms) > 1:
-            # What one of two terms does by itself neither seems to do.
-            needless = [k for k, trial in enumerate(trials) if trial.matters is False]
+        if done == len(parts):
+            # Of two parts that stand in for one another each by itself seems to do nothing.
+            needless = [part for part, trial in zip(parts, trials, strict=True) if trial.matters is False]
             if len(needless) > 1:
-                without = {"changed": _without(scene, [scene.terms[k] for k in needless])}
-                name = "without " + " and ".join(names[k] for k in needless)
-                trials.append(_trial("terms", name, without, run, base, first, scene, size, tolerance, device))
+                without = {"changed": _without(scene, needless)}
+                name = "without " + " and ".join(parts[part] for part in needless)
+                trials.append(_trial("all", name, without, run, base, first, scene, size, tolerance, device))
     return Advice(trials, frames, scene.frames, (first, run(scene)[1]), tolerance)
 
 
-def _names(terms):
-    """Labels of terms, numbered where several have one."""
-    labels = [term.label for term in terms]
+def _parts(scene):
+    """Names of all that can be left out, by kind and index among the terms or colliders; one term alone cannot."""
+    terms, colliders = _names(scene.terms), _names(scene.colliders)
+    found = {("term", k): name for k, name in enumerate(terms) if len(terms) > 1}
+    for k, (collider, name) in enumerate(zip(scene.colliders, colliders, strict=True)):
+        found["collider", k] = f"the collider {name}"
+        if collider.friction:
+            found["friction", k] = f"friction on {name}"
+    return found
+
+
+def _names(declared):
+    """Labels of terms or colliders, numbered where several have one."""
+    labels = [each.label for each in declared]
     counted = [(label, labels[:k].count(label) + 1, labels.count(label)) for k, label in enumerate(labels)]
     return [f"{label} {k} of {count}" if count > 1 else label for label, k, count in counted]
 
 
-def _without(scene, terms):
-    return replace(scene, terms=[other for other in scene.terms if not any(other is term for term in terms)])
+def _without(scene, parts):
+    """The scene without these, each a kind and an index, see :func:`_parts`."""
+    terms = [term for k, term in enumerate(scene.terms) if ("term", k) not in parts]
+    colliders = [
+        replace(collider, friction=0.0) if ("friction", k) in parts else collider
+        for k, collider in enumerate(scene.colliders)
+        if ("collider", k) not in parts
+    ]
+    return replace(scene, terms=terms, colliders=colliders, contact=scene.contact if colliders else None)
 
 
 def _trial(kind, name, options, run, base, first, scene, size, tolerance, device):
@@ -179,9 +198,9 @@ def _trial(kind, name, options, run, base, first, scene, size, tolerance, device
         return Trial(kind, name, np.nan, np.nan, None, str(error), finer)
     cost = milliseconds / first
     if not found.status.ok:
-        if not kind.startswith("term"):
+        if kind not in _LEFT_OUT:
             return Trial(kind, name, np.nan, cost, None, found.status.message, finer)
-        # Of a term that holds the cloth together: it matters, by more than can be said.
+        # Such as a term that holds the cloth together: it matters, by more than can be said.
         return Trial(kind, name, np.inf, cost, True, found.status.message)
     if kind == "resolution":
         if not (len(scene.mesh.triangles) and len(options["changed"].mesh.triangles)):

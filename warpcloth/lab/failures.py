@@ -1,17 +1,26 @@
 """Where terms, weights and fits fail, each failure as measured points beside the laws that explain them.
 
 A chart is a module with a `TITLE`, `PANELS`, what is drawn, and `tasks`, what measures it: each task returns points,
-dictionaries with ``panel``, ``series``, ``x``, ``value`` (None where there is none) and ``reason``.
+dictionaries with ``panel``, ``series``, ``x``, ``y`` (of maps), ``value`` (None where there is none) and ``reason``.
 """
 
 from ..base.checks import choice
 from ..base.outputs import write_table
-from . import cotangents, isometry, locking, rank, slivers
+from . import cotangents, friction, isometry, locking, rank, slivers, tunnelling
 from .campaign import collect
 from .machine import machine
+from .panels import Map
 
-FAILURES = {"locking": locking, "isometry": isometry, "slivers": slivers, "cotangents": cotangents, "rank": rank}
-COLUMNS = ("panel", "series", "x", "value", "law", "expected", "reason", "machine")
+FAILURES = {
+    "locking": locking,
+    "isometry": isometry,
+    "slivers": slivers,
+    "cotangents": cotangents,
+    "rank": rank,
+    "tunnelling": tunnelling,
+    "friction": friction,
+}
+COLUMNS = ("panel", "series", "x", "y", "value", "law", "expected", "reason", "machine")
 
 
 def failure_chart(name, device="cpu", **run):
@@ -39,8 +48,13 @@ def failure_chart(name, device="cpu", **run):
             expected = float(panel.laws[law](point["x"])) if law else None
             rows.append({**point, "law": law, "expected": expected, "machine": where})
     facts = {"failure": name, "title": FAILURES[name].TITLE, "device": str(device), "seed": 0, "machine": machine(device)}
-    shown = {key: {"title": panel.title, "x": panel.x, "y": panel.y} for key, panel in panels.items()}
+    shown = {key: _shown(panel) for key, panel in panels.items()}
     return {**facts, "panels": shown, "rows": rows}
+
+
+def _shown(panel):
+    facts = {"title": panel.title, "x": panel.x, "y": panel.y}
+    return facts | {"value": panel.value} if isinstance(panel, Map) else facts
 
 
 def write_csv(path, found):

@@ -31,7 +31,24 @@ class Panel:
     limits: tuple[float, float] | None = None
 
 
-def point(panel, series, x, value, reason=""):
-    """A measured point as JSON; ``value`` None where there is none, and then the reason."""
-    value = None if value is None else float(value)
-    return {"panel": panel, "series": series, "x": float(x), "value": value, "reason": reason}
+@dataclass(frozen=True)
+class Map(Panel):
+    """A panel of cells over x and y, coloured by value, or by series; laws are lines, y as functions of x.
+
+    Attributes:
+        value: Label of the value, with its unit.
+        colours: Name of the colours of values.
+        kinds: The series, where these are what is coloured.
+        crossed: The series whose cells are crossed out, or None.
+    """
+
+    value: str = ""
+    colours: str = "Blues"
+    kinds: tuple[str, ...] = ()
+    crossed: str | None = None
+
+
+def point(panel, series, x, value, reason="", y=None):
+    """A measured point as JSON; ``value`` None where there is none, and then the reason; ``y`` in a :class:`Map`."""
+    value, y = (None if each is None else float(each) for each in (value, y))
+    return {"panel": panel, "series": series, "x": float(x), "y": y, "value": value, "reason": reason}

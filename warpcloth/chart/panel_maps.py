@@ -1,0 +1,86 @@
+"""Maps among the panels of charts of failures: cells coloured by value or by series, with laws as lines over them."""
+
+import numpy as np
+
+from ..picture.figures import GREY
+from .maps import edges
+
+_DASHES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
+# sRGB of kinds, in their order; they differ in lightness too, for those who do not see red.
+_KINDS = ((0.66, 0.83, 0.93), (0.93, 0.62, 0.20), (0.42, 0.02, 0.11))
+_LETTERS = 8  # [pt]
+_REFUSED = {"facecolor": "white", "edgecolor": "0.8", "hatch": "////"}
+
+
+def draw_map(axes, panel, rows, lines):
+    """Draws the cells and laws of a :class:`warpcloth.lab.panels.Map`.
+
+    Args:
+        axes: Of matplotlib.
+        panel: The map.
+        rows: Its points.
+        lines: Line styles by the label of the law, shared by all maps of a figure.
+
+    Returns:
+        The cells, for a bar of their colours; None if they are coloured by series.
+    """
+    xs, ys = (sorted({row[name] for row in rows}) for name in "xy")
+    values, crossed = np.full((len(ys), len(xs)), np.nan), []
+    for row in rows:
+        shown = panel.kinds.index(row["series"]) if panel.kinds else row["value"]
+        values[ys.index(row["y"]), xs.index(row["x"])] = np.nan if shown is None else shown
+        crossed += [(row["x"], row["y"])] if row["series"] == panel.crossed else []
+    corners = [_edges(np.array(each), scale) for each, scale in zip((xs, ys), panel.scales, strict=True)]
+    axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
+    axes.patch.set(**_REFUSED)
+    style = {"edgecolors": "white", "linewidth": 0.3}
+    if panel.kinds:
+        from matplotlib.colors import ListedColormap
+
+        style |= {"cmap": ListedColormap(_KINDS[: len(panel.kinds)]), "vmin": -0.5, "vmax": len(panel.kinds) - 0.5}
+    else:
+        style |= {"cmap": panel.colours, "vmin": 0.0, "vmax": 100.0}
+    cells = axes.pcolormesh(*corners, np.ma.masked_invalid(values), **style)
+    x = np.geomspace(xs[0], xs[-1], 200) if panel.scales[0] == "log" else np.linspace(xs[0], xs[-1], 200)
+    for label, law in panel.laws.items():
+        dashes = lines.setdefault(label, _DASHES[len(lines) % len(_DASHES)])
+        axes.plot(x, [law(value) for value in x], linestyle=dashes, color="black", linewidth=1.2)
+    if crossed:
+        axes.plot(*np.array(crossed).T, "x", color="tab:red", markersize=5.0)
+    axes.set_xlim(corners[0][0], corners[0][-1])
+    axes.set_ylim(corners[1][0], corners[1][-1])
+    return None if panel.kinds else cells
+
+
+def _edges(values, scale):
+    return 10.0 ** edges(np.log10(values)) if scale == "log" else edges(values)
+
+
+def add_keys(figure, maps, lines):
+    """Adds the bars of colours to a figure, one for all maps alike, and a legend of the lines, kinds and crosses of all.
+
+    Args:
+        figure: Of matplotlib.
+        maps: (axes, panel, cells) of each map, cells as :func:`draw_map` returns them.
+        lines: Line styles by label.
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    bars = {}
+    for axes, panel, cells in maps:
+        if cells is not None:
+            bars.setdefault((panel.value, panel.colours), (cells, []))[1].append(axes)
+    for (label, _colours), (cells, group) in bars.items():
+        bar = figure.colorbar(cells, ax=group, pad=0.01, aspect=8.0 * len(group) ** 0.5)
+        bar.set_label(label, color=GREY, fontsize=_LETTERS)
+        bar.ax.tick_params(colors=GREY, labelsize=_LETTERS)
+        bar.outline.set_visible(False)
+    keys = [Line2D([], [], color="black", linestyle=dashes, label=label) for label, dashes in lines.items()]
+    kinds = dict.fromkeys(kind for _, panel, _ in maps for kind in panel.kinds)
+    keys += [Patch(color=colour, label=kind) for kind, colour in zip(kinds, _KINDS, strict=False)]
+    if any(panel.crossed for _, panel, _ in maps):
+        keys.append(Line2D([], [], color="tab:red", marker="x", linestyle="", label="a vertex passes the wall"))
+    keys += [Patch(**_REFUSED, label="refused")] * any(cells is not None for *_, cells in maps)
+    style = {"frameon": False, "fontsize": _LETTERS, "labelcolor": GREY, "ncols": min(len(keys), 8)}
+    figure.legend(handles=keys, loc="outside lower center", **style)

@@ -1,0 +1,150 @@
+"""Sheets that fly against a thin wall, over speed and step, with the filter of contact and by the energy of contact alone.
+
+A test for contact at the end of each step knows nothing of what lies between. A vertex moves v h in a step and touches a wall
+within the contact distance r on either side: it can pass unnoticed from v h = 2r, and from v h = r it can end beyond the wall,
+where the energy pushes it further on. The energy also gives way where it is less than that of the motion. That of explicit
+steps is ½kr² for each area, that of the others kτ²(2 + ln τ/δ), with τ = r/2 and δ = r/1000, below which it is a parabola.
+
+Implicit steps that see the wall ahead need the filter where their minimiser is nearer than δ. With the prediction v h beyond
+the wall and the pressure kτ²/d it is at d = kτ²h/(ρv).
+"""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from ..base.turns import in_turn
+from ..kernels.term import Term
+from ..kernels.terms.contact import CONTACT, FLOOR
+from ..mesh.mesh import Mesh
+from ..scene.colliders import Box, Contact
+from ..scene.scene import Scene
+from ..solvers import SOLVERS
+from ..terms import Spring
+from ..terms.contact import VertexContact
+from .measurements import task
+from .panels import Map, point
+
+TITLE = "15. Fast cloth and thin colliders: contact alone lets cloth pass, the filter does not"
+DISTANCE, DENSITY = 1e-3, 0.15  # r [m], areal density ρ [kg/m²]
+STIFFNESS = 10.0 * 9.81 * DENSITY / DISTANCE  # the default of a contact, under gravity [Pa/m]
+RATE = np.sqrt(STIFFNESS / DENSITY)  # ω [1/s]
+THICKNESS = 1e-6  # of the wall [m]
+STEPS = np.geomspace(1e-4, 1.0 / 24.0, 10)  # [s]
+SPEEDS = np.geomspace(0.1, 100.0, 13)  # [m/s]
+PHASES = np.arange(6) / 6.0  # of a step, by which sheets start farther away
+# Solvers that are shown without the filter too; the others minimise the same energy as some of these.
+ALONE = ("explicit", "newton", "xpbd", "pbd")
+
+_QUADRATIC, _LOGARITHM, _DEEP = "ρv² = kr²", "½ρv² = ¼kr²(2 + ln r/2δ)", "v = kr²h/(4ρδ)"
+LAWS = {
+    "v h = r": lambda h: DISTANCE / h,
+    "v h = 2r": lambda h: 2.0 * DISTANCE / h,
+    _QUADRATIC: lambda h: DISTANCE * RATE,
+    _LOGARITHM: lambda h: 0.5 * DISTANCE * RATE * np.sqrt(2.0 * (2.0 + np.log(0.5 / FLOOR))),
+    _DEEP: lambda h: 0.25 * RATE**2 * DISTANCE * h / FLOOR,
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PenaltyContact(VertexContact):
+    """Contact with the energy of explicit steps, ½k(r − d)² at all depths, as a term."""
+
+    term: ClassVar[Term] = CONTACT.bounded
+
+
+def _panel(solver, filtered):
+    names = ["v h = r", "v h = 2r"]
+    if solver == "explicit":
+        names.append(_QUADRATIC)
+    elif "pbd" not in solver or solver == "xpbd":  # the stiffness of the others is that of their sweeps
+        names.append(_DEEP if filtered else _LOGARITHM)
+    return Map(
+        f"{solver}, {'filter' if filtered else 'energy alone'}",
+        f"{solver}, {'with the filter' if filtered else 'energy of contact alone'}",
+        "step h [s]",
+        "speed v [m/s]",
+        scales=("log", "log"),
+        laws={name: LAWS[name] for name in names},
+        value="vertices that were cut short [%]" if filtered else "vertices that pass the wall [%]",
+        colours="Blues" if filtered else "Reds",
+        crossed="passes" if filtered else None,
+    )
+
+
+PANELS = (*(_panel(solver, False) for solver in ALONE), *(_panel(solver, True) for solver in SOLVERS))
+
+
+def tasks(device):
+    """One for each panel."""
+    return [
+        task(measure, solver=solver, filtered=filtered, steps=STEPS.tolist(), speeds=SPEEDS.tolist(), device=device)
+        for filtered, solvers in ((False, ALONE), (True, SOLVERS))
+        for solver in solvers
+    ]
+
+
+def measure(solver, filtered, steps, speeds, device):
+    """Points of one panel: of sheets of all phases the share of vertices that were cut, or that passed the wall [%]."""
+    panel, found = _panel(solver, filtered).key, []
+    for h in steps:
+        try:
+            passed, cut = flights(solver, filtered, h, speeds, device)
+        except ValueError as error:
+            found += [point(panel, "refused", h, None, str(error), y=v) for v in speeds]
+            continue
+        for v, through, short in zip(speeds, passed, cut, strict=True):
+            series = "passes" if through > 0.0 else "stays outside"
+            found.append(point(panel, series, h, 100.0 * (short if filtered else through), y=v))
+    return found
+
+
+def sheet(h, filtered, solver):
+    """A scene of nine vertices and a wall at y = 0, with steps of h as frames; without the filter contact is a term."""
+    grid = Mesh.grid(3, 3, size=0.1)
+    wall = Box(size=(10.0, THICKNESS, 10.0), name="wall")
+    scene = Scene(
+        Mesh(grid.points + np.array([0.0, 2.0 * DISTANCE, 0.0]), grid.triangles),
+        density=DENSITY,
+        terms=[Spring(stiffness=0.1)],
+        gravity=(0.0, 0.0, 0.0),
+        fps=1.0 / h,
+        duration=h,
+        colliders=[wall],
+        contact=Contact(distance=DISTANCE, stiffness=STIFFNESS),
+    )
+    if filtered:
+        return scene
+    (declared,) = scene.contact_terms
+    kind = PenaltyContact if solver == "explicit" else VertexContact
+    contact = kind(**vars(declared) | {"collider": None})
+    return replace(scene, terms=[*scene.terms, contact], colliders=(), contact=None)
+
+
+@in_turn
+def flights(solver, filtered, h, speeds, device):
+    """Shares of the vertices that ever end a step beyond the wall or inside, and that were cut short, for each speed, (S,).
+
+    Sheets start r and a part of a step above the wall. They fly until the slowest has passed it, or turned round.
+
+    Raises:
+        ValueError: The solver refuses the step.
+    """
+    scene = sheet(h, filtered, solver)
+    velocity, phase = (each.ravel() for each in np.meshgrid(speeds, PHASES, indexing="ij"))
+    positions = np.repeat(scene.mesh.points[None], len(velocity), axis=0)
+    positions[:, :, 1] = (DISTANCE + 0.5 * THICKNESS + phase * velocity * h)[:, None]
+    velocities = np.zeros_like(positions)
+    velocities[:, :, 1] = -velocity[:, None]
+    vary = {"positions": positions, "velocities": velocities}
+    model = scene.build(device=device, dtype="float64", copies=len(velocity), vary=vary)
+    stepper = SOLVERS[solver](substeps=1).bind(model)
+    passed = np.zeros(positions.shape[:2], dtype=bool)
+    count = int(4.0 * DISTANCE / (min(speeds) * h) + 4.0 / (RATE * h)) + 8
+    for _ in range(count):
+        stepper.step()
+        passed |= stepper.state.x.numpy().reshape(positions.shape)[:, :, 1] < 0.5 * THICKNESS
+    # A sheet is flat, so that all of its vertices are cut in the same steps.
+    cut = np.minimum(stepper.cut * count, 1.0)
+    return passed.mean(axis=1).reshape(len(speeds), -1).mean(axis=1), cut.reshape(len(speeds), -1).mean(axis=1)
