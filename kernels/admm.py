@@ -58,7 +58,8 @@ def local_minimiser(term: Term, dtype):
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     flat = wp.types.vector(3 * term.rows, dtype)
     size = wp.constant(3 * term.rows)
-    project, prox, u, gradient, hessian = term.project, term.prox, term.energy, term.gradient, term.hessian
+    project, prox, prox_from = term.project, term.prox, term.prox_from
+    u, gradient, hessian = term.energy, term.gradient, term.hessian
 
     @wp.func
     def closed(v: y_type, z: y_type, rest: rest_type, r: dtype, steps: int):
@@ -66,7 +67,11 @@ def local_minimiser(term: Term, dtype):
 
     @wp.func
     def by_prox(v: y_type, z: y_type, rest: rest_type, r: dtype, steps: int):
-        return prox(v, rest, dtype(1.0) / r)
+        if wp.static(prox_from is None):
+            p = prox(v, rest, dtype(1.0) / r)
+        else:
+            p = prox_from(z, v, rest, dtype(1.0) / r)
+        return p
 
     @wp.func
     def value(v: y_type, z: y_type, rest: rest_type, r: dtype):

@@ -10,7 +10,9 @@ with G the weights of y and W the inverse masses, or on the scalar constraint of
 
 or by the prox of a term that gives one, with s no less than any eigenvalue of G W Gᵀ (equal to it for M = 1),
 
-    Δλ = (prox(y − s λ, s/α̃) − y)/s,   prox(v, c) = argmin u(y) + ‖y − v‖²/2c.
+    Δλ = (prox(y − s λ, s/α̃) − y)/s,   prox(v, c) = argmin u(y) + ‖y − v‖²/2c,
+
+or in its place ``prox_from``, where the term has that.
 
 XPBD adds Δλ up in λ; for PBD λ is 0. With an infinite stiffness α̃ = 0 and, for springs, this is the projection of Müller et al.
 2006 (*Position based dynamics*). A stencil of pins alone has nothing to move and gives 0, and so does no stiffness; one with
@@ -78,7 +80,7 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     corners = wp.types.vector(term.vertices, dtype)
-    weight, project, prox = term.weight, term.project, term.prox
+    weight, project, prox, prox_from = term.weight, term.project, term.prox, term.prox_from
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
     spread, share_of = spread_compliance(dtype), to_corner(term, dtype)
     if project is not None and prox is None and term.rows > 2:
@@ -142,7 +144,11 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
             largest = wp.max(largest, total)
         rows = y_type()
         if wp.where(compliance < dtype(wp.inf), largest, dtype(0.0)) != dtype(0.0):
-            rows = (prox(y - largest * before, r, largest / compliance) - y) / largest
+            v = y - largest * before
+            if wp.static(prox_from is None):
+                rows = (prox(v, r, largest / compliance) - y) / largest
+            else:
+                rows = (prox_from(y, v, r, largest / compliance) - y) / largest
         return rows, rows
 
     if scalar:
@@ -156,7 +162,7 @@ def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     corners, system_type = wp.types.matrix((term.vertices, 3), dtype), wp.types.matrix((term.rows, term.rows), dtype)
-    weight, project, prox = term.weight, term.project, term.prox
+    weight, project, prox, prox_from = term.weight, term.project, term.prox, term.prox_from
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
     spread, share_of = spread_compliance(dtype), to_corner(term, dtype)
 
@@ -218,7 +224,11 @@ def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
             compliance = spread(mean, compliance, sweeps)
         rows = y_type()
         if wp.where(compliance < dtype(wp.inf), largest, dtype(0.0)) != dtype(0.0):
-            rows = (prox(y - largest * before, r, largest / compliance) - y) / largest
+            v = y - largest * before
+            if wp.static(prox_from is None):
+                rows = (prox(v, r, largest / compliance) - y) / largest
+            else:
+                rows = (prox_from(y, v, r, largest / compliance) - y) / largest
         return rows, rows
 
     if scalar:

@@ -71,6 +71,8 @@ class Term:
             ``prox`` too, any p with ∂u/∂y = y − p(y); or None.
         prox: (v, rest, compliance) → argmin u(y) + ‖y − v‖²/(2·compliance) (M, 3), compliance 0 or more, in closed form, the
             local step where u is not ½‖y − p(y)‖²; or None.
+        prox_from: (y, v, rest, compliance) → the same of u as it is about y, the position before the step, for an energy of
+            which v may be nearer to another branch, such as the far side of a ball; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices.
         quadratic: Whether p is 0 and the weights of an element add up to 0: U is then quadratic in the differences of vertices.
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next four.
@@ -99,6 +101,7 @@ class Term:
     cells: bool = False
     project: Any = None
     prox: Any = None
+    prox_from: Any = None
     linear: bool = False
     quadratic: bool = False
     constraint: Any = None

@@ -179,27 +179,42 @@ def hessian(y: Any, rest: Any, policy: int):
 
 
 @wp.func
-def prox(v: Any, rest: Any, compliance: Any):
-    """Along n: (d − v)/c = −φ′(d), in closed form in each stage; to r where the compliance is infinite."""
-    d, n = gap(v, rest)
-    r = rest[11]
-    half = v.dtype(0.5)
+def gap_after(d: Any, r: Any, compliance: Any):
+    """The distance d* with (d* − d)/c = −φ′(d*), in closed form in each stage; r where the compliance is infinite."""
+    half = type(r)(0.5)
     tau = half * r
     after = d
     if d < r:
-        after = r - (r - d) / (v.dtype(1.0) + compliance)
+        after = r - (r - d) / (type(r)(1.0) + compliance)
         if after < tau:
             c = compliance * tau * tau
             root = wp.sqrt(half * half * d * d + c)
-            if d > v.dtype(0.0):
+            if d > type(r)(0.0):
                 after = half * d + root
             else:  # without the difference of two numbers that are nearly the same
                 after = c / (root - half * d)
-            delta = v.dtype(DELTA) * r
+            delta = type(r)(DELTA) * r
             if after < delta:
-                after = (d + v.dtype(2.0) * c / delta) / (v.dtype(1.0) + c / (delta * delta))
+                after = (d + type(r)(2.0) * c / delta) / (type(r)(1.0) + c / (delta * delta))
+    return after
+
+
+@wp.func
+def prox(v: Any, rest: Any, compliance: Any):
+    """Along n."""
+    d, n = gap(v, rest)
     p = v
-    p[0] = v[0] + (after - d) * n
+    p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
+    return p
+
+
+@wp.func
+def prox_from(y: Any, v: Any, rest: Any, compliance: Any):
+    """That of the half-space which touches the collider nearest to y: beyond its middle, v is nearer to another side."""
+    d, n = gap(y, rest)
+    d += wp.dot(n, v[0] - y[0])
+    p = v
+    p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
     return p
 
 
@@ -294,6 +309,7 @@ CONTACT = Term(
     gradient=gradient,
     hessian=hessian,
     prox=prox,
+    prox_from=prox_from,
     constraint=constraint,
     constraint_gradient=constraint_gradient,
     constraint_hessian=constraint_hessian,

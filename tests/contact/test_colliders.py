@@ -19,6 +19,7 @@ from warpcloth.kernels.term import HessianPolicy
 from warpcloth.kernels.terms.contact import CONTACT
 
 R = 1e-3
+SLOW = pytest.mark.slow
 TILTED = (0.18257419, 0.36514837, 0.54772256, 0.73029674)
 SHAPES = {
     "plane": wc.Plane(normal=(0.2, 1.0, 0.1), position=(0.0, -0.11, 0.0)),
@@ -222,12 +223,14 @@ EXACT = {
 
 
 @pytest.mark.parametrize("name", EXACT)
-@pytest.mark.parametrize("friction", (0.0, 0.3))
-@pytest.mark.parametrize("gravity", (300.0, 981.0))
+@pytest.mark.parametrize(
+    ("gravity", "friction"), [(300.0, 0.0), (300.0, 0.3), (981.0, 0.0), (981.0, 0.3), pytest.param(981.0, 30.0, marks=SLOW)]
+)
 def test_all_meet_at_one_minimiser(name, friction, gravity):
-    """1e-8 m, with gaps down to r/40, deep in the logarithmic range."""
-    if name == "xpbd" and gravity > 500.0:
-        pytest.skip("its sweeps end in another minimum, in which edges are folded")
+    """1e-8 m, with gaps down to r/45, deep in the logarithmic range, sliding and, with a friction of 30, sticking.
+
+    Contact alone would move a vertex by 0.26 m in the step, beyond the middle of the ball, whose far side is then nearer.
+    """
     scene, found = stretched(gravity, friction), []
     for solver in (wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), EXACT[name]):
         stepper = solver.bind(scene.build(dtype="float64"))
@@ -237,6 +240,20 @@ def test_all_meet_at_one_minimiser(name, friction, gravity):
     gaps = np.min([collider.distances(found[0]) for collider in scene.colliders], axis=0)
     assert (gaps < R).sum() > 30 and gaps.min() < R / 10.0
     assert np.abs(found[1] - found[0]).max() < 1e-8
+
+
+@pytest.mark.parametrize("name", [name for name in EXACT if name not in ("newton clamp", "projective dynamics none")])
+def test_all_meet_as_far_as_float32_allows(name, device):
+    """0.5 m are known to 3e-8 m, a gap of r/45 and its force to 1.4e-3: 4e-4 m of the 0.27 m that gravity moves in the step."""
+    scene, exact = stretched(981.0, 0.0), wc.Newton(substeps=1, tolerance=1e-12, linear="factorised")
+    most = {"projective dynamics": 100, "xpbd": 1000, "admm": 300, "constrained dynamics": 40}
+    given = ((exact, "float64"), (replace(EXACT[name], iterations=most[name]), "float32"), (exact, "float32"))
+    found = []
+    for solver, dtype in given:
+        stepper = solver.bind(scene.build(device=device, dtype=dtype))
+        stepper.step()
+        found.append(stepper.state.x.numpy())
+    assert np.abs(found[1] - found[0]).max() < 4e-4 and np.abs(found[2] - found[0]).max() < 4e-4
 
 
 @each_solver

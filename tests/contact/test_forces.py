@@ -15,7 +15,7 @@ SOLVERS = {
     "newton": wc.Newton(substeps=2, tolerance=1e-11),
     "projective dynamics": wc.ProjectiveDynamics(substeps=2, tolerance=1e-10, iterations=500),
     "xpbd": wc.XPBD(substeps=2, iterations=300),
-    "admm": wc.ADMM(substeps=2, tolerance=1e-13, iterations=3000),
+    "admm": wc.ADMM(substeps=2, tolerance=1e-11, iterations=1000),
     "constrained dynamics": wc.ConstrainedDynamics(substeps=2, tolerance=1e-11, iterations=100, linear="factorised"),
 }
 
@@ -42,7 +42,7 @@ def test_a_plane_bears_the_weight(name, device):
     scene, _normal, _down = slope(0.0, 0.0)
     run = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64", record=BOTH)
     weight = [0.0, -G * scene.vertex_masses.sum(), 0.0]
-    np.testing.assert_allclose(run.collider_forces["slope"], np.tile(weight, (7, 1)), rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(run.collider_forces["slope"], np.tile(weight, (7, 1)), rtol=0.0, atol=1e-12)
     rest = wc.equilibrium(scene, device=device, record=BOTH)
     np.testing.assert_allclose(rest.collider_forces["slope"], weight, rtol=0.0, atol=1e-9)
     depth = 0.1 * R
