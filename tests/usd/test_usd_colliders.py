@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from pxr import Usd
 
 import warpcloth as wc
 from support.usd_validation import validate
@@ -121,10 +122,35 @@ def test_a_mirrored_plane_keeps_what_is_behind_it(path, sign, height, side):
         ("Cylinder", 'double radius = 10\ndouble height = 20\nuniform token axis = "X"', np.pi * 2e-3),
         ("Cone", 'double radius = 10\ndouble height = 30\nuniform token axis = "Y"', np.pi * 1e-3),
         ("Mesh", TETRAHEDRON, 1e-3 / 6),
+        (
+            "Mesh",
+            TETRAHEDRON.replace("[3, 3, 3, 3]", "[4, 3, 3, 4]")
+            .replace("0, 2, 1, 0", "2, 4, 1, 0, 0")
+            .replace("2, 1, 2, 3", "2, 1, 4, 2, 3")
+            .replace("10)]", "10), (5, 5, 0)]"),
+            1e-3 / 6,
+        ),
+        (
+            "Mesh",
+            TETRAHEDRON.replace("[3, 3, 3, 3]", "[3, 3, 3, 3, 3]")
+            .replace("2, 1, 2, 3", "2, 1, 4, 3, 2, 1, 4")
+            .replace("10)]", "10), (0, 10, 0)]"),
+            1e-3 / 6,
+        ),
         ("Mesh", 'uniform token orientation = "leftHanded"\n' + INWARD, 1e-3 / 6),
         ("Mesh", ops(scale=("float3", " = (2, -3, 1)")) + TETRAHEDRON, 1e-3),
     ],
-    ids=["ellipsoid", "mirrored ellipsoid", "cylinder", "cone", "mesh", "left-handed", "mirrored mesh"],
+    ids=[
+        "ellipsoid",
+        "mirrored ellipsoid",
+        "cylinder",
+        "cone",
+        "mesh",
+        "corners on a line",
+        "corners at one position",
+        "left-handed",
+        "mirrored mesh",
+    ],
 )
 def test_other_solids_are_meshes_with_their_fronts_outside(path, kind, size, volume):
     """The volume by the divergence theorem, which is negative if the front is inside; 1 % for the facets."""
@@ -389,3 +415,67 @@ def test_a_scene_with_colliders_runs_from_its_stage_to_the_same_bits(tmp_path):
     np.testing.assert_array_equal(one.points, other.points)
     assert one.points[-1, :, 1].min() < -0.02
     assert validate(tmp_path / "one.usdc") == [] and validate(tmp_path / "other.usdc", read.stage.path) == []
+
+
+# A bone that rises by 10 cm a frame, and a tetrahedron that is bound to it as a body or point by point.
+RIG = """
+def SkelRoot "Rig" META
+{
+    def Skeleton "Bones" (prepend apiSchemas = ["SkelBindingAPI"])
+    {
+        uniform token[] joints = ["bone"]
+        uniform matrix4d[] bindTransforms = [((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))]
+        uniform matrix4d[] restTransforms = [((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))]
+        rel skel:animationSource = </Rig/Bones/Walk>
+        def SkelAnimation "Walk"
+        {
+            uniform token[] joints = ["bone"]
+            quatf[] rotations = [(1, 0, 0, 0)]
+            half3[] scales = [(1, 1, 1)]
+            float3[] translations.timeSamples = {101: [(0, 0, 0)], 105: [(0, 0, 40)]}
+        }
+    }
+    def Mesh "Body" (prepend apiSchemas = ["PhysicsCollisionAPI", "SkelBindingAPI"])
+    {
+        rel skel:skeleton = </Rig/Bones>
+        int[] primvars:skel:jointIndices = INDICES (elementSize = 1
+        interpolation = "KIND")
+        float[] primvars:skel:jointWeights = WEIGHTS (elementSize = 1
+        interpolation = "KIND")
+        TETRAHEDRON
+    }
+}
+"""
+
+
+@pytest.mark.parametrize("instanced", [False, True])
+@pytest.mark.parametrize(("kind", "count"), [("constant", 1), ("vertex", 4)])
+def test_skinned_characters_are_posed_in_memory(path, kind, count, instanced):
+    text = RIG.replace("TETRAHEDRON", TETRAHEDRON).replace("KIND", kind).replace("META", "")
+    text = text.replace("INDICES", str([0] * count)).replace("WEIGHTS", str([1] * count))
+    if instanced:
+        text = text.replace("def SkelRoot", "class SkelRoot")
+        text += '\ndef "One" (instanceable = true\nprepend references = </Rig>)\n{\n}\n'
+    body = collider_of(path, text)
+    before = path.read_text()
+    assert before == STAGE + text and body.name == ("/One/Body" if instanced else "/Rig/Body")
+    for frame in range(5):
+        points = turned(body, min(frame, len(body.poses) - 1), body.frames[min(frame, len(body.frames) - 1)])
+        np.testing.assert_allclose(points.min(axis=0), [0, 0, 0.1 * frame], atol=1e-7)
+
+
+def test_a_cloth_of_a_skinned_character_has_pins_that_follow_it(path):
+    """And is not skinned again by viewers of the result."""
+    text = (
+        RIG.replace("INDICES", "[0, 0, 0, 0]").replace("WEIGHTS", "[1, 1, 1, 1]").replace("KIND", "vertex").replace("META", "")
+    )
+    cloth = STAGE[STAGE.index("    int[] faceVertexCounts") : STAGE.rindex("}")]
+    text = text.replace("TETRAHEDRON", cloth + "int[] warpcloth:pins = [0, 1]").replace('"PhysicsCollisionAPI", ', "")
+    path.write_text(STAGE[: STAGE.index("def Mesh")] + text)
+    scene = read_scene(path)
+    np.testing.assert_allclose(scene.pins.keyframes[:, 0, 2], 2 + 0.1 * np.arange(5), atol=1e-6)
+    result = path.parent / "out.usdc"
+    wc.simulate(scene, wc.Explicit(substeps=8), output=result, frames=2)
+    stage = Usd.Stage.Open(str(result))
+    for name in ("Indices", "Weights"):
+        assert not stage.GetPrimAtPath("/Rig/Body").GetAttribute(f"primvars:skel:joint{name}").HasValue()

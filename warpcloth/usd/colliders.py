@@ -22,6 +22,8 @@ _TAKEN_AS_NONE = ("convexDecomposition", "meshSimplification", "sdf")
 _SIZES = ("size", "radius", "height")
 # Scales and angles of float32 and of products of them agree to this part.
 _SAME = 1e-5
+_FLIPS = 20  # rounds in which flat triangles are turned into others
+_FLAT = 1e-4  # height over the longest side at which they are: float32 leaves them no normal
 
 
 def read_colliders(stage, cloth, surroundings, frames, fps):
@@ -260,7 +262,7 @@ class _Reader:
             points = np.broadcast_to(points, (count, *points.shape[-2:])) if points.ndim == 2 or len(points) == 1 else points
             points = np.stack([placed(*pair) for pair in zip(points, self._transforms, strict=True)])
             mirrored = np.linalg.det(self._transforms[0][:3, :3]) < 0.0
-        triangles = triangles[_with_area(points.reshape(-1, *points.shape[-2:])[0], triangles)]
+        triangles = _without_slivers(points.reshape(-1, *points.shape[-2:])[0], triangles)
         triangles = triangles[:, ::-1] if mirrored else triangles
         return self._approximated(points, triangles, given)
 
@@ -338,15 +340,53 @@ def _volume(corners):
     return np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
 
 
-def _with_area(points, triangles):
-    """Which triangles (T,) have an area, as those of a `Mesh` must have."""
-    corners = points[triangles]
+def _without_slivers(points, triangles):
+    """The triangles of a surface as ones with an area, which a `Mesh` must have.
+
+    Those with two corners at one position are left out. One whose corners are on a line, as fans of polygons with such corners
+    have, changes its longest side for the other diagonal with the triangle beyond, so that a closed surface stays closed.
+
+    Raises:
+        ValueError: None has an area.
+    """
+    index = np.unique(points, axis=0, return_inverse=True)[1].reshape(-1)
+    triangles = triangles[(index[triangles] != np.roll(index[triangles], 1, axis=1)).all(axis=1)]
+    for _ in range(_FLIPS):
+        flat = _flat(points[triangles], _FLAT)
+        if not flat.any() or flat.all():
+            break
+        triangles = _flipped(points, triangles, index, np.flatnonzero(flat).tolist())
+    triangles = triangles[~_flat(points[triangles], FLATTEST)]
+    if not len(triangles):
+        raise ValueError("has no triangle with an area, must have one to be a collider")
+    return triangles
+
+
+def _flat(corners, least):
+    """Which triangles (T, 3, 3) are no higher than a part of their longest side."""
     sides = corners - np.roll(corners, 1, axis=1)
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    found = doubled > FLATTEST * np.einsum("tki,tki->tk", sides, sides).max(axis=1)
-    if not found.any():
-        raise ValueError("has no triangle with an area, must have one to be a collider")
-    return found
+    return ~(doubled > least * np.einsum("tki,tki->tk", sides, sides).max(axis=1))
+
+
+def _flipped(points, triangles, index, flat):
+    """The triangles, some flat ones of which share another diagonal with the triangle beyond their longest side."""
+    triangles = triangles.copy()
+    beyond = {}
+    for t, corners in enumerate(index[triangles].tolist()):
+        beyond |= {(corners[k], corners[k - 2]): (t, k) for k in range(3)}  # the side from corner k to the next
+    touched = set()
+    for t in flat:
+        sides = points[np.roll(triangles[t], -1)] - points[triangles[t]]
+        k = int(np.argmax((sides**2).sum(axis=1)))
+        p, q, r = np.roll(triangles[t], -k)
+        other, side = beyond.get((int(index[q]), int(index[p])), (t, 0))
+        if other == t or touched & {t, other}:
+            continue
+        d = triangles[other][side - 1]
+        triangles[t], triangles[other] = (r, p, d), (d, q, r)
+        touched |= {t, other}
+    return triangles
 
 
 def _centre(trimesh, points):

@@ -20,6 +20,7 @@ from .stage import (
     open_stage,
     pinned_points,
     placed,
+    posed,
     refuse_moving_topology,
 )
 from .values import array_of, check_composed, sentences, time_codes_of
@@ -89,7 +90,7 @@ def read_drawn(path, prim=None):
         ValueError: It is no stage or shows no mesh, solid or linear curves; there is no such prim; a prim is broken.
     """
     with sentences(path):
-        stage = open_stage(path)
+        stage = posed(open_stage(path), -np.inf, np.inf)
         own = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY)
         named = prim is not None or (isinstance(own, dict) and "prim" in own)
         chosen = find_prim(stage, path, prim) if named else None

@@ -26,7 +26,7 @@ from .values import (
 # Where an animation keeps, in the root layer's customLayerData, the prim that it animates.
 METADATA_KEY = "warpcloth"
 # Metadata that USD reads from the root layer alone.
-_READ_FROM_ROOTS = ("startTimeCode", "endTimeCode", "metersPerUnit", "upAxis", "kilogramsPerUnit")
+_READ_FROM_ROOTS = ("startTimeCode", "endTimeCode", "metersPerUnit", "upAxis", "kilogramsPerUnit", "customLayerData")
 # Primvar of curves: the mesh vertex of each curve point, for curves repeat the vertices where several of them meet.
 VERTEX_PRIMVAR = "warpcloth:vertex"
 
