@@ -7,10 +7,12 @@ import numpy as np
 import warp as wp
 
 from ..kernels import colliders as kernels
+from ..kernels import mesh_colliders as mesh_kernels
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..kernels.terms.friction import FRICTION
 from ..terms.refresh import STEP, Refresh
+from .mesh_steps import MeshSteps
 
 # Where a vertex stops that would end in a collider, relative to the contact distance: where it comes to rest, a deep gap would
 # be a strong force, and in float32 a noisy one.
@@ -68,7 +70,12 @@ class ColliderSteps:
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
         self.bounded = part == 0.0
         self._move, self._count = model.kernel(kernels.move_colliders, model.dtype), model.kernel(count_step)
-        self._filter = model.kernel(kernels.filter_step, model.dtype)
+        self.meshes = None
+        if declared.meshes is not None:
+            given = {"steps": self.steps, "per_frame": 2 * steps_per_frame, "ahead": self._given[-1], "h": h}
+            given |= {"r": declared.distance, "least": self.least, "landing": LANDING * declared.distance}
+            self.meshes = MeshSteps(model, self.poses, self.bounded, **given)
+        self._filter = model.kernel(kernels.filter_step if self.meshes is None else mesh_kernels.filter_meshes, model.dtype)
         self.terms = []
         for elements in model.terms:
             c = elements.collider
@@ -80,6 +87,13 @@ class ColliderSteps:
         first = all(each.refresh is None or each.collider is None for each in self.terms)
         if elements.term is FRICTION:
             anchors = self.anchors[c] = state.add(f"anchors on collider {c}", self.anchor_rows[c])
+        if declared.facets[c]:
+            if elements.term is FRICTION:
+                of_mesh = self.meshes.friction(elements, float(declared.friction[c]), anchors)
+            else:
+                of_mesh = self.meshes.contact(elements)
+            launch = partial(self._on_mesh, of_mesh, state.v)
+        elif elements.term is FRICTION:
             kernel = model.kernel(kernels.anchor_vertices, model.dtype, self.bounded)
             launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
         elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
@@ -94,9 +108,14 @@ class ColliderSteps:
         """Where a step begins: by the first of the terms for all of them, then for each."""
         if first:
             self.launch_move()
+            if self.meshes is not None:
+                self.meshes.launch_trees()
             wp.copy(self.x_before, moment.x)
         if launch is not None:
             launch(model, elements)
+
+    def _on_mesh(self, launch, v, model, elements):
+        launch(elements, self.x_before, v)
 
     def _pose_elements(self, kernel, c, v, model, elements):
         given = [elements.stencil, self.shapes, *model.free_gravity, self.x_before, v, self.poses]
@@ -131,8 +150,11 @@ class ColliderSteps:
     def launch_end(self, x, v, move=None):
         """Cuts the step short of vertices that would end in a collider or cross one, in x, v and ``move`` (N,)."""
         model = self.model
-        given = [model.inverse_mass, self.shapes, self.x_before, self.poses, self.steps]
-        given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
+        if self.meshes is None:
+            given = [model.inverse_mass, self.shapes, self.x_before, self.poses, self.steps]
+            given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
+        else:
+            given = [model.inverse_mass, self.shapes, self.meshes.geometry, self.x_before, self.meshes.motion, model.per_copy]
         model.launch(self._filter, model.count, given, [x, v, move, self.notes])
         self.launch_count()
 

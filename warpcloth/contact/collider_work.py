@@ -19,6 +19,11 @@ class ColliderWork:
 
     def __init__(self, colliders, terms, x, of_colliders, against_friction, hard=None):
         self.colliders, self.model, self._x, model = colliders, colliders.model, x, colliders.model
+        for c in [] if model.colliders.meshes is None else model.colliders.meshes.deform:
+            label = model.scene.colliders[c].label
+            raise ValueError(
+                f"the collider {label} deforms, the work of which is not recorded; move it as a rigid body, or leave record out"
+            )
         self._sums, self._at_end = [of_colliders, against_friction], colliders.part == 1.0
         self.pulls = ColliderPulls(model, terms, hard)
         self._before, self._x_step = [], x if self._at_end else colliders.x_before

@@ -10,6 +10,7 @@ from ..core.gradient import Gradient
 from ..kernels import colliders as kernels
 from ..kernels.terms.friction import FRICTION
 from ..kernels.work import pulls
+from .mesh_steps import MeshSteps
 
 
 class PresentContact:
@@ -40,6 +41,11 @@ class PresentContact:
         self._moved.after = after  # of the next step, which nothing reads
         self._given = [declared.keyframes, declared.firsts, self._steps, steps.steps_per_frame, 0]
         self._move, self._shapes, self._least = model.kernel(kernels.move_colliders, model.dtype), steps.shapes, steps.least
+        self._meshes = None
+        if steps.meshes is not None:
+            given = steps.meshes.given | {"steps": self._steps, "ahead": 0}
+            self._meshes = MeshSteps(model, self._poses, steps.bounded, **given)
+            self._launches.append(lambda _x, _v: self._meshes.launch_trees())
         self.terms = tuple(elements if elements.collider is None else self._own(elements, steps) for elements in model.terms)
 
     def _own(self, elements, steps):
@@ -48,6 +54,14 @@ class PresentContact:
         own = replace(elements, term=term, rest=wp.clone(elements.rest))
         if elements.term is FRICTION:
             anchors = wp.zeros(model.count, dtype=self._anchor_type, device=model.device)
+        if model.colliders.facets[c]:
+            if elements.term is FRICTION:
+                on_mesh = self._meshes.friction(elements, float(model.colliders.friction[c]), anchors)
+                self._launches.append(lambda _x, _v: self._copy_anchors(c, anchors))
+            else:
+                on_mesh = self._meshes.contact(elements)
+            self._launches.append(partial(on_mesh, own))
+        elif elements.term is FRICTION:
             kernel = model.kernel(kernels.anchor_vertices, model.dtype, steps.bounded)
             self._launches.append(partial(self._anchor, kernel, own, anchors))
         elif model.colliders.moves[c]:
@@ -69,10 +83,14 @@ class PresentContact:
         given += [own.collider, own.per_copy, self._least, 0.0]
         self.model.launch(kernel, own.count, given, [own.rest])
 
-    def _anchor(self, kernel, own, anchors, x, v):
-        model, c, n = self.model, own.collider, self.model.per_copy
+    def _copy_anchors(self, c, anchors):
+        n = self.model.per_copy
         for steps, first, end in self._parts:
             wp.copy(anchors, steps.anchors[c], first * n, 0, (end - first) * n)
+
+    def _anchor(self, kernel, own, anchors, x, v):
+        model, c = self.model, own.collider
+        self._copy_anchors(c, anchors)
         given = [own.stencil, self._shapes, x, self._poses]
         given += [c, own.per_copy, model.colliders.distance, float(model.colliders.friction[c])]
         model.launch(kernel, own.count, given, [anchors, own.rest])

@@ -56,7 +56,7 @@ class Plan:
             count: Steps that moved pins have made (B,) int32, or None.
             pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares them.
             colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of a model that has some, for faster classes
-                to take contact themselves, or None to leave it to the terms and to the end of each step.
+                to take contact themselves, or None to leave it to the terms and to the end of each step, as it is with meshes.
 
         Raises:
             ValueError: If threads cannot share the steps; it names the term.
@@ -67,7 +67,7 @@ class Plan:
             steps = SubdomainSteps(*given, pool)
         else:
             backend = self.backend if self.model.uniform else "core"
-            if colliders is not None and backend != "core":
+            if colliders is not None and colliders.meshes is None and backend != "core":
                 self.guard = ContactGuard(self.model, colliders)
                 given = *given, self.guard
             steps = {"core": ExplicitStep, "blocks": BlockStep, "gather": GatherStep}[backend](*given)

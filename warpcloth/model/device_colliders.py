@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.colliders import pose_types
+from .device_meshes import DeviceMeshes, meshes_on
 
 
 class DeviceColliders(NamedTuple):
@@ -18,6 +19,8 @@ class DeviceColliders(NamedTuple):
         distance: Contact distance [m].
         friction: μ of each, (C,) on the host.
         moves, half_space: Whether each has more than one pose, and whether it is a half-space, lists of C.
+        facets: How many half-spaces stand for each in a step, 0 where its shape does, a list of C.
+        meshes: Those that are triangle meshes, or None.
     """
 
     keyframes: wp.array
@@ -28,10 +31,13 @@ class DeviceColliders(NamedTuple):
     friction: np.ndarray
     moves: list
     half_space: list
+    facets: list
+    meshes: DeviceMeshes | None
 
     @property
     def arrays(self):
-        return [self.keyframes, self.firsts, self.core, self.radius]
+        found = [self.keyframes, self.firsts, self.core, self.radius]
+        return found if self.meshes is None else found + self.meshes.arrays
 
 
 def colliders_on(model, scene):
@@ -50,4 +56,6 @@ def colliders_on(model, scene):
         friction=np.array([collider.friction for collider in scene.colliders]),
         moves=[collider.moves for collider in scene.colliders],
         half_space=[bool(np.isinf(core[0])) for core in cores],
+        facets=[collider.facets for collider in scene.colliders],
+        meshes=meshes_on(model, scene.colliders),
     )

@@ -28,6 +28,7 @@ class DeviceElements:
         refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
         cells: :class:`Cells` or :class:`SparseCells` that the elements are the vertices of, or None.
         collider: Index of the collider of the scene that they are the contact with or the friction on, or None.
+        facet: Of contact with a mesh which of its facets they are with.
     """
 
     label: str
@@ -41,6 +42,7 @@ class DeviceElements:
     refresh: Refresh | None = None
     cells: Cells | SparseCells | None = None
     collider: int | None = None
+    facet: int = 0
 
     @property
     def arguments(self):
@@ -114,7 +116,8 @@ class DeviceElements:
         """Of a limit the elements with no range at all about the rest shape ``points`` of one copy, of contact those with the
         largest Hessian that explicit steps may meet; else these."""
         if self.term.bounded is not None:
-            return replace(self, term=self.term.bounded)
+            found = replace(self, term=self.term.bounded)
+            return found.weighed(np.zeros(self.count)) if self.facet else found  # facets share the stiffness of one
         if not self.term.dead_zone:
             return self
         rest = self.term.rest_state(points, host_values(self.stencil) % len(points), least=1.0, most=1.0)
@@ -181,6 +184,7 @@ def elements_on(model, term, positions, vary):
         cells=cells,
         refresh=one.refresh,
         collider=getattr(term, "collider", None),
+        facet=getattr(term, "facet", 0),
     )
     return found if model.order is None or cells else found.by_lowest()
 

@@ -161,6 +161,8 @@ def equilibrium(
 def _with_colliders_at_rest(scene):
     """The scene with moving colliders where their last keyframe has them; refuses friction."""
     for collider in scene.colliders:
+        if collider.facets:
+            raise ValueError(f"the collider {collider.label} is a mesh, which only steps take; run the scene until it rests")
         if collider.friction:
             raise ValueError(
                 f"the collider {collider.label} has friction {collider.friction:g}, with which there are many rest shapes and "

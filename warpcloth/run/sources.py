@@ -251,12 +251,15 @@ class MovingCollider(Source):
 
     def __init__(self, collider, balance):
         scene, self._balance = balance.model.scene, balance
-        poses, (half, radius) = collider.poses, collider.core
-        extent = np.linalg.norm(half) + radius
+        poses, extent = collider.poses, collider.extent
         if not np.isfinite(extent):
             extent = np.linalg.norm(scene.positions - poses[0, :3], axis=1).max() + np.ptp(scene.positions, axis=0).max()
         turns = 2.0 * np.arccos(np.clip(np.abs((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1)), 0.0, 1.0))
         moves = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + extent * turns
+        deforms = collider.deforms
+        frames = max(len(moves), len(deforms))
+        moves, deforms = (np.append(each, np.zeros(frames - len(each))) for each in (moves, deforms))
+        moves += deforms
         self._speeds = np.append(0.0, scene.fps * moves)
         self._lifts = np.cumsum(np.append(0.0, moves))
 

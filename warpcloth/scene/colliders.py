@@ -88,6 +88,22 @@ class Collider:
         raise NotImplementedError  # each shape has its own
 
     @property
+    def extent(self) -> float:
+        """The farthest of its surface from ``position`` [m]."""
+        half, radius = self.core
+        return float(np.linalg.norm(half)) + radius
+
+    @property
+    def deforms(self) -> np.ndarray:
+        """By how much any of it moves in its own frame from one keyframe to the next, (F − 1,) [m]."""
+        return np.zeros(0)
+
+    @property
+    def facets(self) -> int:
+        """How many half-spaces stand for it in a step, 0 if its shape is one of :attr:`core`."""
+        return 0
+
+    @property
     def up(self) -> np.ndarray:
         """The direction in the frame of ``rotation`` of the y axis in which :attr:`core` is, (3,)."""
         return np.array([0.0, 1.0, 0.0])
@@ -108,7 +124,7 @@ class Collider:
         poses = self.poses
         turns = 2.0 * np.arccos(np.clip(np.einsum("fi,fi->f", poses[1:, 3:], poses[:-1, 3:]), -1.0, 1.0))
         turned = np.zeros_like(turns)  # rounding turns by 1e-8, and planes have no end
-        turned[turns > 1e-7] = turns[turns > 1e-7] * (np.linalg.norm(self.core[0]) + self.core[1])
+        turned[turns > 1e-7] = turns[turns > 1e-7] * self.extent
         return float((np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + turned).max(initial=0.0))
 
     @property

@@ -1,6 +1,6 @@
 """Triangle meshes as colliders."""
 
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from ..base.checks import numeric
 from ..base.turns import in_turn
 from ..base.types import Converted, default
 from ..kernels import nearest
+from ..kernels.mesh_colliders import FACETS, FAR
 from ..mesh.mesh import Mesh
 from .colliders import Collider, turned
 
@@ -64,11 +65,40 @@ class MeshCollider(Collider):
 
     @property
     def core(self) -> tuple[np.ndarray, float]:
-        raise ValueError(f"the collider {self.label} is a mesh, which no solver takes yet")
+        return np.zeros(3), -FAR
+
+    @property
+    def extent(self) -> float:
+        return float(np.linalg.norm(self.frames, axis=-1).max())
+
+    @property
+    def deforms(self) -> np.ndarray:
+        return np.linalg.norm(np.diff(self.frames, axis=0), axis=-1).max(axis=-1, initial=0.0)
+
+    @cached_property
+    def facets(self) -> int:
+        """One if it is convex at all frames, or as many as a corner has."""
+        return 1 if self.closed and all(map(self._bulges, self.frames)) else FACETS
+
+    def _bulges(self, vertices):
+        """Whether it is nowhere concave by more than 1e-4 [rad]."""
+        corners = vertices[self.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        sides = self._welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        keys, back = sides @ [sides.max() + 1, 1], sides[:, ::-1] @ [sides.max() + 1, 1]
+        order = np.argsort(keys)
+        other = order[np.searchsorted(keys[order], back)]  # the side of the neighbour
+        away = corners.reshape(-1, 3)[other // 3 * 3 + (other + 2) % 3] - corners.reshape(-1, 3)
+        height = np.einsum("si,si->s", away, np.repeat(normals, 3, axis=0))
+        return bool((height < 1e-4 * np.linalg.norm(away, axis=1)).all())
 
     @property
     def moves(self) -> bool:
         return super().moves or len(self.frames) > 1
+
+    def at_last(self) -> "MeshCollider":
+        return replace(super().at_last(), points=self.frames[-1])
 
     @cached_property
     def _welded(self) -> np.ndarray:

@@ -246,7 +246,8 @@ class Scene:
         for c, collider in enumerate(self.colliders):
             core, radius = collider.core
             given |= {"collider": c, "pose": collider.poses[0], "core": core, "radius": radius}
-            found.append(VertexContact(name=f"contact with {collider.label}", **given))
+            for facet in range(max(collider.facets, 1)):
+                found.append(VertexContact(name=f"contact with {collider.label}", facet=facet, **given))
             if collider.friction:
                 found.append(VertexFriction(name=f"friction on {collider.label}", **given))
         return tuple(found)

@@ -23,6 +23,7 @@ class VertexContact(Declared):
         distance: r [m].
         pose, core, radius: The collider at the start.
         collider: Its index among those of the scene.
+        facet: Of a mesh which of the half-spaces that stand for it.
     """
 
     term: ClassVar[Term] = CONTACT
@@ -33,6 +34,7 @@ class VertexContact(Declared):
     core: np.ndarray = field(default_factory=lambda: np.zeros(3))
     radius: float = 0.0
     collider: int = 0
+    facet: int = 0
 
     def stencil(self, mesh: Mesh) -> np.ndarray:
         return own_stencil(self.label, "vertices", self.vertices, 1, len(mesh.points))

@@ -1,0 +1,766 @@
+"""Factories of the kernels of colliders that are triangle meshes: the half-spaces that stand for one in a step, and the filter.
+
+For a step a mesh is replaced, for each vertex, by a few half-spaces, the *facets*, which have all of it behind them that is
+near. The first touches the point of the surface that is nearest to where the vertex will be, the next the nearest point in
+front of the first, and so on (Liu et al. 2017, *Planning dynamically feasible trajectories for quadrotors using safe flight
+corridors in 3-D complex environments*). A convex mesh needs one, a groove two, a corner three.
+
+Distances to a surface have no sign: vertices start on one side of it and the filter lets none cross, so that open and
+non-manifold meshes, or those with triangles that are turned over, are as good as closed ones.
+
+All is in the frame of the collider. Points of the mesh move linearly between its keyframes, and so within a step. ``halves``
+count half steps. The tree, a `wp.Bvh` in float32, only finds triangles, with a margin for rounding.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .colliders import ROUNDS, FilterNotes, kept_part, local_gap_of, note_inside, of_pose, pose_types, shapes
+from .rotation import epsilon
+from .terms import contact
+from .terms.contact import turned
+from .vectors import types
+
+turned_by, slope_of = turned, contact.slope
+FAR = 1e30  # the distance to what is not there, of which a difference is a number
+FACETS = 3  # the most, of a vertex and a mesh
+MARCHES = wp.constant(32)  # separating planes between a vertex and a triangle on its way, at most
+CARRIES = wp.constant(16)  # of a vertex by triangles that move, in a step
+SLIDES = wp.constant(3)  # surfaces along which a prediction slides
+BEYOND = wp.constant(0.02)  # of r: how far in front of the facets found so far the nearest point of the next must be
+ALIKE = wp.constant(0.9)  # cosine between the normals of two facets that are one
+
+
+@cache
+def meshes(dtype):
+    """The struct of the meshes of C colliders: ``points`` holds the keyframes of all, ``triangles`` those of all.
+
+    Of collider c: the tree ``bvh`` or 0, index of the first triangle, index of the first point, points of a keyframe, number of
+    keyframes, and the margin of its tree for rounding.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Meshes:
+        points: wp.array(dtype=vec3)
+        triangles: wp.array(dtype=wp.vec3i)
+        bvh: wp.array(dtype=wp.uint64)
+        first_triangle: wp.array(dtype=wp.int32)
+        first_point: wp.array(dtype=wp.int32)
+        size: wp.array(dtype=wp.int32)
+        frames: wp.array(dtype=wp.int32)
+        margin: wp.array(dtype=wp.float32)
+
+    return Meshes
+
+
+@cache
+def motions(dtype):
+    """The struct of a step: poses (copies, colliders) as :func:`.colliders.step_poses`, and what all kernels need of it.
+
+    Each copy has made so many ``steps`` of h [s]. A frame is ``per_frame`` half steps; forces are taken ``ahead`` half steps
+    on. ``r`` is the contact distance, ``least`` the nearest that the filter lets be, ``landing`` where it and predictions stop.
+    """
+    pose_type, _anchor = pose_types(dtype)
+
+    @wp.struct
+    class Motion:
+        before: wp.array2d(dtype=pose_type)
+        at: wp.array2d(dtype=pose_type)
+        after: wp.array2d(dtype=pose_type)
+        steps: wp.array(dtype=wp.int32)
+        per_frame: wp.int32
+        ahead: wp.int32
+        h: dtype
+        r: dtype
+        least: dtype
+        landing: dtype
+
+    return Motion
+
+
+@cache
+def facet_type(dtype):
+    """The type of a facet: a point, the normal, the weight."""
+    return wp.types.vector(7, dtype)
+
+
+@cache
+def geometry(dtype):
+    """Device functions of triangles: ``corners``, ``from_triangle``, ``carry``."""
+    vec3, mat33 = types(dtype)
+    zero, one = dtype(0.0), dtype(1.0)
+
+    @wp.func
+    def corners(mesh: meshes(dtype), c: int, triangle: int, halves: int, per_frame: int):
+        """The corners of a triangle, as rows, after half steps of which a frame has ``per_frame``."""
+        v = mesh.triangles[mesh.first_triangle[c] + triangle]
+        first = mesh.first_point[c]
+        frames = mesh.frames[c]
+        found = mat33()
+        if frames == 1:
+            for k in range(3):
+                found[k] = mesh.points[first + v[k]]
+        else:
+            size = mesh.size[c]
+            frame = wp.max(wp.min(halves // per_frame, frames - 1), 0)
+            after = wp.min(frame + 1, frames - 1)
+            part = dtype(wp.max(halves, 0) - frame * per_frame) / dtype(per_frame)
+            if after == frame:
+                part = zero
+            for k in range(3):
+                a = mesh.points[first + frame * size + v[k]]
+                found[k] = a + part * (mesh.points[first + after * size + v[k]] - a)
+        return found
+
+    @wp.func
+    def nearer_side(p: vec3, a: vec3, b: vec3, best: dtype):
+        """Squared distance to the segment from a to b and where on it, if below ``best``; else −1."""
+        e = b - a
+        l = wp.dot(e, e)
+        t = zero
+        if l > zero:
+            t = wp.clamp(wp.dot(p - a, e) / l, zero, one)
+        y = p - a - t * e
+        s = wp.dot(y, y)
+        return wp.where(s < best, s, -one), t
+
+    @wp.func
+    def from_triangle(p: vec3, t: mat33):
+        """Distance to a triangle, the direction away from it, and the weights of its corners in the nearest point."""
+        a = t[0]
+        b = t[1]
+        c = t[2]
+        n = wp.cross(b - a, c - a)
+        w = vec3(wp.dot(wp.cross(c - b, p - b), n), wp.dot(wp.cross(a - c, p - c), n), wp.dot(wp.cross(b - a, p - a), n))
+        size = w[0] + w[1] + w[2]
+        d = zero
+        away = vec3()
+        if size > zero and w[0] >= zero and w[1] >= zero and w[2] >= zero:
+            w = w / size
+            n = wp.normalize(n)
+            d = wp.dot(n, p - a)
+            away = wp.where(d < zero, -n, n)
+            d = wp.abs(d)
+        else:
+            best = dtype(wp.inf)
+            flat = size <= zero
+            ta = vec3(one, zero, zero)
+            if w[2] < zero or flat:
+                s, at = nearer_side(p, a, b, best)
+                if s >= zero:
+                    best = s
+                    ta = vec3(one - at, at, zero)
+            if w[0] < zero or flat:
+                s, at = nearer_side(p, b, c, best)
+                if s >= zero:
+                    best = s
+                    ta = vec3(zero, one - at, at)
+            if w[1] < zero or flat:
+                s, at = nearer_side(p, c, a, best)
+                if s >= zero:
+                    best = s
+                    ta = vec3(at, zero, one - at)
+            w = ta
+            away = (p - a) - w[1] * (b - a) - w[2] * (c - a)
+            d = wp.length(away)
+            if d > zero:
+                away = away / d
+        return d, away, w
+
+    @wp.func
+    def frame_of(t: mat33):
+        """An orthonormal frame of a triangle, as rows."""
+        x = wp.normalize(t[1] - t[0])
+        z = wp.normalize(wp.cross(t[1] - t[0], t[2] - t[0]))
+        y = wp.cross(z, x)
+        return mat33(x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
+
+    @wp.func
+    def carry(n: vec3, before: mat33, after: mat33):
+        """A direction that turns with a triangle, unless it is flat."""
+        found = wp.transpose(frame_of(after)) * (frame_of(before) * n)
+        return wp.where(wp.dot(found, found) > dtype(0.5), found, n)
+
+    return corners, from_triangle, carry
+
+
+@cache
+def queries(dtype):
+    """Device functions that ask the tree: ``nearest_beyond`` and ``sweep``."""
+    vec3, mat33 = types(dtype)
+    corners, from_triangle, _carry = geometry(dtype)
+    zero, one = dtype(0.0), dtype(1.0)
+
+    @wp.func
+    def margin_of(mesh: meshes(dtype), c: int, p: vec3):
+        return mesh.margin[c] + wp.float32(1e-6) * wp.float32(wp.max(wp.abs(p)))
+
+    @wp.func
+    def nearest_beyond(
+        mesh: meshes(dtype),
+        c: int,
+        halves: int,
+        per_frame: int,
+        p: vec3,
+        radius: dtype,
+        beyond: dtype,
+        count: int,
+        normals: mat33,
+        gaps: vec3,
+    ):
+        """The nearest point within a radius in front of ``count`` facets: distance or −1, direction, triangle, weights."""
+        found = -one
+        away = vec3()
+        weights = vec3()
+        face = wp.int32(-1)
+        k = wp.int32(0)
+        query = wp.bvh_query_sphere(mesh.bvh[c], wp.vec3(p), wp.float32(radius) + margin_of(mesh, c, p))
+        while wp.bvh_query_next(query, k):
+            d, n, w = from_triangle(p, corners(mesh, c, k, halves, per_frame))
+            if d < radius and (found < zero or d < found or (d == found and k < face)):
+                hidden = wp.bool(False)
+                for j in range(count):
+                    if gaps[j] - d * wp.dot(normals[j], n) <= beyond:
+                        hidden = True
+                if not hidden:
+                    found = d
+                    away = n
+                    weights = w
+                    face = k
+        return found, away, face, weights
+
+    @wp.func
+    def march(p: vec3, way: vec3, t: mat33, moves: mat33, least: dtype, most: dtype):
+        """The part of a move, ``most`` at most, that keeps ``least`` or where it starts from a triangle, whose corners move.
+
+        The plane normal to the distance separates the two until one of the corners passes it; from there the next decides.
+        """
+        done = zero
+        d, n, w = from_triangle(p, t)
+        fastest = wp.length(way)
+        for k in range(3):
+            fastest = wp.max(fastest, wp.length(way - moves[k]))
+        if d > fastest * most + least:
+            done = most
+        lowest = wp.min(least, d)
+        k = wp.int32(0)
+        while done < most and k < MARCHES:
+            k += 1
+            step = most - done
+            q = p + done * way
+            for i in range(3):
+                approach = wp.dot(n, moves[i] - way)
+                if approach > zero:
+                    step = wp.min(step, wp.max(wp.dot(n, q - t[i] - done * moves[i]) - lowest, zero) / approach)
+            if step >= most - done:
+                done = most
+            elif step * fastest > dtype(0.01) * least:
+                done += step
+                d, n, w = from_triangle(p + done * way, t + done * moves)
+            else:
+                k = MARCHES
+        return done, n, w
+
+    @wp.func
+    def sweep(
+        mesh: meshes(dtype),
+        c: int,
+        halves: int,
+        after: int,
+        per_frame: int,
+        p: vec3,
+        way: vec3,
+        start: dtype,
+        least: dtype,
+    ):
+        """The part of a move that keeps ``least`` or where it starts, and what stops it: normal, triangle or −1, weights.
+
+        The move begins at the part ``start`` of the time from ``halves`` to ``after`` and ends with it.
+        """
+        kept = one
+        away = vec3()
+        weights = vec3()
+        face = wp.int32(-1)
+        k = wp.int32(0)
+        moves = mat33()
+        # The box of what it passes; or a capsule along a way that is long.
+        query = wp.bvh_query_capsule(mesh.bvh[c], wp.vec3(p), wp.vec3(way), wp.float32(least) + margin_of(mesh, c, p + way))
+        while wp.bvh_query_next(query, k, 1.0):
+            t = corners(mesh, c, k, halves, per_frame)
+            if mesh.frames[c] > 1:
+                moves = corners(mesh, c, k, after, per_frame) - t
+                t += start * moves
+                moves = (one - start) * moves
+            part, n, w = march(p, way, t, moves, least, kept)
+            if part < kept:
+                kept = part
+                away = n
+                weights = w
+                face = k
+        return kept, away, face, weights
+
+    return nearest_beyond, sweep
+
+
+@cache
+def bound_triangles(dtype):
+    """Kernel over the triangles of a mesh that deforms: their boxes from the first half step of any copy to the last."""
+    corners, _from, _carry = geometry(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def bound(
+        # elements
+        mesh: meshes(dtype),
+        collider: int,
+        # state in
+        steps: wp.array(dtype=wp.int32),
+        # parameters
+        per_frame: int,
+        # out
+        lowers: wp.array(dtype=wp.vec3),
+        uppers: wp.array(dtype=wp.vec3),
+    ):
+        k = wp.tid()
+        first = steps[0]
+        last = steps[0]
+        for b in range(steps.shape[0]):
+            first = wp.min(first, steps[b])
+            last = wp.max(last, steps[b])
+        first = 2 * first
+        last = 2 * last + 2
+        low = wp.vec3(wp.inf)
+        high = wp.vec3(-wp.inf)
+        halves = first
+        while halves <= last:
+            t = corners(mesh, collider, k, halves, per_frame)
+            for i in range(3):
+                low = wp.min(low, wp.vec3(t[i]))
+                high = wp.max(high, wp.vec3(t[i]))
+            next = (halves // per_frame + 1) * per_frame  # at which the motion turns
+            if halves < last:
+                next = wp.min(next, last)
+            halves = next
+        edge = wp.vec3(mesh.margin[collider])
+        lowers[k] = low - edge
+        uppers[k] = high + edge
+
+    return bound
+
+
+@cache
+def find_facets(dtype, at_vertex: bool):
+    """Kernel over the elements of contact with one mesh, at the start of a step: the facets of each vertex.
+
+    They are those ``at_vertex``, as explicit steps take them; else those at its prediction, x + h v + h² g, which slides
+    along what it meets on its way. If it ends where the nearest facet is unlike the last along which it slid, or there is none,
+    that one comes first: beyond a thin collider there would be no force that leads back. If it meets nothing, they are
+    those at the vertex, from which other forces may pull it as far as it would go.
+
+    The weights share the area of the vertex among facets: 1/Σ|nⱼ·nₖ| over those within r, so that two that are nearly one press
+    as one does, and no number of them is stiffer than one (Gershgorin).
+    """
+    vec3, mat33 = types(dtype)
+    facet = facet_type(dtype)
+    to_local, to_space = of_pose(dtype)
+    corners, _from, carry = geometry(dtype)
+    nearest_beyond, sweep = queries(dtype)
+    zero, one = dtype(0.0), dtype(1.0)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        mesh: meshes(dtype),
+        gravity: wp.array(dtype=vec3),
+        per_gravity: int,
+        # state in
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        motion: motions(dtype),
+        # parameters
+        collider: int,
+        per_copy: int,
+        # out
+        facets: wp.array2d(dtype=facet),
+    ):
+        e = wp.tid()
+        i = stencil[e, 0]
+        copy = e // per_copy
+        most = facets.shape[1]
+        r = motion.r
+        h = motion.h
+        per_frame = motion.per_frame
+        before = 2 * motion.steps[copy]
+        when = before
+        start = to_local(motion.before[copy, collider], x[i])
+        p = start
+        normals = mat33()
+        points = mat33()
+        gaps = vec3()
+        count = wp.int32(0)
+        radius = r
+        farthest = r
+        if not wp.static(at_vertex):
+            when = before + 2
+            ahead = x[i] + h * (v[i] + h * gravity[i // per_gravity])
+            target = to_local(motion.after[copy, collider], ahead)
+            farthest = dtype(2.0) * r + wp.length(target - start)
+            done = zero
+            n_hit = vec3()
+            foot = vec3()
+            face_hit = wp.int32(-1)
+            moved = p
+            slide = wp.int32(0)
+            while done < one and slide < SLIDES:
+                slide += 1
+                way = target - p
+                kept, n, face, w = sweep(mesh, collider, before, when, per_frame, p, way, done, motion.landing)
+                p += kept * way
+                done += kept * (one - done)
+                if face >= 0:
+                    t = corners(mesh, collider, face, before, per_frame)
+                    t_end = t
+                    if mesh.frames[collider] > 1:
+                        t_end = corners(mesh, collider, face, when, per_frame)
+                        t += done * (t_end - t)
+                        n = carry(n, t, t_end)
+                    end = wp.transpose(t_end) * w
+                    moved = p + end - wp.transpose(t) * w
+                    target += wp.max(wp.dot(n, moved - target), zero) * n
+                    n_hit = n
+                    foot = end
+                    face_hit = face
+                else:
+                    done = one
+            if done < one:
+                p = moved
+            radius = dtype(2.0) * r
+            if face_hit >= 0:
+                radius += wp.min(dtype(0.25) * wp.length(target - foot), dtype(32.0) * r)
+                d, n, face, w = nearest_beyond(mesh, collider, when, per_frame, p, radius, zero, 0, normals, gaps)
+                if d < zero or wp.dot(n, n_hit) < dtype(ALIKE):
+                    normals[0] = n_hit
+                    gaps[0] = wp.dot(n_hit, p - foot)
+                    points[0] = foot
+                    count = 1
+        searching = wp.bool(True)
+        while searching and count < most:
+            d, n, face, w = nearest_beyond(mesh, collider, when, per_frame, p, radius, dtype(BEYOND) * r, count, normals, gaps)
+            searching = d > zero
+            if searching:
+                t = corners(mesh, collider, face, when, per_frame)
+                normals[count] = n
+                gaps[count] = d
+                points[count] = p - d * n
+                if mesh.frames[collider] > 1 and before + motion.ahead != when:
+                    t_at = corners(mesh, collider, face, before + motion.ahead, per_frame)
+                    points[count] = wp.transpose(t_at) * w
+                    normals[count] = carry(n, t, t_at)
+                count += 1
+            elif count == 0 and radius < farthest:
+                if when > before:
+                    when = before
+                    p = start
+                else:
+                    radius *= dtype(2.0)
+                searching = wp.bool(True)
+        pose = motion.at[copy, collider]
+        for j in range(most):
+            f = facet()
+            if j < count:
+                share = zero
+                for k in range(count):
+                    near = wp.clamp(dtype(2.0) - gaps[k] / r, zero, one)
+                    if k == j:
+                        near = one
+                    share += near * wp.abs(wp.dot(normals[j], normals[k]))
+                point = to_space(pose, points[j])
+                n = turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], normals[j])
+                for k in range(3):
+                    f[k] = point[k]
+                    f[3 + k] = n[k]
+                f[6] = one / share
+            facets[i, j] = f
+
+    return find
+
+
+@cache
+def pose_facets(dtype):
+    """Kernel over the elements of one facet: their rest states, a half-space far away where a vertex has fewer facets."""
+    vec3, _ = types(dtype)
+    facet = facet_type(dtype)
+    rest_type = wp.types.vector(contact.PARAMETERS, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pose(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        areas: wp.array(dtype=dtype),
+        # state in
+        facets: wp.array2d(dtype=facet),
+        # parameters
+        which: int,
+        # in and out
+        rest: wp.array(dtype=rest_type),
+    ):
+        e = wp.tid()
+        f = facets[stencil[e, 0], which]
+        r = rest[e]
+        if f[6] > dtype(0.0):
+            w = dtype(1.0) + f[4]
+            turn = vec3(f[5], dtype(0.0), -f[3])
+            size = wp.sqrt(wp.dot(turn, turn) + w * w)
+            if w <= dtype(0.0) or size == dtype(0.0):
+                turn = vec3(dtype(1.0), dtype(0.0), dtype(0.0))
+                w = dtype(0.0)
+                size = dtype(1.0)
+            for k in range(3):
+                r[k] = f[k]
+                r[3 + k] = turn[k] / size
+                r[7 + k] = dtype(wp.inf)
+            r[6] = w / size
+            r[10] = dtype(0.0)
+            r[12] = f[6] * areas[e]
+            rest[e] = r
+        elif r[10] == dtype(0.0):
+            for k in range(3):
+                r[7 + k] = dtype(0.0)
+            r[10] = dtype(-FAR)
+            rest[e] = r
+
+    return pose
+
+
+@cache
+def anchor_on_mesh(dtype, bounded: bool):
+    """Kernel over the elements of friction on one mesh, at the start of a step, as :func:`.colliders.anchor_vertices`.
+
+    N and n are the sum over the facets at the vertex and its direction. Anchors are on the surface, and move on with the
+    triangle that is nearest to the vertex.
+    """
+    vec3, mat33 = types(dtype)
+    _pose, anchor_type = pose_types(dtype)
+    to_local, to_space = of_pose(dtype)
+    corners, _from, _carry = geometry(dtype)
+    nearest_beyond, _sweep = queries(dtype)
+    rest_type = wp.types.vector(8, dtype)
+    zero, one = dtype(0.0), dtype(1.0)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def anchor(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        mesh: meshes(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        motion: motions(dtype),
+        # parameters
+        collider: int,
+        per_copy: int,
+        most: int,
+        friction: dtype,
+        # in and out
+        anchors: wp.array(dtype=anchor_type),
+        rest: wp.array(dtype=rest_type),
+    ):
+        e = wp.tid()
+        i = stencil[e, 0]
+        copy = e // per_copy
+        distance = motion.r
+        per_frame = motion.per_frame
+        before = 2 * motion.steps[copy]
+        p = to_local(motion.before[copy, collider], x[i])
+        normals = mat33()
+        gaps = vec3()
+        faces = wp.vec3i()
+        weights = mat33()
+        count = wp.int32(0)
+        searching = wp.bool(True)
+        while searching and count < most:
+            d, n, face, w = nearest_beyond(
+                mesh, collider, before, per_frame, p, distance, dtype(BEYOND) * distance, count, normals, gaps
+            )
+            searching = d > zero
+            if searching:
+                normals[count] = n
+                gaps[count] = d
+                faces[count] = face
+                weights[count] = w
+                count += 1
+        depth = zero
+        push = vec3()
+        for j in range(count):
+            share = zero
+            for k in range(count):
+                share += wp.abs(wp.dot(normals[j], normals[k]))
+            force = -slope_of(gaps[j], distance)
+            if wp.static(bounded):
+                force = wp.max(distance - gaps[j], zero)
+            depth += force / share
+            push += force / share * normals[j]
+        held = anchors[i]
+        r = rest[e]
+        kept = vec3()
+        if depth > zero:
+            n = wp.normalize(push)
+            a = p - wp.dot(normals[0], gaps[0] * n) * n
+            if held[3] > zero:
+                u = p - vec3(held[0], held[1], held[2])
+                u = u - wp.dot(n, u) * n
+                l = wp.length(u)
+                a = a - wp.where(l > held[3], held[3] / wp.max(l, held[3]), one) * u
+            t = corners(mesh, collider, faces[0], before, per_frame)
+            w = weights[0]
+            foot = wp.transpose(t) * w
+            kept = a
+            if mesh.frames[collider] > 1:
+                kept = a + wp.transpose(corners(mesh, collider, faces[0], before + 2, per_frame)) * w - foot
+                a = a + wp.transpose(corners(mesh, collider, faces[0], before + motion.ahead, per_frame)) * w - foot
+            now = motion.at[copy, collider]
+            target = to_space(now, a)
+            normal = turned_by(vec3(now[3], now[4], now[5]), now[6], n)
+            for k in range(3):
+                r[k] = target[k]
+                r[3 + k] = normal[k]
+        r[6] = friction * depth
+        rest[e] = r
+        anchors[i] = anchor_type(kept[0], kept[1], kept[2], friction * depth)
+
+    return anchor
+
+
+@cache
+def filter_meshes(dtype):
+    """Kernel over vertices, at the end of a step, as :func:`.colliders.filter_step`, of which some colliders are meshes.
+
+    A vertex that a mesh which deforms has stopped goes on with the triangle that has stopped it.
+    """
+    vec3, _mat33 = types(dtype)
+    to_local, to_space = of_pose(dtype)
+    kept_of = kept_part(dtype)
+    corners, from_triangle, carry = geometry(dtype)
+    _nearest, sweep = queries(dtype)
+    zero, one = dtype(0.0), dtype(1.0)
+
+    @wp.func
+    def stopped(mesh: meshes(dtype), c: int, motion: motions(dtype), copy: int, p: vec3, end: vec3, least: dtype, free: int):
+        """Where a move from p to ``end`` ends, and whether something stops it: 1; 2 if it gets past that, of what is free."""
+        per_frame = motion.per_frame
+        before = 2 * motion.steps[copy]
+        hit = wp.int32(0)
+        moving = wp.bool(True)
+        done = zero
+        most = one
+        thick = least
+        rounds = wp.int32(0)
+        while moving and rounds < CARRIES:
+            kept, n, face, w = sweep(mesh, c, before, before + 2, per_frame, p, end - p, done, thick)
+            if thick == least:
+                moving = face >= 0 and free > 0
+                hit = wp.where(face >= 0, 1, hit)
+                most = kept
+                thick = least + motion.landing
+                if face >= 0 and free == 0:
+                    t = corners(mesh, c, face, before + 2, per_frame)
+                    if wp.dot(n, end - t[0]) > -least:
+                        hit = 0
+            else:
+                rounds += 1
+                kept = wp.min(kept, most)
+                p += kept * (end - p)
+                done += kept * (one - done)
+                end = p
+                thick = least
+                moving = face >= 0 and mesh.frames[c] > 1
+                if moving:
+                    t = corners(mesh, c, face, before, per_frame)
+                    t_end = corners(mesh, c, face, before + 2, per_frame)
+                    t += done * (t_end - t)
+                    d, n, w = from_triangle(p, t)
+                    end = wp.transpose(t_end) * w + d * carry(n, t, t_end)
+        if rounds == CARRIES:
+            hit = 2
+        return hit, end
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def filter_vertices(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        shape: shapes(dtype),
+        mesh: meshes(dtype),
+        # state in
+        x_before: wp.array(dtype=vec3),
+        motion: motions(dtype),
+        # parameters
+        per_copy: int,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        notes: FilterNotes,
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        vertex = i - copy * per_copy
+        step = motion.steps[copy]
+        count = shape.radius.shape[0]
+        x0 = x_before[i]
+        end = x[i]
+        free = wp.where(inverse_mass[i] > zero, 1, 0)
+        rounding = dtype(8.0) * epsilon(motion.least) * wp.max(wp.abs(end))
+        rounded = motion.least + rounding
+        most = wp.where(count > 1 and free > 0, ROUNDS, 1)
+        cuts = wp.int32(0)
+        last = wp.int32(0)
+        rounds = wp.int32(0)
+        while rounds <= cuts and rounds < most:  # another one after each that has cut
+            rounds += 1
+            for c in range(count):
+                p = to_local(motion.before[copy, c], x0)
+                way = to_local(motion.after[copy, c], end) - p
+                if mesh.frames[c] > 0:
+                    least = wp.where(free > 0, rounded, rounding)
+                    hit, found = stopped(mesh, c, motion, copy, p, p + way, least, free)
+                    if hit > 0 and free > 0:
+                        end = to_space(motion.after[copy, c], found)
+                        cuts = rounds
+                        last = c
+                    if hit > free:
+                        note_inside(notes, copy, c, step, vertex, per_copy, wp.where(free > 0, c, count))
+                elif free > 0:
+                    t = kept_of(p, way, shape.core[c], shape.radius[c], rounded)
+                    if t < one:
+                        t = kept_of(p, way, shape.core[c], shape.radius[c], rounded + motion.landing)
+                        end = to_space(motion.after[copy, c], p + t * way)
+                        cuts = rounds
+                        last = c
+                else:
+                    d, _n = local_gap_of(p, shape.core[c], shape.radius[c])
+                    deep = -wp.max(rounding, dtype(8.0) * epsilon(motion.least) * wp.max(wp.abs(p)))
+                    if d > deep and kept_of(p, way, shape.core[c], shape.radius[c], deep) < one:
+                        note_inside(notes, copy, c, step, vertex, per_copy, count)
+        if cuts > 0:
+            change = end - x[i]
+            x[i] = end
+            v[i] = v[i] + change / motion.h
+            if move:
+                move[i] = move[i] + change
+            wp.atomic_add(notes.cut, copy, wp.int64(1))
+        if cuts == ROUNDS:
+            for c in range(count):
+                p = to_local(motion.before[copy, c], x0)
+                way = to_local(motion.after[copy, c], end) - p
+                through = wp.bool(False)
+                if mesh.frames[c] > 0:
+                    _kept, _n, face, _w = sweep(mesh, c, 2 * step, 2 * step + 2, motion.per_frame, p, way, zero, rounding)
+                    through = face >= 0
+                else:
+                    d, _n = local_gap_of(p + way, shape.core[c], shape.radius[c])
+                    through = d <= zero
+                if through:
+                    note_inside(notes, copy, c, step, vertex, per_copy, last)
+
+    return filter_vertices

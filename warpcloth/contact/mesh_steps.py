@@ -1,0 +1,82 @@
+"""Colliders that are triangle meshes in the steps of a solver."""
+
+import warp as wp
+
+from ..kernels import mesh_colliders as kernels
+from ..kernels.terms.contact import AREA
+
+
+class MeshSteps:
+    """The trees of meshes, the facets of vertices and the anchors on meshes, in the steps of one solver.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model` of a scene with meshes among its colliders.
+        poses: Those of the step, a :func:`warpcloth.kernels.colliders.step_poses`.
+        bounded: Whether it is that of an explicit method.
+        **given: The numbers and ``steps`` of :func:`warpcloth.kernels.mesh_colliders.motions`.
+
+    Attributes:
+        geometry: See :class:`warpcloth.model.device_meshes.DeviceMeshes`.
+        motion: The struct of these.
+        given: The numbers and ``steps``, by name.
+    """
+
+    def __init__(self, model, poses, bounded, **given):
+        self.model, self._bounded, self._facets = model, bounded, {}
+        self._meshes = model.colliders.meshes.own(model.device)
+        self.geometry, self.motion = self._meshes.geometry, kernels.motions(model.dtype)()
+        self.given = given
+        for name, value in (given | {name: getattr(poses, name) for name in ("before", "at", "after")}).items():
+            setattr(self.motion, name, value)
+        if self._meshes.deform:
+            self._bound = model.kernel(kernels.bound_triangles, model.dtype)
+
+    def launch_trees(self):
+        """Fits the trees of meshes that deform to the step."""
+        for c in self._meshes.deform:
+            tree = self._meshes.trees[c]
+            given = [self.geometry, c, self.motion.steps, self.motion.per_frame]
+            self.model.launch(self._bound, len(tree.lowers), given, [tree.lowers, tree.uppers])
+            tree.refit()
+
+    def contact(self, elements):
+        """The function (elements, x, v) that launches the rest states of contact with one facet where a step begins.
+
+        Args:
+            elements: Those of the model, in the order of their facets.
+        """
+        model, c = self.model, elements.collider
+        pose = model.kernel(kernels.pose_facets, model.dtype)
+        areas = model.array(elements.rest.numpy()[:, AREA], model.dtype)
+        if elements.facet == 0:
+            most = 1 + max(each.facet for each in model.terms if each.collider == c)
+            facet_type = kernels.facet_type(model.dtype)
+            self._facets[c] = wp.zeros((model.count, most), dtype=facet_type, device=model.device)
+            find = model.kernel(kernels.find_facets, model.dtype, self.motion.ahead == 0)
+        facets = self._facets[c]
+
+        def launch(elements, x, v):
+            if elements.facet == 0:
+                given = [elements.stencil, self.geometry, *model.free_gravity, x, v, self.motion, c, elements.per_copy]
+                model.launch(find, elements.count, given, [facets])
+            model.launch(pose, elements.count, [elements.stencil, areas, facets, elements.facet], [elements.rest])
+
+        return launch
+
+    def friction(self, elements, friction, anchors):
+        """The function (elements, x, v) that launches the anchors of a step on one mesh.
+
+        Args:
+            elements: Those of the model.
+            friction: μ.
+            anchors: The array of anchors (N,).
+        """
+        model, c = self.model, elements.collider
+        anchor = model.kernel(kernels.anchor_on_mesh, model.dtype, self._bounded)
+        most = self._facets[c].shape[1]
+
+        def launch(elements, x, _v):
+            given = [elements.stencil, self.geometry, x, self.motion, c, elements.per_copy, most, friction]
+            model.launch(anchor, elements.count, given, [anchors, elements.rest])
+
+        return launch
