@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import warpcloth as wc
+from support.scenes import scene
 
 G, DENSITY = 9.81, 0.15
 # Steps a frame are added; what is tested has little else that moves.
@@ -114,3 +117,141 @@ def test_restitution_of_symplectic_euler(rate, phase):
     """Between √(1 − ω²h²/4) and its inverse, by the phase in which it enters."""
     least = np.sqrt(1.0 - 0.25 * rate**2)
     assert least - 1e-3 < bounce("explicit", rate, phase) < 1.0 / least + 1e-3
+
+
+def methods(*slow, **solvers):
+    """Runs a test with solvers, of which those that are named take long."""
+    marks = [pytest.param(each, id=name, marks=pytest.mark.slow if name in slow else ()) for name, each in solvers.items()]
+    return pytest.mark.parametrize("solver", marks)
+
+
+def tensions(capstan, points):
+    """Of the belt at each edge, mean of both sides (…, edges) [N/m]."""
+    threads = points.reshape(*points.shape[:-2], 2, -1, 3)
+    lengths = np.linalg.norm(np.diff(threads, axis=-2), axis=-1).mean(axis=-2)
+    rest = capstan.mesh.points[1, 0] - capstan.mesh.points[0, 0]
+    return 2.0 * capstan.terms[0].stiffness * (lengths - rest) / np.ptp(capstan.mesh.points[:, 2])
+
+
+def polygon(friction, turn, turns):
+    """Ratio of the tensions of a belt that slides over a polygon."""
+    half = friction * np.tan(0.5 * turn)
+    return ((1.0 + half) / (1.0 - half)) ** turns
+
+
+@methods(
+    "newton",
+    "projective_dynamics",
+    explicit=wc.Explicit(substeps=600),
+    newton=wc.Newton(substeps=1, linear="factorised"),
+    projective_dynamics=wc.ProjectiveDynamics(substeps=1, tolerance=1.0, iterations=300),
+    xpbd=wc.XPBD(substeps=150, iterations=10),
+)
+def test_a_belt_slides_over_a_drum(solver, friction=0.3):
+    """e^{μφ}, to 1 %; of that a belt of 12 edges differs by 0.6 %."""
+    capstan = scene("capstan", friction=friction, turns=12, duration=0.35)
+    found = tensions(capstan, wc.simulate(capstan, solver, dtype="float64").points[11:]).mean(axis=0)
+    assert found[-1] / found[0] == pytest.approx(np.exp(np.pi * friction), rel=0.01)
+    assert found[0] == pytest.approx(20.0, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_belt_slides_over_a_polygon(friction=0.3):
+    """The exact ratio at the vertices between the first and the last on the drum, to 1e-4 of all six of them."""
+    capstan = scene("capstan", friction=friction, turns=8, speed=0.005, stretching=5e4, distance=1e-4, duration=0.5)
+    solver = wc.Newton(substeps=2, tolerance=1e-5, linear="factorised")
+    points = wc.simulate(capstan, solver, dtype="float64").points[16:]
+    edges = np.diff(points[:, : points.shape[1] // 2], axis=1)
+    turns = np.diff(np.unwrap(np.arctan2(edges[..., 2], edges[..., 0])), axis=1)
+    middle = edges.shape[1] // 2
+    inner = slice(middle - 3, middle + 3)  # vertex i + 1 is between the edges i and i + 1
+    expected = np.prod(polygon(friction, turns[:, inner], 1), axis=1)
+    found = tensions(capstan, points)
+    ratio = found[:, inner.stop] / found[:, inner.start]
+    assert (turns[:, inner] > 0.99 * np.pi / 8).all()
+    assert np.mean(ratio / expected) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("softer", (1.0, 20.0))
+def test_a_belt_presses_on_a_drum(softer):
+    """T/R, to 1 %: an overlap of T/(Rk) where that is below r/2, beyond it the gap kr²R/(4T)."""
+    capstan = scene("capstan", friction=0.0)
+    contact = replace(capstan.contact, stiffness=capstan.contact.stiffness / softer)
+    capstan = replace(capstan, contact=contact, pins=capstan.pins.vertices)
+    points = wc.equilibrium(capstan, tolerance=1e-10).points
+    edge = np.linalg.norm(points[0] - points[1])
+    inner = points[:, 2] < -0.05
+    turn = 2.0 * np.arcsin(0.5 * edge / np.linalg.norm(points[inner][:, [0, 2]], axis=1))
+    radius = 0.5 * edge / np.sin(0.5 * turn)
+    gaps = capstan.colliders[0].distances(points[inner])
+    k, r, pressure = contact.stiffness, contact.distance, 20.0 / radius
+    expected = r - pressure / k if softer == 1.0 else k * r**2 / (4.0 * pressure)
+    np.testing.assert_allclose(r - gaps if softer == 1.0 else gaps, r - expected if softer == 1.0 else expected, rtol=0.01)
+
+
+def critical(friction, radius, length=1.0):
+    """The overhang of a limp sheet beyond the flat top at which it slips off a round edge [m], of any radius.
+
+    Along the edge dT/dθ = μ(T + R cos θ) − R sin θ, with T over the weight per area, from μ times what lies on the top.
+    """
+
+    def pulls(over):
+        along = solve_ivp(
+            lambda at, T: friction * (T + radius * np.cos(at)) - radius * np.sin(at),
+            (0.0, 0.5 * np.pi),
+            [friction * (length - over)],
+            rtol=1e-9,
+        )
+        return over - 0.5 * np.pi * radius - along.y[0, -1]
+
+    return brentq(pulls, 0.0, length)
+
+
+@methods(
+    "projective_dynamics",
+    explicit=wc.Explicit(substeps=200),
+    newton=wc.Newton(substeps=2, tolerance=1e-4),
+    projective_dynamics=wc.ProjectiveDynamics(substeps=1, tolerance=1e-3, iterations=40),
+    xpbd=wc.XPBD(substeps=20, iterations=10),
+)
+def test_an_overhang_slips_or_sticks(solver):
+    """One edge more than what the friction holds slips, one edge less sticks."""
+    friction, elements, radius = 0.3, 40, 0.031
+    m = friction * np.exp(0.5 * np.pi * friction)
+    thin, held = m / (1.0 + m), critical(friction, radius)
+    assert critical(friction, 1e-6) == pytest.approx(thin, rel=1e-4)
+    for more, slips in ((-1.0, False), (1.0, True)):
+        part = (held + more / elements) / thin
+        overhang = scene("overhang", friction=friction, part=part, elements=elements, width=0.025, duration=0.4)
+        points = wc.simulate(overhang, solver, dtype="float64").points
+        moved = points[-1, :: elements + 1, 0].mean() - points[15, :: elements + 1, 0].mean()
+        assert moved > 0.02 if slips else abs(moved) < 0.005, more
+
+
+FALLING = {
+    "explicit": wc.Explicit(substeps=300),
+    "newton": wc.Newton(substeps=8, tolerance=1e-6),
+    "projective_dynamics": wc.ProjectiveDynamics(substeps=2, tolerance=1e-4, iterations=40),
+    "xpbd": wc.XPBD(substeps=50, iterations=10),
+}
+
+
+def deeper(solver, duration):
+    """How deep the tip of a chain over an edge is in the end, over what it should be."""
+    chain = scene("chain_over_edge", links=60, duration=duration)
+    points = wc.simulate(chain, solver, dtype="float64").points
+    depths = points[0, :, 1].max() - points[:, -1, 1]
+    return depths[-1] / (depths[0] * np.cosh(duration * np.sqrt(G)))
+
+
+@methods("newton", "projective_dynamics", **FALLING)
+def test_a_chain_slides_over_an_edge(solver):
+    """a₀ cosh(t√(g/L)), to 1 %."""
+    assert deeper(solver, 0.7) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_chain_slides_over_an_edge_with_first_order():
+    """Of steps of implicit Euler; links leave the rest."""
+    found = [deeper(replace(FALLING["newton"], substeps=2**k), 0.4) for k in (1, 2, 3)]
+    assert (found[0] - found[1]) / (found[1] - found[2]) == pytest.approx(2.0, abs=0.2)
