@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import choice, number, shown, whole
 from ..base.types import FilePath, Progress, UpAxis
-from ..mesh.mesh import UP_AXES, Mesh, same_topology
+from ..mesh.mesh import UP_AXES, Mesh, areas_of, same_topology
 from ..mesh.sequences import HasPoints, Sequence, as_sequence, open_sequence
-from .distances import surface_distances, triangle_areas
+from .distances import surface_distances
 from .measures import MEASURES
 from .samples import Exclusion
 from .surfaces import Triangles
@@ -270,7 +270,7 @@ class _Pair:
             if apart is not None:  # a partner is a point of the other surface
                 found = np.minimum(found, apart[used])
             largest[k] = found.max()
-            thirds = np.repeat(triangle_areas(points[k], self.triangles[k]) / 3.0, 3)
+            thirds = np.repeat(areas_of(points[k], self.triangles[k]) / 3.0, 3)
             areas = np.bincount(self.triangles[k].ravel(), thirds)[used]
             if areas.sum() > 0.0:
                 weights = areas / areas.sum()

@@ -6,15 +6,10 @@ import warp as wp
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..kernels import nearest
+from ..mesh.mesh import areas_of
 
 # 2·area by the sum of the squared sides: an equilateral triangle has 0.29. Float32 searches ones below by their rounding.
 _FLAT = 1e-3
-
-
-def triangle_areas(x, triangles):
-    """Areas of triangles (T,) [m²] between points x (n, 3) [m]."""
-    a, b, c = (x[corner] for corner in triangles.T)
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
 @in_turn
@@ -40,7 +35,7 @@ def surface_distances(points, x, triangles, device="cpu"):
     scale = 2.0 ** np.ceil(np.log2(np.max(high - low) / 2.0 or 1.0))
     points, x = (points - centre) / scale, (x - centre) / scale
     sides = x[triangles] - x[np.roll(triangles, 1, axis=1)]
-    flat = 2.0 * triangle_areas(x, triangles) <= _FLAT * np.einsum("tki,tki->t", sides, sides)
+    flat = 2.0 * areas_of(x, triangles) <= _FLAT * np.einsum("tki,tki->t", sides, sides)
     triangles = np.ascontiguousarray(triangles, dtype=np.int32)
     with wp.ScopedDevice(find_device(device)):
         mesh = wp.Mesh(wp.array(x, dtype=wp.vec3), wp.array(triangles.ravel(), dtype=wp.int32))

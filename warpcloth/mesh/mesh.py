@@ -393,9 +393,8 @@ class Mesh:
     @cached_property
     def triangle_areas(self) -> np.ndarray:
         """Rest areas (T,) [m²], ½‖(x₁−x₀)×(x₂−x₀)‖."""
-        x0, x1, x2 = (self.points[corner] for corner in self.triangles.T)
         with np.errstate(invalid="ignore", over="ignore"):  # points of a `Surface` may be infinite
-            return _read_only(np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) / 2)
+            return _read_only(areas_of(self.points, self.triangles))
 
     @cached_property
     def vertex_areas(self) -> np.ndarray:
@@ -466,6 +465,12 @@ class Surface(Mesh):
 
     def _refuse_degenerate(self):
         """Refuses nothing."""
+
+
+def areas_of(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Areas of triangles (T,) [m²] between points x (n, 3) [m]."""
+    a, b, c = (x[corner] for corner in triangles.T)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
 def same_topology(one: Mesh, other: Mesh) -> bool:
