@@ -1,4 +1,4 @@
-"""Contact with colliders of closed form against known answers."""
+"""Contact with planes, of closed form and of triangles, and with prisms against known answers."""
 
 from dataclasses import replace
 
@@ -25,6 +25,14 @@ sticky = pytest.mark.parametrize("name", [name for name in SOLVERS if name != "c
 implicit = pytest.mark.parametrize("name", [name for name in SOLVERS if name != "explicit"])
 
 
+def of_triangles(plane):
+    """An open mesh in a plane through the origin."""
+    grid = wc.Mesh.grid(14, 14, size=8.0, pattern="alternating")
+    along = np.array([plane.normal[1], -plane.normal[0], 0.0])
+    frame = np.array([along, plane.normal, np.cross(along, plane.normal)])
+    return wc.MeshCollider((grid.points - [3.9, 0.0, 3.95]) @ frame, grid.triangles, friction=plane.friction)
+
+
 def sheet(gap, collider=None, stiffness=1000.0, size=0.1, turn=None, **fields):
     """A square of nine vertices at a distance ``gap`` [m] above a plane, turned by a matrix with it."""
     grid = wc.Mesh.grid(3, 3, size=size)
@@ -38,19 +46,19 @@ def run(scene, name, substeps):
     return wc.simulate(scene, replace(SOLVERS[name], substeps=substeps), dtype="float64")
 
 
-def incline(degrees, friction, duration=1.0):
+def incline(degrees, friction, duration=1.0, mesh=False):
     """A sheet at rest on a slope, pressed in by its weight, and the direction down the slope."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     plane = wc.Plane(normal=turn[:, 1], friction=friction)
-    return sheet(1e-3 - 1e-4 * c, plane, turn=turn, duration=duration), turn[:, 0]
+    return sheet(1e-3 - 1e-4 * c, of_triangles(plane) if mesh else plane, turn=turn, duration=duration), turn[:, 0]
 
 
 @sticky
-@pytest.mark.parametrize("friction", (0.1, 0.3, 0.5))
-def test_a_sheet_slides_down_a_slope(name, friction):
+@pytest.mark.parametrize(("friction", "mesh"), ((0.1, False), (0.3, False), (0.5, False), (0.3, True)))
+def test_a_sheet_slides_down_a_slope(name, friction, mesh):
     """a = g(sin θ − μ cos θ), of the second half, when anchors are dragged along."""
-    scene, down = incline(30.0, friction)
+    scene, down = incline(30.0, friction, mesh=mesh)
     animation = run(scene, name, 60 if name == "explicit" else 2)
     along = (animation.velocities @ down).mean(axis=1)
     expected = G * (0.5 - friction * np.sqrt(0.75))
@@ -58,9 +66,10 @@ def test_a_sheet_slides_down_a_slope(name, friction):
 
 
 @sticky
-def test_a_sheet_sticks_to_a_slope(name):
+@pytest.mark.parametrize("mesh", (False, pytest.param(True, marks=pytest.mark.slow)))
+def test_a_sheet_sticks_to_a_slope(name, mesh):
     """tan θ = 0.95 μ. Anchored friction does not creep; explicit steps swing about the anchor, and no farther than it holds."""
-    scene, down = incline(np.degrees(np.arctan(0.95 * 0.3)), 0.3, duration=2.0)
+    scene, down = incline(np.degrees(np.arctan(0.95 * 0.3)), 0.3, duration=2.0, mesh=mesh)
     animation = run(scene, name, 60 if name == "explicit" else 2)
     along = ((animation.points - animation.points[0]) @ down).mean(axis=1)
     held = 0.3 * 1e-4  # ε = μN/(kA) with N = wA and w = k r/10
@@ -69,14 +78,18 @@ def test_a_sheet_sticks_to_a_slope(name):
 
 
 @each_solver
-@pytest.mark.parametrize("pressure, gap", ((1.4715, 0.99985e-3), (147.15, 0.98529e-3), (14715.0, 0.16989e-3)))
-def test_the_gap_under_a_pressure(name, pressure, gap):
+@pytest.mark.parametrize(
+    ("pressure", "gap", "mesh"),
+    ((1.4715, 0.99985e-3, False), (147.15, 0.98529e-3, False), (14715.0, 0.16989e-3, False), (147.15, 0.98529e-3, True)),
+)
+def test_the_gap_under_a_pressure(name, pressure, gap, mesh):
     """r − p/k above half of r, r²k/(4p) below, at r = 1 mm and k = 1e7 Pa/m."""
     if name == "explicit" and pressure > 5e3:
         pytest.skip("explicit steps have the first of the two stages alone")
     contact, gravity = wc.Contact(distance=1e-3, stiffness=1e7), (0.0, -pressure / DENSITY, 0.0)
     start = gap if name == "explicit" else 1e-3  # what nothing damps does not come to rest
-    scene = sheet(start, contact=contact, gravity=gravity, duration=0.25)
+    collider = of_triangles(wc.Plane()) if mesh else None
+    scene = sheet(start, collider, contact=contact, gravity=gravity, duration=0.25)
     animation = run(scene, name, 100 if name == "explicit" else 2)
     np.testing.assert_allclose(animation.points[-1][:, 1], gap, rtol=1e-3)
     assert animation.cut == 0.0
