@@ -19,6 +19,7 @@ MODULES = {
     "panels": "the pictures of warpcloth.lab.panels",
     "measures": "what writes warpcloth.analysis.measures into a stage",
     "loads": "the arrays on a device of what warpcloth.terms.loads declares",
+    "colliders": "what reads warpcloth.scene.colliders from a stage",
     "scene": "what reads and writes warpcloth.scene.scene as a stage",
 }
 # Classes and functions that mean one thing in several modules, and why.
