@@ -722,7 +722,8 @@ def filter_meshes(dtype):
                 p = to_local(motion.before[copy, c], x0)
                 way = to_local(motion.after[copy, c], end) - p
                 if mesh.frames[c] > 0:
-                    least = wp.where(free > 0, rounded, rounding)
+                    near = wp.max(rounding, dtype(8.0) * epsilon(motion.least) * wp.max(wp.abs(p)))
+                    least = wp.where(free > 0, motion.least + near, near)
                     hit, found = stopped(mesh, c, motion, copy, p, p + way, least, free)
                     if hit > 0 and free > 0:
                         end = to_space(motion.after[copy, c], found)

@@ -44,7 +44,8 @@ def colliders_on(model, scene):
     """The colliders of a scene on the device of a model, or None if there are none."""
     if not scene.colliders:
         return None
-    poses = [collider.poses for collider in scene.colliders]
+    centred = [collider.centred() for collider in scene.colliders]
+    poses = [collider.poses for collider in centred]
     cores, radii = zip(*(collider.core for collider in scene.colliders), strict=True)
     firsts = np.cumsum([0, *map(len, poses)])
     return DeviceColliders(
@@ -57,5 +58,5 @@ def colliders_on(model, scene):
         moves=[collider.moves for collider in scene.colliders],
         half_space=[bool(np.isinf(core[0])) for core in cores],
         facets=[collider.facets for collider in scene.colliders],
-        meshes=meshes_on(model, scene.colliders),
+        meshes=meshes_on(model, centred),
     )

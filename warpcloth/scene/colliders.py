@@ -118,6 +118,10 @@ class Collider:
         position, rotation = np.atleast_2d(self.position)[-1], np.atleast_2d(self.rotation)[-1]
         return replace(self, position=position, rotation=rotation)
 
+    def centred(self) -> "Collider":
+        """This collider in a frame about which its shape lies, for float32."""
+        return self
+
     @property
     def most_move(self) -> float:
         """By how much a point of its surface moves in a frame, at most [m]; infinite for a plane that turns."""

@@ -100,6 +100,12 @@ class MeshCollider(Collider):
     def at_last(self) -> "MeshCollider":
         return replace(super().at_last(), points=self.frames[-1])
 
+    def centred(self) -> "MeshCollider":
+        poses, frames = self.poses, self.frames
+        centre = 0.5 * (frames.min(axis=(0, 1)) + frames.max(axis=(0, 1)))
+        position = [pose[:3] + turned(pose[3:], centre) for pose in poses]
+        return replace(self, points=self.points - centre, position=position, rotation=poses[:, 3:])
+
     @cached_property
     def _welded(self) -> np.ndarray:
         """The triangles with one index for each position."""
