@@ -12,10 +12,11 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.cli import main
+from warpcloth.cli.bench import _contact
 from warpcloth.core.capture import Segment
 from warpcloth.lab import benchmarks
 from warpcloth.lab.bandwidth import measure as bandwidth
-from warpcloth.lab.benchmarks import Run, SolverBenchmark, standard
+from warpcloth.lab.benchmarks import Run, SolverBenchmark, contacts, standard
 from warpcloth.lab.counts import compulsory_bytes, elements_of, launches_of
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.results import exponent, growth, ratios, write_csv
@@ -97,6 +98,41 @@ def test_a_row_of_every_solver(one, device):
     assert row["spread"][0] <= row["ms"] <= row["spread"][1] and row["start_s"] > row["bind_s"] > 0.0
     assert row["memory"] is None or row["memory"] > model.report()["bytes"]
     json.dumps(row, allow_nan=False)
+
+
+def test_contact_is_measured_touched_and_far_away():
+    """All vertices are at the gap of each shape, within the contact distance or farther than a second of falling."""
+    listed = contacts(dtype="float64")
+    assert [each.setup.solver for each in listed] == ["explicit", "newton", "xpbd", "projective-dynamics", "explicit"]
+    assert {each.dtype for each in listed} == {"float64"}
+    for each in listed:
+        for ref in each.scenes():
+            scene = SceneRef(ref.name, ref.parameters | {"n": 5}).load()
+            gap, (shape,) = ref.parameters.get("gap", 0.9e-3), scene.colliders
+            np.testing.assert_allclose(shape.distances(scene.positions), gap, rtol=1e-6, atol=1e-6)  # float32 of meshes
+            assert gap < scene.contact.distance or gap > 0.5 * 9.81
+    shapes = [(each["collider"], each["gap"] < 1.0) for each in listed[0].variants]
+    assert len(shapes) == len(set(shapes)) == 10
+    assert [ref.load().colliders[0].triangles.shape[0] for ref in listed[-1].scenes()] == [1250, 5000, 20000, 80000]
+
+
+@pytest.mark.parametrize("scene", [SceneRef("resting", {"n": 5, "collider": "sphere"}), SceneRef("drape", {"n": 5})], ids=str)
+def test_what_contact_costs(scene, device):
+    """The difference of two frames, over vertices, substeps and colliders."""
+    setup = Setup("explicit", {"substeps": 32})
+    row = measure(asdict(scene), asdict(setup), frames=2, device=device, dtype="float32", started=time.time())
+    count = 25 * 32 * len(scene.load().colliders)
+    assert row["status"] == "ok" and row["triangles"] == 0 and row["ms_without"] > 0.0
+    assert row["contact_ns"] == pytest.approx(1e6 * (row["ms"] - row["ms_without"]) / count)
+    said = _contact(row)
+    assert said.startswith(f"{row['ms'] / row['ms_without']:.2f} of the time without") and _contact({"ms": 1.0}) == ""
+
+
+def test_growth_with_triangles():
+    rows = [row(8, 0.1 * count**0.5, triangles=count) for count in (100, 400, 1600)]
+    (one,) = growth(rows)
+    assert one["over"] == "triangles" and one["frame"] == pytest.approx([0.5, 0.0], abs=1e-9)
+    assert growth([row(n, n**2) for n in (4, 8)])[0]["over"] == "vertices"
 
 
 def test_the_standard_has_every_solver_on_growing_scenes():

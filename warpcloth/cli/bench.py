@@ -12,8 +12,9 @@ from .terminal import Bar, Interrupted, aligned, check_writable, say
 
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
-scene net; this takes a few minutes. Rows are measured one after another, each in its own process. If neither dt nor substeps
-is given, the step is chosen as by 'warpcloth run'.
+scene net. The scene resting then shows what contact costs, for colliders of each shape, touched and far away, and for meshes of
+growing size. All of it takes several minutes. Rows are measured one after another, each in its own process. If neither dt nor
+substeps is given, the step is chosen as by 'warpcloth run'.
 
 Columns:
   ms a frame  time of a frame after warm-up, with its points copied to the host: median
@@ -30,6 +31,8 @@ Columns:
   compile s   additional time when all kernels must be compiled
   factor s    time to factorise constant matrices
   MB          peak memory: of the process on a CPU, of Warp's memory pool on CUDA
+With colliders, the last column compares the time of a frame with that of the same cloth without them, and divides the
+difference by the numbers of vertices, substeps and colliders.
 
   warpcloth bench --json > before.json
   warpcloth bench hanging --solver xpbd -s substeps=4 iterations=20 --sizes 32 64 128
@@ -102,14 +105,14 @@ def _benchmarks(arguments, device):
     Raises:
         ValueError: They do not go together, or one of them is wrong.
     """
-    from ..lab.benchmarks import SolverBenchmark, standard
+    from ..lab.benchmarks import SolverBenchmark, contacts, standard
     from ..lab.measurements import SceneRef, Setup
     from ..solvers import SOLVERS
 
     given = {"device": str(device), **values_of(arguments, "dtype", "frames", "copies", "threads")}
     if arguments.scene is None:
         _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which must stand before it")
-        return standard(**given)
+        return [*standard(**given), *contacts(**given)]
     _source, values, scene = named_scene(arguments)
     parameters = {name: values[name] for name in assignments(arguments.p)}
     arguments.solver = arguments.solver or DEFAULT
@@ -179,8 +182,9 @@ def _text(facts):
     ]
     for each in facts["growth"]:
         words = [each["solver"], *(f"{name}={value}" for name, value in each["options"].items())]
+        over = each["over"]
         powers = [f"{p:.2f}" + ("" if error is None else f" ± {error:.2f}") for p, error in (each["frame"], each["iteration"])]
-        lines.append(f"{' '.join(words)}: a frame grows as vertices^{powers[0]}, an iteration as vertices^{powers[1]}")
+        lines.append(f"{' '.join(words)}: a frame grows as {over}^{powers[0]}, an iteration as {over}^{powers[1]}")
     return "\n".join(lines)
 
 
@@ -201,8 +205,15 @@ def _cells(row):
             f"{row['launches']:.4g}",
         ),
         *map(_number, numbers),
-        row["reason"],
+        row["reason"] or _contact(row),
     )
+
+
+def _contact(row):
+    """What contact costs, or "" without colliders."""
+    if row.get("ms_without") is None:
+        return ""
+    return f"{row['ms'] / row['ms_without']:.2f} of the time without colliders, {row['contact_ns']:.3g} ns a vertex and substep"
 
 
 def _scene_of(row):

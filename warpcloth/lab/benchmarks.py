@@ -1,7 +1,7 @@
 """Benchmarks as data, and their rows: each in a fresh process, one after another."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
 
 from ..base.quiet import initialise_warp
@@ -27,6 +27,7 @@ class SolverBenchmark:
         frames: To time at most.
         copies: How many of the scene run at once.
         threads: That share the steps, on the CPU.
+        variants: Parameters of the scene by name, one dictionary each, beside which there are no sizes.
     """
 
     scene: SceneRef
@@ -37,13 +38,16 @@ class SolverBenchmark:
     frames: int = 20
     copies: int = 1
     threads: int = 1
+    variants: tuple = ()
 
     def scenes(self):
-        """The scene of each size.
+        """The scene of each size or variant.
 
         Raises:
             ValueError: It has no resolution.
         """
+        if self.variants:
+            return [replace(self.scene, parameters=self.scene.parameters | each) for each in self.variants]
         return [refined(self.scene, size) for size in self.sizes] or [self.scene]
 
     def setup_of(self, scene):
@@ -65,6 +69,27 @@ def standard(**given):
     listed = [(name, each) for name, record in SOLVERS.items() for each in record.facts.benchmarks]
     listed.sort(key=lambda one: one[1].scene != "hanging")
     return [SolverBenchmark(SceneRef(one.scene), Setup(name, one.options), getattr(one, kind), **given) for name, one in listed]
+
+
+# Of the sheet `resting`: one that touches, and one so far above that it falls for longer than is timed.
+_GAPS = (0.9e-3, 100.0)
+_SHAPES = ("plane", "sphere", "capsule", "box", "mesh")
+_TRIANGLES = (1250, 5000, 20000, 80000)
+_TOUCHING = {"explicit": {}, "newton": {"substeps": 4}, "xpbd": {"substeps": 4}, "projective-dynamics": {"substeps": 4}}
+
+
+def contacts(**given):
+    """Returns what contact costs on the scene ``resting``: shapes of colliders, near and far, and meshes of growing size.
+
+    Args:
+        given: Further fields of each :class:`SolverBenchmark`.
+    """
+    shapes = tuple({"collider": shape, "gap": gap} for shape in _SHAPES for gap in _GAPS)
+    few = tuple(each for each in shapes if each["collider"] in ("sphere", "mesh"))
+    setups = [(Setup(solver, options), shapes if solver == "explicit" else few) for solver, options in _TOUCHING.items()]
+    meshes = tuple({"collider": "mesh", "triangles": count} for count in _TRIANGLES)
+    setups.append((Setup("explicit"), meshes))
+    return [SolverBenchmark(SceneRef("resting"), setup, variants=variants, **given) for setup, variants in setups]
 
 
 class Run:
@@ -96,22 +121,23 @@ class Run:
             # An empty folder for the kernels that are compiled meanwhile.
             with TemporaryDirectory(prefix="warpcloth-kernels-") as folder, environment({"WARP_CACHE_PATH": folder}):
                 for i, scene in enumerate(benchmark.scenes()):
-                    self.rows.append({**self._row(benchmark, scene, cold=i == 0), "benchmark": index})
+                    row = self._row(benchmark, scene, cold=i == 0, compiles=i == 0 or bool(benchmark.variants))
+                    self.rows.append({**row, "benchmark": index})
                     progress(len(self.rows), self.total)
 
-    def _row(self, benchmark, scene, cold):
+    def _row(self, benchmark, scene, cold, compiles):
         setup = benchmark.setup_of(scene)
         given = {"device": benchmark.device, "dtype": benchmark.dtype, "copies": benchmark.copies, "threads": benchmark.threads}
 
         def measured(frames):
             return _alone(task(measure, scene=scene, setup=setup, frames=frames, started=time.time(), **given))
 
-        started = measured(0)["start_s"] if cold else None
+        started = measured(0)["start_s"] if compiles else None
         row = measured(benchmark.frames)
         share = row["bytes_per_s"] and row["bytes_per_s"] / max(self.bandwidth.values())
         named = {"scene": scene.name, "parameters": scene.parameters, "solver": setup.solver, "options": setup.options}
         named |= {"label": label(setup), **given}
-        return {**named, **row, "share": share, "cold_start_s": started}
+        return {**named, **row, "share": share, "cold_start_s": started if cold else None}
 
 
 def _alone(asked):

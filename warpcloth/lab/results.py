@@ -14,7 +14,7 @@ COLUMNS = (
     *("scene", "parameters", "solver", "options", "device", "dtype", "copies", "threads", "status", "reason"),
     *("vertices", "elements", "substeps", "iterations", "frames", "ms", "ms_low", "ms_high", "cloths_per_s", "ns", "bytes"),
     *("bytes_per_s", "share", "launches"),
-    *("start_s", "cold_start_s", "bind_s", "factorise_s", "memory"),
+    *("start_s", "cold_start_s", "bind_s", "factorise_s", "memory", "triangles", "ms_without", "contact_ns"),
 )
 
 
@@ -41,24 +41,27 @@ def exponent(sizes, values):
 
 
 def growth(rows):
-    """How the time of a frame and that of an iteration grow with the vertices n², of each benchmark with two sizes or more.
+    """How the time of a frame and that of an iteration grow with the vertices, of each benchmark with two sizes or more.
 
-    They differ where finer scenes take more substeps or iterations.
+    They differ where finer scenes take more substeps or iterations. Of one cloth on meshes of several sizes, they grow with the
+    triangles of the meshes.
 
     Returns:
-        list: Of each ``solver``, ``options`` that all sizes share, and ``frame`` and ``iteration``, each [p, error] of
-        :func:`exponent`.
+        list: Of each ``solver``, ``options`` that all sizes share, ``over``, "vertices" or "triangles", and ``frame`` and
+        ``iteration``, each [p, error] of :func:`exponent`.
     """
     found, known = [], [row for row in rows if row["status"] == "ok"]
     for number in dict.fromkeys(row["benchmark"] for row in known):
         of = [row for row in known if row["benchmark"] == number]
-        vertices = [row["vertices"] for row in of]
-        frame = exponent(vertices, [row["ms"] for row in of])
+        triangles = [row.get("triangles") for row in of]
+        over = "triangles" if len({row["vertices"] for row in of}) == 1 and all(triangles) else "vertices"
+        sizes = [row[over] for row in of]
+        frame = exponent(sizes, [row["ms"] for row in of])
         if frame[0] is None:
             continue
-        iteration = exponent(vertices, [row["ms"] / (row["substeps"] * max(row["iterations"], 1.0)) for row in of])
+        iteration = exponent(sizes, [row["ms"] / (row["substeps"] * max(row["iterations"], 1.0)) for row in of])
         shared = {k: v for k, v in of[0]["options"].items() if all(row["options"].get(k) == v for row in of)}
-        one = {"benchmark": number, "solver": of[0]["solver"], "options": shared}
+        one = {"benchmark": number, "solver": of[0]["solver"], "options": shared, "over": over}
         found.append({**one, "frame": list(frame), "iteration": list(iteration)})
     return found
 
