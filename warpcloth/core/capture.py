@@ -1,10 +1,8 @@
 """Graph capture, on the CPU too: a segment of launches is recorded once and replayed."""
 
-import gc
-from contextlib import contextmanager
-
 import warp as wp
 
+from ..base.collector import uncollected
 from ..base.turns import TURN
 
 
@@ -57,18 +55,6 @@ class Mirror:
             wp.synchronize_stream(self.array.device)  # or the next write would change what is still being copied
 
 
-@contextmanager
-def _uncollected():
-    """Disables garbage collection meanwhile: memory that it frees on CUDA (the factors of cholespy) would break a capture."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
 class Segment:
     """Launches that always run together: recorded when it is built, replayed when it is called, on the CPU and on CUDA.
 
@@ -80,7 +66,8 @@ class Segment:
     def __init__(self, device, record):
         self.device = device
         self.record = record  # the graph has only addresses of the arrays that the function refers to, which must not be freed
-        with TURN, _uncollected(), wp.ScopedCapture(device=device) as capture:
+        # Memory that the collector frees on CUDA, such as the factors of cholespy, would break a capture.
+        with TURN, uncollected(), wp.ScopedCapture(device=device) as capture:
             record()
         self.graph = capture.graph
 
