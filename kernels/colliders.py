@@ -289,7 +289,7 @@ def anchor_vertices(dtype, bounded: bool):
 
 @wp.struct
 class FilterNotes:
-    """What the filter notes: how often it cut, (copies,), and the first that is inside each collider, (copies, colliders).
+    """Notes of the filter: how often it cut, (copies,), and the first that is inside each collider, (copies, colliders).
 
     Where something is inside, ``inside`` is FIRST − ((step·n + vertex)(C + 1) + other), of n vertices and C colliders: other is
     the collider that held it back last, or C for a vertex that is not free. 0 where nothing is.

@@ -210,7 +210,7 @@ def _cells(row):
 
 
 def _contact(row):
-    """What contact costs, or "" without colliders."""
+    """Describes the cost of contact; "" without colliders."""
     if row.get("ms_without") is None:
         return ""
     return f"{row['ms'] / row['ms_without']:.2f} of the time without colliders, {row['contact_ns']:.3g} ns a vertex and substep"

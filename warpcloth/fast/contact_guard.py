@@ -13,7 +13,7 @@ from .structs import int32_array
 
 
 class ContactGuard:
-    """What a step needs of colliders, see :mod:`warpcloth.kernels.fast.contact_guard`.
+    """The part of a step that concerns colliders, see :mod:`warpcloth.kernels.fast.contact_guard`.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`, whose terms of contact it takes from the kernels of a step.

@@ -100,7 +100,7 @@ class Stepper:
 
     @property
     def inside(self):
-        """What :meth:`warpcloth.contact.collider_steps.ColliderSteps.inside` says of the steps so far, a list."""
+        """The list that :meth:`warpcloth.contact.collider_steps.ColliderSteps.inside` returns, for the steps so far."""
         return [] if self.colliders is None else self.colliders.inside()
 
     def follow_contact(self):
