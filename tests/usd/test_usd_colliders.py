@@ -9,6 +9,7 @@ from pxr import Usd
 import warpcloth as wc
 from support.usd_validation import validate
 from warpcloth.usd import read_scene, write_scene
+from warpcloth.usd.drawn import read_drawn
 
 # A square of 1 m at a height of 2 m, in centimetres with z up, at 24 frames a second from time code 101 to 105.
 STAGE = """#usda 1.0
@@ -294,6 +295,10 @@ CHOSEN = {
     "a shape": (shape("Sphere"), 1),
     "without the mark": (shape("Sphere", meta=""), 0),
     "turned off": (shape("Sphere", "bool physics:collisionEnabled = 0"), 0),
+    "a mesh that is turned off": (
+        shape("Mesh", MARKED.format(0) + "\ndouble warpcloth:friction = 1" + TETRAHEDRON, meta=""),
+        0,
+    ),
     "our mark": (shape("Sphere", MARKED.format(1), meta=""), 1),
     "our mark first": (shape("Sphere", MARKED.format(0)), 0),
     "the mark of an object": (shape("Xform", MARKED.format(1) + "\n" + shape("Sphere", meta=""), "Object", ""), 1),
@@ -462,6 +467,9 @@ def test_skinned_characters_are_posed_in_memory(path, kind, count, instanced):
     for frame in range(5):
         points = turned(body, min(frame, len(body.poses) - 1), body.frames[min(frame, len(body.frames) - 1)])
         np.testing.assert_allclose(points.min(axis=0), [0, 0, 0.1 * frame], atol=1e-7)
+    shown = read_drawn(str(path))
+    drawn = next(each for each in shown.prims if each.path == body.name)
+    np.testing.assert_allclose(drawn.points(105).min(axis=0), [0, 0, 0.4], atol=1e-7)
 
 
 def test_a_cloth_of_a_skinned_character_has_pins_that_follow_it(path):

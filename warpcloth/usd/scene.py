@@ -18,7 +18,7 @@ from ..terms import TERMS, QuadraticBending, Spring
 from ..terms.loads import LOADS
 from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of, own_names
 from .chunks import export
-from .colliders import is_collider, located, read_colliders
+from .colliders import located, read_colliders
 from .gprims import define_colliders
 from .layers import scene_layer
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics
@@ -128,11 +128,12 @@ def _refuse_missing(mass, term):
 def _cloth_prim(stage, path, prim):
     """The prim that is named, or the only one with cloth attributes, or what `find_prim` takes."""
     if prim is None:
+        of_colliders = {row.name for row in attributes() if row.location == "collider"}
         cloths = [
             found
             for found in stage.Traverse(Usd.TraverseInstanceProxies())
             if found.IsA(UsdGeom.PointBased)
-            and ((own_names(found) and not is_collider(found)) or has_api(found, "PhysicsSurfaceDeformableSimAPI"))
+            and (set(own_names(found)) - of_colliders or has_api(found, "PhysicsSurfaceDeformableSimAPI"))
         ]
         prim = cloths[0].GetPath() if len(cloths) == 1 else None
     return find_prim(stage, path, prim)
