@@ -146,6 +146,13 @@ def test_pins_that_are_refused(tmp_path, pins, message):
     assert "prim /root/Pole/Flag/FlagMesh: " in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_attributes_of_an_object_with_shape_keys(tmp_path):
+    """Blender makes a SkelRoot of it."""
+    path = flag(tmp_path / "flag.usda")
+    path.write_text(path.read_text().replace('Xform "Flag"', 'SkelRoot "Flag"'))
+    assert read_scene(path).density == 0.15
+
+
 @pytest.mark.parametrize("prim", [None, "Flag", "/root/Pole/Flag", "FlagMesh"])
 def test_a_flag_that_is_keyed_as_an_object_follows_its_pole(tmp_path, prim):
     """Pins move with it, and the result is written in its space, where they stand still, with velocities relative to it."""

@@ -349,6 +349,10 @@ REFUSED = {
         "prim /Thing: is Points, must be a Mesh or one of Cube, Sphere",
     ),
     "empty": (shape("Xform"), "prim /Thing: is Xform without a shape right below it, must be a shape to be a collider"),
+    "scope": (
+        shape("Scope", shape("Sphere", name="Ball", meta="")),
+        "prim /Thing: is Scope without a shape right below it, must be",
+    ),
     "instancer": (
         shape("PointInstancer", shape("Sphere"), "Many", ""),
         "prim /Many: has a collider as a prototype, which must be",
@@ -479,11 +483,12 @@ def test_a_cloth_of_a_skinned_character_has_pins_that_follow_it(path):
     )
     cloth = STAGE[STAGE.index("    int[] faceVertexCounts") : STAGE.rindex("}")]
     text = text.replace("TETRAHEDRON", cloth + "int[] warpcloth:pins = [0, 1]").replace('"PhysicsCollisionAPI", ', "")
+    text = text.replace("rel skel:skeleton", 'uniform token[] skel:blendShapes = ["big"]\nrel skel:skeleton')
     path.write_text(STAGE[: STAGE.index("def Mesh")] + text)
     scene = read_scene(path)
     np.testing.assert_allclose(scene.pins.keyframes[:, 0, 2], 2 + 0.1 * np.arange(5), atol=1e-6)
     result = path.parent / "out.usdc"
     wc.simulate(scene, wc.Explicit(substeps=8), output=result, frames=2)
     stage = Usd.Stage.Open(str(result))
-    for name in ("Indices", "Weights"):
-        assert not stage.GetPrimAtPath("/Rig/Body").GetAttribute(f"primvars:skel:joint{name}").HasValue()
+    for name in ("primvars:skel:jointIndices", "primvars:skel:jointWeights", "skel:blendShapes"):
+        assert not stage.GetPrimAtPath("/Rig/Body").GetAttribute(name).HasValue()

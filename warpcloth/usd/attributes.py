@@ -33,7 +33,7 @@ import numpy as np
 
 from ..base.texts import camel_case
 from ..terms import TERMS
-from .modules import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+from .modules import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdSkel, Vt
 from .values import refuse_unknown, value_of
 
 
@@ -265,9 +265,9 @@ def has_api(prim, name):
 
 
 def holders(prim):
-    """The prims whose attributes are those of a shape: itself and, if that is an Xform, the prim above it."""
+    """The prims whose attributes are those of a shape: itself and, if that is an Xform or a SkelRoot, the prim above it."""
     parent = prim.GetParent()
-    return [prim, parent] if parent.IsA(UsdGeom.Xform) else [prim]
+    return [prim, parent] if parent.IsA(UsdGeom.Xform) or parent.IsA(UsdSkel.Root) else [prim]
 
 
 def own_names(prim):

@@ -87,14 +87,11 @@ def _collides(prim):
     if prim.IsA(UsdGeom.Gprim):
         return is_collider(prim)
     own = prim.HasAPI(UsdPhysics.CollisionAPI) or prim.GetAttribute("warpcloth:collider").HasAuthoredValue()
-    if own and is_collider(prim) and not any(each.IsA(UsdGeom.Gprim) for each in _below(prim)):
+    below = prim.GetFilteredChildren(Usd.TraverseInstanceProxies())
+    if own and is_collider(prim) and not any(each.IsA(UsdGeom.Gprim) and prim in holders(each) for each in below):
         kind = prim.GetTypeName() or "untyped"
         raise ValueError(f"is {kind} without a shape right below it, must be a shape to be a collider")
     return False
-
-
-def _below(prim):
-    return prim.GetFilteredChildren(Usd.TraverseInstanceProxies())
 
 
 class _Reader:
@@ -243,7 +240,11 @@ class _Reader:
         turns = [operations[order[1]].Get(code) for code in codes]
         rotations = np.array([[*each.GetImaginary(), each.GetReal()] for each in turns], dtype=np.float64)
         sizes = np.array(scale.Get(Usd.TimeCode.EarliestTime()) if scale else (1, 1, 1), dtype=np.float64)
-        if not (sizes.all() and np.isfinite(positions).all() and (np.abs((rotations**2).sum(axis=1) - 1.0) < _SAME).all()):
+        if not (
+            sizes.all()
+            and np.isfinite([*sizes, *positions.ravel()]).all()
+            and (np.abs((rotations**2).sum(axis=1) - 1.0) < _SAME).all()
+        ):
             return None  # for the general way to refuse
         return np.diag(sizes), positions, rotations
 

@@ -25,6 +25,7 @@ _BLOCKED = (
     "primvars:normals:indices",
     "primvars:skel:jointIndices",
     "primvars:skel:jointWeights",
+    "skel:blendShapes",
 )
 _COLOUR = (0.17, 0.35, 0.58)
 _LINE_COLOUR = (0.05, 0.05, 0.05)
