@@ -186,21 +186,21 @@ def test_steps_above_gershgorins_bound_warn(device):
 @pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.host)])
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_sheet_at_rest_stays_there(name, dtype, device):
-    """Its rest shape, one pinned vertex, no gravity: it does not move in a second, and does not spin about the pin."""
-    pin, solver = 14, SOLVERS[name]
+    """Its rest shape, one pinned vertex, no gravity: it does not move in a third of a second, and does not spin about the pin."""
+    pin, solver, steps = 14, SOLVERS[name], 200
     scene = square(solver=solver, gravity=(0.0, 0.0, 0.0), fps=600.0, pins=[pin])
     stepper = solver.bind(scene.build(device=device, dtype=dtype))
-    for _ in range(600):
+    for _ in range(steps):
         stepper.step()
     x, v = (array.numpy().astype(np.float64) for array in stepper.state)
     arms, mass, eps = scene.mesh.points - scene.mesh.points[pin], scene.vertex_masses, np.finfo(dtype).eps
     L = np.cross(arms, mass[:, None] * v).sum(axis=0)
     inertia = np.einsum("n,nkk,ij->ij", mass, arms[:, :, None] * arms[:, None], np.eye(3))
     inertia -= np.einsum("n,ni,nj->ij", mass, arms, arms)
-    # Forces are made of rounding: a step moves a place of size 1 by up to ε, to and fro or, at worst, as in a random walk.
-    assert np.abs(x - scene.mesh.points).max() < 2.0 * np.sqrt(600) * eps
+    # Forces are made of rounding: a step moves a position of size 1 by up to ε, to and fro or, at worst, as in a random walk.
+    assert np.abs(x - scene.mesh.points).max() < 2.0 * np.sqrt(steps) * eps
     # A random walk of the velocity ends √3 times as fast as it is in the mean: of a vertex 0.5 m off that moves by that much.
-    assert np.linalg.norm(np.linalg.solve(inertia, L)) * 600 * stepper.h * 0.5 < np.sqrt(3.0) * 2.0 * np.sqrt(600) * eps
+    assert np.linalg.norm(np.linalg.solve(inertia, L)) * steps * stepper.h * 0.5 < np.sqrt(3.0) * 2.0 * np.sqrt(steps) * eps
 
 
 @pytest.mark.parametrize("damping", [None, 3.0])
