@@ -386,7 +386,16 @@ REFUSED = {
     ),
     "approximation": (
         shape("Mesh", 'token warpcloth:collider = "round"' + TETRAHEDRON),
-        "prim /Thing: warpcloth:collider is 'round', must be one of none, boundingCube, boundingSphere, convexHull",
+        "prim /Thing: warpcloth:collider is 'round', must be true, false or one of none, boundingCube, boundingSph",
+    ),
+    "text": (
+        shape("Sphere", 'string warpcloth:collider = "false"', meta=""),
+        "warpcloth:collider is 'false', must be true, false or",
+    ),
+    "type": (shape("Sphere", "double3 warpcloth:collider = (1, 0, 0)", meta=""), "has type double3, must be bool or token"),
+    "for a while": (
+        shape("Sphere", "bool physics:collisionEnabled.timeSamples = {101: 0, 103: 1}"),
+        "prim /Thing: physics:collisionEnabled changes over time, must have one value",
     ),
     "attribute": (
         shape("Sphere", "double warpcloth:fricton = 1"),

@@ -71,27 +71,27 @@ def located(where):
         raise ValueError(f"{where}: {error}") from error
 
 
-def is_collider(prim):
-    """Whether a prim, or the Xform above it, is marked as a collider that is on."""
-    marks = [each.GetAttribute("warpcloth:collider") for each in holders(prim)]
-    own = next((each.Get(Usd.TimeCode.EarliestTime()) for each in marks if each and each.HasAuthoredValue()), None)
-    if own is not None:
-        return bool(own)
-    applied = [each for each in holders(prim) if each.HasAPI(UsdPhysics.CollisionAPI)]
-    enabled = applied and UsdPhysics.CollisionAPI(applied[0]).GetCollisionEnabledAttr().Get(Usd.TimeCode.EarliestTime())
-    return bool(enabled)
+def _mark(prim):
+    """The attribute that says whether a prim is a collider, of it or of the prim above it, ours first; or None."""
+    own = [each.GetAttribute("warpcloth:collider") for each in holders(prim)]
+    of_physics = [UsdPhysics.CollisionAPI(each) for each in holders(prim) if each.HasAPI(UsdPhysics.CollisionAPI)]
+    found = [each for each in own if each and each.HasAuthoredValue()]
+    return next(iter([*found, *(each.GetCollisionEnabledAttr() for each in of_physics)]), None)
 
 
 def _collides(prim):
     """Whether a prim is a shape that is a collider; refuses prims that are marked as colliders and are none."""
-    if prim.IsA(UsdGeom.Gprim):
-        return is_collider(prim)
-    own = prim.HasAPI(UsdPhysics.CollisionAPI) or prim.GetAttribute("warpcloth:collider").HasAuthoredValue()
+    mark = _mark(prim)
+    if mark and mark.ValueMightBeTimeVarying():
+        raise ValueError(f"{mark.GetName()} changes over time, must have one value")
+    if mark is None or not mark.Get(Usd.TimeCode.EarliestTime()):
+        return False
     below = prim.GetFilteredChildren(Usd.TraverseInstanceProxies())
-    if own and is_collider(prim) and not any(each.IsA(UsdGeom.Gprim) and prim in holders(each) for each in below):
+    own = mark.GetPrim() == prim
+    if own and not any(each.IsA(UsdGeom.Gprim) and prim in holders(each) for each in (prim, *below)):
         kind = prim.GetTypeName() or "untyped"
         raise ValueError(f"is {kind} without a shape right below it, must be a shape to be a collider")
-    return False
+    return prim.IsA(UsdGeom.Gprim)
 
 
 class _Reader:
@@ -118,6 +118,7 @@ class _Reader:
 
     def collider(self):
         """The `Collider`."""
+        approximation = self._approximation()
         self._warn_of_dynamics()
         given = {"friction": self._friction(), "name": self._name()}
         size = None if self._shape_codes else self._size
@@ -144,7 +145,7 @@ class _Reader:
                 return Box(size=lengths * size["size"], **given)
         elif self.kind == "Plane":
             raise ValueError("is a Plane whose scale changes over time, must keep it to be a collider")
-        return self._mesh(given)
+        return self._mesh(approximation, given)
 
     def _warn_of_dynamics(self):
         """Says that a rigid body does not move by forces."""
@@ -248,7 +249,7 @@ class _Reader:
             return None  # for the general way to refuse
         return np.diag(sizes), positions, rotations
 
-    def _mesh(self, given):
+    def _mesh(self, approximation, given):
         """A `MeshCollider`, or what approximates it."""
         prim = self.prim
         if not (prim.IsA(UsdGeom.Mesh) or self.kind in SOLIDS):
@@ -265,7 +266,7 @@ class _Reader:
             mirrored = np.linalg.det(self._transforms[0][:3, :3]) < 0.0
         triangles = _without_slivers(points.reshape(-1, *points.shape[-2:])[0], triangles)
         triangles = triangles[:, ::-1] if mirrored else triangles
-        return self._approximated(points, triangles, given)
+        return self._approximated(approximation, points, triangles, given)
 
     def _surface(self):
         """Points (n, 3) or (F, n, 3) in the prim's own space, and triangles (T, 3) from the front there."""
@@ -292,13 +293,18 @@ class _Reader:
         same = exact is not None and np.array_equal(exact.astype(np.float32), points.astype(np.float32))
         return exact if same else points.astype(np.float64)
 
-    def _approximated(self, points, triangles, given):
-        """The collider that is asked for in the place of a mesh."""
+    def _approximation(self):
+        """How a mesh is approximated."""
         own = self.values.get("(collides)")
+        name = "warpcloth:collider" if isinstance(own, str) else "physics:approximation"
         wanted = own if isinstance(own, str) else self.values.get("(approximation)") or "none"
         if wanted not in (*_APPROXIMATIONS, *_TAKEN_AS_NONE):
-            name = "warpcloth:collider" if isinstance(own, str) else "physics:approximation"
-            raise ValueError(f"{name} is {wanted!r}, must be one of {', '.join((*_APPROXIMATIONS, *_TAKEN_AS_NONE))}")
+            also = "true, false or " if isinstance(own, str) else ""
+            raise ValueError(f"{name} is {wanted!r}, must be {also}one of {', '.join((*_APPROXIMATIONS, *_TAKEN_AS_NONE))}")
+        return wanted
+
+    def _approximated(self, wanted, points, triangles, given):
+        """The collider that is asked for in the place of a mesh."""
         if wanted in _TAKEN_AS_NONE or (wanted != "none" and points.ndim == 3):
             reason = "it deforms" if points.ndim == 3 else "it is not approximated in that way"
             self._warn(f"its approximation {wanted} is taken as none, as {reason}: its triangles are the collider")
