@@ -748,12 +748,16 @@ PROBE = """
 import inspect, json, os, sys
 import warp as wp
 
-launched, rows = {}, set()
-launch, make = wp.launch, wp.array.__init__
+launched, loaded, rows = {}, set(), set()
+launch, load, make = wp.launch, wp.Module.load, wp.array.__init__
 
 def recorded_launch(kernel, *args, **kwargs):
     launched[kernel.module.name] = kernel
     return launch(kernel, *args, **kwargs)
+
+def recorded_load(module, *args, **kwargs):
+    loaded.add(module.name)
+    return load(module, *args, **kwargs)
 
 def recorded_make(self, *args, **kwargs):
     make(self, *args, **kwargs)
@@ -768,43 +772,36 @@ def homes(function, seen):
             homes(value.func, seen)
     return {each.__module__ for each in seen}
 
-wp.launch, wp.array.__init__ = recorded_launch, recorded_make
+wp.launch, wp.Module.load, wp.array.__init__ = recorded_launch, recorded_load, recorded_make
 import numpy as np
 import warpcloth as wc
 
-solver, declared, device = sys.argv[1:]
-mesh = wc.Mesh.grid(7, 5, pattern="alternating")
-terms = [wc.Spring(stiffness=100.0)]
-if declared == "all":
-    terms += [wc.QuadraticBending(stiffness=1e-4), wc.DihedralBending(stiffness=1e-4)]
-    terms += [wc.Attachment(vertices=list(range(1, 34)), stiffness=10.0)]
-model = wc.Scene(mesh, density=0.1, terms=terms, pins=[0]).build(device=device)
-stepper = getattr(wc, solver)(substeps=8).bind(model)
-stepper.step()
-stepper.step()
-wp.synchronize()
-assert np.isfinite(stepper.state.x.numpy()).all()
-cache = wp.config.kernel_cache_dir
-print(json.dumps({
-    "homes": sorted(set().union(*(homes(kernel.func, {kernel.func}) for kernel in launched.values()))),
-    "named": sorted(model.kernels),
-    "launched": sorted(launched),
-    "compiled": sorted(name for name in os.listdir(cache) if os.path.isdir(os.path.join(cache, name))),
-    "rows": sorted(rows),
-}))
+def probe(solver, declared, device):
+    for record in (launched, loaded, rows):
+        record.clear()
+    mesh = wc.Mesh.grid(7, 5, pattern="alternating")
+    terms = [wc.Spring(stiffness=100.0)]
+    if declared == "all":
+        terms += [wc.QuadraticBending(stiffness=1e-4), wc.DihedralBending(stiffness=1e-4)]
+        terms += [wc.Attachment(vertices=list(range(1, 34)), stiffness=10.0)]
+    model = wc.Scene(mesh, density=0.1, terms=terms, pins=[0]).build(device=device)
+    stepper = getattr(wc, solver)(substeps=8).bind(model)
+    stepper.step()
+    stepper.step()
+    wp.synchronize()
+    assert np.isfinite(stepper.state.x.numpy()).all()
+    cache = wp.config.kernel_cache_dir
+    return {
+        "homes": sorted(set().union(*(homes(kernel.func, {kernel.func}) for kernel in launched.values()))),
+        "named": sorted(model.kernels),
+        "launched": sorted(launched),
+        "loaded": sorted(loaded),
+        "compiled": sorted(name for name in os.listdir(cache) if os.path.isdir(os.path.join(cache, name))),
+        "rows": sorted(rows),
+    }
+
+print(json.dumps([probe(*build, sys.argv[1]) for build in json.loads(sys.argv[2])]))
 """
-
-
-def probed(tmp_path, solver, declared, device):
-    """What a new process with an empty kernel cache builds, compiles and launches."""
-    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", PROBE, solver, declared, device]
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, cwd=Path(__file__).parent)
-    assert run.returncode == 0, run.stderr
-    found = json.loads(run.stdout.splitlines()[-1])
-    found["homes"] = [home.rpartition(".")[2] for home in found["homes"] if ".kernels.terms." in home]
-    found["named terms"] = sorted({name.partition(".")[2] for name in found["named"] if "." in name})
-    return found
 
 
 # Solver; terms of the scene; which files of energies are found in kernels; names in the report.
@@ -818,18 +815,34 @@ BUILDS = {
 }
 
 
-@pytest.mark.parametrize(("solver", "declared", "homes", "names"), BUILDS.values(), ids=BUILDS)
-def test_nothing_undeclared_exists(tmp_path, solver, declared, homes, names, device):
-    found = probed(tmp_path, solver, declared, device)
-    assert found["homes"] == homes
-    assert found["named terms"] == names
-    # Each kernel is a module of its own; what was compiled is what was launched, and no more than the report names.
-    assert len(found["compiled"]) == len(found["launched"]) <= len(found["named"])
-    assert all(any(module in folder for folder in found["compiled"]) for module in found["launched"])
+@pytest.fixture(scope="module")
+def probed(tmp_path_factory, device):
+    """By build, what a new process with an empty kernel cache builds, loads and launches, and has compiled so far."""
+    cache = tmp_path_factory.mktemp("cache")
+    environment = os.environ | {"WARP_CACHE_PATH": str(cache), "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", PROBE, device, json.dumps([build[:2] for build in BUILDS.values()])]
+    run = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, cwd=Path(__file__).parent)
+    assert run.returncode == 0, run.stderr
+    return dict(zip(BUILDS, json.loads(run.stdout.splitlines()[-1]), strict=True))
+
+
+@pytest.mark.parametrize("name", BUILDS)
+def test_nothing_undeclared_exists(name, probed):
+    found, (_solver, _declared, homes, names) = probed[name], BUILDS[name]
+    assert [home.rpartition(".")[2] for home in found["homes"] if ".kernels.terms." in home] == homes
+    assert sorted({named.partition(".")[2] for named in found["named"] if "." in named}) == names
+    # Each kernel is a module of its own; what was loaded is what was launched, and no more than the report names.
+    assert found["loaded"] == found["launched"] and len(found["launched"]) <= len(found["named"])
     # One array at least has a row for each element of what is declared, and none has one for anything else.
     assert EDGES in found["rows"]
     assert (HINGES in found["rows"]) == ("QuadraticBending" in names)
     assert (ATTACHED in found["rows"]) == ("Attachment" in names)
+
+
+def test_nothing_is_compiled_that_is_not_launched(probed):
+    """Folders of the cache are named wp_<module>_<7 digits>."""
+    launched = {module for each in probed.values() for module in each["launched"]}
+    assert {folder[3:-8] for folder in list(probed.values())[-1]["compiled"]} == launched
 
 
 @pytest.mark.parametrize("name", SOLVERS)
