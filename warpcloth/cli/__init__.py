@@ -55,7 +55,8 @@ def main(argv=None):
             debug = arguments.debug
             with interrupts.loading():
                 from .. import simulate  # noqa: F401  loads Warp, which takes most of the time
-            gc.freeze()  # what is loaded stays to the end, so it is not looked through for garbage there either
+            if argv is None:  # what this process has loaded stays to the end, where it need not be looked through either
+                gc.freeze()
             if options.asks_for_help(arguments):
                 return options.show_help(arguments)
             return arguments.command(arguments)

@@ -4,6 +4,7 @@ import itertools
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -103,8 +104,17 @@ def _copies(stepper, number):
     found = wp.empty(shape, dtype=model.vec3, device=model.device)
     host = wp.empty(shape, dtype=model.vec3, device="cpu", pinned=True)
     indices = None if model.indices is None else wp.array(model.indices, dtype=wp.int32, device=model.device)
-    stream = wp.Stream(model.device)
-    return [_DeviceCopy(stepper, stream, indices, found[k], host[k]) for k in range(number)]
+    return [_DeviceCopy(stepper, _copy_stream(model.device), indices, found[k], host[k]) for k in range(number)]
+
+
+@cache
+def _copy_stream(device):
+    """The stream of a device that copies frames, made once and kept.
+
+    Warp notes the streams that exist in a table without a lock: one that ends in one thread while another records a graph would
+    break that table.
+    """
+    return wp.Stream(device)
 
 
 class _HostCopy:
