@@ -39,11 +39,22 @@ def checked_record(record: Any) -> tuple[str, ...]:
 
 
 def energy_names(scene: Scene) -> list[str]:
-    """Names of the energies and works that a run of a scene records; of terms their labels, numbered where one is taken."""
+    """Names of the energies and works that a run of a scene records."""
+    return [*dict.fromkeys(_term_names(scene)), *_other_names(scene)]
+
+
+def _term_names(scene):
+    """Names of the terms, and of contact and friction: their labels, numbered where one is taken; facets share theirs."""
+    terms = [*scene.terms, *scene.contact_terms]
+    first = [k for k, term in enumerate(terms) if not getattr(term, "facet", 0)]
+    names = _numbered((terms[k].label for k in first), _other_names(scene))
+    return [names[np.searchsorted(first, k, side="right") - 1] for k in range(len(terms))]
+
+
+def _other_names(scene):
     moved = any(collider.moves for collider in scene.colliders)
     others = ["kinetic", "gravity", *["work of pins"] * scene.pins.moves, *["work of loads"] * bool(scene.loads)]
-    others += ["work of colliders"] * moved + ["heat of friction"] * len(scene.rubbing[:1])
-    return _numbered((term.label for term in (*scene.terms, *scene.contact_terms)), others) + others
+    return others + ["work of colliders"] * moved + ["heat of friction"] * bool(scene.rubbing)
 
 
 def collider_names(scene: Scene) -> list[str]:
@@ -94,8 +105,10 @@ class Evaluation:
         self._gravity = model.gravity.numpy().astype(np.float64)[:, None]
         self._start, self._energies = self._host(model.positions), None
         self.names = energy_names(model.scene)
-        of_terms = zip(self.names, model.terms, strict=False)  # those of terms are first
-        self.names_of_friction = [name for name, each in of_terms if each.term is FRICTION]
+        self._term_names = _term_names(model.scene)
+        self.names_of_friction = [
+            name for name, each in zip(self._term_names, model.terms, strict=True) if each.term is FRICTION
+        ]
         if not forces:
             return
         self.gradient = model.vectors()
@@ -144,11 +157,11 @@ class Evaluation:
             sums = Sums(model)
             self._energies = [None if each.hard else Energy(model, sums, terms=(each,)) for each in self._terms]
         self._present.launch(x, v)
-        for label, energy in zip(self.names, self._energies, strict=False):  # those of terms are first
+        for name, energy in zip(self._term_names, self._energies, strict=True):
             total = model.scalars()
             if energy is not None:  # a hard term stores none
                 energy.add(x, total)
-            found[label] = np.array(total.numpy())
+            found[name] = found.get(name, 0.0) + total.numpy()
         moved = self._host(x) - self._start
         if v is not None:
             with np.errstate(over="ignore"):  # of a copy that diverges
