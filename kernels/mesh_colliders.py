@@ -765,3 +765,47 @@ def filter_meshes(dtype):
                     note_inside(notes, copy, c, step, vertex, per_copy, last)
 
     return filter_vertices
+
+
+@cache
+def surface_moves(dtype):
+    """Kernel over vertices, after a step: the moves in it of the material of a mesh that deforms, at the points nearest to x.
+
+    x is where the vertices are ``when`` half steps on, and ``poses`` are those of then. 0 beyond the contact distance.
+    """
+    vec3, mat33 = types(dtype)
+    pose_type, _anchor = pose_types(dtype)
+    to_local, to_space = of_pose(dtype)
+    corners, _from, _carry = geometry(dtype)
+    nearest_beyond, _sweep = queries(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def moves(
+        # elements
+        mesh: meshes(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        poses: wp.array2d(dtype=pose_type),
+        motion: motions(dtype),
+        # parameters
+        when: int,
+        collider: int,
+        per_copy: int,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        first = 2 * motion.steps[copy] - 2  # of the step that is over
+        p = to_local(poses[copy, collider], x[i])
+        d, n, face, w = nearest_beyond(
+            mesh, collider, first + when, motion.per_frame, p, motion.r, dtype(0.0), 0, mat33(), vec3()
+        )
+        found = vec3()
+        if face >= 0:
+            start = wp.transpose(corners(mesh, collider, face, first, motion.per_frame)) * w
+            end = wp.transpose(corners(mesh, collider, face, first + 2, motion.per_frame)) * w
+            found = to_space(motion.after[copy, collider], end + d * n) - to_space(motion.before[copy, collider], start + d * n)
+        out[i] = found
+
+    return moves

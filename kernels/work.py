@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .colliders import of_pose, step_poses
+from .colliders import of_pose, pose_types, step_poses
 from .local import local_coordinate
 from .project import multiplier_type
 from .term import Term
@@ -182,61 +182,78 @@ def half_way(dtype):
 
 @cache
 def pulls(dtype):
-    """The struct of ∂U/∂x of contact and friction with a collider, and of friction alone, which may be None."""
+    """The struct of ∂U/∂x of contact and friction with a collider, of friction alone, and of the collider's moves, or None."""
     vec3, _ = types(dtype)
 
     @wp.struct
     class Pulls:
         all: wp.array(dtype=vec3)
         friction: wp.array(dtype=vec3)
+        move: wp.array(dtype=vec3)
 
     return Pulls
 
 
 @cache
-def add_collider_work(dtype, at_end: bool):
+def rigid_moves(dtype):
+    """Kernel over vertices: the moves in a step of the material of a collider at x, where ``poses`` has the collider then."""
+    vec3, _ = types(dtype)
+    pose_type, _anchor = pose_types(dtype)
+    to_local, to_space = of_pose(dtype)
+
+    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
+    def moves(
+        # state in
+        x: wp.array(dtype=vec3),
+        poses: wp.array2d(dtype=pose_type),
+        step: step_poses(dtype),
+        # parameters
+        collider: int,
+        per_copy: int,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        X = to_local(poses[copy, collider], x[i])
+        out[i] = to_space(step.after[copy, collider], X) - to_space(step.before[copy, collider], X)
+
+    return moves
+
+
+@cache
+def add_collider_work(dtype):
     """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
 
     ∇U is that of contact and friction, ∇H that of friction alone; δ is the move of the collider's material at the vertex. Both
-    are those at the position x_step where the step takes its forces. Where that is ``at_end``, the mean of the products there
-    and where the step began is taken, as the trapezoidal rule has it; ∇U and ∇H are then kept for the next step.
+    are those where the step takes its forces, ``now``. With ``before`` the mean is taken of the products there and where the
+    step began, as the trapezoidal rule has it; ∇U and ∇H are then kept for the next step.
     """
     vec3, _ = types(dtype)
-    to_local, to_space = of_pose(dtype)
     product = wide_dot(dtype)
 
-    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}.{at_end}", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
     def add(
         # state in
         x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
-        x_step: wp.array(dtype=vec3),
         now: pulls(dtype),
-        poses: step_poses(dtype),
-        # parameters
-        collider: int,
-        per_copy: int,
         # in and out
         before: pulls(dtype),
         of_collider: wp.array(dtype=wp.float64),
         against_friction: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
-        copy = i // per_copy
-        X = to_local(poses.at[copy, collider], x_step[i])
-        move = to_space(poses.after[copy, collider], X) - to_space(poses.before[copy, collider], X)
         slip = x[i] - x_before[i]
-        work = product(now.all[i], move)
+        work = product(now.all[i], now.move[i])
         rubbed = wp.float64(0.0)
         if now.friction.shape[0] > 0:
-            rubbed = product(now.friction[i], slip - move)
-        if wp.static(at_end):
-            X = to_local(poses.before[copy, collider], x_before[i])
-            move = to_space(poses.after[copy, collider], X) - to_space(poses.before[copy, collider], X)
-            work = wp.float64(0.5) * (work + product(before.all[i], move))
+            rubbed = product(now.friction[i], slip - now.move[i])
+        if before.all.shape[0] > 0:
+            work = wp.float64(0.5) * (work + product(before.all[i], before.move[i]))
             before.all[i] = now.all[i]
             if now.friction.shape[0] > 0:
-                rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], slip - move))
+                rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], slip - before.move[i]))
                 before.friction[i] = now.friction[i]
         of_collider[i] = of_collider[i] - work
         against_friction[i] = against_friction[i] + rubbed

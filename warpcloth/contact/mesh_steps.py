@@ -23,7 +23,7 @@ class MeshSteps:
 
     def __init__(self, model, poses, bounded, **given):
         self.model, self._bounded, self._facets = model, bounded, {}
-        self._meshes = model.colliders.meshes.own(model.device)
+        self._meshes = model.colliders.meshes.own(model)
         self.geometry, self.motion = self._meshes.geometry, kernels.motions(model.dtype)()
         self.given = given
         for name, value in (given | {name: getattr(poses, name) for name in ("before", "at", "after")}).items():

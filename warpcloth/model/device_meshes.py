@@ -1,6 +1,5 @@
 """The triangle meshes among the colliders of a scene on a device."""
 
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -25,13 +24,15 @@ class DeviceMeshes(NamedTuple):
     trees: list
     deform: list
 
-    def own(self, device):
+    def own(self, model):
         """These, with trees of their own of what deforms."""
         trees = list(self.trees)
         for c in self.deform:
             trees[c] = wp.Bvh(wp.clone(trees[c].lowers), wp.clone(trees[c].uppers))
-        geometry = copy(self.geometry)
-        geometry.bvh = _ids(trees, device)
+        geometry = kernels.meshes(model.dtype)()  # as copies of a struct share its memory
+        for name in ("points", "triangles", "first_triangle", "first_point", "size", "frames", "margin"):
+            setattr(geometry, name, getattr(self.geometry, name))
+        geometry.bvh = _ids(trees, model.device)
         return self._replace(geometry=geometry, trees=trees)
 
     @property
