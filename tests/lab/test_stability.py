@@ -533,6 +533,17 @@ def test_wrong_values_are_refused(make, words):
         make()
 
 
+def test_a_map_refuses_colliders_that_move(tmp_path):
+    (tmp_path / "lift.py").write_text(
+        "import warpcloth as wc\n"
+        "def scene():\n"
+        "    ball = wc.Sphere(radius=0.1, position=[(0, -1, 0), (0, -0.9, 0)], name='ball')\n"
+        "    return wc.Scene(wc.Mesh.grid(3, 3), density=0.1, terms=[wc.Spring(stiffness=1.0)], colliders=[ball])\n"
+    )
+    with pytest.raises(ValueError, match="the collider ball moves, frame by frame; a map needs colliders at rest"):
+        scene_at(SceneRef(str(tmp_path / "lift.py")), {"dt": 0.1}, 4)
+
+
 def test_values_of_axes():
     assert AXES["iterations"].values(1, 8, 10) == [1, 2, 3, 4, 5, 6, 8]
     assert AXES["dt"].values(1e-4, 1e-1, 4) == [1e-4, 1e-3, 1e-2, 1e-1]

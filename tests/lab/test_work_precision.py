@@ -33,7 +33,7 @@ from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
 
 pytestmark = pytest.mark.host
-SMALL = SceneRef("hanging", {"n": 6})
+SMALL, TOUCHING = SceneRef("hanging", {"n": 6}), SceneRef("drape", {"n": 4})
 FRAME, SUBSTEPS = 12, 4
 STEPS = setups_of_steps()
 
@@ -102,6 +102,13 @@ def test_all_that_minimise_close_the_gap(setup, device):
         assert all(later <= before + found["floor"] for before, later in pairwise(gaps))
 
 
+@pytest.mark.parametrize("solver", ["newton", "projective-dynamics", "xpbd"])
+def test_the_gap_closes_in_contact(solver, device):
+    found = measure(setups_of_steps([solver])[-1], device, TOUCHING)
+    assert found["status"] == "ok" and found["points"][0]["gap"] > 1e-6
+    assert found["points"][-1]["gap"] <= max(found["floor"], 1e-12)
+
+
 def test_float32_ends_where_its_rounding_is(device):
     """The same first iterations, and an end that more of them do not change."""
     single, double = (measure(STEPS[0], device, dtype=dtype) for dtype in ("float32", "float64"))
@@ -161,11 +168,13 @@ def test_errors_of_projective_dynamics_end_at_the_floor(device):
     assert 0.01 * found["floor"] < np.linalg.norm(left) / np.linalg.norm(first) < found["floor"] < spectrum.RESOLVED
 
 
-@pytest.mark.parametrize("substeps", [4, 16])
-def test_projective_dynamics_converges_as_its_spectrum_says(substeps, device):
+@pytest.mark.parametrize(
+    ("scene", "substeps"), [(SMALL, 4), (SMALL, 16), pytest.param(TOUCHING, 4, id="touching-4")], ids=lambda value: str(value)
+)
+def test_projective_dynamics_converges_as_its_spectrum_says(scene, substeps, device):
     """What is neglected is of second order in the error: from 1e-2 on the prediction is off by less than 1e-2 of itself, and
     the last factor of an iteration, at errors of 1e-4 or less, by less than 1e-4 of 1 less it."""
-    found = spectrum.measure(asdict(SMALL), scene_digest(SMALL.load()), FRAME, substeps, device, limit=np.inf)
+    found = spectrum.measure(asdict(scene), scene_digest(scene.load()), FRAME, substeps, device, limit=np.inf)
     mu = np.array(found["eigenvalues"])
     assert 0.0 < mu[0] and mu[-1] <= 1.0 + 1e-12, "the matrix is never below the Hessian"
     known = [point for point in found["points"] if point["predicted"] is not None and point["error"] > spectrum.RESOLVED]
@@ -395,6 +404,16 @@ def test_time_diagram(device, tmp_path, drawn):
         assert joined.get_xydata().tolist() == [
             [found["rows"][i]["ms_per_second"], found["rows"][i][name]] for i in front_of[name]
         ]
+
+
+def test_time_diagram_of_contact(device):
+    """A sheet that falls on a ball: errors of implicit settings fall to that of the reference."""
+    with ThreadPoolExecutor(1) as executor:
+        found = time_diagram(TOUCHING, ["explicit", "xpbd", "pbd"], frames=8, device=device, store=Store(), executor=executor)
+    rows = {row["label"]: row for row in found["rows"]}
+    assert {row["status"] for row in rows.values()} == {"ok", "refused"}
+    assert all("friction" in row["reason"] for row in rows.values() if row["solver"] == "pbd")
+    assert min(row["error"] for row in rows.values() if row["solver"] == "xpbd") < 0.01 > found["reference"]["error"]
 
 
 def test_a_chart_of_errors_needs_motion(tmp_path):

@@ -154,9 +154,11 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         if done == len(parts):
             # Of two parts that stand in for one another each by itself seems to do nothing.
             needless = [part for part, trial in zip(parts, trials, strict=True) if trial.matters is False]
+            needless = [(kind, k) for kind, k in needless if kind != "friction" or ("collider", k) not in needless]
             if len(needless) > 1:
                 without = {"changed": _without(scene, needless)}
-                name = "without " + " and ".join(parts[part] for part in needless)
+                *most, last = (parts[part] for part in needless)
+                name = f"without {', '.join(most)} and {last}"
                 trials.append(_trial("all", name, without, run, base, first, scene, size, tolerance, device))
     return Advice(trials, frames, scene.frames, (first, run(scene)[1]), tolerance)
 

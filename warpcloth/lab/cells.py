@@ -38,6 +38,9 @@ def scene_at(ref, values, steps, duration=None):
         raise ValueError(
             f"{scene.name}: its pins move, frame by frame; a map needs pins at rest, for it changes the frame rate"
         )
+    for collider in (each for each in scene.colliders if each.moves):
+        rule = "a map needs colliders at rest, for it changes the frame rate"
+        raise ValueError(f"{scene.name}: the collider {collider.label} moves, frame by frame; {rule}")
     for name in VARIED:
         if name in values:
             scene = applied(scene, name, values[name])

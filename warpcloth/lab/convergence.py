@@ -85,6 +85,8 @@ class OneStep:
             array.assign(model.array(values, model.vec3))
         if stepper.count is not None:
             stepper.count.fill_(self._count)
+        if stepper.colliders is not None:
+            stepper.colliders.steps.fill_(self._count)
 
     def correction(self, stepper):
         """d (n, 3) [m] of a step from the state: x − x̃ = h(v − v₀ − hg), g with loads, which float32 resolves better than x."""

@@ -3,7 +3,8 @@
 Near the minimiser an iteration d ← d − A⁻¹∇φ(d) takes the error e to (1 − A⁻¹H)e, H the Hessian of φ there and A the constant
 matrix. With the eigenvectors v of Hv = μAv each part of e shrinks by its own 1 − μ an iteration, the slowest by
 max |1 − μ|, in the norm ‖e‖²_A = eᵀAe; as A takes projections as fixed, H ≤ A and 0 ≤ 1 − μ (Liu et al. 2017, *Quasi-Newton
-methods for real-time simulation of hyperelastic materials*, for its view as a descent).
+methods for real-time simulation of hyperelastic materials*, for its view as a descent). With colliders A includes the
+semi-definite Hessian of contact at the minimiser, as that of the iterations does near it.
 """
 
 import time
@@ -40,10 +41,16 @@ def relative_spectrum(step):
     if len(unknowns) > MOST:
         raise ValueError(f"{step.scene.name} has {len(unknowns)} unknowns; a spectrum takes {MOST} at most, of a coarser mesh")
     model, s = step.model, 1.0 / step.h**2
-    (scalar,) = constant_matrices(model, s)
+    touching = [elements for elements in model.terms if elements.collider is not None]
+    (scalar,) = constant_matrices(model.with_terms([each for each in model.terms if each.collider is None]), s)
+    best = model.array(step.best, model.vec3)
     hessian = Hessian(model, HessianPolicy.RAW, corrected=True)
-    hessian.assemble(step.base, s, model.array(step.best, model.vec3))
-    both = hessian.matrix().toarray(), np.kron(scalar.toarray(), np.eye(3))
+    hessian.assemble(step.base, s, best)
+    both = [hessian.matrix().toarray(), np.kron(scalar.toarray(), np.eye(3))]
+    if touching:
+        contact = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=touching)
+        contact.assemble(step.base, 0.0, best)
+        both[1] += contact.matrix().toarray()
     H, A = (matrix[np.ix_(unknowns, unknowns)] for matrix in both)
     mu, V = eigh(H, A)
     return mu, V, A
