@@ -35,7 +35,7 @@ def block_step(
     vec3, _ = types(dtype)
     add, step = add_block_forces(parts, dtype, compensated), kick_and_drift(dtype, symplectic, compensated)
     vector, number, whole, put = load(vec3), load(dtype), load(wp.int32), store(vec3)
-    clear, touch = in_ball(dtype, moving), touching_step(dtype, symplectic)
+    clear, touch = (in_ball(dtype, moving), touching_step(dtype, symplectic)) if guarded else (None, None)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
     def step_blocks(

@@ -27,7 +27,7 @@ def gather_vertex(
     step = kick_and_drift(dtype, symplectic, compensated)
     vector, number, put = load(vec3), load(dtype), store(vec3)
     residual_of, put_residual = move_of(dtype, stored), store(stored)
-    clear, touch = in_ball(dtype, moving), touching_step(dtype, symplectic)
+    clear, touch = (in_ball(dtype, moving), touching_step(dtype, symplectic)) if guarded else (None, None)
 
     @wp.func
     def gather_one(
