@@ -289,12 +289,13 @@ def anchor_vertices(dtype, bounded: bool):
 
 @wp.struct
 class FilterNotes:
-    """Notes of the filter: how often it cut, (copies,), and the first that is inside each collider, (copies, colliders).
+    """Notes of the filter after so many ``steps``: how often it cut, (copies,), the first that is inside, (copies, colliders).
 
     Where something is inside, ``inside`` is FIRST − ((step·n + vertex)(C + 1) + other), of n vertices and C colliders: other is
     the collider that held it back last, or C for a vertex that is not free. 0 where nothing is.
     """
 
+    steps: wp.array(dtype=wp.int32)
     cut: wp.array(dtype=wp.int64)
     inside: wp.array2d(dtype=wp.int64)
 
@@ -413,7 +414,6 @@ def filter_step(dtype):
         # state in
         x_before: wp.array(dtype=vec3),
         poses: step_poses(dtype),
-        step: wp.array(dtype=wp.int32),
         # parameters
         per_copy: int,
         least: dtype,
@@ -426,7 +426,7 @@ def filter_step(dtype):
         notes: FilterNotes,
     ):
         i = wp.tid()
-        now = step[i // per_copy]
+        now = notes.steps[i // per_copy]
         if inverse_mass[i] > dtype(0.0):
             end, short = end_outside(x_before[i], x[i], i, now, shape, poses, per_copy, least, landing, notes)
             if short:
@@ -456,7 +456,6 @@ def note_fixed(dtype):
         x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         poses: step_poses(dtype),
-        step: wp.array(dtype=wp.int32),
         # parameters
         per_copy: int,
         least: dtype,
@@ -465,6 +464,6 @@ def note_fixed(dtype):
     ):
         p = wp.tid()
         i = fixed[p]
-        note_entry(x_before[p], x[i], i, step[i // per_copy], shape, poses, per_copy, least, notes)
+        note_entry(x_before[p], x[i], i, notes.steps[i // per_copy], shape, poses, per_copy, least, notes)
 
     return note

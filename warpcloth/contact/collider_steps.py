@@ -60,6 +60,7 @@ class ColliderSteps:
         self.x_before = model.vectors()
         self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device))
         self.notes = kernels.FilterNotes()
+        self.notes.steps = self.steps
         self.notes.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
         self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
         self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
@@ -151,7 +152,7 @@ class ColliderSteps:
         """Cuts the step short of vertices that would end in a collider or cross one, in x, v and ``move`` (N,)."""
         model = self.model
         if self.meshes is None:
-            given = [model.inverse_mass, self.shapes, self.x_before, self.poses, self.steps]
+            given = [model.inverse_mass, self.shapes, self.x_before, self.poses]
             given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
         else:
             given = [model.inverse_mass, self.shapes, self.meshes.geometry, self.x_before, self.meshes.motion, model.per_copy]

@@ -75,7 +75,7 @@ class ContactGuard:
         """Launches, where pins have moved on, what notes those inside colliders, and counts the step if kernels do not."""
         colliders, model = self.colliders, self.model
         if len(self._fixed):
-            given = [self._fixed, colliders.shapes, self._fixed_before, x, colliders.poses, colliders.steps]
+            given = [self._fixed, colliders.shapes, self._fixed_before, x, colliders.poses]
             model.launch(self._note, len(self._fixed), [*given, model.per_copy, colliders.least], [colliders.notes])
         if self.moving:
             colliders.launch_count()
