@@ -42,3 +42,17 @@ def limit_passes(module: str):
             proceed[0] = 0
 
     return limit
+
+
+@cache
+def count_down():
+    """Kernel of one thread: passes that are left −= 1."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def count_left(
+        # in and out
+        left: wp.array(dtype=wp.int32),
+    ):
+        left[0] = left[0] - 1
+
+    return count_left

@@ -17,6 +17,7 @@ from warpcloth.core.hessian import Hessian
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.kernels.terms.contact import CONTACT
+from warpcloth.solvers.solver import Stepper
 
 R = 1e-3
 SLOW = pytest.mark.slow
@@ -294,6 +295,48 @@ def test_nothing_near_changes_nothing(name):
     stepper = solver.bind(alone.build())
     assert stepper.colliders is None and stepper.model.colliders is None
     assert not any("Contact" in kernel or "filter" in kernel for kernel in stepper.model.report()["kernels"])
+
+
+@pytest.mark.parametrize("away", (2.0, 0.85))
+@pytest.mark.parametrize("name", [name for name in SOLVERS if name != "explicit"])
+def test_steps_without_contact_end_where_those_with_it_do(name, away, monkeypatch):
+    """A short spring stretches into a plane in a step for which its prediction, gravity alone, has nothing near."""
+    mesh = wc.Mesh.chain(2)
+    scene = wc.Scene(
+        mesh,
+        masses=[1.0, 1.0],
+        terms=[wc.Spring(stiffness=1e4)],
+        positions=0.7 * mesh.points,
+        pins=[0],
+        fps=24.0,
+        colliders=[wc.Plane(position=(0.0, -away, 0.0))],
+        contact=wc.Contact(distance=R, stiffness=1e6),
+    )
+    model = scene.build(dtype="float64")
+    stepper = SOLVERS[name].bind(model)
+    monkeypatch.setattr(Stepper, "find_twin", lambda stepper: None)
+    other = SOLVERS[name].bind(model)
+    for each in (stepper, other):
+        each.step()
+    assert stepper.clear_steps.near.numpy()[0] == (away == 0.85) and other.clear_steps is None
+    np.testing.assert_allclose(stepper.state.x.numpy(), other.state.x.numpy(), rtol=0.0, atol=1e-12 if away == 0.85 else 1e-3)
+    assert (scene.colliders[0].distances(stepper.state.x.numpy()) < R).any() == (away == 0.85)
+    assert stepper.colliders.steps.numpy() == [1] and (stepper.iterations == other.iterations or away == 2.0)
+
+
+@pytest.mark.parametrize("name", ("newton", "xpbd"))
+def test_what_falls_again_leaves_its_anchors(name, monkeypatch):
+    """To the bit as if all steps had contact, and as a run that is recorded, for which all steps refresh contact."""
+    plane = wc.Plane(friction=0.5, position=[(0.0, y, 0.0) for y in (*[0.03] * 4, *[-0.3] * 15)])
+    scene = falling([plane], n=4, contact=wc.Contact(distance=R, stiffness=1e5), duration=0.75)
+    solver = replace(SOLVERS[name], substeps=4)
+    runs = [wc.simulate(scene, solver, dtype="float64", record=record) for record in ((), ("energies",))]
+    monkeypatch.setattr(Stepper, "find_twin", lambda stepper: None)
+    runs.append(wc.simulate(scene, solver, dtype="float64", record=("energies",)))
+    gaps = np.array([plane.distances(points, frame).min() for frame, points in enumerate(runs[0].points)])
+    assert (np.diff((gaps < R).astype(int)) == 1).sum() > 1
+    assert all((run.points == runs[0].points).all() for run in runs)
+    assert all((runs[1].energies[name] == energies).all() for name, energies in runs[2].energies.items())
 
 
 @pytest.mark.parametrize("integrator", ("euler", "midpoint", "bdf2"))

@@ -1,5 +1,6 @@
 """The colliders of a scene in the steps of a solver."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -65,7 +66,7 @@ class ColliderSteps:
         self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
         self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
-        self._spare = None
+        self._spare, self._reads = None, False
         self.least = FLOOR * declared.distance
         # Of midpoint forces are those half-way, of others at the end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
@@ -124,16 +125,31 @@ class ColliderSteps:
         model.launch(kernel, elements.count, given, [elements.rest])
 
     def _anchor(self, kernel, c, anchors, friction, model, elements):
-        if self._spare is not None:
+        if self._reads:
             wp.copy(self._spare, anchors)
             anchors = self._spare
         given = [elements.stencil, self.shapes, self.x_before, self.poses]
         given += [c, elements.per_copy, model.colliders.distance, friction]
         model.launch(kernel, elements.count, given, [anchors, elements.rest])
 
-    def leave_anchors(self):
-        """Lets refreshed terms read anchors only, for steps that move these themselves."""
-        self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
+    @contextmanager
+    def reading_anchors(self):
+        """Meanwhile terms that are refreshed leave anchors as they are, which steps then move themselves."""
+        self._reads = True
+        try:
+            yield
+        finally:
+            self._reads = False
+
+    def follow(self):
+        """Allocates what terms need to do so."""
+        if self._spare is None:
+            self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
+
+    def launch_release(self):
+        """Launches the end of all anchors, where nothing is in contact."""
+        for array in self.anchors.values():
+            array.zero_()
 
     def launch_move(self):
         """Launches the poses of the step that begins."""
@@ -145,8 +161,8 @@ class ColliderSteps:
 
     @property
     def drift(self):
-        """By how much the surface of a collider moves on in a step, at most [m]."""
-        return max(collider.most_move for collider in self.model.scene.colliders) / self.steps_per_frame
+        """By how much the bounds of a collider move on in a step, at most [m]."""
+        return max(collider.centred().most_move for collider in self.model.scene.colliders) / self.steps_per_frame
 
     def launch_end(self, x, v, move=None):
         """Cuts the step short of vertices that would end in a collider or cross one, in x, v and ``move`` (N,)."""

@@ -24,10 +24,12 @@ class State:
         starts: Values at the start, for those arrays that neither start at 0 nor have their start in the model.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).
+        lent: Arrays by name that another state lends, which it has in place of those that are added.
     """
 
     def __init__(self, x, v, batch_size, shares=()):
         self.arrays, self.starts, self.shares = {"x": x, "v": v}, {}, tuple(shares)
+        self.lent = {}
         self._results, self._residual = [Result.COMPLETED] * batch_size, np.zeros(batch_size)
 
     @property
@@ -63,9 +65,9 @@ class State:
         return iter((self.x, self.v))
 
     def add(self, name, array):
-        """Registers an array that is 0 at the start, or None, and returns it."""
+        """Registers an array that is 0 at the start, or None, and returns it, or the one that is lent in its place."""
         if array is not None:
-            self.arrays[name] = array
+            array = self.arrays[name] = self.lent.get(name, array)
         return array
 
     def start_here(self, *names):

@@ -60,12 +60,13 @@ class ContactGuard:
     def follow(self):
         """Makes steps refresh the terms of contact as well."""
         self.followed = True
-        self.colliders.leave_anchors()
+        self.colliders.follow()
 
     def launch_start(self, x):
         """Launches what moves colliders on, where a step begins from x (N,)."""
         if self.followed:
-            self.model.refresh(STEP, Moment(x), self._contact)
+            with self.colliders.reading_anchors():
+                self.model.refresh(STEP, Moment(x), self._contact)
         elif self.moving:
             self.colliders.launch_move()
         if len(self._fixed):

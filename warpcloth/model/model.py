@@ -182,6 +182,12 @@ class Model:
         other.terms = tuple(terms)
         return other
 
+    def without_colliders(self):
+        """This model without colliders and contact, all else shared."""
+        other = self.with_terms(elements for elements in self.terms if elements.collider is None)
+        other.colliders = None
+        return other
+
     def refresh(self, when, moment, terms=None):
         """Launches what its loads and terms, or only the ``terms`` given, have set anew.
 

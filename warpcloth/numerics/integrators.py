@@ -129,8 +129,10 @@ class BDF2(Euler):
         """Finds the past state, by two steps with x₋₁ = x₀ and v₋₁ = v₀, which are steps of Euler of hₑ, and restores the
         state.
 
-        The results of these steps count like those of other steps.
+        The results of these steps count like those of other steps. A twin shares the past state of its lead.
         """
+        if self.stepper.lead is not None:
+            return
         stepper, model, (x, v) = self.stepper, self.stepper.model, self.stepper.state
         for _ in range(2):
             self.move.zero_()

@@ -88,6 +88,11 @@ class Collider:
         raise NotImplementedError  # each shape has its own
 
     @property
+    def bounds(self) -> tuple[np.ndarray, float]:
+        """Half sizes and radius, as of :attr:`core`, of a shape that holds all of it at all frames."""
+        return self.core
+
+    @property
     def extent(self) -> float:
         """The farthest of its surface from ``position`` [m]."""
         half, radius = self.core
@@ -124,11 +129,11 @@ class Collider:
 
     @property
     def most_move(self) -> float:
-        """By how much a point of its surface moves in a frame, at most [m]; infinite for a plane that turns."""
+        """By how much a point of :attr:`bounds` moves in a frame, at most [m]; infinite for a plane that turns."""
         poses = self.poses
         turns = 2.0 * np.arccos(np.clip(np.einsum("fi,fi->f", poses[1:, 3:], poses[:-1, 3:]), -1.0, 1.0))
         turned = np.zeros_like(turns)  # rounding turns by 1e-8, and planes have no end
-        turned[turns > 1e-7] = turns[turns > 1e-7] * self.extent
+        turned[turns > 1e-7] = turns[turns > 1e-7] * (np.linalg.norm(self.bounds[0]) + self.bounds[1])
         return float((np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + turned).max(initial=0.0))
 
     @property

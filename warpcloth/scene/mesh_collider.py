@@ -68,6 +68,10 @@ class MeshCollider(Collider):
         return np.zeros(3), -FAR
 
     @property
+    def bounds(self) -> tuple[np.ndarray, float]:
+        return np.abs(self.frames).max(axis=(0, 1)), 0.0
+
+    @property
     def extent(self) -> float:
         return float(np.linalg.norm(self.frames, axis=-1).max())
 

@@ -174,7 +174,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._move()
         self._stuck = self._stepped.read() == 0.0
 
-    def constraint_forces(self, collider=None):
+    def multiplier_forces(self, collider=None):
         """Of M(x − x̃) = Jᵀλ: −Jᵀλ/hₑ²."""
         model, constraints = self.model, self.constraints
         hard = [part for part in constraints.parts if part.elements.hard and collider in (None, part.elements.collider)]

@@ -257,7 +257,7 @@ class ExplicitStepper(LaunchedStepper):
     def follow_contact(self):
         if self.plan.guard is not None:
             self.plan.guard.follow()
-            self.record((lambda: self.launch_steps(1), 1))
+            super().follow_contact()
 
     def launch_steps(self, steps):
         self._steps.launch(steps, self.launch_end_of if self.plan.guard is None else self.launch_pins_of)

@@ -19,11 +19,25 @@ class ImplicitStepper(Stepper):
         self.iterations = 0
 
     def ready(self):
-        """Records the graph of the end of a step, and starts the integrator, which may step."""
+        """Records the graph of the end of a step, finds a twin, and starts the integrator, which may step."""
+        self.find_twin()
+        if self.clear_steps is not None:
+            self.clear_steps.record()
         self._finish = Segment(self.model.device, lambda: self.launch_finish(self.correction))
         self.integrator.start()
 
+    def follow_contact(self):
+        super().follow_contact()
+        if self.clear_steps is not None:
+            self.clear_steps.record()
+
     def step(self):
+        if self.clear_steps is None:
+            self._iterate()
+        else:
+            self.clear_steps.step(self._iterate)
+
+    def _iterate(self):
         ended = iterate(self, self.options.tolerance, self.options.iterations)
         self.iterations = ended.iterations
         self._finish()

@@ -15,6 +15,7 @@ from ..kernels import step as kernels
 from ..model.damping import damped_terms
 from ..numerics.integrators import INTEGRATORS
 from ..terms.refresh import STEP
+from .clear_steps import ClearSteps
 
 
 class Stepper:
@@ -41,6 +42,8 @@ class Stepper:
     iterations = 1
     uniform = False  # Whether all steps have as many iterations
     _motion = None  # x and v that are parts of those of another stepper, see `part_of`
+    lead = None  # of a twin without contact, the stepper whose state it shares, see `find_twin`
+    clear_steps = None  # of a stepper with a twin
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -48,14 +51,15 @@ class Stepper:
 
     def __init__(self, options, model, integrator=None):
         fps = model.scene.fps
-        self.options, self.model = options, model
+        self.options, self.model, self._bound_to = options, model, model
         self.steps_per_frame = options.per_frame(fps)
         self.h = 1.0 / (fps * self.steps_per_frame)
         motion = self._motion or (wp.clone(model.positions), wp.clone(model.velocities))
         self.state = State(*motion, model.copies)
+        if self.lead is not None:
+            self.state.lent = self.lead.state.arrays
         timed = model.pins is not None or (model.loads is not None and model.loads.timed)
-        self.count = model.scalars(wp.int32) if timed else None
-        self.state.add("steps of keyframes", self.count)
+        self.count = self.state.add("steps of keyframes", model.scalars(wp.int32) if timed else None)
         self._reset = None
         self.integrator, self.he = None, self.h
         self.colliders = None
@@ -75,6 +79,16 @@ class Stepper:
         stepper._motion = motion
         stepper.__init__(options, model)
         return stepper
+
+    def find_twin(self):
+        """Makes ``clear_steps`` if there are colliders, unless the residual of a twin has another meaning."""
+        model = self._bound_to
+        if model.colliders is None or self.options.residual_on(model) != self.options.residual_on(model.without_colliders()):
+            return
+        twin = type(self).__new__(type(self))
+        twin._motion, twin.lead = tuple(self.state), self
+        twin.__init__(self.options, model.without_colliders())
+        self.clear_steps = ClearSteps(self, twin)
 
     @property
     def results(self):
@@ -108,6 +122,8 @@ class Stepper:
 
         Who reads these of :attr:`colliders` after a step calls it first, and takes steps one by one.
         """
+        if self.clear_steps is not None:
+            self.clear_steps.follow()
 
     def launch_pins(self, parts=1):
         """Moves the pins that have keyframes on by h/``parts``, the same in all calls."""
@@ -150,6 +166,13 @@ class Stepper:
         Raises:
             ValueError: If the method has no multipliers.
         """
+        touching = self.multiplier_forces(collider)
+        if self.clear_steps is None:
+            return touching
+        return self.clear_steps.constraint_forces(touching, self.clear_steps.twin.multiplier_forces(collider))
+
+    def multiplier_forces(self, collider=None):
+        """See :meth:`constraint_forces`; of steps that this stepper took itself."""
         raise ValueError(
             f"{type(self.options).__name__} has no multipliers, so that the forces of terms with infinite stiffness are not "
             "known, nor what pins bear; XPBD and ConstrainedDynamics have, and a finite stiffness gives them with every solver"
@@ -236,10 +259,19 @@ class LaunchedStepper(Stepper):
             parts: Pairs of a function and of how many times it runs. The function launches the part of the thread of the pool
                 that calls it.
         """
-        launches = self.model.launches
-        self._parts = [(launch, times) for launch, times in parts if times]
+        self.parts = [(launch, times) for launch, times in parts if times]
+        if self.lead is not None:
+            return  # which records both
+        if self.integrator is not None and self.pool.threads == 1:
+            self.find_twin()
+        self._record_step()
+
+    def _record_step(self):
+        launches, self._taken = self.model.launches, self.parts
+        if self.clear_steps is not None:
+            self._taken = self.clear_steps.parts(self.parts)
         self._step, self._frame, self._size = [], None, 0
-        for launch, times in self._parts:
+        for launch, times in self._taken:
             before = launches[0]
             self._step.append((self._segments(launch), times))
             self._size += (launches[0] - before) // self.pool.threads * times
@@ -249,10 +281,14 @@ class LaunchedStepper(Stepper):
         pool = self.pool
         return [Segment(self.model.device, pool.as_thread(thread, launch)) for thread in range(pool.threads)]
 
+    def follow_contact(self):
+        super().follow_contact()
+        self._record_step()
+
     def launch_steps(self, steps):
         """Launches this number of steps."""
         for _ in range(steps):
-            for launch, times in self._parts:
+            for launch, times in self._taken:
                 for _ in range(times):
                     launch()
 

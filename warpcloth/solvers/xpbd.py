@@ -191,7 +191,7 @@ class XPBDStepper(LaunchedStepper):
         given = [self.model.mass, self.sweep.correction, sign / self.he**2]
         self.model.launch(self._add_momentum, self.model.count, given, [self._force])
 
-    def constraint_forces(self, collider=None):
+    def multiplier_forces(self, collider=None):
         """Of M(x − x̃) = Gᵀλ: −Gᵀλ/hₑ², which is right at any number of sweeps."""
         model, pulls = self.model, []
         for elements, values, key in self.sweep.with_multipliers():

@@ -1,0 +1,132 @@
+"""Steps in which nothing comes near a collider, without contact."""
+
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from ..core.capture import Mirror, Segment
+from ..kernels import clearance as kernels
+from ..kernels.colliders import shapes
+from ..kernels.loop import count_down
+from ..terms.refresh import STEP
+
+
+class ClearSteps:
+    """Gives the steps in which no vertex comes near a collider to a twin of a stepper that knows none.
+
+    Before a step, twice the way of the prediction tells. Where that was not enough, the step is taken again with contact, so
+    that all steps end at the minimiser of one problem.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`, bound to a model with colliders.
+        twin: One of the same options on that model without, which shares its state.
+
+    Attributes:
+        twin: As given.
+        near: Whether the last step was one with contact, (1,) int32.
+    """
+
+    def __init__(self, stepper, twin):
+        self.stepper, self.twin, model, colliders = stepper, twin, stepper.model, stepper.colliders
+        self.near, self._followed = wp.zeros(1, dtype=wp.int32, device=model.device), False
+        self._kept = {name: wp.zeros_like(array) for name, array in twin.state.arrays.items()}
+        radii = np.zeros((model.count, 4))
+        radii[:, 3] = -1.0
+        if model.pins is None and not any(model.colliders.moves):
+            radii[model.inverse_mass.numpy() == 0.0, 3] = np.inf  # pins may stand near
+        clear = kernels.balls(model.dtype)()
+        clear.balls = model.array(radii, wp.types.vector(4, model.dtype))
+        clear.found = wp.zeros(model.count, dtype=wp.int32, device=model.device)
+        clear.drift = colliders.drift
+        self._bounds = shapes(model.dtype)()
+        halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
+        self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
+        self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy]]
+        self._given[1] += [model.colliders.distance, stepper.h]
+        self._out = [clear, self.near]
+        self._finds = [model.kernel(kernels.near_colliders, model.dtype, ended) for ended in (False, True)]
+        self._contact = [elements for elements in model.terms if elements.collider is not None]
+        self._left = wp.zeros_like(self.near)
+
+    def follow(self):
+        """Makes steps without contact refresh its terms as well."""
+        self._followed = True
+        self.stepper.colliders.follow()
+
+    def record(self):
+        """Records what :meth:`step` launches."""
+        launches = self._launch_look, self._launch_check, self._restore, self.stepper.colliders.launch_count
+        self._segments = [Segment(self.stepper.model.device, launch) for launch in launches]
+        self._read = Mirror(self.near)
+
+    def parts(self, touching):
+        """The parts of steps that are launches, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with
+        contact; the twin has as many."""
+        found = [(self._launch_look, 1)]
+        for (own, times), (clear, _times) in zip(touching[:-1], self.twin.parts[:-1], strict=True):
+            found.append((partial(wp.capture_if, self.near, own, clear), times))
+        (own, times), (clear, _times) = touching[-1], self.twin.parts[-1]
+
+        def last():
+            clear()
+            self._launch_check()
+            wp.capture_if(self.near, lambda: self._launch_again(touching), self.stepper.colliders.launch_count)
+
+        return [*found, (partial(wp.capture_if, self.near, own, last), times)]
+
+    def step(self, touching):
+        """Takes a step of a method that returns to the host: ``touching`` takes it with contact."""
+        stepper, twin = self.stepper, self.twin
+        look, check, restore, count = self._segments
+        look()
+        if not self._read.read()[0]:
+            twin.results, twin.residual = stepper.results, stepper.residual
+            twin.step()
+            check()
+            if not self._read.read()[0]:
+                count()
+                stepper.results, stepper.residual, stepper.iterations = twin.results, twin.residual, twin.iterations
+                return
+            restore()
+        touching()
+
+    def constraint_forces(self, touching, clear):
+        """The function of an array that launches ``touching`` or ``clear``, functions of it, as the last step was."""
+        return lambda out: wp.capture_if(self.near, lambda: touching(out), lambda: clear(out))
+
+    def _launch_look(self):
+        """Launches what finds whether the step is near, and keeps the state."""
+        stepper = self.stepper
+        stepper.colliders.launch_move()
+        self.near.zero_()
+        if self._followed:
+            with stepper.colliders.reading_anchors():
+                stepper.model.refresh(STEP, stepper.integrator.moment, self._contact)
+        for name, array in self.twin.state.arrays.items():
+            wp.copy(self._kept[name], array)
+        self._launch(0, None)
+
+    def _launch_check(self):
+        """Launches what finds whether it was, and leaves no anchor of a step before."""
+        self.stepper.colliders.launch_release()
+        self._launch(1, self.stepper.state.x)
+
+    def _launch(self, find, end):
+        (elements, others), model = self._given, self.stepper.model
+        model.launch(self._finds[find], model.count, [*elements, self._kept["x"], self._kept["v"], end, *others], self._out)
+
+    def _restore(self):
+        for name, array in self.twin.state.arrays.items():
+            wp.copy(array, self._kept[name])
+
+    def _launch_again(self, touching):
+        model = self.stepper.model
+        self._restore()
+        for launch, times in touching:
+            self._left.fill_(times)
+            wp.capture_while(self._left, partial(self._launch_one, launch, model.kernel(count_down)))
+
+    def _launch_one(self, launch, count):
+        launch()
+        self.stepper.model.launch(count, 1, [], [self._left])
