@@ -175,7 +175,7 @@ def test_order_on_a_net_whose_pins_move(name, integrator, damping, device):
 
     Damped, so would midpoint with s of the mean state taken for the mean of s; and BDF2 that knows no past of pins loses both.
     """
-    scene, substeps, errors = held(damping), [4, 8, 16], []
+    scene, substeps, errors = held(damping), [8, 16], []
     free = np.setdiff1d(np.arange(16), scene.pins.vertices)
     for steps in substeps:
         stepper = bound(scene, SOLVERS[name], device, integrator=integrator, substeps=steps)
@@ -185,7 +185,7 @@ def test_order_on_a_net_whose_pins_move(name, integrator, damping, device):
         ends = np.stack([stepper.state.x.numpy()[free], stepper.state.v.numpy()[free]])
         errors.append(np.sqrt(((ends - true_end(damping)) ** 2).mean(axis=(1, 2))))
     found = np.log2(np.divide(errors[:-1], errors[1:]))
-    assert np.abs(found[-1] - (1 if integrator == "euler" else 2)).max() < 0.15
+    assert np.abs(found - (1 if integrator == "euler" else 2)).max() < 0.15
 
 
 # A net of 6 × 6, stretched at rest or its vertices in any motion: ωh of the stiffest mode 0.8 to 800, βh/m of an edge 4 to 4e5.
