@@ -104,12 +104,12 @@ def _copies(stepper, number):
     found = wp.empty(shape, dtype=model.vec3, device=model.device)
     host = wp.empty(shape, dtype=model.vec3, device="cpu", pinned=True)
     indices = None if model.indices is None else wp.array(model.indices, dtype=wp.int32, device=model.device)
-    return [_DeviceCopy(stepper, _copy_stream(model.device), indices, found[k], host[k]) for k in range(number)]
+    return [_DeviceCopy(stepper, _copy_stream(str(model.device)), indices, found[k], host[k]) for k in range(number)]
 
 
 @cache
 def _copy_stream(device):
-    """The stream of a device that copies frames, made once and kept.
+    """The stream of a device, by its name, that copies frames, made once and kept.
 
     Warp notes the streams that exist in a table without a lock: one that ends in one thread while another records a graph would
     break that table.
