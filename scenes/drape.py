@@ -8,16 +8,19 @@ import warpcloth as wc
 def scene(n: int = 32, radius: float = 0.3, friction: float = 0.3, stiffness: float = 300.0, duration: float = 2.0):
     """Vertices a side, radius of the ball [m], coefficient of friction, spring stiffness [N/m], duration [s]."""
     wc.checks.number("radius", radius, above=0.0)
+    wc.checks.whole("n", n, 2)
     grid = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")
+    density, distance = 0.15, max(0.75 / (n - 1) ** 2 / radius, 1e-3)  # so that edges of triangles stay above the ball too
     return wc.Scene(
         grid,
-        density=0.15,
+        density=density,
         terms=[wc.Spring(pairs=("structural", "shear"), stiffness=stiffness), wc.QuadraticBending(stiffness=1e-5)],
         positions=grid.points + np.array([-0.5, 2.2 * radius, -0.5]),
         colliders=[
             wc.Sphere(radius=radius, position=(0.0, radius, 0.0), friction=friction, name="ball"),
             wc.Plane(friction=friction, name="floor"),
         ],
+        contact=wc.Contact(distance=distance, stiffness=40.0 * 9.81 * density / distance),
         duration=duration,
         name="drape",
     )

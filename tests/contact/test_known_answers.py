@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 
 import warpcloth as wc
 from support.scenes import scene
+from warpcloth.scenes import ring
 
 G, DENSITY = 9.81, 0.15
 # Steps a frame are added; what is tested has little else that moves.
@@ -318,3 +319,49 @@ def test_order_of_convergence_on_a_curve(name, friction, order, device):
     runs = [wc.simulate(beads_on_a_ball(friction), each, device=device, dtype="float64").points for each in steppers]
     coarse, fine = (np.abs(one - other).max() for one, other in pairwise(runs))
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.6 if friction else 0.25)
+
+
+def borne(declared, points):
+    """PR²/D of a ring on its first plate, and H/2R."""
+    plate, contact, width = declared.colliders[0], declared.contact, np.ptp(declared.mesh.points[:, 1])
+    pressure = contact.stiffness * np.maximum(contact.distance - plate.distances(points), 0.0)  # above r/2
+    return (declared.mesh.vertex_areas * pressure).sum() / width * 0.1**2, np.ptp(points[:, 2]) / 0.2
+
+
+@pytest.mark.parametrize("load", (1.0, 2.0, 4.0))
+def test_a_ring_bears_a_load_between_plates(load):
+    """H of the load that it bears, to 0.5 %, and the load of H, to 1 %, touching along a line and flat."""
+    declared = ring.scene(load, elements=64)
+    part = ring.gap(load)
+    fixed, moving = declared.colliders
+    plates = [fixed, replace(moving, position=moving.position[-1])]
+    start = declared.mesh.points * [2.0 - part, 1.0, part] - [0.0, 0.0, 0.1 * (1.0 - part)]
+    squeezed = replace(declared, colliders=plates, positions=start)
+    rest = wc.equilibrium(squeezed)
+    assert rest.status.ok
+    found, high = borne(squeezed, rest.points)
+    assert high == pytest.approx(ring.gap(found), rel=5e-3)
+    assert found == pytest.approx(brentq(lambda each: ring.gap(each) - high, 0.1, 10.0), rel=0.01)
+
+
+def test_the_answers_of_a_ring():
+    """The quadrature against elliptic integrals: where the ring begins to lie flat, and beyond."""
+    assert [ring.gap(1.0), ring.gap(2.0), ring.gap(2.786408)] == pytest.approx([0.9165281, 0.8132354, 0.717770], abs=1e-6)
+    assert 4.0 * ring.gap(4.0) ** 2 == pytest.approx(5.7421601 / 4.0, rel=1e-6)
+
+
+@methods(
+    "explicit",
+    "projective_dynamics",
+    "xpbd",
+    explicit=wc.Explicit(substeps=2500),
+    newton=wc.Newton(substeps=2),
+    projective_dynamics=wc.ProjectiveDynamics(substeps=1, tolerance=3.0, iterations=100),
+    xpbd=wc.XPBD(substeps=200, iterations=10),
+)
+def test_a_ring_is_pressed_by_a_plate(solver):
+    """The load, to 3 %, of which 2 % are those of 24 edges, and H, to 0.2 %."""
+    declared = ring.scene(elements=24, duration=0.5)
+    found, high = borne(declared, wc.simulate(declared, solver, dtype="float64").points[-1])
+    assert found == pytest.approx(2.0, rel=0.03)
+    assert high == pytest.approx(ring.gap(2.0), rel=2e-3)

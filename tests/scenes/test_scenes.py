@@ -9,7 +9,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.meshes import PAIR
-from support.scenes import LIVELY, QUICK, SMALL, scene
+from support.scenes import LIVELY, QUICK, SMALL, TOUCHING, scene
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result, digits, sentence
@@ -298,6 +298,30 @@ def test_every_solver_runs_every_scene(name, solver, device, tmp_path):
     scale = np.abs(kept.points).max()
     assert np.abs(kept.points - np.asarray(written.points)).max() <= 4 * np.finfo(np.float32).eps * scale
     assert np.abs(kept.velocities - np.asarray(written.velocities)).max() <= 1e-5 * (1 + np.abs(kept.velocities).max())
+
+
+# Those without which a run of each scene would be slow to test; the others take friction or contact like one of them.
+EACH_KIND = ("newton", "explicit", "pbd", "xpbd")
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [each if each in EACH_KIND else pytest.param(each, marks=pytest.mark.slow) for each in QUICK if "plain" not in each],
+)
+@pytest.mark.parametrize("name", TOUCHING)
+def test_no_vertex_is_inside_a_collider(name, solver, device):
+    """At any frame, with those that refuse friction without it."""
+    declared, method = scene(name, **TOUCHING[name]), QUICK[solver]
+    if "pbd" in solver and solver != "xpbd":
+        declared = replace(declared, colliders=[replace(each, friction=0.0) for each in declared.colliders])
+    if solver == "explicit":
+        limit, _ = step_limits(declared.build(device=device))
+        method = wc.Explicit(substeps=int(np.ceil(2.0 / (declared.fps * limit))))
+    animation = wc.simulate(declared, method, device=device, frames=min(declared.frames, 30))
+    assert animation.status.ok, animation.status
+    for frame, points in enumerate(animation.points.astype(np.float64)):
+        for collider in declared.colliders:
+            assert collider.distances(points, frame).min() > 0.0, (frame, collider.label)
 
 
 def test_a_diverging_run_stops_with_its_last_good_frame(device, tmp_path):

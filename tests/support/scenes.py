@@ -47,6 +47,16 @@ SMALL = {
     "bar_twist": {"cells": 2},
     "bunny": {"stiffness": 10.0, "bending": 1e-4},
 }
+TOUCHING = {
+    "incline": {"n": 4},
+    "capstan": {"turns": 6},
+    "overhang": {"elements": 20, "width": 0.05},
+    "chain_over_edge": {"links": 30},
+    "ring": {"elements": 12, "bending": 1e-3, "duration": 0.2},
+    "drape": {"n": 9},
+    "tablecloth": {"n": 9},
+    "curtain": {"nx": 13, "ny": 9, "duration": 1.0},
+}
 QUICK = {
     "newton": wc.Newton(substeps=4),
     "explicit": wc.Explicit(substeps=256),
