@@ -494,7 +494,7 @@ def test_an_animation_has_colliders_as_primitives(tmp_path):
         wc.MeshCollider(BREATHING, BALL.faces, position=(0.0, -4.0, 0.0), name="breathing"),
     ]
     path = str(tmp_path / "a.usda")
-    wc.simulate(falling(colliders, n=3), wc.Newton(substeps=4), output=path, frames=2)
+    wc.simulate(falling(colliders, n=3, fps=60.0, duration=0.1), wc.Newton(substeps=4), output=path, frames=2)
     stage = Usd.Stage.Open(path)
     names = {prim.GetName(): prim.GetTypeName() for prim in stage.GetPrimAtPath("/World/Colliders").GetChildren()}
     assert names == {"ball": "Sphere", "Capsule": "Capsule", "Box": "Cube", "ball_2": "Plane", "breathing": "Mesh"}

@@ -90,6 +90,8 @@ class AnimationWriter(ChunkWriter):
             target.declare(rest, [f"primvars:{name}" for name in (*primvars, *history)])
             targets = [target, *define_lines(rest, mesh, lines or {})]
             define_colliders(rest, colliders, mesh)
+            if colliders:  # whose keyframes are in this layer, and would be read at 24 a second otherwise
+                rest.timeCodesPerSecond = float(fps)
         else:
             for name, given in (("pins", pins), ("lines", lines)):
                 if given:
