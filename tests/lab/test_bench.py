@@ -350,6 +350,20 @@ def test_each_benchmark_begins_with_an_empty_kernel_cache(monkeypatch):
     assert len({folder for folder, _, _ in seen[:3]}) == 1 and seen[0][0] != seen[3][0]
 
 
+def test_variants_are_compiled_before_they_are_measured(monkeypatch):
+    made, asked = rows_until(-1, None), []
+
+    def alone(one):
+        asked.append((one.arguments.get("scene", {}).get("parameters"), one.arguments.get("frames")))
+        return made(one)
+
+    monkeypatch.setattr(benchmarks, "_alone", alone)
+    run = Run([SolverBenchmark(SceneRef("hanging", {"n": 7}), Setup("pbd", {"substeps": 1}), variants=({"n": 4}, {"n": 6}))])
+    run.measure()
+    assert asked[1:] == [({"n": 4}, 0), ({"n": 4}, 20), ({"n": 6}, 0), ({"n": 6}, 20)] and run.total == 2
+    assert [row["cold_start_s"] is None for row in run.rows] == [False, True]
+
+
 def test_scenes_without_sizes_are_taken_as_they_are(monkeypatch, tmp_path):
     made = rows_until(-1, None)
     monkeypatch.setattr(benchmarks, "_alone", made)

@@ -1,5 +1,7 @@
 """Sheets that fly against a thin wall, over speed and step, with the filter of contact and by the energy of contact alone.
 
+The wall is a box of 1 µm, or a sheet of triangles without thickness.
+
 A test for contact at the end of each step knows nothing of what lies between. A vertex moves v h in a step and touches a wall
 within the contact distance r on either side: it can pass unnoticed from v h = 2r, and from v h = r it can end beyond the wall,
 where the energy pushes it further on. The energy also gives way where it is less than that of the motion. That of explicit
@@ -19,6 +21,7 @@ from ..kernels.term import Term
 from ..kernels.terms.contact import CONTACT, FLOOR
 from ..mesh.mesh import Mesh
 from ..scene.colliders import Box, Contact
+from ..scene.mesh_collider import MeshCollider
 from ..scene.scene import Scene
 from ..solvers import SOLVERS
 from ..terms import Spring
@@ -34,8 +37,10 @@ THICKNESS = 1e-6  # of the wall [m]
 STEPS = np.geomspace(1e-4, 1.0 / 24.0, 10)  # [s]
 SPEEDS = np.geomspace(0.1, 100.0, 13)  # [m/s]
 PHASES = np.arange(6) / 6.0  # of a step, by which sheets start farther away
-# Solvers that are shown without the filter too; the others minimise the same energy as some of these.
-ALONE = ("explicit", "newton", "xpbd", "pbd")
+# Solvers by the wall against which they are shown: a box by the energy of contact alone, a box with the filter, triangles with
+# it. Those that are left out minimise the same energy as some of these.
+_FEW = ("explicit", "newton", "xpbd", "pbd")
+SHOWN = {"energy alone": _FEW, "filter": tuple(SOLVERS), "filter, triangles": _FEW}
 
 _QUADRATIC, _LOGARITHM, _DEEP = "ρv² = kr²", "½ρv² = ¼kr²(2 + ln r/2δ)", "v = kr²h/(4ρδ)"
 LAWS = {
@@ -54,15 +59,16 @@ class PenaltyContact(VertexContact):
     term: ClassVar[Term] = CONTACT.bounded
 
 
-def _panel(solver, filtered):
+def _panel(solver, wall):
     names = ["v h = r", "v h = 2r"]
     if solver == "explicit":
         names.append(_QUADRATIC)
     elif "pbd" not in solver or solver == "xpbd":  # the stiffness of the others is that of their sweeps
-        names.append(_DEEP if filtered else _LOGARITHM)
+        names.append(_LOGARITHM if wall == "energy alone" else _DEEP)
+    filtered = wall != "energy alone"
     return Map(
-        f"{solver}, {'filter' if filtered else 'energy alone'}",
-        f"{solver}, {'with the filter' if filtered else 'energy of contact alone'}",
+        f"{solver}, {wall}",
+        f"{solver}, with the {wall}" if filtered else f"{solver}, energy of contact alone",
         "step h [s]",
         "speed v [m/s]",
         scales=("log", "log"),
@@ -73,37 +79,36 @@ def _panel(solver, filtered):
     )
 
 
-PANELS = (*(_panel(solver, False) for solver in ALONE), *(_panel(solver, True) for solver in SOLVERS))
+PANELS = tuple(_panel(solver, wall) for wall, solvers in SHOWN.items() for solver in solvers)
 
 
 def tasks(device):
     """One for each panel."""
-    return [
-        task(measure, solver=solver, filtered=filtered, steps=STEPS.tolist(), speeds=SPEEDS.tolist(), device=device)
-        for filtered, solvers in ((False, ALONE), (True, SOLVERS))
-        for solver in solvers
-    ]
+    given = {"steps": STEPS.tolist(), "speeds": SPEEDS.tolist(), "device": device}
+    return [task(measure, solver=solver, wall=wall, **given) for wall, solvers in SHOWN.items() for solver in solvers]
 
 
-def measure(solver, filtered, steps, speeds, device):
+def measure(solver, wall, steps, speeds, device):
     """Points of one panel: of sheets of all phases the share of vertices that were cut, or that passed the wall [%]."""
-    panel, found = _panel(solver, filtered).key, []
+    panel, found = _panel(solver, wall).key, []
     for h in steps:
         try:
-            passed, cut = flights(solver, filtered, h, speeds, device)
+            passed, cut = flights(solver, wall, h, speeds, device)
         except ValueError as error:
             found += [point(panel, "refused", h, None, str(error), y=v) for v in speeds]
             continue
         for v, through, short in zip(speeds, passed, cut, strict=True):
             series = "passes" if through > 0.0 else "stays outside"
-            found.append(point(panel, series, h, 100.0 * (short if filtered else through), y=v))
+            found.append(point(panel, series, h, 100.0 * (through if wall == "energy alone" else short), y=v))
     return found
 
 
-def sheet(h, filtered, solver):
-    """A scene of nine vertices and a wall at y = 0, with steps of h as frames; without the filter contact is a term."""
+def sheet(h, wall, solver):
+    """A scene of nine vertices and a wall at y = 0, with steps of h as frames; by the energy alone contact is a term."""
     grid = Mesh.grid(3, 3, size=0.1)
-    wall = Box(size=(10.0, THICKNESS, 10.0), name="wall")
+    box = Box(size=(1.0, THICKNESS, 1.0))
+    ground = Mesh.grid(5, 5, size=1.0)  # whose edges are none of the sheet
+    triangles = MeshCollider(ground.points - np.array([0.47, 0.0, 0.43]), ground.triangles)
     scene = Scene(
         Mesh(grid.points + np.array([0.0, 2.0 * DISTANCE, 0.0]), grid.triangles),
         density=DENSITY,
@@ -111,10 +116,10 @@ def sheet(h, filtered, solver):
         gravity=(0.0, 0.0, 0.0),
         fps=1.0 / h,
         duration=h,
-        colliders=[wall],
+        colliders=[triangles if "triangles" in wall else box],
         contact=Contact(distance=DISTANCE, stiffness=STIFFNESS),
     )
-    if filtered:
+    if wall != "energy alone":
         return scene
     (declared,) = scene.contact_terms
     kind = PenaltyContact if solver == "explicit" else VertexContact
@@ -123,7 +128,7 @@ def sheet(h, filtered, solver):
 
 
 @in_turn
-def flights(solver, filtered, h, speeds, device):
+def flights(solver, wall, h, speeds, device):
     """Shares of the vertices that ever end a step beyond the wall or inside, and that were cut short, for each speed, (S,).
 
     Sheets start r and a part of a step above the wall. They fly until the slowest has passed it, or turned round.
@@ -131,10 +136,10 @@ def flights(solver, filtered, h, speeds, device):
     Raises:
         ValueError: The solver refuses the step.
     """
-    scene = sheet(h, filtered, solver)
+    scene, top = sheet(h, wall, solver), 0.0 if "triangles" in wall else 0.5 * THICKNESS
     velocity, phase = (each.ravel() for each in np.meshgrid(speeds, PHASES, indexing="ij"))
     positions = np.repeat(scene.mesh.points[None], len(velocity), axis=0)
-    positions[:, :, 1] = (DISTANCE + 0.5 * THICKNESS + phase * velocity * h)[:, None]
+    positions[:, :, 1] = (DISTANCE + top + phase * velocity * h)[:, None]
     velocities = np.zeros_like(positions)
     velocities[:, :, 1] = -velocity[:, None]
     vary = {"positions": positions, "velocities": velocities}
@@ -144,7 +149,7 @@ def flights(solver, filtered, h, speeds, device):
     count = int(4.0 * DISTANCE / (min(speeds) * h) + 4.0 / (RATE * h)) + 8
     for _ in range(count):
         stepper.step()
-        passed |= stepper.state.x.numpy().reshape(positions.shape)[:, :, 1] < 0.5 * THICKNESS
+        passed |= stepper.state.x.numpy().reshape(positions.shape)[:, :, 1] < top
     # A sheet is flat, so that all of its vertices are cut in the same steps.
     cut = np.minimum(stepper.cut * count, 1.0)
     return passed.mean(axis=1).reshape(len(speeds), -1).mean(axis=1), cut.reshape(len(speeds), -1).mean(axis=1)
