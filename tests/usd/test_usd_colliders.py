@@ -126,7 +126,7 @@ def test_a_mirrored_plane_keeps_what_is_behind_it(path, sign, height, side):
         (
             "Mesh",
             TETRAHEDRON.replace("[3, 3, 3, 3]", "[4, 3, 3, 4]")
-            .replace("0, 2, 1, 0", "2, 4, 1, 0, 0")
+            .replace("0, 2, 1, 0", "0, 2, 4, 1, 0")
             .replace("2, 1, 2, 3", "2, 1, 4, 2, 3")
             .replace("10)]", "10), (5, 5, 0)]"),
             1e-3 / 6,
@@ -184,6 +184,12 @@ def test_colliders_follow_the_transforms_above_them(path, kind, text):
             np.testing.assert_allclose(turned(found, frame, found.points[[1]]), [at_frame + along], atol=1e-7)
     if kind == "Mesh":
         assert found.points.shape == (4, 3)  # a body, which is not stored at each frame
+
+
+def test_motion_is_read_until_a_frame_after_the_last(path):
+    """So that steps up to the last frame are computed as with all of it."""
+    text = ops(translate=("double3", ".timeSamples = {101: (0, 0, 0), 111: (100, 0, 0)}"))
+    np.testing.assert_allclose(collider_of(path, shape("Sphere", text)).poses[:, 0], 0.1 * np.arange(6))
 
 
 DEFORMING = {
