@@ -8,7 +8,7 @@ from pxr import Usd
 
 import warpcloth as wc
 from support.usd_validation import validate
-from warpcloth.usd import read_scene, write_scene
+from warpcloth.usd import read_scene, read_stage_mesh, write_scene
 from warpcloth.usd.drawn import read_drawn
 
 # A square of 1 m at a height of 2 m, in centimetres with z up, at 24 frames a second from time code 101 to 105.
@@ -244,6 +244,11 @@ def test_a_mesh_that_faces_inwards_is_said(path):
     room = shape("Mesh", ops(translate=("double3", " = (-500, -500, -500)"), scale=("float3", " = (500, 500, 500)")) + INWARD)
     with pytest.warns(UserWarning, match="prim /Thing: its triangles face inwards, so that what they enclose is free"):
         assert collider_of(path, room).closed
+
+
+def test_a_mesh_that_is_a_collider_is_not_the_cloth(path):
+    collider_of(path, shape("Mesh", TETRAHEDRON))
+    assert read_stage_mesh(path).prim == "/Cloth"
 
 
 MATERIAL = """

@@ -157,8 +157,10 @@ def loads():
 def colliders():
     """Each kind, standing, moved, turned about an axis of its own and deformed, with numbers that float32 cannot hold."""
     cube, random = trimesh.creation.box((0.3, 0.2, 0.1)), np.random.default_rng(1)
-    turns = random.normal(size=(4, 4))
-    turns /= np.linalg.norm(turns, axis=1)[:, None]
+    turns = [random.normal(size=(1000, 4))]
+    for _ in range(3):
+        turns.append(turns[-1] / np.linalg.norm(turns[-1], axis=1)[:, None])
+    turns = turns[1][(turns[3] != turns[2]).any(axis=1)][:4]  # of length 1 to rounding, and never exactly
     moves = random.normal(size=(4, 3)) / 3 + np.array([0, -5, 0])
     return wc.Scene(
         mesh(),
