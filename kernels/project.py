@@ -244,7 +244,8 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool =
     rest_type, mobility = wp.types.vector(term.parameters, dtype), vec3 if axes else dtype
     corners = wp.types.matrix((term.vertices, 3), dtype) if axes else wp.types.vector(term.vertices, dtype)
     change_of = (multiplier_by_axis if axes else multiplier)(term, dtype, scalar, per_step)
-    y_of, measure = local_coordinate(term, dtype, True), term.measure
+    y_of, measure, idle = local_coordinate(term, dtype, True), term.measure, term.idle
+    y_type = wp.types.matrix((term.rows, 3), dtype)
     lambda_type, number, vertex = multiplier_type(term, dtype, scalar), load(mobility), load(wp.int32, 2)
 
     @wp.func
@@ -260,11 +261,15 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool =
         multipliers: lambda_type,
         sweeps: int,
     ):
+        y = y_of(stencil, e, r, x, d)
+        if wp.static(idle is not None):
+            if idle(y, r) == 1 and multipliers == lambda_type(dtype(0.0)):
+                return lambda_type(dtype(0.0)), y_type()
         w = corners()
         for i in range(K):
             w[i] = number(inverse_mass, vertex(stencil, K * e + i))
         compliance = dtype(1.0) / (stiffness * measure(r) * h * h)
-        return change_of(y_of(stencil, e, r, x, d), r, w, compliance, multipliers, sweeps)
+        return change_of(y, r, w, compliance, multipliers, sweeps)
 
     return change
 

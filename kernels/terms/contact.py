@@ -155,15 +155,42 @@ def bend(d: Any, r: Any):
 
 
 @wp.func
+def idle(y: Any, rest: Any):
+    """Whether a vertex is farther than r from the half-space, or from a ball about the collider."""
+    away = y[0] - wp.vector(rest[0], rest[1], rest[2])
+    found = wp.int32(0)
+    if wp.isfinite(rest[7]):
+        reach = rest[7] + rest[8] + rest[9] + rest[10] + rest[11]
+        if wp.dot(away, away) > y.dtype(1.0001) * reach * wp.abs(reach):
+            found = 1
+    else:
+        two = y.dtype(2.0)
+        n = wp.vector(
+            two * (rest[3] * rest[4] - rest[6] * rest[5]),
+            y.dtype(1.0) - two * (rest[3] * rest[3] + rest[5] * rest[5]),
+            two * (rest[4] * rest[5] + rest[6] * rest[3]),
+        )
+        if wp.dot(n, away) > y.dtype(1.01) * rest[11]:
+            found = 1
+    return found
+
+
+@wp.func
 def energy(y: Any, rest: Any):
-    d, _n = gap(y, rest)
-    return potential(d, rest[11])
+    u = y.dtype(0.0)
+    if idle(y, rest) == 0:
+        d, _n = gap(y, rest)
+        u = potential(d, rest[11])
+    return u
 
 
 @wp.func
 def gradient(y: Any, rest: Any):
-    d, n = gap(y, rest)
-    return wp.matrix_from_rows(slope(d, rest[11]) * n)
+    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    if idle(y, rest) == 0:
+        d, n = gap(y, rest)
+        g[0] = slope(d, rest[11]) * n
+    return g
 
 
 @wp.func
@@ -310,6 +337,7 @@ CONTACT = Term(
     hessian=hessian,
     prox=prox,
     prox_from=prox_from,
+    idle=idle,
     constraint=constraint,
     constraint_gradient=constraint_gradient,
     constraint_hessian=constraint_hessian,

@@ -29,6 +29,12 @@ def measure(rest: Any):
 
 
 @wp.func
+def idle(y: Any, rest: Any):
+    """Whether the vertex has no contact in the step."""
+    return wp.where(rest[6] > y.dtype(0.0), wp.int32(0), wp.int32(1))
+
+
+@wp.func
 def slip(y: Any, rest: Any):
     """u."""
     n = wp.vector(rest[3], rest[4], rest[5])
@@ -104,5 +110,6 @@ FRICTION = Term(
     dead_zone=True,
     project=project,
     prox=prox,
+    idle=idle,
     bounded=BOUNDED_FRICTION,
 )
