@@ -182,3 +182,44 @@ def test_a_flag_that_is_keyed_as_an_object_follows_its_pole(tmp_path, prim):
 def test_a_stage_from_blender_is_drawn_with_its_pins(tmp_path):
     (prim,) = read_drawn(str(flag(tmp_path / "flag.usda"))).prims
     assert prim.pins.tolist() == PINNED
+
+
+# A ball of 0.4 m, whose mesh is that of an octahedron, keyed from one side of the flag to the other.
+BALL = """
+    def Xform "Ball"
+    {
+        custom string userProperties:blender:object_name = "Ball"
+        custom string warpcloth:collider
+        string warpcloth:collider.timeSamples = {1: "boundingSphere"}
+        custom double warpcloth:friction
+        double warpcloth:friction.timeSamples = {1: 0.25}
+        float3 xformOp:rotateXYZ.timeSamples = {1: (0, -0, 0)}
+        float3 xformOp:scale.timeSamples = {1: (2, 2, 2)}
+        double3 xformOp:translate.timeSamples = {1: (1, -0.6, 2), 3: (1, -0.2, 2), 5: (1, 0.2, 2)}
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ", "xformOp:scale"]
+
+        def Mesh "Octahedron" (
+            active = true
+        )
+        {
+            int[] faceVertexCounts = [3, 3, 3, 3, 3, 3, 3, 3]
+            int[] faceVertexIndices = [0, 2, 4, 2, 1, 4, 1, 3, 4, 3, 0, 4, 2, 0, 5, 1, 2, 5, 3, 1, 5, 0, 3, 5]
+            point3f[] points = [(0.2, 0, 0), (-0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0), (0, 0, 0.2), (0, 0, -0.2)]
+            uniform token subdivisionScheme = "none"
+        }
+    }
+"""
+
+
+def test_an_animated_ball_pushes_the_flag(device, tmp_path):
+    path = flag(tmp_path / "flag.usda")
+    path.write_text(path.read_text().replace('def Xform "root"\n{', 'def Xform "root"\n{' + BALL))
+    scene = read_scene(path)
+    (ball,) = scene.colliders
+    assert (type(ball), ball.friction, ball.name) == (wc.Sphere, 0.25, "/root/Ball/Octahedron")
+    assert ball.radius == pytest.approx(0.4)
+    np.testing.assert_allclose(ball.position[:, 1], np.linspace(-0.6, 0.2, 5), atol=1e-7)
+    animation = wc.simulate(scene, wc.Explicit(substeps=200), output=tmp_path / "out.usdc", device=device)
+    distances = [ball.distances(points, frame) for frame, points in enumerate(animation.points)]
+    assert np.min(distances) > -1e-6 and np.min(distances[-1]) < 1e-2  # frames are rounded to float32
+    assert animation.points[-1, 6, 1] > 0.3  # the vertex that was in its way
