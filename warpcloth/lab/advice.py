@@ -77,6 +77,8 @@ class Advice:
                 else f"half the step: {step.reason}"
             )
         needless = [trial for trial in self.trials if trial.kind in _LEFT_OUT[:-1] and trial.matters is False]
+        left = {trial.name.partition("the collider ")[2] for trial in needless if trial.kind == "collider"}  # with its friction
+        needless = [trial for trial in needless if trial.name.partition("friction on ")[2] not in left - {""}]
         together = next((trial for trial in self.trials if trial.kind == "all"), None)
         redundant = together is not None and together.matters is not False
         for trial in needless:
