@@ -442,6 +442,37 @@ def filter_step(dtype):
 
 
 @cache
+def hold_locked(dtype):
+    """Kernel over vertices: undoes what the filter did along axes on which a vertex does not move, from where it was before."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def hold(
+        # elements
+        mobility: wp.array(dtype=vec3),
+        # state in
+        wanted: wp.array(dtype=vec3),
+        # parameters
+        h: dtype,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        change = vec3()
+        for axis in range(3):
+            if mobility[i][axis] == dtype(0.0):
+                change[axis] = wanted[i][axis] - x[i][axis]
+        x[i] = x[i] + change
+        v[i] = v[i] + change / h
+        if move:
+            move[i] = move[i] + change
+
+    return hold
+
+
+@cache
 def note_fixed(dtype):
     """Kernel over vertices that are not free, of all copies: :func:`entry` of each, from where the step began."""
     vec3, _ = types(dtype)

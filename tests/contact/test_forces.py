@@ -112,12 +112,12 @@ ORDERS = {
 }
 
 
-DEFORMED = [pytest.param(swelling, name, 0.4, marks=() if name == "newton" else pytest.mark.slow) for name in ORDERS]
+CASES = [(pushed, name, 0.4) for name in ORDERS] + [(swelling, "newton", 0.4)]
+CASES += [pytest.param(pushed, name, 0.0, marks=pytest.mark.slow) for name in ORDERS]
+CASES += [pytest.param(swelling, name, 0.4, marks=pytest.mark.slow) for name in ORDERS if name != "newton"]
 
 
-@pytest.mark.parametrize(
-    ("scene", "name", "friction"), [*((pushed, name, friction) for name in ORDERS for friction in (0.0, 0.4)), *DEFORMED]
-)
+@pytest.mark.parametrize(("scene", "name", "friction"), CASES)
 def test_work_of_colliders_is_the_change_of_energy_to_the_order_of_the_scheme(scene, name, friction, device):
     """With friction too, of which the heat is counted; below 1e-4 of the work midpoint has no order any more."""
     solver, order = ORDERS[name]

@@ -78,6 +78,9 @@ class ColliderSteps:
             given |= {"r": declared.distance, "least": self.least, "landing": LANDING * declared.distance}
             self.meshes = MeshSteps(model, self.poses, self.bounded, **given)
         self._filter = model.kernel(kernels.filter_step if self.meshes is None else mesh_kernels.filter_meshes, model.dtype)
+        if model.mobility is not None:
+            self._wanted, self._hold = model.vectors(), model.kernel(kernels.hold_locked, model.dtype)
+            self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
         self.terms = []
         for elements in model.terms:
             c = elements.collider
@@ -172,7 +175,13 @@ class ColliderSteps:
             given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
         else:
             given = [model.inverse_mass, self.shapes, self.meshes.geometry, self.x_before, self.meshes.motion, model.per_copy]
-        model.launch(self._filter, model.count, given, [x, v, move, self.notes])
+        out = [x, v, move, self.notes]
+        if model.mobility is not None:
+            wp.copy(self._wanted, x)
+        model.launch(self._filter, model.count, given, out)
+        if model.mobility is not None:  # those who then end inside are noted like pins
+            model.launch(self._hold, model.count, [model.mobility, self._wanted, self.h], out[:-1])
+            model.launch(self._filter, model.count, [self._fixed, *given[1:]], out)
         self.launch_count()
 
     @property
