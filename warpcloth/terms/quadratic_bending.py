@@ -10,7 +10,7 @@ from .bending import Bending
 
 @dataclass(frozen=True, kw_only=True)
 class QuadraticBending(Bending):
-    """Quadratic bending of a sheet that is flat at rest, U = Σ ½D‖y‖²/(A₁+A₂) (Bergou et al. 2006). Its forces are linear.
+    """Quadratic bending of a sheet that is flat at rest, U = Σ ½D‖y‖²/(A₁+A₂) (Bergou et al. 2006). Forces are linear in x.
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh, which has a Poisson's ratio
