@@ -300,15 +300,20 @@ def test_every_solver_runs_every_scene(name, solver, device, tmp_path):
     assert np.abs(kept.velocities - np.asarray(written.velocities)).max() <= 1e-5 * (1 + np.abs(kept.velocities).max())
 
 
-# Those without which a run of each scene would be slow to test; the others take friction or contact like one of them.
-EACH_KIND = ("newton", "explicit", "pbd", "xpbd")
+def _takes_long(name, solver):
+    """Whether it is left to slow tests, as solvers are that take contact as one of these four does."""
+    return solver != "xpbd" if name == "character" else solver not in ("newton", "explicit", "pbd", "xpbd")
 
 
 @pytest.mark.parametrize(
-    "solver",
-    [each if each in EACH_KIND else pytest.param(each, marks=pytest.mark.slow) for each in QUICK if "plain" not in each],
+    ("name", "solver"),
+    [
+        pytest.param(name, solver, marks=pytest.mark.slow if _takes_long(name, solver) else ())
+        for name in TOUCHING
+        for solver in QUICK
+        if "plain" not in solver and "searching" not in solver and (name, solver) != ("character", "constrained dynamics")
+    ],
 )
-@pytest.mark.parametrize("name", TOUCHING)
 def test_no_vertex_is_inside_a_collider(name, solver, device):
     """At any frame, with those that refuse friction without it."""
     declared, method = scene(name, **TOUCHING[name]), QUICK[solver]

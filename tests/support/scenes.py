@@ -56,6 +56,7 @@ TOUCHING = {
     "drape": {"n": 9},
     "tablecloth": {"n": 9},
     "curtain": {"nx": 13, "ny": 9, "duration": 1.0},
+    "character": {"duration": 0.5},
 }
 QUICK = {
     "newton": wc.Newton(substeps=4),
