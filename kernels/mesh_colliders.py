@@ -24,6 +24,8 @@ from .vectors import types
 
 turned_by, slope_of = turned, contact.slope
 FAR = 1e30  # the distance to what is not there, of which a difference is a number
+LISTED = 32  # triangles near a vertex that are kept
+AHEAD = wp.constant(10)  # steps for which they are to last
 FACETS = 3  # the most, of a vertex and a mesh
 MARCHES = wp.constant(32)  # separating planes between a vertex and a triangle on its way, at most
 CARRIES = wp.constant(16)  # of a vertex by triangles that move, in a step
@@ -78,6 +80,27 @@ def motions(dtype):
         landing: dtype
 
     return Motion
+
+
+@cache
+def near_lists(dtype):
+    """The struct of the triangles near each vertex, for steps that are short: (meshes, N) lists of at most :data:`LISTED`.
+
+    A list has those within r + w of a ball's centre, ``ball`` (x, y, z, w), at the step ``built``: all that count until the
+    vertex and the mesh, by ``drift`` a step, have come nearer by w. ``count`` is −1 of one that is too long, w of none below 0.
+    ``row`` is the row of each collider. Without lists it has no entries.
+    """
+
+    @wp.struct
+    class NearLists:
+        row: wp.array(dtype=wp.int32)
+        drift: wp.array(dtype=dtype)
+        ball: wp.array2d(dtype=wp.types.vector(4, dtype))
+        built: wp.array2d(dtype=wp.int32)
+        count: wp.array2d(dtype=wp.int32)
+        triangles: wp.array3d(dtype=wp.int32)
+
+    return NearLists
 
 
 @cache
@@ -188,9 +211,10 @@ def geometry(dtype):
 
 @cache
 def queries(dtype):
-    """Device functions that ask the tree: ``nearest_beyond`` and ``sweep``."""
+    """Device functions that ask the tree or the list of a vertex."""
     vec3, mat33 = types(dtype)
     corners, from_triangle, _carry = geometry(dtype)
+    ball_type = wp.types.vector(4, dtype)
     zero, one = dtype(0.0), dtype(1.0)
 
     @wp.func
@@ -209,6 +233,9 @@ def queries(dtype):
         count: int,
         normals: mat33,
         gaps: vec3,
+        lists: near_lists(dtype),
+        row: int,
+        i: int,
     ):
         """The nearest point within a radius in front of ``count`` facets: distance or −1, direction, triangle, weights."""
         found = -one
@@ -216,8 +243,19 @@ def queries(dtype):
         weights = vec3()
         face = wp.int32(-1)
         k = wp.int32(0)
+        at = wp.int32(0)
+        more = wp.bool(True)
         query = wp.bvh_query_sphere(mesh.bvh[c], wp.vec3(p), wp.float32(radius) + margin_of(mesh, c, p))
-        while wp.bvh_query_next(query, k):
+        while more:
+            if row >= 0:
+                more = at < lists.count[row, i]
+                if more:
+                    k = lists.triangles[row, i, at]
+                    at += 1
+            else:
+                more = wp.bvh_query_next(query, k)
+            if not more:
+                break
             d, n, w = from_triangle(p, corners(mesh, c, k, halves, per_frame))
             if d < radius and (found < zero or d < found or (d == found and k < face)):
                 hidden = wp.bool(False)
@@ -274,6 +312,9 @@ def queries(dtype):
         way: vec3,
         start: dtype,
         least: dtype,
+        lists: near_lists(dtype),
+        row: int,
+        i: int,
     ):
         """The part of a move that keeps ``least`` or where it starts, and what stops it: normal, triangle or −1, weights.
 
@@ -285,9 +326,19 @@ def queries(dtype):
         face = wp.int32(-1)
         k = wp.int32(0)
         moves = mat33()
-        # The box of what it passes; or a capsule along a way that is long.
+        at = wp.int32(0)
+        more = wp.bool(True)
         query = wp.bvh_query_capsule(mesh.bvh[c], wp.vec3(p), wp.vec3(way), wp.float32(least) + margin_of(mesh, c, p + way))
-        while wp.bvh_query_next(query, k, 1.0):
+        while more:
+            if row >= 0:
+                more = at < lists.count[row, i]
+                if more:
+                    k = lists.triangles[row, i, at]
+                    at += 1
+            else:
+                more = wp.bvh_query_next(query, k, 1.0)
+            if not more:
+                break
             t = corners(mesh, c, k, halves, per_frame)
             if mesh.frames[c] > 1:
                 moves = corners(mesh, c, k, after, per_frame) - t
@@ -301,7 +352,72 @@ def queries(dtype):
                 face = k
         return kept, away, face, weights
 
-    return nearest_beyond, sweep
+    @wp.func
+    def has_list(lists: near_lists(dtype), c: int, i: int, step: int, p: vec3, way: dtype):
+        """The row of the list of a vertex at p that has all that is within r on a way so long, or −1."""
+        row = wp.int32(-1)
+        if lists.row.shape[0] > 0:
+            row = lists.row[c]
+            ball = lists.ball[row, i]
+            moved = wp.length(p - vec3(ball[0], ball[1], ball[2])) + way
+            moved += dtype(wp.abs(step - lists.built[row, i])) * lists.drift[row]
+            if not (moved <= ball[3]) or lists.count[row, i] < 0:
+                row = -1
+        return row
+
+    @wp.func
+    def is_alone(lists: near_lists(dtype), c: int, i: int, step: int, p: vec3, way: dtype):
+        """Whether the list of a vertex says that nothing is within r on its way."""
+        row = has_list(lists, c, i, step, p, way)
+        alone = wp.bool(False)
+        if row >= 0:
+            alone = lists.count[row, i] == 0
+        return alone
+
+    @wp.func
+    def listed(
+        mesh: meshes(dtype),
+        c: int,
+        halves: int,
+        per_frame: int,
+        p: vec3,
+        way: dtype,
+        r: dtype,
+        lists: near_lists(dtype),
+        i: int,
+    ):
+        """The row of the list of a vertex at p that moves by ``way`` a step, built anew where it has none, or −1."""
+        step = halves // 2
+        row = lists.row[c]
+        if has_list(lists, c, i, step, p, zero) < 0:
+            ball = lists.ball[row, i]
+            moved = wp.length(p - vec3(ball[0], ball[1], ball[2]))
+            moved += dtype(wp.abs(step - lists.built[row, i])) * lists.drift[row]
+            if not (moved <= ball[3]):  # and not one that is too long
+                w = dtype(wp.max(dtype(AHEAD) * (way + lists.drift[row]), dtype(0.5) * r))
+                count = wp.int32(LISTED + 1)
+                tries = wp.int32(0)
+                while count > LISTED and tries < 4:
+                    tries += 1
+                    count = wp.int32(0)
+                    k = wp.int32(0)
+                    query = wp.bvh_query_sphere(mesh.bvh[c], wp.vec3(p), wp.float32(r + w) + margin_of(mesh, c, p))
+                    while count <= LISTED and wp.bvh_query_next(query, k):
+                        d, _n, _w = from_triangle(p, corners(mesh, c, k, halves, per_frame))
+                        if d < r + w:
+                            if count < LISTED:
+                                lists.triangles[row, i, count] = k
+                            count += 1
+                    if count > LISTED:
+                        w *= dtype(0.25)
+                lists.ball[row, i] = ball_type(p[0], p[1], p[2], w)
+                lists.built[row, i] = step
+                lists.count[row, i] = wp.where(count > LISTED, -1, count)
+            if lists.count[row, i] < 0:
+                row = -1
+        return row
+
+    return nearest_beyond, sweep, has_list, is_alone, listed
 
 
 @cache
@@ -365,7 +481,7 @@ def find_facets(dtype, at_vertex: bool):
     facet = facet_type(dtype)
     to_local, to_space = of_pose(dtype)
     corners, _from, carry = geometry(dtype)
-    nearest_beyond, sweep = queries(dtype)
+    nearest_beyond, sweep, _has_list, _is_alone, listed = queries(dtype)
     zero, one = dtype(0.0), dtype(1.0)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -382,6 +498,8 @@ def find_facets(dtype, at_vertex: bool):
         # parameters
         collider: int,
         per_copy: int,
+        # in and out
+        lists: near_lists(dtype),
         # out
         facets: wp.array2d(dtype=facet),
     ):
@@ -402,11 +520,15 @@ def find_facets(dtype, at_vertex: bool):
         count = wp.int32(0)
         radius = r
         farthest = r
-        if not wp.static(at_vertex):
+        row = wp.int32(-1)
+        if wp.static(at_vertex):
+            way = wp.length(to_local(motion.after[copy, collider], x[i] + h * v[i]) - p)
+            row = listed(mesh, collider, before, per_frame, p, way, r, lists, i)
+        else:
             when = before + 2
             ahead = x[i] + h * (v[i] + h * gravity[i // per_gravity])
             target = to_local(motion.after[copy, collider], ahead)
-            farthest = dtype(2.0) * r + wp.length(target - start)
+            farthest = dtype(2.0) * r + wp.min(wp.length(target - start), dtype(64.0) * r)
             done = zero
             n_hit = vec3()
             foot = vec3()
@@ -416,7 +538,7 @@ def find_facets(dtype, at_vertex: bool):
             while done < one and slide < SLIDES:
                 slide += 1
                 way = target - p
-                kept, n, face, w = sweep(mesh, collider, before, when, per_frame, p, way, done, motion.landing)
+                kept, n, face, w = sweep(mesh, collider, before, when, per_frame, p, way, done, motion.landing, lists, -1, i)
                 p += kept * way
                 done += kept * (one - done)
                 if face >= 0:
@@ -439,15 +561,19 @@ def find_facets(dtype, at_vertex: bool):
             radius = dtype(2.0) * r
             if face_hit >= 0:
                 radius += wp.min(dtype(0.25) * wp.length(target - foot), dtype(32.0) * r)
-                d, n, face, w = nearest_beyond(mesh, collider, when, per_frame, p, radius, zero, 0, normals, gaps)
+                d, n, face, w = nearest_beyond(mesh, collider, when, per_frame, p, radius, zero, 0, normals, gaps, lists, -1, i)
                 if d < zero or wp.dot(n, n_hit) < dtype(ALIKE):
                     normals[0] = n_hit
                     gaps[0] = wp.dot(n_hit, p - foot)
                     points[0] = foot
                     count = 1
         searching = wp.bool(True)
+        if row >= 0:
+            searching = lists.count[row, i] > 0
         while searching and count < most:
-            d, n, face, w = nearest_beyond(mesh, collider, when, per_frame, p, radius, dtype(BEYOND) * r, count, normals, gaps)
+            d, n, face, w = nearest_beyond(
+                mesh, collider, when, per_frame, p, radius, dtype(BEYOND) * r, count, normals, gaps, lists, row, i
+            )
             searching = d > zero
             if searching:
                 t = corners(mesh, collider, face, when, per_frame)
@@ -545,7 +671,7 @@ def anchor_on_mesh(dtype, bounded: bool):
     _pose, anchor_type = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
     corners, _from, _carry = geometry(dtype)
-    nearest_beyond, _sweep = queries(dtype)
+    nearest_beyond, _sweep, has_list, is_alone, _listed = queries(dtype)
     rest_type = wp.types.vector(8, dtype)
     zero, one = dtype(0.0), dtype(1.0)
 
@@ -562,6 +688,7 @@ def anchor_on_mesh(dtype, bounded: bool):
         per_copy: int,
         most: int,
         friction: dtype,
+        lists: near_lists(dtype),
         # in and out
         anchors: wp.array(dtype=anchor_type),
         rest: wp.array(dtype=rest_type),
@@ -576,12 +703,13 @@ def anchor_on_mesh(dtype, bounded: bool):
         normals = mat33()
         gaps = vec3()
         faces = wp.vec3i()
+        row = has_list(lists, collider, i, motion.steps[copy], p, zero)
         weights = mat33()
         count = wp.int32(0)
-        searching = wp.bool(True)
+        searching = not is_alone(lists, collider, i, motion.steps[copy], p, zero)
         while searching and count < most:
             d, n, face, w = nearest_beyond(
-                mesh, collider, before, per_frame, p, distance, dtype(BEYOND) * distance, count, normals, gaps
+                mesh, collider, before, per_frame, p, distance, dtype(BEYOND) * distance, count, normals, gaps, lists, row, i
             )
             searching = d > zero
             if searching:
@@ -642,11 +770,22 @@ def filter_meshes(dtype):
     to_local, to_space = of_pose(dtype)
     kept_of = kept_part(dtype)
     corners, from_triangle, carry = geometry(dtype)
-    _nearest, sweep = queries(dtype)
+    _nearest, sweep, has_list, is_alone, _listed = queries(dtype)
     zero, one = dtype(0.0), dtype(1.0)
 
     @wp.func
-    def stopped(mesh: meshes(dtype), c: int, motion: motions(dtype), copy: int, p: vec3, end: vec3, least: dtype, free: int):
+    def stopped(
+        mesh: meshes(dtype),
+        c: int,
+        motion: motions(dtype),
+        copy: int,
+        p: vec3,
+        end: vec3,
+        least: dtype,
+        free: int,
+        lists: near_lists(dtype),
+        i: int,
+    ):
         """Where a move from p to ``end`` ends, and whether something stops it: 1; 2 if it gets past that, of what is free."""
         per_frame = motion.per_frame
         before = 2 * motion.steps[copy]
@@ -657,7 +796,8 @@ def filter_meshes(dtype):
         thick = least
         rounds = wp.int32(0)
         while moving and rounds < CARRIES:
-            kept, n, face, w = sweep(mesh, c, before, before + 2, per_frame, p, end - p, done, thick)
+            row = has_list(lists, c, i, motion.steps[copy], p, wp.length(end - p))
+            kept, n, face, w = sweep(mesh, c, before, before + 2, per_frame, p, end - p, done, thick, lists, row, i)
             if thick == least:
                 moving = face >= 0 and free > 0
                 hit = wp.where(face >= 0, 1, hit)
@@ -694,6 +834,7 @@ def filter_meshes(dtype):
         # state in
         x_before: wp.array(dtype=vec3),
         motion: motions(dtype),
+        lists: near_lists(dtype),
         # parameters
         per_copy: int,
         # in and out
@@ -724,7 +865,10 @@ def filter_meshes(dtype):
                 if mesh.frames[c] > 0:
                     near = wp.max(rounding, dtype(8.0) * epsilon(motion.least) * wp.max(wp.abs(p)))
                     least = wp.where(free > 0, motion.least + near, near)
-                    hit, found = stopped(mesh, c, motion, copy, p, p + way, least, free)
+                    hit = wp.int32(0)
+                    found = p
+                    if not is_alone(lists, c, i, step, p, wp.length(way)):
+                        hit, found = stopped(mesh, c, motion, copy, p, p + way, least, free, lists, i)
                     if hit > 0 and free > 0:
                         end = to_space(motion.after[copy, c], found)
                         cuts = rounds
@@ -756,7 +900,9 @@ def filter_meshes(dtype):
                 way = to_local(motion.after[copy, c], end) - p
                 through = wp.bool(False)
                 if mesh.frames[c] > 0:
-                    _kept, _n, face, _w = sweep(mesh, c, 2 * step, 2 * step + 2, motion.per_frame, p, way, zero, rounding)
+                    _kept, _n, face, _w = sweep(
+                        mesh, c, 2 * step, 2 * step + 2, motion.per_frame, p, way, zero, rounding, lists, -1, i
+                    )
                     through = face >= 0
                 else:
                     d, _n = local_gap_of(p + way, shape.core[c], shape.radius[c])
@@ -777,7 +923,7 @@ def surface_moves(dtype):
     pose_type, _anchor = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
     corners, _from, _carry = geometry(dtype)
-    nearest_beyond, _sweep = queries(dtype)
+    nearest_beyond, _sweep, _has_list, _is_alone, _listed = queries(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def moves(
@@ -791,6 +937,7 @@ def surface_moves(dtype):
         when: int,
         collider: int,
         per_copy: int,
+        lists: near_lists(dtype),
         # out
         out: wp.array(dtype=vec3),
     ):
@@ -799,7 +946,7 @@ def surface_moves(dtype):
         first = 2 * motion.steps[copy] - 2  # of the step that is over
         p = to_local(poses[copy, collider], x[i])
         d, n, face, w = nearest_beyond(
-            mesh, collider, first + when, motion.per_frame, p, motion.r, dtype(0.0), 0, mat33(), vec3()
+            mesh, collider, first + when, motion.per_frame, p, motion.r, dtype(0.0), 0, mat33(), vec3(), lists, -1, i
         )
         found = vec3()
         if face >= 0:

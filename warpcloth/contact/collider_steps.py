@@ -174,7 +174,8 @@ class ColliderSteps:
             given = [model.inverse_mass, self.shapes, self.x_before, self.poses]
             given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
         else:
-            given = [model.inverse_mass, self.shapes, self.meshes.geometry, self.x_before, self.meshes.motion, model.per_copy]
+            given = [model.inverse_mass, self.shapes, self.meshes.geometry, self.x_before]
+            given += [self.meshes.motion, self.meshes.lists, model.per_copy]
         out = [x, v, move, self.notes]
         if model.mobility is not None:
             wp.copy(self._wanted, x)

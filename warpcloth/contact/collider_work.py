@@ -63,7 +63,7 @@ class ColliderWork:
         model, colliders = self.model, self.colliders
         if c in self._deform:
             meshes = colliders.meshes
-            given = [meshes.geometry, x, poses, meshes.motion, when, c, model.per_copy]
+            given = [meshes.geometry, x, poses, meshes.motion, when, c, model.per_copy, meshes.lists]
             model.launch(self._surface, model.count, given, [out])
         else:
             model.launch(self._rigid, model.count, [x, poses, colliders.poses, c, model.per_copy], [out])

@@ -1,5 +1,6 @@
 """Colliders that are triangle meshes in the steps of a solver."""
 
+import numpy as np
 import warp as wp
 
 from ..kernels import mesh_colliders as kernels
@@ -28,8 +29,31 @@ class MeshSteps:
         self.given = given
         for name, value in (given | {name: getattr(poses, name) for name in ("before", "at", "after")}).items():
             setattr(self.motion, name, value)
+        self.lists = kernels.near_lists(model.dtype)()
+        if self.motion.ahead == 0:
+            self._set_lists()
         if self._meshes.deform:
             self._bound = model.kernel(kernels.bound_triangles, model.dtype)
+
+    def _set_lists(self):
+        """Lists of the triangles near vertices, for explicit steps, which are short."""
+        model, scene = self.model, self.model.scene
+        meshes = [c for c, tree in enumerate(self._meshes.trees) if tree is not None]
+        dim, rows = (len(meshes), model.count), np.full(len(scene.colliders), -1, np.int32)
+        rows[meshes] = np.arange(len(meshes))
+        balls = np.zeros((*dim, 4))
+        balls[..., 3] = -1.0
+        steps = self.motion.per_frame / 2
+        self._kept = {  # whose memory the struct does not keep
+            "row": wp.array(rows, dtype=wp.int32, device=model.device),
+            "drift": model.array([scene.colliders[c].deforms.max(initial=0.0) / steps for c in meshes], model.dtype),
+            "ball": model.array(balls, wp.types.vector(4, model.dtype)),
+            "built": wp.zeros(dim, dtype=wp.int32, device=model.device),
+            "count": wp.zeros(dim, dtype=wp.int32, device=model.device),
+            "triangles": wp.zeros((*dim, kernels.LISTED), dtype=wp.int32, device=model.device),
+        }
+        for name, value in self._kept.items():
+            setattr(self.lists, name, value)
 
     def launch_trees(self):
         """Fits the trees of meshes that deform to the step."""
@@ -58,7 +82,7 @@ class MeshSteps:
         def launch(elements, x, v):
             if elements.facet == 0:
                 given = [elements.stencil, self.geometry, *model.free_gravity, x, v, self.motion, c, elements.per_copy]
-                model.launch(find, elements.count, given, [facets])
+                model.launch(find, elements.count, given, [self.lists, facets])
             model.launch(pose, elements.count, [elements.stencil, areas, facets, elements.facet], [elements.rest])
 
         return launch
@@ -76,7 +100,7 @@ class MeshSteps:
         most = self._facets[c].shape[1]
 
         def launch(elements, x, _v):
-            given = [elements.stencil, self.geometry, x, self.motion, c, elements.per_copy, most, friction]
+            given = [elements.stencil, self.geometry, x, self.motion, c, elements.per_copy, most, friction, self.lists]
             model.launch(anchor, elements.count, given, [anchors, elements.rest])
 
         return launch

@@ -30,8 +30,7 @@ class DeviceMeshes(NamedTuple):
         for c in self.deform:
             trees[c] = wp.Bvh(wp.clone(trees[c].lowers), wp.clone(trees[c].uppers))
         geometry = kernels.meshes(model.dtype)()  # as copies of a struct share its memory
-        for name in ("points", "triangles", "first_triangle", "first_point", "size", "frames", "margin"):
-            setattr(geometry, name, getattr(self.geometry, name))
+        geometry.assign(self.geometry)
         geometry.bvh = _ids(trees, model.device)
         return self._replace(geometry=geometry, trees=trees)
 
