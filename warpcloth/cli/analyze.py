@@ -278,12 +278,12 @@ def _summary(facts):
         cells = [(f"{end['value']:.5g}", f"{end['frame']:g}", str(end["element"])) for end in ends.values()]
         rows.append((name, *cells[0], *cells[1], ends["largest"]["unit"]))
     table = [f"  {line}" for line in aligned(rows)]
-    frames = f"{facts['rows']} from {facts['first_frame']:g} to {facts['last_frame']:g}"
+    frames = f"{facts['rows']} frames from {facts['first_frame']:g} to {facts['last_frame']:g}"
     of = f"{facts['triangles']} triangles" if facts["measured"] == "triangle" else f"{facts['vertices']} vertices"
     around = f", {facts['neighbourhood']}" if facts["neighbourhood"] else ""
     lines = [f"{facts['input']}: {of}{around}, {frames}, in {facts['seconds']:.3g} s", *table]
     if not facts["rest_declared"]:
-        lines.append("  rest shape    that of the first frame, for neither the input nor --rest says one")
+        lines.append("  rest shape    that of the first frame, because neither the input nor --rest gives one")
     if facts["coloured"]:
         low, high = facts["colour_range"]
         lines.append(f"  colours       {facts['coloured']}, {low:.5g} to {high:.5g}")

@@ -165,7 +165,7 @@ def _summary(facts, found):
     rms = " and ".join(_metres(value) for value in facts["surface_rms"])
     lines += [
         f"  surfaces      RMS {rms} over all frames, from A and from B",
-        f"  Hausdorff     {_at(facts['hausdorff'])}, as vertices have it; at most {_metres(facts['hausdorff_bound']['value'])}",
+        f"  Hausdorff     {_at(facts['hausdorff'])}, sampled at vertices; at most {_metres(facts['hausdorff_bound']['value'])}",
     ]
     if facts["same_topology"]:
         worst = facts["stretch_largest"]

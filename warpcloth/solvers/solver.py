@@ -174,8 +174,8 @@ class Stepper:
     def multiplier_forces(self, collider=None):
         """See :meth:`constraint_forces`; of steps that this stepper took itself."""
         raise ValueError(
-            f"{type(self.options).__name__} has no multipliers, so that the forces of terms with infinite stiffness are not "
-            "known, nor what pins bear; XPBD and ConstrainedDynamics have, and a finite stiffness gives them with every solver"
+            f"{type(self.options).__name__} has no multipliers, so the forces of terms with infinite stiffness and the "
+            "reactions of pins are not known; take XPBD or ConstrainedDynamics, or a finite stiffness"
         )
 
     def launch_prediction(self):
