@@ -246,6 +246,12 @@ def test_a_mesh_that_faces_inwards_is_said(path):
         assert collider_of(path, room).closed
 
 
+def test_a_flat_mesh_has_a_sphere_about_it(path):
+    flat = TETRAHEDRON.replace("(0, 0, 10)", "(10, 10, 0)")
+    ball = collider_of(path, shape("Mesh", 'token warpcloth:collider = "boundingSphere"' + flat))
+    np.testing.assert_allclose([ball.radius, *ball.position], [0.1 * np.sqrt(0.5), 0.05, 0.05, 0], atol=1e-6)
+
+
 def test_a_mesh_that_is_a_collider_is_not_the_cloth(path):
     collider_of(path, shape("Mesh", TETRAHEDRON))
     assert read_stage_mesh(path).prim == "/Cloth"

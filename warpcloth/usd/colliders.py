@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..mesh.mesh import FLATTEST
+from ..mesh.slivers import without_slivers
 from ..scene.colliders import Box, Capsule, Plane, Sphere
 from ..scene.mesh_collider import MeshCollider
 from .attributes import Values, holders
@@ -22,8 +22,6 @@ _TAKEN_AS_NONE = ("convexDecomposition", "meshSimplification", "sdf")
 _SIZES = ("size", "radius", "height")
 # Scales and angles of float32 and of products of them agree to this part.
 _SAME = 1e-5
-_FLIPS = 20  # rounds in which flat triangles are turned into others
-_FLAT = 1e-4  # height over the longest side at which they are: float32 leaves them no normal
 
 
 def read_colliders(stage, cloth, surroundings, frames, fps):
@@ -264,7 +262,7 @@ class _Reader:
             points = np.broadcast_to(points, (count, *points.shape[-2:])) if points.ndim == 2 or len(points) == 1 else points
             points = np.stack([placed(*pair) for pair in zip(points, self._transforms, strict=True)])
             mirrored = np.linalg.det(self._transforms[0][:3, :3]) < 0.0
-        triangles = _without_slivers(points.reshape(-1, *points.shape[-2:])[0], triangles)
+        triangles = without_slivers(points.reshape(-1, *points.shape[-2:])[0], triangles)
         triangles = triangles[:, ::-1] if mirrored else triangles
         return self._approximated(approximation, points, triangles, given)
 
@@ -314,18 +312,13 @@ class _Reader:
             if found.closed and _volume(found.frames[0][triangles]) < 0.0:
                 self._warn("its triangles face inwards, so that what they enclose is free and all else is solid")
             return found
-        import trimesh  # loaded late, as importing this package stays light
-
         if wanted == "convexHull":
-            try:
-                hull = trimesh.convex.convex_hull(points)
-            except Exception:  # of the package that trimesh calls, which it does not name
-                raise ValueError("its points are in a plane, must have a volume for a convexHull") from None
-            return MeshCollider(points=np.array(hull.vertices), triangles=np.array(hull.faces), **given)
+            points, triangles = _hull(points)
+            return MeshCollider(points=points, triangles=triangles, **given)
         if wanted == "boundingCube":
             low, high = points.min(axis=0), points.max(axis=0)
             return Box(size=high - low, **given | self._shifted(0.5 * (low + high), given))
-        centre = _centre(trimesh, points)
+        centre = _centre(points)
         radius = float(np.linalg.norm(points - centre, axis=1).max())
         return Sphere(radius=radius, **given | self._shifted(centre, given))
 
@@ -347,58 +340,28 @@ def _volume(corners):
     return np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
 
 
-def _without_slivers(points, triangles):
-    """The triangles of a surface as ones with an area, which a `Mesh` must have.
+def _hull(points):
+    """The points (n, 3) and triangles (T, 3) of the convex hull, with their fronts outside."""
+    from scipy.spatial import ConvexHull, QhullError  # loaded late, as importing this package stays light
 
-    Those with two corners at one position are left out. One whose corners are on a line, as fans of polygons with such corners
-    have, changes its longest side for the other diagonal with the triangle beyond, so that a closed surface stays closed.
-
-    Raises:
-        ValueError: None has an area.
-    """
-    index = np.unique(points, axis=0, return_inverse=True)[1].reshape(-1)
-    triangles = triangles[(index[triangles] != np.roll(index[triangles], 1, axis=1)).all(axis=1)]
-    for _ in range(_FLIPS):
-        flat = _flat(points[triangles], _FLAT)
-        if not flat.any() or flat.all():
-            break
-        triangles = _flipped(points, triangles, index, np.flatnonzero(flat).tolist())
-    triangles = triangles[~_flat(points[triangles], FLATTEST)]
-    if not len(triangles):
-        raise ValueError("has no triangle with an area, must have one to be a collider")
-    return triangles
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        raise ValueError("its points are in a plane, must have a volume for a convexHull") from None
+    a, b, c = points[hull.simplices].transpose(1, 0, 2)
+    inwards = np.einsum("ti,ti->t", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
+    triangles = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
+    used, triangles = np.unique(triangles, return_inverse=True)
+    points, triangles = points[used], triangles.reshape(-1, 3)
+    return points, without_slivers(points, triangles)
 
 
-def _flat(corners, least):
-    """Which triangles (T, 3, 3) are no higher than a part of their longest side."""
-    sides = corners - np.roll(corners, 1, axis=1)
-    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    return ~(doubled > least * np.einsum("tki,tki->tk", sides, sides).max(axis=1))
-
-
-def _flipped(points, triangles, index, flat):
-    """The triangles, some flat ones of which share another diagonal with the triangle beyond their longest side."""
-    triangles = triangles.copy()
-    beyond = {}
-    for t, corners in enumerate(index[triangles].tolist()):
-        beyond |= {(corners[k], corners[k - 2]): (t, k) for k in range(3)}  # the side from corner k to the next
-    touched = set()
-    for t in flat:
-        sides = points[np.roll(triangles[t], -1)] - points[triangles[t]]
-        k = int(np.argmax((sides**2).sum(axis=1)))
-        p, q, r = np.roll(triangles[t], -k)
-        other, side = beyond.get((int(index[q]), int(index[p])), (t, 0))
-        if other == t or touched & {t, other}:
-            continue
-        d = triangles[other][side - 1]
-        triangles[t], triangles[other] = (r, p, d), (d, q, r)
-        touched |= {t, other}
-    return triangles
-
-
-def _centre(trimesh, points):
+def _centre(points):
     """The centre (3,) of the smallest sphere about points."""
+    import trimesh
+    from scipy.spatial import QhullError
+
     try:
         return np.asarray(trimesh.nsphere.minimum_nsphere(points)[0])
-    except Exception:  # points in a plane, of which the package that trimesh calls makes no cells
+    except QhullError:  # points in a plane
         return 0.5 * (points.min(axis=0) + points.max(axis=0))
