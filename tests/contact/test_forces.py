@@ -146,6 +146,22 @@ def test_forces_of_an_implicit_step_balance_its_momentum(device):
     assert np.abs(run.collider_forces["ball"]).max() > 0.1
 
 
+def test_a_roller_and_a_plane_share_the_weight(device):
+    """A vertex that is held at 0.4 r, by contact pushed up and pressed down by its pin, at rest and as the others swing."""
+    scene, _normal, _down = slope(0.0, 0.0)
+    positions = scene.positions + np.eye(9, 1) * [0.0, -0.5 * R, 0.0]
+    scene = replace(scene, positions=positions, pins=wc.Pins([0], axes="y"))
+    weight = G * scene.vertex_masses.sum()
+    rest = wc.equilibrium(scene, device=device, tolerance=1e-11, record="reactions")
+    assert rest.reactions[0, 1] < -0.1 * weight
+    assert rest.reactions[0, 1] - rest.collider_forces["slope"][1] == pytest.approx(weight, rel=1e-12)
+    solver = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised")
+    run = wc.simulate(scene, solver, device=device, dtype="float64", record="reactions")
+    rates = np.diff((scene.vertex_masses[:, None] * run.velocities).sum(axis=1), axis=0) * scene.fps
+    found = (run.reactions.sum(axis=1) - run.collider_forces["slope"])[1:]
+    np.testing.assert_allclose(found, rates - scene.vertex_masses.sum() * scene.gravity, atol=1e-12)
+
+
 def test_hard_contact_bears_the_weight_by_its_multipliers(device):
     scene, _normal, _down = slope(0.0, 0.0, contact=wc.Contact(distance=R, stiffness=np.inf), duration=0.4)
     run = wc.simulate(scene, SOLVERS["xpbd"], device=device, dtype="float64", record="reactions")
