@@ -133,7 +133,7 @@ def test_errors_fall_with_the_order_of_the_method(scene, method, shared):
 def test_contact_has_a_reference(shared):
     """A sheet that slides, once its anchors are stretched, by g(sin 30° − 0.3 cos 30°); others meet it, by first order."""
     scene = SceneRef("incline", {"n": 3})
-    exact = reference(scene, 8, tolerance=1e-4)
+    exact = reference(scene, 6, tolerance=1e-3)
     down = np.array([np.sqrt(0.75), -0.5, 0.0])
     along = ((exact.points - exact.points[0]) @ down).mean(axis=1)
     assert exact.method == "Newton" and np.diff(along[3:], 2) * 60.0**2 == pytest.approx(2.35629, rel=1e-3)

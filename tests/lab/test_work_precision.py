@@ -33,7 +33,7 @@ from warpcloth.solvers import SOLVERS
 from warpcloth.solvers.explicit import step_limits
 
 pytestmark = pytest.mark.host
-SMALL, TOUCHING = SceneRef("hanging", {"n": 6}), SceneRef("drape", {"n": 4})
+SMALL, TOUCHING = SceneRef("hanging", {"n": 6}), SceneRef("incline", {"n": 4})
 FRAME, SUBSTEPS = 12, 4
 STEPS = setups_of_steps()
 
@@ -102,11 +102,11 @@ def test_all_that_minimise_close_the_gap(setup, device):
         assert all(later <= before + found["floor"] for before, later in pairwise(gaps))
 
 
-@pytest.mark.parametrize("solver", ["newton", "projective-dynamics", "xpbd"])
-def test_the_gap_closes_in_contact(solver, device):
-    found = measure(setups_of_steps([solver])[-1], device, TOUCHING)
-    assert found["status"] == "ok" and found["points"][0]["gap"] > 1e-6
-    assert found["points"][-1]["gap"] <= max(found["floor"], 1e-12)
+@pytest.mark.parametrize(("solver", "which"), [("newton", 0), ("projective-dynamics", -1), ("xpbd", 0)])
+def test_the_gap_closes_in_contact(solver, which, device):
+    """Also where friction and contact are most of what is to be minimised."""
+    found = measure(setups_of_steps([solver])[which], device, TOUCHING)
+    assert found["status"] == "ok" and found["points"][-1]["gap"] <= max(found["floor"], 1e-12)
 
 
 def test_float32_ends_where_its_rounding_is(device):
@@ -407,7 +407,7 @@ def test_time_diagram(device, tmp_path, drawn):
 
 
 def test_time_diagram_of_contact(device):
-    """A sheet that falls on a ball: errors of implicit settings fall to that of the reference."""
+    """A sheet that slides on a slope; PBD takes no friction."""
     with ThreadPoolExecutor(1) as executor:
         found = time_diagram(TOUCHING, ["explicit", "xpbd", "pbd"], frames=8, device=device, store=Store(), executor=executor)
     rows = {row["label"]: row for row in found["rows"]}
