@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..mesh.slivers import without_slivers
+from ..mesh.flat_triangles import without_slivers
 from ..scene.colliders import Box, Capsule, Plane, Sphere
 from ..scene.mesh_collider import MeshCollider
 from .attributes import Values, holders
@@ -47,7 +47,7 @@ def read_colliders(stage, cloth, surroundings, frames, fps):
     found = []
     walk = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     for prim in walk:
-        with located(f"{surroundings.path}, prim {prim.GetPath()}"):
+        with errors_at(f"{surroundings.path}, prim {prim.GetPath()}"):
             if prim.IsA(UsdGeom.PointInstancer):
                 walk.PruneChildren()
                 if any(map(_collides, Usd.PrimRange(prim, Usd.TraverseInstanceProxies()))):
@@ -55,13 +55,13 @@ def read_colliders(stage, cloth, surroundings, frames, fps):
             wanted = prim != cloth and _collides(prim)
         if wanted:
             check_composed(prim, surroundings.path)
-            with located(f"{surroundings.path}, prim {prim.GetPath()}"):
+            with errors_at(f"{surroundings.path}, prim {prim.GetPath()}"):
                 found.append(_Reader(stage, prim, surroundings, frames, fps).collider())
     return found
 
 
 @contextmanager
-def located(where):
+def errors_at(where):
     """Says where a ValueError arose."""
     try:
         yield

@@ -18,7 +18,7 @@ from ..terms import TERMS, QuadraticBending, Spring
 from ..terms.loads import LOADS
 from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of, own_names
 from .chunks import export
-from .colliders import located, read_colliders
+from .colliders import errors_at, read_colliders
 from .gprims import define_colliders
 from .layers import scene_layer
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics
@@ -63,7 +63,7 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
         cloth = _cloth_prim(stage, path, prim)
         surroundings = read_stage_mesh(path, str(cloth.GetPath()))
         where = f"{path}, prim {cloth.GetPath()}"
-        with located(where):
+        with errors_at(where):
             fps = surroundings.fps or surroundings.time_codes_per_second
             duration = _duration(stage, Values(stage, cloth), fps)
             first = surroundings.start or 0.0
@@ -72,7 +72,7 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
             cloth = stage.GetPrimAtPath(surroundings.prim)
             scene = _scene(stage, cloth, surroundings, fps, duration)
         colliders = read_colliders(stage, cloth, scene.stage, scene.frames, fps)
-        with located(where):
+        with errors_at(where):
             return replace(scene, colliders=colliders) if colliders else scene
 
 
