@@ -32,7 +32,7 @@ NAMES = {
     "register": "adds a record to the catalogue of its room",
     "constant_blocks": "the launch of the kernel",
     "open_sequence": "reads any sequence, and one of a stage",
-    "vertex_normals": "on the host and as a kernel",
+    "vertex_normals turned": "on the host and on the device",
     "scene": "each file of scenes/ has its own",
     "energy": "of a term, and its kernel",
 }
