@@ -1,5 +1,6 @@
 """Makes the pictures of the README and of docs/ from animations and equilibria: python docs/pictures.py"""
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import matplotlib.pyplot as plt
 import warpcloth as wc
 from warpcloth.cli.reports import write_report
 from warpcloth.lab import elastica
-from warpcloth.scenes import bar_twist, bunny, cantilever, hanging, mobile
+from warpcloth.scenes import bar_twist, bunny, cantilever, character, hanging, mobile, tablecloth
 
 DOCS = Path(__file__).parent
 GREY = "0.35"
@@ -96,6 +97,16 @@ def picture_mobile(moments=(0.0, 1.0, 2.0, 3.0)):
     wc.render(animation, DOCS / "mobile.png", size=(1430, 400), samples=16, azimuth=-30.0, elevation=14.0)
 
 
+def picture_contact():
+    """The tablecloth on its table, and the figure that walks in its skirt in real time, from the stages of their runs."""
+    with tempfile.TemporaryDirectory() as folder:
+        laid, walking = (Path(folder) / name for name in ("tablecloth.usdc", "character.usdc"))
+        run(tablecloth.scene(), wc.Newton(substeps=2), output=laid)
+        wc.render(laid, DOCS / "tablecloth.png", size=(720, 405), samples=16)
+        run(character.scene(), wc.Newton(substeps=4), output=walking)
+        wc.render(walking, DOCS / "character.gif", size=(320, 264), samples=8, azimuth=-60.0, elevation=10.0)
+
+
 def picture_analysis(n=32, frame=20):
     """A frame of the hanging cloth with its first principal stretch and both directions, as `analyze` makes it."""
     scene = hanging.scene(n=n)
@@ -108,5 +119,6 @@ if __name__ == "__main__":
     picture_analysis()
     picture_hanging()
     picture_mobile()
+    picture_contact()
     picture_deformation()
     picture_cantilever()
