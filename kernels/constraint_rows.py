@@ -104,7 +104,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     slope = slope_type(term, dtype, scalar, curved)
     y_of, weight, measure, dead_zone = local_coordinate(term, dtype, True), term.weight, term.measure, term.dead_zone
-    gradient, constraint, constraint_gradient = term.gradient, term.constraint, term.constraint_gradient
+    gradient, constraint, constraint_gradient, secant = term.gradient, term.constraint, term.constraint_gradient, term.secant
     stiffening, share_of, row_of = term.stiffening, to_corner(term, dtype), covector_row(term, dtype, scalar, curved)
 
     @wp.func
@@ -211,8 +211,13 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
         e = wp.tid()
         s = first_row(e, layout, Q)
         r = rest[e]
-        c = gradient(y_of(stencil, e, r, x, d), r)  # y − p(y), as u = ½‖y − p(y)‖²
+        y = y_of(stencil, e, r, x, d)
+        c = gradient(y, r)  # y − p(y), as u = ½‖y − p(y)‖²
         alpha = dtype(1.0) / (stiffness[e] * measure(r) * h * h)
+        if wp.static(secant is not None):  # the same force, of a softer spring to a farther point
+            share = secant(y, r)
+            c = c / share
+            alpha = alpha / share
         active = wp.isfinite(alpha)
         if wp.static(dead_zone):
             active = active and wp.ddot(c, c) != dtype(0.0)

@@ -74,6 +74,8 @@ class Term:
         prox_from: (y, v, rest, compliance) → the same of u as it is about y, the position before the step, for an energy of
             which v may be nearer to another branch, such as the far side of a ball; or None.
         idle: (y, rest) → 1 where there is surely no force at y, which is quicker to tell than the force, else 0; or None.
+        secant: (y, rest) → s, from 0 to 1: where p moves with y, y − p is s times the distance to a point that moves less, and
+            constraint rows, which hold p fixed in an iteration, take that point and s k instead; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices.
         quadratic: Whether p is 0 and the weights of an element add up to 0: U is then quadratic in the differences of vertices.
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next four.
@@ -104,6 +106,7 @@ class Term:
     prox: Any = None
     prox_from: Any = None
     idle: Any = None
+    secant: Any = None
     linear: bool = False
     quadratic: bool = False
     constraint: Any = None

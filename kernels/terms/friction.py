@@ -70,6 +70,16 @@ def hessian(y: Any, rest: Any, policy: int):
 
 
 @wp.func
+def secant(y: Any, rest: Any):
+    """ε/‖u‖ of a vertex that slides: ∂u/∂y is that times the distance to the anchor."""
+    l = wp.length(slip(y, rest))
+    share = y.dtype(1.0)
+    if l > rest[6] and rest[6] > y.dtype(0.0):
+        share = rest[6] / l
+    return share
+
+
+@wp.func
 def project(y: Any, rest: Any):
     """y − ∂u/∂y."""
     return y - gradient(y, rest)
@@ -111,5 +121,6 @@ FRICTION = Term(
     project=project,
     prox=prox,
     idle=idle,
+    secant=secant,
     bounded=BOUNDED_FRICTION,
 )
