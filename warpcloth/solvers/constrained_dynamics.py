@@ -41,8 +41,8 @@ class ConstrainedDynamics(ImplicitStep):
 
     through (J M̃⁻¹Jᵀ + α̃)Δλ = −(C + α̃λ) + J M̃⁻¹(M(x − x̃) − Jᵀλ). Springs and hinges have the published scalar C; other
     terms have the rows C = y − p(y) with p fixed in an iteration, as in projective dynamics; limits have none inside their
-    range, and friction that slides has those of a softer spring to its anchor. The system admits any stiffness. The fixed point is the x(t+h) of :class:`warpcloth.Newton`, and for infinite
-    stiffness the point of C = 0 that is nearest to x̃.
+    range, and friction that slides those of a softer spring to its anchor. The system admits any stiffness. The fixed point is
+    the x(t+h) of :class:`warpcloth.Newton`, and for infinite stiffness the point of C = 0 that is nearest to x̃.
 
     One iteration with M̃ = M is the method as published. It leaves out −λ∂²C, so that a spring overshoots perpendicular to
     itself once its tension is above about m l/h², and more iterations need a safeguard. Geometric stiffness (Tournier et al.
