@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -168,6 +169,18 @@ def test_a_belt_slides_over_a_drum(solver, friction=0.3):
     found = tensions(capstan, wc.simulate(capstan, solver, dtype="float64").points[11:]).mean(axis=0)
     assert found[-1] / found[0] == pytest.approx(np.exp(np.pi * friction), rel=0.01)
     assert found[0] == pytest.approx(20.0, rel=0.01)
+
+
+def test_a_belt_slides_over_a_drum_of_triangles(friction=0.3):
+    """As over a round one; the watch of energy knows that the belt is pressed on it at the start."""
+    capstan = scene("capstan", friction=friction, turns=12, duration=0.35)
+    drum = trimesh.creation.cylinder(radius=0.1, height=0.4, sections=512)
+    points = drum.vertices[:, [1, 2, 0]]
+    capstan = replace(capstan, colliders=[wc.MeshCollider(points, drum.faces, position=(0.0, 0.05, 0.0), friction=friction)])
+    animation = wc.simulate(capstan, wc.Newton(substeps=1, linear="factorised"), dtype="float64")
+    assert animation.status.ok
+    found = tensions(capstan, animation.points[11:]).mean(axis=0)
+    assert found[-1] / found[0] == pytest.approx(np.exp(np.pi * friction), rel=0.01)
 
 
 @pytest.mark.slow

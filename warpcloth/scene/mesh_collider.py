@@ -129,17 +129,30 @@ class MeshCollider(Collider):
 
         Of triangles that are as near to within float32 it may take either.
         """
-        pose = self.poses[min(frame, len(self.poses) - 1)]
         points = np.asarray(points, dtype=np.float64)
-        local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3]).reshape(-1, 3)
-        vertices = self.frames[min(frame, len(self.frames) - 1)]
-        faces = nearest_faces(local, vertices, self.triangles)
-        weights = _nearest_weights(local, vertices[self.triangles[faces]])
-        away = local - np.einsum("kc,kci->ki", weights, vertices[self.triangles[faces]])
+        away, vertices, faces, weights = self._away(points.reshape(-1, 3), frame)
         found = np.linalg.norm(away, axis=1)
         if self.closed:
             found = found * np.sign(np.einsum("ki,ki->k", away, self._normals(vertices, faces, weights)))
         return found.reshape(points.shape[:-1])
+
+    def _away(self, points, frame):
+        """From the nearest points of the surface, in its frame; its vertices, and the faces and weights of these points."""
+        pose = self.poses[min(frame, len(self.poses) - 1)]
+        local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
+        vertices = self.frames[min(frame, len(self.frames) - 1)]
+        faces = nearest_faces(local, vertices, self.triangles)
+        weights = _nearest_weights(local, vertices[self.triangles[faces]])
+        return local - np.einsum("kc,kci->ki", weights, vertices[self.triangles[faces]]), vertices, faces, weights
+
+    def planes(self, points: np.ndarray) -> np.ndarray:
+        """Poses (n, 7) of half-spaces that touch it, at the start, where it is nearest to points (n, 3) outside."""
+        away = turned(self.poses[0, 3:], self._away(points, 0)[0])
+        normals = away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None]
+        x, y, z = normals.T
+        turns = np.stack([z, 0.0 * x, -x, 1.0 + y], axis=1)
+        turns[1.0 + y < 1e-12] = [1.0, 0.0, 0.0, 0.0]
+        return np.concatenate([points - away, turns / np.linalg.norm(turns, axis=1)[:, None]], axis=1)
 
     def _normals(self, vertices, faces, weights):
         """The normals of the face, the side or the corner where the nearest points of faces (k,) are, (k, 3).

@@ -18,6 +18,7 @@ from ..terms.contact import VertexContact, VertexFriction
 from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
 from .colliders import Collider, Contact, default_stiffness, refuse_inside
+from .mesh_collider import MeshCollider
 
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
@@ -247,7 +248,10 @@ class Scene:
             core, radius = collider.core
             given |= {"collider": c, "pose": collider.poses[0], "core": core, "radius": radius}
             for facet in range(max(collider.facets, 1)):
-                found.append(VertexContact(name=f"contact with {collider.label}", facet=facet, **given))
+                shape = {}
+                if isinstance(collider, MeshCollider) and facet == 0:  # the others are set by steps
+                    shape = {"pose": collider.planes(self.positions[free]), "core": np.full(3, np.inf), "radius": 0.0}
+                found.append(VertexContact(name=f"contact with {collider.label}", facet=facet, **{**given, **shape}))
             if collider.friction:
                 found.append(VertexFriction(name=f"friction on {collider.label}", **given))
         return tuple(found)
