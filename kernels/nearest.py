@@ -74,7 +74,14 @@ def faces():
     """Kernel over points: out[i] = the triangle of ``mesh`` that is nearest to points[i], all within [−1, 1]³."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def find(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.int32)):
+    def find(
+        # elements
+        mesh: wp.uint64,
+        # state in
+        points: wp.array(dtype=wp.vec3),
+        # out
+        out: wp.array(dtype=wp.int32),
+    ):
         i = wp.tid()
         query = wp.mesh_query_point_no_sign(mesh, points[i], FAR)
         if query.result:
