@@ -4,7 +4,7 @@ A cloth is judged by its kinetic energy and its height, whose sum never exceeds 
 because sweeps that end too early store a huge ½kx² without exploding; strain is judged separately.
 
 Symplectic Euler has its velocities half a step before its positions. For x″ = −ω²x it conserves v² + ω²x² − hω²xv, which near
-the limit ωh = 2 is far below v², by a factor of up to 199 at ωh = 1.995. With the velocity at the time of the position,
+the limit ωh = 2 is far below v², by a factor of up to 200 at ωh = 1.995. With the velocity at the time of the position,
 u = v − ½hω²x, the conserved quantity is u² + ω²x²(1 − ω²h²/4). Below the limit u² never exceeds it, so u is judged and not v.
 
 Where elastic energy is below 0, as that of an attraction may be, it is counted like height: the cloth may fall into it.
