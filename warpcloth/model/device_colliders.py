@@ -7,6 +7,7 @@ import warp as wp
 
 from ..kernels.colliders import pose_types
 from .device_meshes import DeviceMeshes, meshes_on
+from .precision import refuse_large
 
 
 class DeviceColliders(NamedTuple):
@@ -47,6 +48,7 @@ def colliders_on(model, scene):
     centred = [collider.centred() for collider in scene.colliders]
     poses = [collider.poses for collider in centred]
     cores, radii = zip(*(collider.core for collider in scene.colliders), strict=True)
+    refuse_large(scene, model.numpy_dtype)
     firsts = np.cumsum([0, *map(len, poses)])
     return DeviceColliders(
         keyframes=model.array(np.concatenate(poses), pose_types(model.dtype)[0]),

@@ -76,5 +76,27 @@ def refuse_coarse(mesh, positions, dtype, label):
         )
 
 
+def refuse_large(scene, dtype):
+    """Refuses colliders so large that a precision loses their surface.
+
+    ε·size may be a fifth of the contact distance, or 1e-4 of the median edge, which is what the cloth has anyway; the size is
+    the radius, or the shortest half of a box.
+
+    Raises:
+        ValueError: Naming the collider.
+    """
+    mesh, limits = scene.mesh, np.finfo(dtype)
+    edge = np.median(np.linalg.norm(np.diff(mesh.points[mesh.edges], axis=1), axis=2))
+    for collider in scene.colliders:
+        half, radius = collider.core
+        size = half.min() + radius
+        if np.isfinite(size) and limits.eps * size > max(0.2 * scene.contact.distance, 1e-4 * edge):
+            raise ValueError(
+                f"the surface of the collider {collider.label} is {size:.6g} m from its centre, where {limits.dtype} resolves "
+                f"{limits.eps * size:.2g} m, and the contact distance is {scene.contact.distance:g} m, which must be 5 times "
+                f"that; {_instead('take a plane', dtype)}"
+            )
+
+
 def _instead(advice, dtype):
     return advice if dtype is np.float64 else f"{advice} or use float64"

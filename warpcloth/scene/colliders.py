@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..base.checks import array, number, shown
+from ..base.checks import array, as_array, number, shown
 from ..base.types import Converted, default
 
 # The part of the contact distance by which the weight of the cloth presses it in, with the default stiffness.
@@ -34,8 +34,8 @@ class Contact:
 
     def __post_init__(self) -> None:
         number("contact.distance", self.distance, above=0.0)
-        if self.stiffness is not None and not (np.ndim(self.stiffness) == 0 and self.stiffness > 0.0):
-            raise ValueError(f"contact.stiffness is {shown(self.stiffness)}; it must be above 0, or None")
+        if self.stiffness is not None and (np.ndim(self.stiffness) or self.stiffness != np.inf):
+            number("contact.stiffness", self.stiffness, above=0.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,7 +65,7 @@ class Collider:
         counts = []
         for name, size in (("position", 3), ("rotation", 4)):
             given = getattr(self, name)
-            frames = len(given) if np.ndim(given) == 2 else None
+            frames = len(given) if as_array(given).ndim == 2 else None
             if frames == 0:
                 raise ValueError(f"{self.label}.{name} has no frame; it must have one or more, (F, {size})")
             values = array(f"{self.label}.{name}", given, (size,) if frames is None else (frames, size))
@@ -304,6 +304,7 @@ def refuse_inside(colliders: Sequence[Collider], positions: np.ndarray, free: np
     for collider in colliders:
         found = collider.distances(positions)
         for vertex in np.flatnonzero(free & ~(found > 0.0))[:1]:
+            depth = abs(found[vertex])
             raise ValueError(
-                f"vertex {vertex} starts {-found[vertex]:.3g} m inside the collider {collider.label}{copy}; it must be outside"
+                f"vertex {vertex} starts {depth:.3g} m inside the collider {collider.label}{copy}; it must be outside"
             )

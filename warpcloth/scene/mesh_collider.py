@@ -57,6 +57,23 @@ class MeshCollider(Collider):
             raise ValueError(f"{self.label}.{error}") from None
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "triangles", mesh.triangles)
+        self._refuse_turned_over()
+
+    def _refuse_turned_over(self):
+        """Refuses keyframes at which the inside of a closed one is outside, for cloth cannot get there."""
+        if len(self.frames) == 1 or not self.closed:
+            return
+        first = self._filling(self.frames[0])
+        for frame, vertices in enumerate(self.frames):
+            if min(abs(first), -np.sign(first) * self._filling(vertices)) > 1e-6:  # flat ones have no side
+                raise ValueError(
+                    f"{self.label}.points[{frame}] is points[0] turned inside out; what is outside must stay outside"
+                )
+
+    def _filling(self, vertices):
+        """The volume within it over that of a cube as long as it; below 0 if its fronts look inwards."""
+        a, b, c = (vertices - vertices.mean(axis=0))[self.triangles].transpose(1, 0, 2)
+        return np.einsum("ti,ti", a, np.cross(b, c)) / (6.0 * max(np.ptp(vertices, axis=0).max() ** 3, 1e-300))
 
     @property
     def frames(self) -> np.ndarray:
@@ -133,7 +150,8 @@ class MeshCollider(Collider):
         away, vertices, faces, weights = self._away(points.reshape(-1, 3), frame)
         found = np.linalg.norm(away, axis=1)
         if self.closed:
-            found = found * np.sign(np.einsum("ki,ki->k", away, self._normals(vertices, faces, weights)))
+            behind = np.einsum("ki,ki->k", away, self._normals(vertices, faces, weights)) < 0.0
+            found = np.where(behind, -found, found)  # one that has shrunk to a point has no normals, and nothing is behind
         return found.reshape(points.shape[:-1])
 
     def _away(self, points, frame):
