@@ -181,7 +181,7 @@ def half_way(dtype):
 
 
 @cache
-def pulls(dtype):
+def collider_pulls(dtype):
     """The struct of ∂U/∂x of contact and friction with a collider, of friction alone, and of the collider's moves, or None."""
     vec3, _ = types(dtype)
 
@@ -237,9 +237,9 @@ def add_collider_work(dtype):
         # state in
         x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
-        now: pulls(dtype),
+        now: collider_pulls(dtype),
         # in and out
-        before: pulls(dtype),
+        before: collider_pulls(dtype),
         of_collider: wp.array(dtype=wp.float64),
         against_friction: wp.array(dtype=wp.float64),
     ):

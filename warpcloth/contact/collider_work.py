@@ -24,7 +24,7 @@ class ColliderWork:
         self.pulls = ColliderPulls(model, terms, hard)
         self._before, self._x_step = [], x if self._at_end else colliders.x_before
         for now in self.pulls.found:
-            before = kernels.pulls(model.dtype)()
+            before = kernels.collider_pulls(model.dtype)()
             now.move = model.vectors()
             if self._at_end:
                 before.all, before.friction = model.vectors(), model.vectors() if now.friction else None

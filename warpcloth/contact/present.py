@@ -9,7 +9,7 @@ import warp as wp
 from ..core.gradient import Gradient
 from ..kernels import colliders as kernels
 from ..kernels.terms.friction import FRICTION
-from ..kernels.work import pulls
+from ..kernels.work import collider_pulls
 from .mesh_steps import MeshSteps
 
 
@@ -106,7 +106,7 @@ class ColliderPulls:
             multipliers, or None.
 
     Attributes:
-        found: A :func:`warpcloth.kernels.work.pulls` of each collider.
+        found: A :func:`warpcloth.kernels.work.collider_pulls` of each collider.
         hard: Whether contact is hard.
     """
 
@@ -116,7 +116,7 @@ class ColliderPulls:
             mine = [elements for elements in terms if elements.collider == c]
             friction = tuple(elements for elements in mine if elements.term.name == FRICTION.name)
             contact = tuple(elements for elements in mine if elements not in friction)
-            found = pulls(model.dtype)()
+            found = collider_pulls(model.dtype)()
             found.all = model.vectors()
             if friction:
                 found.friction = model.vectors()
