@@ -1,6 +1,6 @@
 """A skirt on a figure that walks: a stage with a skeleton, whose skinned legs and hips are colliders that deform.
 
-The waist is pinned to the hips. The stage is made by character_stage.py; the animation is a layer over it.
+The waist is pinned to the hips. The stage is made by docs/character_stage.py; the animation is a layer over it.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
-"""Writes character.usda beside itself: a figure with a skeleton that walks, in a skirt, which is the cloth.
+"""Writes scenes/character.usda: a figure with a skeleton that walks, in a skirt, which is the cloth.
 
-python scenes/character_stage.py
+python docs/character_stage.py
 """
 
 from pathlib import Path
@@ -203,4 +203,4 @@ def write(path):
 
 
 if __name__ == "__main__":
-    write(Path(__file__).parent / "character.usda")
+    write(Path(__file__).parents[1] / "scenes" / "character.usda")
