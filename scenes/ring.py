@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 import warpcloth as wc
 
 
-def gap(load):
+def height(load):
     """H/2R for PR²/D, by quadrature over a quarter of the ring, where (R dφ/ds)² = c + PR²/D sin φ."""
 
     def integral(power, c):  # of sinᵖ φ ds/R; φ = t², which leaves no pole where c is 0
@@ -39,7 +39,7 @@ def scene(load: float = 2.0, elements: int = 48, radius: float = 0.1, bending: f
     thick, outer = 0.2 * radius, radius + 0.95 * distance  # of a plate, and where its surface is when it just touches
     size = (2.5 * radius, 3.0 * width, thick)
     at = np.array([0.0, 1.5 * width, outer + 0.5 * thick])
-    closing = -2.0 * radius * (1.0 - gap(load)) * part
+    closing = -2.0 * radius * (1.0 - height(load)) * part
     return wc.Scene(
         mesh,
         density=0.3,

@@ -345,7 +345,7 @@ def borne(declared, points):
 def test_a_ring_bears_a_load_between_plates(load):
     """H of the load that it bears, to 0.5 %, and the load of H, to 1 %, touching along a line and flat."""
     declared = ring.scene(load, elements=64)
-    part = ring.gap(load)
+    part = ring.height(load)
     fixed, moving = declared.colliders
     plates = [fixed, replace(moving, position=moving.position[-1])]
     start = declared.mesh.points * [2.0 - part, 1.0, part] - [0.0, 0.0, 0.1 * (1.0 - part)]
@@ -353,14 +353,16 @@ def test_a_ring_bears_a_load_between_plates(load):
     rest = wc.equilibrium(squeezed)
     assert rest.status.ok
     found, high = borne(squeezed, rest.points)
-    assert high == pytest.approx(ring.gap(found), rel=5e-3)
-    assert found == pytest.approx(brentq(lambda each: ring.gap(each) - high, 0.1, 10.0), rel=0.01)
+    assert high == pytest.approx(ring.height(found), rel=5e-3)
+    assert found == pytest.approx(brentq(lambda each: ring.height(each) - high, 0.1, 10.0), rel=0.01)
 
 
 def test_the_answers_of_a_ring():
     """The quadrature against elliptic integrals: where the ring begins to lie flat, and beyond."""
-    assert [ring.gap(1.0), ring.gap(2.0), ring.gap(2.786408)] == pytest.approx([0.9165281, 0.8132354, 0.717770], abs=1e-6)
-    assert 4.0 * ring.gap(4.0) ** 2 == pytest.approx(5.7421601 / 4.0, rel=1e-6)
+    assert [ring.height(1.0), ring.height(2.0), ring.height(2.786408)] == pytest.approx(
+        [0.9165281, 0.8132354, 0.717770], abs=1e-6
+    )
+    assert 4.0 * ring.height(4.0) ** 2 == pytest.approx(5.7421601 / 4.0, rel=1e-6)
 
 
 @methods(
@@ -377,4 +379,4 @@ def test_a_ring_is_pressed_by_a_plate(solver):
     declared = ring.scene(elements=24, duration=0.5)
     found, high = borne(declared, wc.simulate(declared, solver, dtype="float64").points[-1])
     assert found == pytest.approx(2.0, rel=0.03)
-    assert high == pytest.approx(ring.gap(2.0), rel=2e-3)
+    assert high == pytest.approx(ring.height(2.0), rel=2e-3)

@@ -17,7 +17,7 @@ from ..mesh.sequences import Sequence, as_sequence, open_sequence
 from ..run.simulate import Animation
 from ..scene.lines import lines_of
 from ..scene.scene import Scene
-from ..usd.drawn import read_drawn
+from ..usd.drawn import draw_colliders, read_drawn
 from ..usd.layers import CURVE_WIDTH
 from .shape import BACK, CLOTH, Shape
 
@@ -95,7 +95,7 @@ def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0):
     elif isinstance(source, Sequence):
         found = _of_sequence(source, source.mesh)
     elif isinstance(source, Scene):
-        found = _of_frames(source.name, source.mesh, source.positions[None], None, source.pins.vertices, lines_of(source))
+        found = _of_frames(source.name, source.mesh, source.positions[None], None, source.pins.vertices, source)
     elif isinstance(source, Animation) and source.scene is not None:
         scene = source.scene
         found = _of_animation(source, scene, copy, azimuth)
@@ -136,12 +136,7 @@ def _of_stage(path, name, prim, fps):
     codes = stage.codes
     first = np.concatenate([each.points(codes[0]) for each in stage.prims if each.cloth])
     size = _size(first)
-    shapes = []
-    for each in stage.prims:
-        edge = np.linalg.norm(np.diff(each.points(codes[0])[each.edges], axis=1), axis=-1).mean() if len(each.edges) else 0.0
-        radius = max(each.radius, min((_THINNEST if each.cloth else _THINNEST_LINE) * size, 0.2 * edge))
-        colour = CLOTH if each.cloth else LINES if len(each.edges) else SURROUNDINGS
-        shapes.append(_shape(each.count, each.triangles, each.edges, radius or 0.2 * edge, each.pins, size, edge, colour))
+    shapes = [_prim_shape(each, codes[0], size) for each in stage.prims]
     labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
     times = (codes - codes[0]) / (stage.rate if fps is None else fps)
 
@@ -158,6 +153,14 @@ def _of_stage(path, name, prim, fps):
     return Subject(name, shapes, labels, times, read, stage.up_axis, sequences, cloths[0], files)
 
 
+def _prim_shape(prim, code, size):
+    """The shape of a `DrawnPrim`, beside a cloth of a size."""
+    edge = np.linalg.norm(np.diff(prim.points(code)[prim.edges], axis=1), axis=-1).mean() if len(prim.edges) else 0.0
+    radius = max(prim.radius, min((_THINNEST if prim.cloth else _THINNEST_LINE) * size, 0.2 * edge))
+    colour = CLOTH if prim.cloth else LINES if len(prim.edges) else SURROUNDINGS
+    return _shape(prim.count, prim.triangles, prim.edges, radius or 0.2 * edge, prim.pins, size, edge, colour)
+
+
 def _of_sequence(sequence, mesh):
     if sequence.stage is not None:
         found = _of_stage(os.fspath(sequence.path), Path(sequence.path).name, sequence.stage.prim, None)
@@ -171,16 +174,18 @@ def _of_sequence(sequence, mesh):
     )
 
 
-def _of_frames(name, mesh, frames, times, pins=(), lines=None):
-    """Frames (F, n, 3) of a mesh."""
-    read, count = _reader(frames, mesh)
-    shapes = [_cloth(mesh, read(0), pins), *_strings(mesh, lines)]
-    times = None if times is None else np.asarray(times, dtype=float)
+def _of_frames(name, mesh, frames, times, pins=(), scene=None):
+    """Frames (F, n, 3) of a mesh, with the strings, bars and colliders of a scene."""
+    positions, count = _reader(frames, mesh)
+    read = lambda frame: [positions(frame)]  # noqa: E731
+    shapes, times = [_cloth(mesh, positions(0), pins)], None if times is None else np.asarray(times, dtype=float)
+    if scene is not None:
+        shapes, read = _with_surroundings(scene, shapes, positions)
 
     def sequences():
         return [as_sequence(mesh, frames, times=times)]
 
-    return Subject(name, shapes, np.arange(count), times, lambda frame: [read(frame)] * len(shapes), mesh.up_axis, sequences)
+    return Subject(name, shapes, np.arange(count), times, read, mesh.up_axis, sequences)
 
 
 def _reader(frames, mesh):
@@ -197,28 +202,51 @@ def _reader(frames, mesh):
 
 def _of_animation(animation, scene, copy, azimuth):
     """The frames of a run; of a batch all cloths side by side, or one."""
-    points, lines = animation.points, lines_of(scene)
+    points = animation.points
     if points.ndim == 3 and copy is not None:
         raise ValueError(f"copy is {shown(copy)}; the animation is of one cloth, so that it must be None")
     if copy is not None:
         whole("copy", copy, 0, points.shape[1] - 1)
         points = points[:, copy]
     if points.ndim == 3:
-        found = _of_frames(scene.name, scene.mesh, points, animation.times, scene.pins.vertices, lines)
+        found = _of_frames(scene.name, scene.mesh, points, animation.times, scene.pins.vertices, scene)
         return replace(found, up_axis=scene.up_axis)
     batch = points.shape[1]
     offsets = _side_by_side(points, azimuth, scene.up_axis)
     count = len(scene.mesh.points)
-    shapes = [_cloth(scene.mesh, scene.positions, scene.pins.vertices), *_strings(scene.mesh, lines)]
-    shapes = [_repeated(shape, batch) for shape in shapes]
 
-    def read(frame):
-        return [(np.asarray(points[frame], dtype=np.float64) + offsets).reshape(batch * count, 3)] * len(shapes)
+    def positions(frame):
+        return (np.asarray(points[frame], dtype=np.float64) + offsets).reshape(batch * count, 3)
+
+    cloth = _cloth(scene.mesh, scene.positions, scene.pins.vertices)
+    shapes, read = _with_surroundings(scene, [cloth], positions, offsets)
+    shapes = [_repeated(shape, batch) for shape in shapes]
 
     def sequences():
         return [as_sequence(scene.mesh, points[:, k], times=animation.times) for k in range(batch)]
 
     return Subject(scene.name, shapes, np.arange(len(points)), np.asarray(animation.times), read, scene.up_axis, sequences)
+
+
+def _with_surroundings(scene, cloth, positions, offsets=0.0):
+    """Adds the strings, bars and colliders of a scene to the shape of its cloth; with the function that reads all.
+
+    Args:
+        scene: The scene.
+        cloth: A list of the shape.
+        positions: Function that gives the positions of the cloth from the index of a frame.
+        offsets: Of the cloths of a batch, (B, 1, 3) [m], each of which has the colliders about it; 0 for one.
+    """
+    own = [*cloth, *_strings(scene.mesh, lines_of(scene))]
+    if not scene.colliders:
+        return own, lambda frame: [positions(frame)] * len(own)
+    stage, size = draw_colliders(scene), _size(scene.positions)
+
+    def read(frame):
+        beside = [(each.points(frame) + offsets).reshape(-1, 3) for each in stage.prims]
+        return [positions(frame)] * len(own) + beside
+
+    return own + [_prim_shape(each, 0, size) for each in stage.prims], read
 
 
 def _side_by_side(points, azimuth, up_axis):

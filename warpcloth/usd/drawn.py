@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from .layers import CURVE_WIDTH
-from .modules import Usd, UsdGeom
+from .gprims import define_colliders
+from .layers import CURVE_WIDTH, scene_layer
+from .modules import Usd, UsdGeom, UsdPhysics
 from .solids import SOLIDS
 from .stage import (
     METADATA_KEY,
@@ -108,6 +109,16 @@ def read_drawn(path, prim=None):
         times = sorted({code for each in prims if each.cloth for code in each.codes})
         times = times or sorted({code for each in prims for code in each.codes}) or [0.0]
         return DrawnStage(prims, np.array(times), stage.GetTimeCodesPerSecond(), str(UsdGeom.GetStageUpAxis(stage)), stage)
+
+
+def draw_colliders(scene):
+    """The colliders of a :class:`warpcloth.Scene` as a `DrawnStage` of their own, whose time codes are frames."""
+    layer, *_rest = scene_layer(scene.mesh, None, scene.up_axis, "Cloth")
+    define_colliders(layer, scene.colliders, scene.mesh)
+    stage = Usd.Stage.Open(layer)
+    found = [prim for prim in _shown(stage) if prim.HasAPI(UsdPhysics.CollisionAPI)]
+    prims = [_drawn(prim, scene.name, False, _codes(prim)) for prim in found]
+    return DrawnStage(prims, np.zeros(1), 1.0, scene.up_axis, stage)
 
 
 def _shown(stage):
