@@ -13,7 +13,7 @@ from .vectors import types
 def balls(dtype):
     """The struct of a center and a radius of each vertex, among the colliders before step ``found``.
 
-    From there the surface of none moves on by more than ``drift`` a step [m].
+    From there the surface of none moves on by more than ``drift`` a step [m]. ``distance`` is the contact distance [m].
     """
 
     @wp.struct
@@ -21,6 +21,7 @@ def balls(dtype):
         balls: wp.array(dtype=wp.types.vector(4, dtype))
         found: wp.array(dtype=wp.int32)
         drift: dtype
+        distance: dtype
 
     return Balls
 
@@ -51,7 +52,6 @@ def near_colliders(dtype, ended: bool):
         step: wp.array(dtype=wp.int32),
         # parameters
         per_copy: int,
-        distance: dtype,
         h: dtype,
         # in and out
         clear: balls(dtype),
@@ -73,7 +73,7 @@ def near_colliders(dtype, ended: bool):
             for c in range(shape.radius.shape[0]):
                 d, _n = local_gap_of(to_local(poses.before[copy, c], x0), shape.core[c], shape.radius[c])
                 radius = wp.min(radius, d)
-            radius -= distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(x0))
+            radius -= clear.distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(x0))
             clear.balls[i] = ball_type(x0[0], x0[1], x0[2], radius)
             clear.found[i] = now
             if not (way <= radius):

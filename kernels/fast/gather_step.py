@@ -116,7 +116,6 @@ def gather_step(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        per_copy: int,
         guard: guard_struct(dtype),
         # state in
         x: wp.array(dtype=vec3),
@@ -133,7 +132,7 @@ def gather_step(
         thread = wp.tid()
         copy = 0
         if wp.static(not alone):
-            copy = thread // (lanes * per_copy)  # a tenth of the instructions of a step of springs
+            copy = thread // (lanes * guard.per_copy)  # a tenth of the instructions of a step of springs
         gather_one(thread, chain, inverse_mass, gravity[copy], guard, h, unit, x, v, residual, x_after, v_after, residual_after)
 
     return step_vertices
@@ -166,7 +165,6 @@ def gather_steps_of_copies(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        per_copy: int,
         guard: guard_struct(dtype),
         # parameters
         h: dtype,
@@ -179,8 +177,8 @@ def gather_steps_of_copies(
     ):
         copy, thread = wp.tid()
         g = gravity[copy]
-        first = copy * per_copy + thread
-        end = (copy + 1) * per_copy
+        first = copy * guard.per_copy + thread
+        end = (copy + 1) * guard.per_copy
         left = steps
         while left > 0:
             i = first

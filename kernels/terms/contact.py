@@ -160,8 +160,8 @@ def idle(y: Any, rest: Any):
     away = y[0] - wp.vector(rest[0], rest[1], rest[2])
     found = wp.int32(0)
     if wp.isfinite(rest[7]):
-        reach = rest[7] + rest[8] + rest[9] + rest[10] + rest[11]
-        if wp.dot(away, away) > y.dtype(1.0001) * reach * wp.abs(reach):
+        radius = rest[7] + rest[8] + rest[9] + rest[10] + rest[11]
+        if wp.dot(away, away) > y.dtype(1.0001) * radius * wp.abs(radius):
             found = 1
     else:
         two = y.dtype(2.0)

@@ -68,7 +68,8 @@ class GatherStep:
         )
         self._states = [(x, v, self.residual), (model.vectors(), model.vectors() if damped else v, other)]
         data = guard.data if guard else guard_struct(model.dtype)()
-        self._given, self._h = [chain, model.inverse_mass, model.gravity, model.per_copy, data], h
+        data.per_copy = model.per_copy
+        self._given, self._h = [chain, model.inverse_mass, model.gravity, data], h
         self._unit = unit or 1.0
 
     def launch(self, steps, move_pins):

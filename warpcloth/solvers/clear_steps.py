@@ -38,12 +38,11 @@ class ClearSteps:
         clear = kernels.balls(model.dtype)()
         clear.balls = model.array(radii, wp.types.vector(4, model.dtype))
         clear.found = wp.zeros(model.count, dtype=wp.int32, device=model.device)
-        clear.drift = colliders.drift
+        clear.drift, clear.distance = colliders.drift, model.colliders.distance
         self._bounds = shapes(model.dtype)()
         halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
         self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
-        self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy]]
-        self._given[1] += [model.colliders.distance, stepper.h]
+        self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy, stepper.h]]
         self._out = [clear, self.near]
         self._finds = [model.kernel(kernels.near_colliders, model.dtype, ended) for ended in (False, True)]
         self._contact = [elements for elements in model.terms if elements.collider is not None]
