@@ -269,12 +269,16 @@ def test_all_meet_at_one_minimiser(name, friction, gravity, mesh):
 
 
 @pytest.mark.parametrize(
-    "name", ("xpbd", "admm", *(pytest.param(f"{each} dynamics", marks=SLOW) for each in ("projective", "constrained")))
+    "name",
+    (
+        *("newton clamp", "xpbd", "admm"),
+        *(pytest.param(f"{each} dynamics", marks=SLOW) for each in ("projective", "constrained")),
+    ),
 )
 def test_all_meet_as_far_as_float32_allows(name, device):
     """0.5 m are known to 3e-8 m, a gap of r/45 and its force to 1.4e-3: 4e-4 m of the 0.27 m that gravity moves in the step."""
     scene, exact = stretched(981.0, 0.0), wc.Newton(substeps=1, tolerance=1e-12, linear="factorised")
-    most = {"projective dynamics": 100, "xpbd": 1000, "admm": 300, "constrained dynamics": 40}
+    most = {"newton clamp": 100, "projective dynamics": 100, "xpbd": 1000, "admm": 300, "constrained dynamics": 40}
     given = ((exact, "float64"), (replace(EXACT[name], iterations=most[name]), "float32"), (exact, "float32"))
     found = []
     for solver, dtype in given:

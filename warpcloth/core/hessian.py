@@ -146,6 +146,8 @@ class Hessian:
         """Finds the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""
         self._multiply = self.model.kernel(linear.multiply, self.model.dtype)
         self._invert_diagonal = self.model.kernel(linear.invert_diagonal, self.model.dtype)
+        contact = any(elements.collider is not None for elements in self.terms)
+        self._lost = 16.0 * float(np.finfo(self.model.numpy_dtype).eps) * contact
 
     def multiply(self, p, q, active):
         """q = A p for the copies that are ``active`` (B,)."""
@@ -154,7 +156,7 @@ class Hessian:
 
     def invert_diagonal(self, out):
         """out = the inverse diagonal blocks."""
-        self.model.launch(self._invert_diagonal, self.count, [self.diagonal, self.values], [out])
+        self.model.launch(self._invert_diagonal, self.count, [self.diagonal, self.values, self._lost], [out])
 
     def matrices(self):
         """The present values on the host: for each copy a scipy matrix (3n, 3n) in block compressed rows, in float64."""
