@@ -8,6 +8,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..base.checks import numeric
+from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..base.types import Converted, default
 from ..kernels import nearest
@@ -204,7 +205,7 @@ def nearest_faces(points, vertices, triangles):
     """The triangle that is nearest to each of points (k, 3), to within float32, (k,)."""
     centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     scale = 1.0 / max(np.abs(vertices - centre).max(), np.abs(points - centre).max(initial=0.0))
-    with wp.ScopedDevice("cpu"):
+    with wp.ScopedDevice(find_device("cpu")):
         mesh = wp.Mesh(wp.array((vertices - centre) * scale, dtype=wp.vec3), wp.array(triangles.ravel(), dtype=wp.int32))
         out = wp.zeros(len(points), dtype=wp.int32)
         local = wp.array((points - centre) * scale, dtype=wp.vec3)
