@@ -11,11 +11,12 @@ def scene(n: int = 32, radius: float = 0.3, friction: float = 0.3, stiffness: fl
     wc.checks.whole("n", n, 2)
     grid = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")
     density, distance = 0.15, max(0.75 / (n - 1) ** 2 / radius, 1e-3)  # so that edges of triangles stay above the ball too
+    height = max(2.2 * radius, 2.0 * radius + 1.1 * distance)  # where it touches nothing yet
     return wc.Scene(
         grid,
         density=density,
         terms=[wc.Spring(pairs=("structural", "shear"), stiffness=stiffness), wc.QuadraticBending(stiffness=1e-5)],
-        positions=grid.points + np.array([-0.5, 2.2 * radius, -0.5]),
+        positions=grid.points + np.array([-0.5, height, -0.5]),
         colliders=[
             wc.Sphere(radius=radius, position=(0.0, radius, 0.0), friction=friction, name="ball"),
             wc.Plane(friction=friction, name="floor"),

@@ -543,6 +543,12 @@ def test_the_scene_drape_stays_outside():
     assert scene.colliders[0].distances(points[-1]).min() < scene.contact.distance < points[-1][:, 1].max()
 
 
+@pytest.mark.parametrize("n", (3, 4, 7))
+def test_the_scene_drape_starts_without_contact(n):
+    scene = importlib.import_module("warpcloth.scenes.drape").scene(n=n)
+    assert all(collider.distances(scene.positions).min() > scene.contact.distance for collider in scene.colliders)
+
+
 @pytest.mark.parametrize("name", ("explicit", "newton"))
 def test_a_resumed_run_has_its_anchors(name, tmp_path):
     colliders = [wc.Sphere(radius=0.1, position=[(0.25, -0.08 + 0.002 * k, 0.25) for k in range(25)], friction=0.3)]
