@@ -434,6 +434,10 @@ REFUSED = {
         "the surface of the collider Sphere is 1e+06 m from its centre, where float32 resolves 0.12 m",
     ),
     "weightless": (lambda: falling([wc.Plane()], gravity=(0, 0, 0)), "contact.stiffness has no default without gravity"),
+    "all pinned": (
+        lambda: wc.simulate(falling([wc.Plane()], pins=range(36)), wc.XPBD(substeps=1)),
+        "pins hold every vertex; colliders need one that is free",
+    ),
     "points": (lambda: wc.MeshCollider(np.full((3, 3), np.nan), [[0, 1, 2]]), "MeshCollider.points[0, 0] is nan"),
     "no points": (lambda: wc.MeshCollider(np.zeros((0, 3)), [[0, 1, 2]]), "MeshCollider.points has shape (0, 3)"),
     "index": (

@@ -241,6 +241,8 @@ class Scene:
         areas, mass = self._touching_areas, self._areal_mass
         areas = np.where(areas > 0.0, areas, self.vertex_masses / mass)  # of a vertex without a triangle, by its mass
         free = np.delete(np.arange(len(areas), dtype=np.int32), self.fixed)
+        if not len(free):
+            raise ValueError("pins hold every vertex; colliders need one that is free")
         given = {"vertices": free, "areas": areas[free]}
         given |= {"stiffness": self.contact.stiffness, "distance": self.contact.distance}
         found: list[VertexContact] = []
