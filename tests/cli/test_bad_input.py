@@ -73,7 +73,7 @@ WRONG_STAGES = [  # the text, what stands in place of a part of it, the sentence
         r"prim /Cloth: GeomSubset pins: indices\[1\] = 99, must be a point, 0 to 3",
     ),
     (STAGE, "indices = [0, 1]", "indices = [-1, 0]", r"GeomSubset pins: indices\[0\] = -1, must be a point"),
-    (STAGE, 'elementType = "point"', 'elementType = "face"', "GeomSubset pins: elementType is 'face', must be"),
+    (STAGE, 'elementType = "point"', 'elementType = "edge"', "GeomSubset pins: elementType is 'edge', must be"),
     (STAGE, "indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [1]}", "1 GeomSubset pins: indices at time code 2, must"),
     (STAGE, "double warpcloth:density = 0.15", "double warpcloth:density = nan", "warpcloth:density is nan, must be finite"),
     (STAGE, "(0, -9.81, 0)", "(0, -inf, 0)", r"warpcloth:gravity\[1\] is -inf, must be finite"),

@@ -240,7 +240,7 @@ EXACT = {
     "projective dynamics none": wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=3000, acceleration="none"),
     "xpbd": wc.XPBD(substeps=1, iterations=30_000),
     "admm": wc.ADMM(substeps=1, tolerance=1e-9, iterations=20_000),
-    "constrained dynamics": wc.ConstrainedDynamics(substeps=1, tolerance=1e-9, iterations=40, linear="factorised"),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=1, tolerance=1e-9, iterations=60, linear="factorised"),
 }
 
 

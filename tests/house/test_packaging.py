@@ -99,7 +99,8 @@ def test_a_wheel_has_all_files_and_no_others(wheel):
         # The links in warpcloth/ to the other two are not followed by every Python.
         expected |= {f"{inside}/{path}" for path in paths if path.parts[0] not in ("kernels", "scenes")}
     assert {"warpcloth/kernels/assemble.py", "warpcloth/kernels/terms/spring.py", "warpcloth/scenes/hanging.py"} <= expected
-    assert {name for name in names if ".dist-info/" not in name} == expected | {"warpcloth/py.typed"}
+    expected |= {"warpcloth/py.typed", "warpcloth/scenes/character.usda"}
+    assert {name for name in names if ".dist-info/" not in name} == expected
     assert [name for name in names if name.endswith("/LICENSE")]
 
 

@@ -120,7 +120,8 @@ class MeshCollider(Collider):
         return super().moves or len(self.frames) > 1
 
     def at_last(self) -> "MeshCollider":
-        return replace(super().at_last(), points=self.frames[-1])
+        position, rotation = np.atleast_2d(self.position)[-1], np.atleast_2d(self.rotation)[-1]
+        return replace(self, position=position, rotation=rotation, points=self.frames[-1])
 
     def centred(self) -> "MeshCollider":
         poses, frames = self.poses, self.frames
@@ -208,7 +209,7 @@ def nearest_faces(points, vertices, triangles):
     with wp.ScopedDevice(find_device("cpu")):
         mesh = wp.Mesh(wp.array((vertices - centre) * scale, dtype=wp.vec3), wp.array(triangles.ravel(), dtype=wp.int32))
         out = wp.zeros(len(points), dtype=wp.int32)
-        local = wp.array((points - centre) * scale, dtype=wp.vec3)
+        local: wp.array = wp.array((points - centre) * scale, dtype=wp.vec3)
         wp.launch(nearest.faces(), len(points), inputs=[mesh.id, local], outputs=[out])
         return out.numpy()
 
