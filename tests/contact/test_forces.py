@@ -89,7 +89,7 @@ def pushed(friction):
 
 
 def swelling(friction):
-    """The same sheet over a box of triangles that grows, leans and rises."""
+    """A sheet over a box of triangles that grows, leans and rises."""
     corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
     triangles = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4]]
     k = np.arange(12)[:, None]

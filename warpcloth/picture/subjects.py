@@ -177,10 +177,8 @@ def _of_sequence(sequence, mesh):
 def _of_frames(name, mesh, frames, times, pins=(), scene=None):
     """Frames (F, n, 3) of a mesh, with the strings, bars and colliders of a scene."""
     positions, count = _reader(frames, mesh)
-    read = lambda frame: [positions(frame)]  # noqa: E731
-    shapes, times = [_cloth(mesh, positions(0), pins)], None if times is None else np.asarray(times, dtype=float)
-    if scene is not None:
-        shapes, read = _with_surroundings(scene, shapes, positions)
+    times = None if times is None else np.asarray(times, dtype=float)
+    shapes, read = _with_surroundings(scene, _cloth(mesh, positions(0), pins), positions)
 
     def sequences():
         return [as_sequence(mesh, frames, times=times)]
@@ -219,7 +217,7 @@ def _of_animation(animation, scene, copy, azimuth):
         return (np.asarray(points[frame], dtype=np.float64) + offsets).reshape(batch * count, 3)
 
     cloth = _cloth(scene.mesh, scene.positions, scene.pins.vertices)
-    shapes, read = _with_surroundings(scene, [cloth], positions, offsets)
+    shapes, read = _with_surroundings(scene, cloth, positions, offsets)
     shapes = [_repeated(shape, batch) for shape in shapes]
 
     def sequences():
@@ -229,22 +227,23 @@ def _of_animation(animation, scene, copy, azimuth):
 
 
 def _with_surroundings(scene, cloth, positions, offsets=0.0):
-    """Adds the strings, bars and colliders of a scene to the shape of its cloth; with the function that reads all.
+    """The shapes of a cloth and of the strings, bars and colliders of its scene, and the function that reads their positions.
 
     Args:
-        scene: The scene.
-        cloth: A list of the shape.
+        scene: The scene, or None.
+        cloth: The shape of the cloth.
         positions: Function that gives the positions of the cloth from the index of a frame.
         offsets: Of the cloths of a batch, (B, 1, 3) [m], each of which has the colliders about it; 0 for one.
     """
-    own = [*cloth, *_strings(scene.mesh, lines_of(scene))]
+    if scene is None:
+        return [cloth], lambda frame: [positions(frame)]
+    own = [cloth, *_strings(scene.mesh, lines_of(scene))]
     if not scene.colliders:
         return own, lambda frame: [positions(frame)] * len(own)
     stage, size = draw_colliders(scene), _size(scene.positions)
 
-    def read(frame):
-        beside = [(each.points(frame) + offsets).reshape(-1, 3) for each in stage.prims]
-        return [positions(frame)] * len(own) + beside
+    def read(frame):  # keeps the stage, without which its prims cannot be read
+        return [positions(frame)] * len(own) + [(each.points(frame) + offsets).reshape(-1, 3) for each in stage.prims]
 
     return own + [_prim_shape(each, 0, size) for each in stage.prims], read
 
