@@ -1,6 +1,7 @@
 """The command line: wrong use in one line, runs and their summaries, what is left of runs that end early."""
 
 import contextlib
+import importlib
 import json
 import math
 import os
@@ -616,7 +617,7 @@ def test_a_second_interrupt_comes_at_once_and_loses_nothing(moment, ending, tmp_
 
 def test_interrupts_in_the_frames_before_and_after_them(tmp_path, capfd, monkeypatch):
     """Before the first frame nothing is left; in frames one ends the run and a second one leaves it in chunks."""
-    output, watch = tmp_path / "out.usdz", sys.modules["warpcloth.run.watch"].Watch
+    output, watch = tmp_path / "out.usdz", importlib.import_module("warpcloth.run.watch").Watch
     with monkeypatch.context() as patched:
         interrupt_in(patched, watch, "__init__", signal.SIGINT)
         found = run(capfd, "run", *SMALL, "-o", output)

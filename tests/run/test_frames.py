@@ -1,8 +1,8 @@
 """Frames computed ahead of who takes them: the same to the bit, and nothing lost or written wrongly where a run ends early."""
 
-import sys
 import threading
 from contextlib import closing
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,9 +10,10 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from warpcloth.base.turns import TURN
 from warpcloth.mesh.ordering import near_order
 from warpcloth.run.frames_ahead import frames_of, state_of
-from warpcloth.scenes import hanging
+from warpcloth.scenes import flag, hanging, ring
 from warpcloth.usd import FrameSequence, chunks
 
 SOLVERS = {
@@ -32,7 +33,7 @@ def threads():
 
 def look_ahead(monkeypatch, frames):
     """Lets runs compute so many frames ahead, on the CPU too."""
-    module = sys.modules["warpcloth.run.watch"]
+    module = import_module("warpcloth.run.watch")
     monkeypatch.setattr(module, "frames_of", lambda stepper, count, _ahead, keeps: frames_of(stepper, count, frames, keeps))
 
 
@@ -157,6 +158,22 @@ def test_a_run_that_diverges_ends_as_without(solver, output, tmp_path, device, m
     assert len(other.timings["frames"]) == one.status.frame + 1
 
 
+@pytest.mark.parametrize("scene", [flag.scene(nx=6, ny=4), ring.scene(elements=12)], ids=["moving pins", "moving colliders"])
+def test_nothing_reads_a_device_beside_the_frames(scene, device, monkeypatch):
+    """Warp changes the stream of a device while it reads an array: two threads that read at once may leave a wrong stream."""
+    read, apart = wp.array.numpy, []
+
+    def numpy(array, **options):
+        if threads() and not TURN._lock._is_owned() and array.device == wp.get_device(device):
+            apart.append(threading.current_thread().name)
+        return read(array, **options)
+
+    look_ahead(monkeypatch, 2)
+    monkeypatch.setattr(wp.array, "numpy", numpy)
+    wc.simulate(scene, wc.XPBD(substeps=4), frames=4, device=device, record=("energies", "reactions"))
+    assert not apart
+
+
 def test_a_full_disk_is_said_with_the_file(tmp_path, device, monkeypatch):
     """The frames of the chunks before stay."""
     look_ahead(monkeypatch, 2)
@@ -191,10 +208,10 @@ def test_an_interrupt_keeps_the_frames_until_then(frame, tmp_path, device, monke
 @pytest.mark.parametrize(("output", "cores", "expected"), [(None, 2, 0), ("out.usdc", 2, 1), ("out.usdc", 1, 0)])
 def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_path, device, monkeypatch):
     """On CUDA frames are computed ahead in any case."""
-    asked, module = [], sys.modules["warpcloth.run.simulate"]
+    asked, module = [], import_module("warpcloth.run.simulate")
     monkeypatch.setattr(module.os, "sched_getaffinity", lambda _process: set(range(cores)), raising=False)
     monkeypatch.setattr(
-        sys.modules["warpcloth.run.watch"],
+        import_module("warpcloth.run.watch"),
         "frames_of",
         lambda stepper, count, ahead, keeps: asked.append(ahead) or frames_of(stepper, count, ahead, keeps),
     )
@@ -210,4 +227,4 @@ def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_
 def test_frames_ahead_leave_memory_to_others(count, free, expected):
     """A GiB of frames of 24 bytes a vertex, or a quarter of what the device has free; two where not even these fit."""
     model = SimpleNamespace(device=SimpleNamespace(is_cuda=True, free_memory=free), count=count, vec3=wp.vec3)
-    assert sys.modules["warpcloth.run.simulate"]._ahead(model, None) == expected
+    assert import_module("warpcloth.run.simulate")._ahead(model, None) == expected

@@ -126,6 +126,8 @@ def equilibrium(
     # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
     if result in SETTLED and minimiser.curves_down(tolerance):
         base.assign(base.numpy() + _nudge(model))
+        # What is left unbalanced compresses the edges of a nearly straight chain by many times itself, and curves the energy.
+        descent.tolerance *= 0.01
         result = descent.run(1.0, _frequency_scale(model))
         if result in SETTLED and minimiser.curves_down(tolerance):
             result = Result.SADDLE

@@ -262,9 +262,9 @@ class MovingCollider(Source):
         moves += deforms
         self._speeds = np.append(0.0, scene.fps * moves)
         self._lifts = np.cumsum(np.append(0.0, moves))
+        self._gravity = np.linalg.norm(balance.model.gravity.numpy().astype(np.float64), axis=1)
 
     def energy(self, frame, speed):
         speeds = 2.0 * self._speeds[: frame + 1]
-        gravity = np.linalg.norm(self._balance.model.gravity.numpy().astype(np.float64), axis=1)
-        lifted = gravity * self._lifts[min(frame, len(self._lifts) - 1)]
+        lifted = self._gravity * self._lifts[min(frame, len(self._lifts) - 1)]
         return self._balance.total * (0.5 * (speeds**2).sum() + speeds.sum() * speed + lifted)
