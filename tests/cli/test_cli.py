@@ -22,6 +22,7 @@ import warpcloth.usd
 from support.command_line import refused, run
 from warpcloth.base.outputs import Lock
 from warpcloth.base.texts import convert
+from warpcloth.cli import main
 from warpcloth.run import scene_files
 from warpcloth.scene.scene import Scene
 from warpcloth.solvers import explicit
@@ -518,6 +519,19 @@ def test_a_process_prints_nothing_but_its_json_and_its_line(tmp_path):
     out, err = process.communicate(timeout=120)
     assert (process.returncode, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("warpcloth: device is 'cuda:99'")
+
+
+def test_a_reader_that_has_gone_changes_nothing(tmp_path, capfd, monkeypatch):
+    """Output that ``head`` cuts gives no message, and the exit code is that of the command."""
+    monkeypatch.chdir(tmp_path)
+    diverged = ["run", *SMALL, "--solver", "pbd", "-s", "sweep=jacobi", "relaxation=1.9", "iterations=1", "-o", "a.usdc"]
+    for argv, code in ((["scenes"], 0), (["info", *SMALL], 0), (diverged, 1)):
+        read, write = os.pipe()
+        os.close(read)
+        with open(write, "w") as stream:  # whose end flushes what is left, as the end of a process does
+            monkeypatch.setattr(sys, "stdout", stream)
+            assert main(argv) == code
+        assert capfd.readouterr().err.count("\n") == code  # the line that says how it diverged
 
 
 def test_the_progress_bar_shows_on_a_terminal(tmp_path):

@@ -236,13 +236,19 @@ def printable(text):
 
 
 class Printable:
-    """A stream that escapes its text by :func:`printable`."""
+    """A stream that escapes its text by :func:`printable`, and drops it once its reader, such as ``head``, has gone."""
 
     def __init__(self, stream):
         self._stream = stream
 
     def write(self, text):
-        return self._stream.write(printable(text))
+        try:
+            self._stream.write(printable(text))
+            self._stream.flush()  # while an error can still be told
+        except BrokenPipeError:  # Python flushes what is left when it exits
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), self._stream.fileno())
+        return len(text)
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
