@@ -5,7 +5,7 @@
 Travelling waves stretch, shear and bend an irregular flat sheet of n² vertices and 1 m, so F and D of its tangent plane are
 known everywhere. Two frames, 1/60 s apart, have normal noise of a fraction of the mean edge in each coordinate. The script
 prints a line for each kind of neighbourhood: its mean number of vertices, the RMS error of F [%], and the RMS error of D
-divided by the RMS of D [%]. Each noise is measured over the vertices at least 0.2 m from the outline; the last columns are the
+divided by the RMS of D [%]. Each noise is measured over the vertices at least 0.2 m from the boundary; the last columns are the
 vertices nearer to it, without noise. Triangles count by their centroids.
 """
 
@@ -18,7 +18,7 @@ import warpcloth as wc
 
 KINDS = (None, "1-ring", "2-ring", "nearest:1%", "nearest:2%", "nearest:5%", "nearest:10%")
 NOISE = (0.0, 1e-3, 1e-2)  # of the mean edge
-INNER = 0.2  # from the outline [m]
+INNER = 0.2  # from the boundary [m]
 DT = 1.0 / 60.0  # [s]
 
 
@@ -30,7 +30,7 @@ def sheet(n):
     uv[inner] += np.random.default_rng(0).uniform(-0.3, 0.3, (inner.sum(), 2)) / (n - 1)
     triangles = Delaunay(uv).simplices[:, ::-1]
     a, b = (uv[triangles[:, k]] - uv[triangles[:, 0]] for k in (1, 2))
-    whole = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-3 / n**2  # no slivers from rounding along the outline
+    whole = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-3 / n**2  # no slivers from rounding along the boundary
     return wc.Mesh(np.stack([uv[:, 0], np.zeros(n * n), uv[:, 1]], axis=1), triangles[whole])
 
 
@@ -61,7 +61,7 @@ def known(points, t, waves):
 
 
 def errors(mesh, kind, noise, seed, waves):
-    """Returns the mean number of vertices, and RMS errors of F and (relative) D, (2,) inside and (2,) near the outline."""
+    """Returns the mean number of vertices, and RMS errors of F and (relative) D, (2,) inside and (2,) near the boundary."""
     edge, rng = mesh.edge_lengths.mean(), np.random.default_rng(seed)
     frames = [motion(mesh.points, t, waves)[0] for t in (0.0, DT)]
     frames = [x + noise * edge * rng.normal(size=x.shape) for x in frames]
@@ -93,7 +93,7 @@ def members(mesh, kind):
 
 
 def table(n=33, seeds=3, waves=2.0):
-    """Returns rows of kind, vertices, and errors of F and D [%]: for each noise the RMS over seeds, then near the outline."""
+    """Returns rows of kind, vertices, and errors of F and D [%]: for each noise the RMS over seeds, then near the boundary."""
     mesh, rows = sheet(n), []
     for kind in KINDS:
         cells = []
@@ -101,8 +101,8 @@ def table(n=33, seeds=3, waves=2.0):
             found = [errors(mesh, kind, noise, seed, waves) for seed in range(seeds if noise else 1)]
             cells.append(np.sqrt(np.mean([inner**2 for _, inner, _ in found], axis=0)))
             if noise == 0.0:
-                (outline,) = (outer for _, _, outer in found)
-        rows.append((kind or "triangle", found[0][0], *(100.0 * np.concatenate([*cells, outline])).tolist()))
+                (boundary,) = (outer for _, _, outer in found)
+        rows.append((kind or "triangle", found[0][0], *(100.0 * np.concatenate([*cells, boundary])).tolist()))
     return rows
 
 
@@ -112,7 +112,7 @@ def main():
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--waves", type=float, default=2.0)
     arguments = parser.parse_args()
-    heads = [f"{100.0 * noise:g} %" for noise in NOISE] + ["outline"]
+    heads = [f"{100.0 * noise:g} %" for noise in NOISE] + ["boundary"]
     print("| neighbourhood | vertices | " + " | ".join(f"F, {head} | D, {head}" for head in heads) + " |")
     print("|---" * (2 + 2 * len(heads)) + "|")
     for kind, size, *cells in table(arguments.n, arguments.seeds, arguments.waves):
