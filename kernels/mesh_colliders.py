@@ -218,6 +218,11 @@ def queries(dtype):
     zero, one = dtype(0.0), dtype(1.0)
 
     @wp.func
+    def is_point(t: mat33):
+        """Whether a triangle has shrunk to a point, and so is absent."""
+        return t[0] == t[1] and t[1] == t[2]
+
+    @wp.func
     def margin_of(mesh: meshes(dtype), c: int, p: vec3):
         return mesh.margin[c] + wp.float32(1e-6) * wp.float32(wp.max(wp.abs(p)))
 
@@ -256,8 +261,9 @@ def queries(dtype):
                 more = wp.bvh_query_next(query, k)
             if not more:
                 break
-            d, n, w = from_triangle(p, corners(mesh, c, k, halves, per_frame))
-            if d < radius and (found < zero or d < found or (d == found and k < face)):
+            t = corners(mesh, c, k, halves, per_frame)
+            d, n, w = from_triangle(p, t)
+            if d < radius and not is_point(t) and (found < zero or d < found or (d == found and k < face)):
                 hidden = wp.bool(False)
                 for j in range(count):
                     if gaps[j] - d * wp.dot(normals[j], n) <= beyond:
@@ -340,12 +346,15 @@ def queries(dtype):
             if not more:
                 break
             t = corners(mesh, c, k, halves, per_frame)
+            absent = wp.bool(False)
             if mesh.frames[c] > 1:
-                moves = corners(mesh, c, k, after, per_frame) - t
+                t_after = corners(mesh, c, k, after, per_frame)
+                absent = is_point(t) and is_point(t_after)
+                moves = t_after - t
                 t += start * moves
                 moves = (one - start) * moves
             part, n, w = march(p, way, t, moves, least, kept)
-            if part < kept:
+            if part < kept and not absent:
                 kept = part
                 away = n
                 weights = w

@@ -175,6 +175,9 @@ MOVING = {
             rotation=[(0.0, 0.0, np.sin(0.4 * k), np.cos(0.4 * k)) for k in range(9)],
         )
     ],
+    "mesh that comes and goes": [
+        wc.MeshCollider([s * BALL.vertices for s in (0, 0, 1, 1, 1, 0, 0, 1, 1)], BALL.faces, position=(0.25, -0.12, 0.25))
+    ],
     "balls that close": [
         wc.Sphere(radius=0.1, position=[(0.25, -0.2 + 0.03 * k, 0.25) for k in range(9)]),
         wc.Sphere(radius=0.1, position=[(0.25, 0.3 - 0.005 * k, 0.25) for k in range(9)]),
@@ -290,10 +293,15 @@ def test_all_meet_as_far_as_float32_allows(name, device):
 
 @each_solver
 def test_nothing_near_changes_nothing(name):
-    """Free fall with contact declared, far from it: to rounding, or to the bit; and without colliders nothing is built."""
+    """Free fall with contact declared, far from it or past a mesh that is a point: to rounding, or to the bit.
+
+    Without colliders nothing is built.
+    """
     solver = replace(SOLVERS[name], substeps=40 if name == "explicit" else 4)
     ball = wc.MeshCollider(BALL.vertices, BALL.faces, position=(1.0, -50.0, 0.0))
-    far = falling([wc.Sphere(radius=0.1, position=(0.0, -50.0, 0.0)), ball], contact=wc.Contact(stiffness=1e3))
+    absent = wc.MeshCollider([*[0.0 * BALL.vertices] * 9, BALL.vertices], BALL.faces, position=(0.2, -0.2, 0.2))
+    colliders = [wc.Sphere(radius=0.1, position=(0.0, -50.0, 0.0)), ball, absent]
+    far = falling(colliders, 0.0, contact=wc.Contact(stiffness=1e3))
     alone = replace(far, colliders=(), contact=None)
     one, other = (wc.simulate(scene, solver, dtype="float64") for scene in (far, alone))
     np.testing.assert_allclose(one.points, other.points, rtol=0.0, atol={"explicit": 0.0, "admm": 1e-6}.get(name, 1e-12))
@@ -428,6 +436,10 @@ REFUSED = {
     "turned inside out": (
         lambda: wc.MeshCollider([s * np.asarray(CUBE.vertices) for s in (1, 0, -1)], CUBE.faces, name="ball"),
         "ball.points[2] is points[0] turned inside out",
+    ),
+    "inside out once it is there": (
+        lambda: wc.MeshCollider([s * np.asarray(CUBE.vertices) for s in (0, 1, -1)], CUBE.faces, name="ball"),
+        "ball.points[2] is points[1] turned inside out",
     ),
     "large": (
         lambda: wc.simulate(falling([wc.Sphere(radius=1e6, position=(0, -1e6, 0))]), wc.Newton(substeps=1)),

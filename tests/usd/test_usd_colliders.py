@@ -211,6 +211,20 @@ def test_shapes_that_change_are_meshes_that_deform(path, case):
     np.testing.assert_allclose(tops, 0.1 + 0.05 * np.arange(5), atol=1e-7)
 
 
+@pytest.mark.parametrize("scale", ((1, 1, 1), (-1, 1, 1)))
+def test_a_scale_of_0_hides_a_shape(path, scale):
+    """It is a point then, at its position; at other frames its fronts look outwards."""
+    samples = f"101: (0, 0, 0), 102: (0, 0, 0), 103: {scale}, 104: {scale}, 105: (0, 0, 0)"
+    scaled = ("float3", f".timeSamples = {{{samples}}}")
+    found = collider_of(path, shape("Cube", ops(translate=("double3", " = (0, 0, 100)"), scale=scaled)))
+    sizes = [0.0, 0.0, 0.02, 0.02, 0.0]
+    assert found.closed and found.facets == 1
+    np.testing.assert_allclose(np.ptp(found.frames, axis=1), np.outer(sizes, np.ones(3)), atol=1e-9)
+    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.03]])
+    for frame, size in enumerate(sizes):
+        np.testing.assert_allclose(found.distances(points, frame), [-size / 2, 0.03 - size / 2], atol=1e-7)
+
+
 APPROXIMATED = {
     "none": (wc.MeshCollider, 0),
     "convexHull": (wc.MeshCollider, 0),
@@ -374,13 +388,17 @@ REFUSED = {
         shape("PointInstancer", shape("Sphere"), "Many", ""),
         "prim /Many: has a collider as a prototype, which must be",
     ),
-    "zero scale": (
+    "flat": (
         shape("Sphere", ops(scale=("float3", " = (1, 0, 1)"))),
         "prim /Thing: the transform to world space is .*invertible",
     ),
-    "zero scale later": (
-        shape("Sphere", ops(scale=("float3", ".timeSamples = {101: (1, 1, 1), 103: (0, 0, 0)}"))),
+    "flat later": (
+        shape("Sphere", ops(scale=("float3", ".timeSamples = {101: (1, 1, 1), 103: (0, 0, 1)}"))),
         "prim /Thing: time code 103: the transform to world space is .*, must be invertible",
+    ),
+    "zero scale": (
+        shape("Sphere", ops(scale=("float3", ".timeSamples = {101: (0, 0, 0), 105: (0, 0, 0)}"))),
+        "prim /Thing: is scaled to 0 at all frames, must be larger at some or be turned off with warpcloth:collider",
     ),
     "radius": (shape("Sphere", "double radius = 0"), "prim /Thing: radius is 0.0, must be above 0"),
     "swelling plane": (
@@ -389,7 +407,7 @@ REFUSED = {
     ),
     "no points": (shape("Mesh"), "prim /Thing: has no points"),
     "no faces": (shape("Mesh", "point3f[] points = [(0, 0, 0)]"), "prim /Thing: has no faces"),
-    "flat": (
+    "no area": (
         shape("Mesh", TETRAHEDRON.replace("10", "0")),
         "prim /Thing: has no triangle with an area, must have one to be a collider",
     ),

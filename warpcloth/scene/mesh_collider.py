@@ -22,7 +22,8 @@ class MeshCollider(Collider):
     """A triangle mesh.
 
     If its triangles close it is the solid that their fronts look away from. Otherwise it is a sheet without thickness, which is
-    touched from both sides. Vertices that are at one position at all frames count as one, so that seams do not open it.
+    touched from both sides. Vertices that are at one position at all frames count as one, so that seams do not open it. At
+    frames where all of it is at one position it is absent.
 
     Attributes:
         points: Its vertices, (n, 3) [m], or at the frames 0 … F−1 of the scene, (F, n, 3), in the frame of ``position`` and
@@ -53,7 +54,7 @@ class MeshCollider(Collider):
             index = ", ".join(map(str, bad[0]))
             raise ValueError(f"{self.label}.points[{index}] is {points[tuple(bad[0])]}; it must be finite")
         try:
-            mesh = Mesh(points if points.ndim == 2 else points[0], self.triangles)
+            mesh = Mesh(first_extended(points), self.triangles)
         except ValueError as error:
             raise ValueError(f"{self.label}.{error}") from None
         object.__setattr__(self, "points", points)
@@ -64,17 +65,19 @@ class MeshCollider(Collider):
         """Refuses keyframes at which the inside of a closed one is outside, for cloth cannot get there."""
         if len(self.frames) == 1 or not self.closed:
             return
-        first = self._filling(self.frames[0])
-        for frame, vertices in enumerate(self.frames):
-            if min(abs(first), -np.sign(first) * self._filling(vertices)) > 1e-6:  # flat ones have no side
-                raise ValueError(
-                    f"{self.label}.points[{frame}] is points[0] turned inside out; what is outside must stay outside"
-                )
+        found = np.array([self._filling(vertices) for vertices in self.frames])
+        sides = np.sign(found) * (np.abs(found) > 1e-6)  # flat ones have none
+        first = np.argmax(sides != 0)
+        for frame in np.flatnonzero(sides * sides[first] < 0)[:1]:
+            raise ValueError(
+                f"{self.label}.points[{frame}] is points[{first}] turned inside out; what is outside must stay outside"
+            )
 
     def _filling(self, vertices):
         """The volume within it over that of a cube as long as it; below 0 if its fronts look inwards."""
         a, b, c = (vertices - vertices.mean(axis=0))[self.triangles].transpose(1, 0, 2)
-        return np.einsum("ti,ti", a, np.cross(b, c)) / (6.0 * max(np.ptp(vertices, axis=0).max() ** 3, 1e-300))
+        size = np.ptp(vertices, axis=0).max()
+        return np.einsum("ti,ti", a, np.cross(b, c)) / (6.0 * size**3) if size else 0.0
 
     @property
     def frames(self) -> np.ndarray:
@@ -113,7 +116,7 @@ class MeshCollider(Collider):
         other = order[np.searchsorted(keys[order], back)]  # the side of the neighbour
         away = corners.reshape(-1, 3)[other // 3 * 3 + (other + 2) % 3] - corners.reshape(-1, 3)
         height = np.einsum("si,si->s", away, np.repeat(normals, 3, axis=0))
-        return bool((height < 1e-4 * np.linalg.norm(away, axis=1)).all())
+        return bool((height <= 1e-4 * np.linalg.norm(away, axis=1)).all())
 
     @property
     def moves(self) -> bool:
@@ -201,6 +204,12 @@ class MeshCollider(Collider):
         return found
 
 
+def first_extended(points):
+    """The first of points (F, n, 3) that are not all at one position, or points (n, 3)."""
+    frames = points.reshape(-1, *points.shape[-2:])
+    return frames[np.argmax(np.ptp(frames, axis=1).any(axis=1))]
+
+
 @in_turn
 def nearest_faces(points, vertices, triangles):
     """The triangle that is nearest to each of points (k, 3), to within float32, (k,)."""
@@ -221,7 +230,7 @@ def _nearest_weights(points, corners):
     size = np.maximum(np.einsum("ki,ki->k", normal, normal), 1e-300)
     parts = [np.einsum("ki,ki->k", np.cross(q - p, points - p), normal) / size for p, q in ((b, c), (c, a), (a, b))]
     found = np.stack(parts, axis=1)
-    outside = (found < 0.0).any(axis=1)
+    outside = (found < 0.0).any(axis=1) | ~found.any(axis=1)  # or of triangles without area
     best = np.full(len(points), np.inf)
     for i, j in ((0, 1), (1, 2), (2, 0)):
         p, along = corners[:, i], corners[:, j] - corners[:, i]

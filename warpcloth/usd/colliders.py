@@ -8,7 +8,7 @@ import numpy as np
 
 from ..mesh.flat_triangles import without_slivers
 from ..scene.colliders import Box, Capsule, Plane, Sphere
-from ..scene.mesh_collider import MeshCollider
+from ..scene.mesh_collider import MeshCollider, first_extended
 from .attributes import Values, holders
 from .modules import Usd, UsdGeom, UsdPhysics
 from .solids import SOLIDS
@@ -192,10 +192,16 @@ class _Reader:
 
     @cached_property
     def _transforms(self):
-        """The transform (4, 4) to metres at each frame, or one where the space stands still."""
+        """The transform (4, 4) to metres at each frame, or one where the space stands still.
+
+        A scale of 0 hides it: it shrinks to a point.
+        """
         if not moving_space(self.prim):
             return [local_to_metres(self.prim, "")]
-        return [local_to_metres(self.prim, f"time code {code:g}", code) for code in self.codes]
+        found = [local_to_metres(self.prim, f"time code {code:g}", code, shrinks=True) for code in self.codes]
+        if not any(each[:3, :3].any() for each in found):
+            raise ValueError("is scaled to 0 at all frames, must be larger at some or be turned off with warpcloth:collider")
+        return found
 
     @cached_property
     def _rigid(self):
@@ -207,6 +213,8 @@ class _Reader:
         if said is not None:
             return said
         linear = np.array([each[:3, :3] for each in self._transforms])
+        if not linear.any(axis=(1, 2)).all():
+            return None
         u, sizes, vt = np.linalg.svd(linear[0])
         turn, scale = u @ vt, (u * sizes) @ u.T
         if np.linalg.det(turn) < 0.0:
@@ -261,8 +269,8 @@ class _Reader:
             count = len(self.codes)
             points = np.broadcast_to(points, (count, *points.shape[-2:])) if points.ndim == 2 or len(points) == 1 else points
             points = np.stack([placed(*pair) for pair in zip(points, self._transforms, strict=True)])
-            mirrored = np.linalg.det(self._transforms[0][:3, :3]) < 0.0
-        triangles = without_slivers(points.reshape(-1, *points.shape[-2:])[0], triangles)
+            mirrored = any(np.linalg.det(each[:3, :3]) < 0.0 for each in self._transforms)
+        triangles = without_slivers(first_extended(points), triangles)
         triangles = triangles[:, ::-1] if mirrored else triangles
         return self._approximated(approximation, points, triangles, given)
 

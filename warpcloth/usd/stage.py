@@ -294,13 +294,14 @@ def space_codes(prim):
     return sorted(codes)
 
 
-def local_to_metres(prim, where, time=None):
+def local_to_metres(prim, where, time=None, shrinks=False):
     """The transform (4, 4) float64 from a prim's own space and units to the stage's world space [m], for row vectors.
 
     Args:
         prim: The prim.
         where: File and prim, for messages; or nothing.
         time: Time code, or None where it must be the same at all of them.
+        shrinks: Whether the scale may be 0.
 
     Returns:
         np.ndarray: The matrix; its last column is [0, 0, 0, 1].
@@ -317,7 +318,7 @@ def local_to_metres(prim, where, time=None):
     matrix = np.array(UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(code))
     if not np.isfinite(matrix).all() or (matrix[:, 3] != [0, 0, 0, 1]).any():
         raise ValueError(f"{where}the transform to world space is {matrix.tolist()}, must be affine and finite")
-    if not np.linalg.matrix_rank(matrix[:3, :3]) == 3:
+    if not (np.linalg.matrix_rank(matrix[:3, :3]) == 3 or (shrinks and not matrix[:3, :3].any())):
         raise ValueError(f"{where}the transform to world space is {matrix.tolist()}, must be invertible")
     matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(prim.GetStage())
     return matrix
