@@ -28,16 +28,16 @@ _MOST = 100  # missing frames that have a sentence each
 def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, **options: Any) -> Analysis:
     """Measures an animation.
 
-    With a ``neighbourhood`` of each vertex, else of each triangle: see :data:`warpcloth.analysis.measures.MEASURES` for all
-    measures, or docs/measuring.md. Everything is kept; :class:`Analyzer` gives a row at a time, in memory that does not
-    grow.
+    With a ``neighbourhood`` it measures each vertex, else each triangle. For all measures see
+    :data:`warpcloth.analysis.measures.MEASURES` or docs/measuring.md. All frames are kept in memory; :class:`Analyzer` gives
+    one frame at a time.
 
     Args:
-        frames: Points (F, n, 3) [m], an :class:`warpcloth.Animation`, anything that :func:`warpcloth.open_sequence` opens or
-            returned.
+        frames: Points (F, n, 3) [m], an :class:`warpcloth.Animation`, or anything that :func:`warpcloth.open_sequence` opens or
+            returns.
         mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape; by default that of the file.
         dt: Time between frames [s], which rates need; a file or an animation has its own.
-        options: As of :class:`Analyzer`.
+        options: The options of :class:`Analyzer`.
 
     Returns:
         :class:`Analysis`.

@@ -97,25 +97,26 @@ def compare(
     up_axis_a: UpAxis | None = None,
     up_axis_b: UpAxis | None = None,
 ) -> Comparison:
-    """Compares two animations frame by frame, those frames that both have.
+    """Compares two animations, frame by frame, at the times that both have.
 
-    One frame of each is in memory at a time. Frames belong together by time: where times differ by no more than 1e-6 of the
-    shortest frame. The same frames of the same triangles give zeros.
+    One frame of each is in memory at a time. Two frames are compared if their times differ by no more than 1e-6 of the shortest
+    frame. Identical frames of the same triangles have distance 0.
 
     Args:
-        a: What `open_sequence` takes or returned, or (mesh, frames): a rest shape, and a path or what `as_sequence` takes.
+        a: Anything that `open_sequence` takes or returns, or (mesh, frames): a rest shape, and a path or anything that
+            `as_sequence` takes.
         b: The same.
         prim_a: Prim of a stage with several.
         prim_b: The same of b.
-        fps: Frames per second of both, where they say nothing or are to have others than they say.
+        fps: Frames per second of both, if they give none or to override theirs.
         fps_a: The same of a alone.
         fps_b: The same of b alone.
         frames: Compare only that many frames after the first that both have.
         device: A Warp device.
         progress: Function called with (frame, frames) once each frame is compared, ``frames`` being those after the first.
-        up_axis: "Y" or "Z", the up axis of both, which overrides what they say. If one is Y up and the other Z up, b is turned
-            about x by 90° to the axis of a: (x, y, z) of Z up is (x, z, −y) of Y up. An animation that does not say its axis
-            is taken to have that of the other.
+        up_axis: "Y" or "Z", the up axis of both, which overrides their own. If one is Y up and the other Z up, b is rotated
+            about x by 90° to the axis of a: (x, y, z) of Z up is (x, z, −y) of Y up. An animation without an up axis takes that
+            of the other.
         up_axis_a: The up axis of a alone.
         up_axis_b: The up axis of b alone.
 
@@ -123,8 +124,8 @@ def compare(
         :class:`Comparison`.
 
     Raises:
-        ValueError: An input is refused or has no times, a frame cannot be read, no two frames have one time, or none of those
-            that do can be compared.
+        ValueError: An input is refused or has no times, a frame cannot be read, no two frames have the same time, or none of
+            those that have can be compared.
 
     Examples:
         >>> import warpcloth as wc

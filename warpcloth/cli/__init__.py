@@ -196,8 +196,8 @@ def _parser():
         )
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
     runs.add_argument("--film", metavar="FILE", help="also draw the run as a film, .mp4 or .gif; see 'warpcloth render'")
-    runs.add_argument("--csv", metavar="FILE", help="also write a table of energies and forces, a row a frame")
-    runs.add_argument("--report", metavar="FILE", help="also write energies and forces, of each pin, as JSON")
+    runs.add_argument("--csv", metavar="FILE", help="also write a table of energies and forces, one row per frame")
+    runs.add_argument("--report", metavar="FILE", help="also write energies, forces and the reaction of each pin as JSON")
     runs.add_argument(
         "--resume",
         action="store_true",

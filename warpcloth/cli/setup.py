@@ -15,9 +15,9 @@ _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
 If neither dt nor substeps is given, the step is chosen: about 1/240 s for most solvers. Solvers with a stability limit, such as
-explicit, take the fewest substeps that respect two limits. The first is for small motion about the rest shape, and is kept with
-a margin of 10 %. The second is for large motion. It is a strict bound for springs and quadratic bending, but only an estimate
-for dihedral bending and membranes, which are taken as stiff as at rest.
+explicit, take the fewest substeps that respect two limits. The first, with a margin of 10 %, is for small motion about the
+rest shape. The second is for large motion. It is a strict bound for springs and quadratic bending, but only an estimate for
+dihedral bending and membranes, because it uses their stiffness at rest.
 """
 
 

@@ -27,14 +27,15 @@ All runs are compared over the same simulated time. A run with a large step cont
 show whether it diverges. Runs with small steps cost the most. The error is the RMS distance to a reference over vertices and
 frames, divided by the size of the cloth. The reference is Newton's method with BDF2 in float64, with steps of a quarter of the
 size, but at most 2000 of them. Verdicts:
-  stable       the run ended well, and its error is within --accuracy, if errors are measured
-  inaccurate   the error exceeds --accuracy, even if the uncertainty of the reference is subtracted
-  unsure       there is no reference, or it is too uncertain to tell stable from inaccurate
+  stable       the run ended well, and its error is within --accuracy, even with the uncertainty of the reference added
+  inaccurate   the error exceeds --accuracy, even with the uncertainty of the reference subtracted
+  unsure       the reference failed, or is too uncertain to tell stable from inaccurate
   stalled      a step could not be finished: no lower energy, a saddle point, or contradictory constraints
   diverged     the run broke a bound on its energy or strain, see docs/stability.md
   refused      the solver does not take the scene or the setting
   slow         the run took longer than --limit
-Measured rows are stored and reused.
+With hard constraints and with --accuracy 0 no errors are measured, and a run that ended well is stable. Measured rows are
+stored and reused.
 
   warpcloth chart stability hanging -p n=8 --x stiffness --y dt -o map.png
   warpcloth chart stability net -p n=12 stiffness=inf --x resolution --y relaxation --solvers pbd:sweep=jacobi -o jacobi.png

@@ -63,7 +63,7 @@ class Reset:
         """The mask (B,), and positions and velocities (B·n,) vectors or None, as Warp arrays.
 
         Raises:
-            ValueError: If one of them breaks a rule.
+            ValueError: If one of them is not allowed.
         """
         mask = self._mask(mask)
         x = None if positions is None else self._vectors("positions", "m", positions)

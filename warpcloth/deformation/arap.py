@@ -61,22 +61,23 @@ class Arap:
       Sanan & Schröder 2010, *A simple geometric model for elastic deformations*). It is Σ_t area ‖∇x − R_c‖² over the
       triangles at c, so never negative.
 
-    Either step is an exact minimiser, of all R_c by themselves or of all x, so that the energy never rises. The second is
-    L x = b with a constant matrix, which is factorised once. Weights w_ij of edges:
+    An iteration first minimises E exactly over all R_c, then over all x, so the energy never rises. The second step solves L x
+    = b with a constant matrix, which is factorised once. Weights w_ij of edges:
 
     - "cotangent": ½(cot α + cot β) of the angles opposite the edge; negative where α + β > 180°.
-    - "clamped": the same, negative ones 0. Gives up linear precision: of a flat mesh L x = 0 no longer holds inside.
-    - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges replace those of the mesh (Fisher
-      et al. 2007); negative at most on the boundary. Of manifolds that can be oriented. Needs libigl:
+    - "clamped": the same, with negative weights set to 0. Linear precision is lost: inside a flat mesh, L x = 0 no longer
+      holds.
+    - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges replace those of the mesh (Fisher et al.
+      2007); negative on the boundary at most. For orientable manifolds. Needs libigl:
       ``pip install -e '.[intrinsic]'`` in the checkout.
-    - "uniform": 1 for each edge; the only ones for an edge mesh.
+    - "uniform": 1 for each edge; an edge mesh takes only these.
 
-    "spokes_and_rims" takes "cotangent" alone.
+    "spokes_and_rims" takes only "cotangent".
 
     Args:
         mesh: The rest shape, a :class:`warpcloth.Mesh`.
-        handles: Vertices that are moved (h,), each once, or a selection (see :meth:`warpcloth.Mesh.select`), then sorted.
-            Every part of the mesh that hangs together needs one.
+        handles: Vertices that are moved (h,), each once, or a selection (see :meth:`warpcloth.Mesh.select`), which is sorted.
+            Every connected component of the mesh needs a handle.
         weights: One of those above.
         energy: One of those above.
         device: A Warp device, ``"cpu"`` or ``"cuda:0"``.
@@ -84,14 +85,14 @@ class Arap:
 
     Attributes:
         handles: (h,) int32, in the order in which :meth:`solve` takes their positions.
-        parts: Number of the part of the mesh that each vertex belongs to (n,): what hangs together by edges with a weight.
+        parts: Number of the connected component of each vertex (n,); edges with a weight other than 0 connect vertices.
         laplacian: L (n, n), scipy CSR, with L_ij = −w_ij and rows that sum to 0.
         negative_edges: (k, 2) pairs of vertices with a negative weight. With "spokes" each of them adds a negative energy, so
             that even a rigid motion may not be a minimum, and there is a warning.
 
     Raises:
-        ValueError: An argument is none of those above, a vertex is isolated, a part of the mesh has no handle, or the weights
-            leave a matrix that is not definite.
+        ValueError: An argument is not one of those above, a vertex is isolated, a component of the mesh has no handle, or the
+            matrix of the weights is not positive definite.
         ImportError: "intrinsic" without libigl.
 
     Examples:
@@ -186,22 +187,22 @@ class Arap:
     def solve(
         self, positions: ArrayLike, iterations: int = 100, tolerance: float = 1e-6, initial: ArrayLike | None = None
     ) -> Deformed:
-        """Moves the handles and lets the rest follow. Reuses the factors and all arrays of earlier calls.
+        """Moves the handles and lets the rest follow. Reuses the factorisation and all arrays of earlier calls.
 
         Args:
             positions: Targets of the handles (h, 3) [m], in their order.
-            iterations: The most iterations, each of one solve and one fit of rotations.
+            iterations: Maximum number of iterations, each of one solve and one fit of rotations.
             tolerance: It has converged when an iteration lowers the energy by no more than this share of it, or than edges
                 strained by this much have, or by what rounding makes of it; 0 to make all iterations.
-            initial: Points to start from (n, 3) [m], where those of handles do not count. Default: the rest shape, each
-                part of the mesh moved rigidly to where its handles fit their targets best. A rigid motion of all handles is
-                then followed exactly, where the energy is not negative.
+            initial: Points to start from (n, 3) [m]; those of handles are ignored. By default the rest shape, each component of
+                which is moved rigidly so that its handles fit their targets best. If the energy is not negative, a rigid motion
+                of all handles is then followed exactly.
 
         Returns:
             Deformed: Points, rotations, energies.
 
         Raises:
-            ValueError: If an argument breaks a rule, or the energy overflows.
+            ValueError: If an argument is not allowed, or the energy overflows.
         """
         whole("iterations", iterations, 0)
         number("tolerance", tolerance, least=0.0)
@@ -252,12 +253,12 @@ class Arap:
 
     @in_turn
     def carry(self, points: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Points moved along with the handles: each part of the mesh rigidly, as fits best how its handles went.
+        """Points moved along with the handles: each component rigidly, by the best fit to the motion of its handles.
 
         Args:
             points: (n, 3) [m].
-            before: Where its handles were (h, 3) [m], in their order.
-            after: Where they went (h, 3) [m].
+            before: Positions of the handles before (h, 3) [m], in their order.
+            after: Their positions after (h, 3) [m].
 
         Returns:
             np.ndarray: (n, 3) [m].

@@ -75,24 +75,24 @@ def deform(
 ) -> Deformation:
     """Deforms a mesh as rigidly as its moved handles allow (Sorkine & Alexa 2007).
 
-    Each solve starts from the frame before it, carried along with the handles (:meth:`warpcloth.Arap.carry`): they may turn
-    as far as they like in steps of less than half a turn, and what they take along rigidly costs one iteration.
-    A scene with moved pins is deformed by ``deform(scene.mesh, scene.pins, fps=scene.fps, stage=scene.stage)``; of the scene
-    its keyframes count, and where it starts does not.
+    Each solve starts from the previous frame, moved along with the handles (:meth:`warpcloth.Arap.carry`). So the handles may
+    rotate by any angle, if they rotate by less than half a turn per frame, and a rigid motion takes one iteration. A scene with
+    moved pins is deformed by ``deform(scene.mesh, scene.pins, fps=scene.fps, stage=scene.stage)``; it uses the keyframes of the
+    scene, not its start positions.
 
     Args:
         mesh: The :class:`warpcloth.Mesh`; its points are the rest shape.
         pins: :class:`warpcloth.Pins`: the handles and their keyframes (F, p, 3), each of which is a frame.
         fps: Frames per second.
-        weights: See :class:`warpcloth.Arap`, as for ``energy``, ``device`` and ``dtype``.
+        weights: See :class:`warpcloth.Arap`, also for ``energy``, ``device`` and ``dtype``.
         energy: See there.
-        iterations: Most iterations of a frame.
+        iterations: Maximum number of iterations of a frame.
         tolerance: See :meth:`warpcloth.Arap.solve`.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
-        output: Path of a USD file (.usd, .usda, .usdc, .usdz) to write, frame by frame; memory then stays flat. Velocities
-            are differences to the frame before, zero in the first.
-        single_file: Whether ``output`` is to be one file in the end, with nothing beside it.
+        output: Path of a USD file (.usd, .usda, .usdc, .usdz) to write, frame by frame, so that memory use does not grow.
+            Velocities are differences from the previous frame, zero in the first.
+        single_file: Whether ``output`` ends as one file, without a folder of frames beside it.
         progress: Function called with (frame, frames) once each frame is kept, ``frames`` being those after the first; or None.
         stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; ``output`` is then a layer over it.
         up_axis: Up axis of an output that is not a layer, "Y" or "Z"; by default that of the mesh.
@@ -102,8 +102,8 @@ def deform(
 
     Raises:
         BlockingIOError, Interrupted, OSError: As :func:`warpcloth.simulate`.
-        ValueError: If an argument breaks a rule, as :class:`warpcloth.Arap` has them too, or a frame overflows; the frames
-            before it are in ``output``.
+        ValueError: If an argument is not allowed here or by :class:`warpcloth.Arap`, or a frame overflows; the frames before it
+            are in ``output``.
 
     Examples:
         >>> import warpcloth as wc

@@ -125,7 +125,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         :class:`Advice`.
 
     Raises:
-        ValueError: An option breaks a rule, or the scene as it is diverges.
+        ValueError: An option is not allowed, or the scene as it is diverges.
     """
     number("tolerance", tolerance, above=0.0)
     frames = min(scene.frames, 30) if frames is None else frames

@@ -49,7 +49,7 @@ AXES = {
     "relaxation": Axis("relaxation ω", 0.1, 4.0),
     "weight": Axis("weight r = W²/(kA)", 1e-3, 1e3),
     "mass-ratio": Axis("mass of the vertex furthest from the pins, times the scene's", 1e-2, 1e4),
-    "compression": Axis("compression of the start, 1 − l/L", 0.0, 0.9, logarithmic=False),
+    "compression": Axis("initial compression, 1 − l/L", 0.0, 0.9, logarithmic=False),
 }
 # What copies of one model differ in; a row along such an axis is one run.
 VARIED = ("stiffness", "mass-ratio", "compression")

@@ -67,7 +67,7 @@ class Setup:
         """The options record, such as ``wc.Newton(substeps=4)``.
 
         Raises:
-            ValueError: There is no such solver, or an option breaks a rule.
+            ValueError: There is no such solver, or an option is not allowed.
         """
         if self.solver not in SOLVERS:
             raise ValueError(f"solver is {self.solver!r}; it must be one of {', '.join(SOLVERS)}")

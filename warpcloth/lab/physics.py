@@ -89,7 +89,7 @@ def measure(
         ``elements``, ``h`` over L and ``iterations``. What is not known is None.
 
     Raises:
-        ValueError: An argument breaks a rule.
+        ValueError: An argument is not allowed.
     """
     choice("case", case, CASES)
     choice("bending", bending, tuple(BENDING))

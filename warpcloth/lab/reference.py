@@ -137,7 +137,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
         UserWarning: If its error is above the tolerance, or a term makes it slow.
 
     Raises:
-        ValueError: An argument breaks a rule, no method takes the scene, or ``limit`` does not suffice for any estimate.
+        ValueError: An argument is not allowed, no method takes the scene, or ``limit`` does not suffice for any estimate.
     """
     number("tolerance", tolerance, above=0.0)
     number("limit", limit, above=0.0)

@@ -42,7 +42,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         - ``frames``: How many are good.
 
     Raises:
-        ValueError: An argument breaks a rule, or the reference is that of another scene or too short.
+        ValueError: An argument is not allowed, or the reference is that of another scene or too short.
         FileNotFoundError: There is no such scene or reference.
     """
     number("limit", limit, above=0.0)

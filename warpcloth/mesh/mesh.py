@@ -30,7 +30,7 @@ _BYTES_OF_A_VERTEX = 24 + 16 + 48
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mesh:
-    """Triangles, or edges alone as for a chain or a net, in their rest shape.
+    """A mesh in its rest shape: triangles, or edges alone, as for a chain or a net.
 
     Every array is copied, checked and made read-only. Edges are computed at once, and the rest of the topology when it is first
     used.
@@ -38,8 +38,8 @@ class Mesh:
     Attributes:
         points: Rest positions (n, 3) [m], float64.
         triangles: Vertices of each triangle (T, 3), int32, counter-clockwise from the front; (0, 3) of an edge mesh.
-        edges: Vertices of each edge (E, 2), int32. Of triangles, each edge occurs once, with the smaller index first, and rows
-            are in lexicographic order. Of an edge mesh, edges are as given.
+        edges: Vertices of each edge (E, 2), int32. In a triangle mesh, each edge occurs once, with the smaller index first, and
+            rows are in lexicographic order. In an edge mesh, edges are as given.
         texture_coordinates: One st pair for each vertex (n, 2), float64, or None.
         grid_shape: (nx, ny) if vertex i + nx·j is column i, row j of a grid of four-sided cells, or None.
         up_axis: "Y" or "Z", the up axis of gravity and of files; None if unknown, which counts as "Y".
@@ -47,9 +47,9 @@ class Mesh:
             None.
 
     Raises:
-        ValueError: An array has the wrong shape or type, is empty, or has an element (named by its index) that is not
-            finite, refers to no vertex, repeats a vertex, has no area or length, or (edges) occurs twice; or the up axis
-            is neither "Y" nor "Z".
+        ValueError: An array has the wrong shape or type or is empty. Or an element, which the message names by its index, is
+            not finite, refers to a vertex that does not exist, repeats a vertex, has no area or length, or is an edge that
+            occurs twice. Or the up axis is neither "Y" nor "Z".
 
     Examples:
         >>> import warpcloth as wc
@@ -119,12 +119,12 @@ class Mesh:
         - "alternating": rectangular cells, the diagonals of neighbouring cells mirrored, like a checkerboard.
         - "equilateral": rows along x with edges of length a = size/(nx−1), spaced a·√3/2 along z, odd rows shifted by a/2 along
           +x. So the boundary at the ends of the rows zigzags by a/2, and there are no half triangles. The grid has no
-          four-sided cells and so no `grid_shape`. Hinge energies are isotropic on this pattern only.
+          four-sided cells, and therefore no `grid_shape`. Hinge energies are isotropic on this pattern only.
 
         Args:
             nx: Number of vertices of a row, at least 2.
             ny: Number of rows, at least 2.
-            size: Width and depth (along x, along z) or one length for both [m]; of "equilateral" the length of a row.
+            size: Width along x and depth along z, or one length for both [m]; for "equilateral", the length of a row.
             pattern: How the grid is divided into triangles.
 
         Returns:
@@ -164,15 +164,15 @@ class Mesh:
     def join(cls: type[Own], meshes: Mapping[str, "Mesh"]) -> Own:
         """One mesh of several, such as pieces of a garment: the vertices of the first part, then those of the next.
 
-        The selection ``part(name)`` is the vertices of a part, a term with ``part=name`` acts on that part alone, and a
+        The selection ``part(name)`` has the vertices of one part. A term with ``part=name`` acts on that part alone. A
         :class:`warpcloth.Spring` with given pairs can join two parts. Texture coordinates are kept if all parts have them.
 
         Args:
             meshes: The mesh of each part by its name, which must be an identifier.
 
         Raises:
-            ValueError: There is none, one has parts itself, triangles are mixed with edges alone, the up axes differ, or a name
-                is no identifier.
+            ValueError: There is no mesh, a mesh has parts itself, triangle meshes are mixed with edge meshes, the up axes
+                differ, or a name is not an identifier.
         """
         return cls(**joined(meshes))
 
@@ -235,10 +235,10 @@ class Mesh:
 
         Args:
             path: An .obj, .ply, .stl, .off, .glb or .gltf file, or a .usd, .usda, .usdc or .usdz stage.
-            prim: Name of the geometry, or path of the prim, where the file has several.
+            prim: Name of the geometry, or path of the prim, if the file has several.
 
         Returns:
-            Mesh: With vertices in the order of the file, of the class on which it was called.
+            Mesh: An instance of the class on which it was called, with vertices in the order of the file.
         """
         read = READERS.get(Path(path).suffix.lower())
         if read is None:
@@ -290,7 +290,7 @@ class Mesh:
         return self.boundary[list(dict.fromkeys(nearest.tolist()))]
 
     def springs(self, kind: str) -> np.ndarray:
-        """Pairs of vertices that springs of one kind join (Provot 1995, "Deformation constraints in a mass-spring model").
+        """Vertex pairs that springs of one kind connect (Provot 1995, "Deformation constraints in a mass-spring model").
 
         | kind | a grid with `grid_shape` | other triangle meshes | edge meshes |
         |---|---|---|---|
@@ -303,11 +303,11 @@ class Mesh:
             kind: One of the four.
 
         Returns:
-            np.ndarray: Pairs (E, 2), int32: the smaller index first, each pair once. Where they are every edge, row e is
-                edge e of the mesh; all others are in lexicographic order.
+            np.ndarray: Pairs (E, 2), int32: the smaller index first, each pair once. If the pairs are all edges, row e is edge
+                e of the mesh; otherwise they are in lexicographic order.
 
         Raises:
-            ValueError: The kind is unknown, or is "shear" where there are no cells, or "bending" where hinges are refused.
+            ValueError: The kind is unknown, is "shear" on a mesh without cells, or "bending" on a mesh that refuses hinges.
         """  # noqa: E501 (a table's row is one line)
         if kind not in ("structural", "shear", "bending", "edges"):
             raise ValueError(f'kind is {kind!r}; it must be "structural", "shear", "bending" or "edges"')

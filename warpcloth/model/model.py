@@ -62,7 +62,7 @@ class Model:
         threads: As given.
 
     Raises:
-        ValueError: If an argument breaks a rule, or a value or the cloth itself is lost in the precision of the model.
+        ValueError: If an argument is not allowed, or a value or the cloth itself is lost in the precision of the model.
 
     Warns:
         UserWarning: If there are more threads than cores.

@@ -59,8 +59,8 @@ def render(
 ) -> str:
     """Draws a picture or a film by casting rays, on the CPU or a GPU, without a display.
 
-    Frames are read and drawn one at a time, so memory stays flat. The camera shows all of the motion, seen from one direction.
-    A film plays in real time. The same input makes the same bytes on one device.
+    Frames are read and drawn one at a time, so memory use does not grow. The camera stands still and shows all of the motion. A
+    film plays in real time. On one device, the same input gives the same bytes.
 
     Args:
         source: A path: a stage, all of whose meshes and linear curves are drawn; a mesh file; a folder or pattern of mesh
@@ -68,28 +68,30 @@ def render(
             :class:`warpcloth.Deformation`, :class:`warpcloth.Scene`, :class:`warpcloth.Mesh`, :class:`warpcloth.Sequence`,
             or frames (F, n, 3) [m]. Two of them in a list are drawn side by side, by one camera.
         output: File to write: .png, .gif or, with PyAV, .mp4.
-        mesh: The :class:`warpcloth.Mesh` of frames that have none; of other sources the rest shape, against which they are
-            measured.
-        prim: Path or name of the cloth in a stage; without it the prims that move are cloths. Name of the geometry in a file.
-        fps: Frames a second of the source, where it does not say it or says it wrong.
-        up_axis: "Y" or "Z", where the source does not say it.
+        mesh: The :class:`warpcloth.Mesh` of frames given as an array; for other sources, the rest shape relative to which they
+            are measured.
+        prim: Path or name of the cloth in a stage, or name of the geometry in a mesh file. Without it, the prims of a stage
+            that move are cloths.
+        fps: Frames per second of the source, if the source does not give them or to override them.
+        up_axis: "Y" or "Z", if the source does not give it.
         copy: Index of the cloth of a batch; None draws all of them side by side.
         frame: Number of the frame of a .png, as the source counts them; by default the last.
-        frames: Numbers of the first and the last frame of a film; None is an end of the source.
-        every: Only every k-th frame.
+        frames: Numbers of the first and the last frame of a film; None stands for the first or last frame of the source.
+        every: Draw only every k-th frame.
         speed: 0.5 plays at half speed.
         size: Width and height [px].
         samples: Rays through each pixel.
-        colour: A number that ``warpcloth analyze`` measures, such as "stretch_1", shown with a bar; or values (F, n) of
+        colour: A number that ``warpcloth analyze`` measures, such as "stretch_1", shown with a colour bar; or values (F, n) of
             vertices or (F, T) of triangles, also as ``{"text above the bar": values}``; None is the plain colour of cloth.
-        colour_range: Low and high of the colours; by default of all frames of the source, as `analyze` takes them.
+        colour_range: Lowest and highest value of the colour scale; by default from all frames of the source, as in `analyze`.
         colormap: Name of a colour map of matplotlib.
         measuring: Options of :class:`warpcloth.Analyzer` for the colour, by name, such as ``{"neighbourhood": "1-ring"}``.
         azimuth: Angle of the viewer about the vertical [°], from +z of a y-up world, from −y of a z-up one.
         elevation: Angle of the viewer above the horizontal [°].
-        zoom: 2 shows half of what the camera would show.
-        ground: Whether there is a ground at the lowest point of the motion, or its height [m]. None is seen from below.
-        time: Whether the time stands in a corner, or the number of the frame if the source has no times.
+        zoom: Factor by which the camera zooms in; 2 shows half of the width and height.
+        ground: Whether there is a ground at the lowest point of the motion, or the height of the ground [m]. From below it is
+            not drawn.
+        time: Whether to write the time into a corner, or the number of the frame if the source has no times.
         device: A Warp device.
         progress: Function called with (pictures drawn, pictures), from 0; or None.
 
@@ -100,7 +102,7 @@ def render(
         FileNotFoundError: There is no such file or folder.
         ImportError: Colours need matplotlib, .mp4 needs PyAV.
         Interrupted: A KeyboardInterrupt, if the user interrupts; the message says what is in the file.
-        ValueError: An argument breaks a rule, a source cannot be drawn, or a frame of it cannot be read.
+        ValueError: An argument is not allowed, a source cannot be drawn, or a frame of it cannot be read.
 
     Examples:
         >>> import os, tempfile

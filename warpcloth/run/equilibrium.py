@@ -30,14 +30,14 @@ class Equilibrium(NamedTuple):
     Attributes:
         points: (n, 3) [m].
         status: How it ended, see :class:`warpcloth.core.status.Result`, with the residual: the sum Σ‖fᵢ‖ of the unbalanced
-            forces of all free vertices, divided by the whole load Σmᵢ‖g‖ (without gravity, by its value at the start).
+            forces of all free vertices, divided by the weight Σmᵢ‖g‖ (without gravity, by its value at the start).
         iterations: Newton iterations in all, each round of proximal steps counting as one more.
         lowest_eigenvalue: Lowest eigenvalue of the Hessian of the energy over the free vertices [N/m]; NaN if the descent did
             not end in balance.
-        stable: Whether the descent ended in balance and no eigenvalue is negative by more than rounding and the tolerance
-            explain. Then no small move lowers the energy to second order. Moves that cost nothing, such as those of a body
-            that nothing holds, have the eigenvalue 0 and count as stable.
-        energies: With ``record="energies"``, by name [J]: of each term, ``"gravity"`` since the start, and the ``"work of
+        stable: Whether the descent ended in balance and no eigenvalue is more negative than rounding and the tolerance explain.
+            Then no small move lowers the energy to second order. Moves that change no energy, such as those of a body that
+            nothing holds, have the eigenvalue 0 and count as stable.
+        energies: With ``record="energies"``, a dictionary [J]: each term, ``"gravity"`` since the start, and the ``"work of
             loads"`` that are constant.
         reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (p, 3) [N].
         collider_forces: With ``record="reactions"``, the force of the cloth on each collider by its name, (3,) [N].
@@ -67,38 +67,38 @@ def equilibrium(
     """Finds the shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins in their final positions.
 
     Pins with keyframes end at the last keyframe; all others stay where they start. Loads have the values of their last
-    keyframes, and pressure, which follows the cloth, is that of the shape found: its forces are kept while the cloth settles
-    and taken anew until they balance; ``stable`` and ``lowest_eigenvalue`` are of these forces. Colliders stand where their
-    last keyframe has them, and free vertices must start outside of them there; how they came there has no effect. With friction
-    there are many rest shapes, and the motion decides among them, so colliders must be without: to find one, run the scene with
-    damping until it rests.
+    keyframes. Pressure follows the cloth: its forces are held constant while the cloth settles, then computed again, until they
+    balance. ``stable`` and ``lowest_eigenvalue`` are for these forces. Colliders stand at their last keyframe, however they
+    came there, and free vertices must start outside them. With friction there are many rest shapes, and the motion decides
+    among them, so colliders with friction are refused: run such a scene with damping until it rests. Colliders that are meshes
+    are refused too.
 
-    Newton's method without inertia, with a line search, gravity applied in equal load steps. Where it cannot go on, because
-    the Hessian is singular (a flat cloth without bending stiffness has nothing that holds it against its weight), the step
-    is taken with inertia, s/2‖x − x_now‖²_M, and s is lowered from there: a proximal point method, which goes downhill all
-    the way. Cloth that nothing holds has no equilibrium and is reported as not converged. Where the Hessian has a negative
-    eigenvalue in the end, the shape is in balance without being a minimum: it is nudged and settles again.
+    The method is Newton's without inertia, with a line search; gravity is applied in equal load steps. If the Hessian is
+    singular, because, for example, a flat cloth without bending stiffness cannot carry its weight, the step is taken with
+    inertia, s/2‖x − x_now‖²_M, and s is lowered from there. This is a proximal point method, in which the energy never rises.
+    Cloth that nothing holds has no equilibrium and is reported as not converged. If the Hessian has a negative eigenvalue in
+    the end, the shape is in balance but not a minimum: it is perturbed a little and settles again.
 
     Args:
         scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
-        tolerance: Of the residual, see :class:`Equilibrium`, and of the unbalanced acceleration of each vertex over gravity's
-            (without any, over the largest at the start). Where rounding leaves more at a vertex, the descent ends when nothing
-            is left to gain, and the residual decides; with half the weight or more unbalanced it does not pass for a rest
-            shape. Without gravity there is no load to hide.
-        load_steps: Number of steps in which gravity and loads grow and pins move along their keyframes. Pins that turn far need
-            several.
-        iterations: The most Newton iterations in all.
+        tolerance: Tolerance of the residual, see :class:`Equilibrium`, and of the unbalanced acceleration of each vertex
+            divided by gravity (without gravity, by the largest at the start). If rounding leaves more than this at a vertex,
+            the descent ends when it cannot lower the energy any more, and the residual decides. With gravity, a shape with half
+            of the weight or more unbalanced does not count as a rest shape.
+        load_steps: Number of steps in which gravity and loads grow and pins move along their keyframes. Pins that rotate far
+            need several.
+        iterations: Maximum number of Newton iterations in total.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
         linear: ``"factorised"``, which stiff and slender cloth needs, or ``"cg"``.
-        record: ``"energies"``, ``"reactions"`` or both, to have them in the result.
+        record: ``"energies"``, ``"reactions"`` or both, which the result then has.
 
     Returns:
         :class:`Equilibrium`.
 
     Raises:
-        ValueError: If an argument breaks a rule, a stiffness is infinite, a collider has friction, or a free vertex starts
-            inside of one as it stands last.
+        ValueError: If an argument is not allowed, a stiffness is infinite, a collider is a mesh or has friction, or a free
+            vertex starts inside a collider at its last keyframe.
 
     Examples:
         >>> import warpcloth as wc

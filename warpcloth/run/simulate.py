@@ -63,8 +63,8 @@ class Animation:
     """The result of a run: the start and every good frame after it.
 
     Attributes:
-        points: (frames+1, n, 3) [m]; with B > 1 copies (frames+1, B, n, 3). With ``output`` they are float32 and read from the
-            file when asked for, else in memory.
+        points: (frames+1, n, 3) [m]; with B > 1 copies (frames+1, B, n, 3). With ``output`` they are float32, and are read from
+            the file when they are accessed; else they are in memory.
         velocities: The same shape [m/s].
         times: (frames+1,) [s].
         status: :class:`warpcloth.core.status.Status`.
@@ -74,21 +74,22 @@ class Animation:
             its good frames.
         output: Path of the USD file, or None.
         scene: The :class:`warpcloth.Scene` of the run, or None.
-        energies: With ``record="energies"``, by name and (frames+1,) or (frames+1, B) [J]: of each term under its label, of
-            ``"contact with Ball"`` and ``"friction on Ball"`` for a collider of that name, ``"kinetic"``, ``"gravity"`` (0 at
-            the start), and where there are any ``"work of pins"`` that move, ``"work of loads"``, ``"work of colliders"`` that
-            move, and ``"heat of friction"``. A copy that diverged is NaN from then on.
+        energies: With ``record="energies"``, a dictionary of arrays (frames+1,) or (frames+1, B) [J]: each term under its
+            label, ``"contact with Ball"`` and ``"friction on Ball"`` for a collider called Ball, ``"kinetic"``, ``"gravity"``
+            (0 at the start), and, if the scene has them, ``"work of pins"`` that move, ``"work of loads"``, ``"work of
+            colliders"`` that move, and ``"heat of friction"``. A copy that diverged is NaN from then on.
         reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (frames+1, p,
             3) or (frames+1, B, p, 3) [N], in the order of ``scene.pins.vertices``.
-        collider_forces: With ``record="reactions"``, the force of the cloth on each collider, friction included, by the name
-            of the collider and (frames+1, 3) or (frames+1, B, 3) [N].
-        friction_forces: Likewise the part of friction, of colliders that have it.
-        cuts: With a record, the share of the moves of free vertices in each frame that was cut short, (frames+1,) or
-            (frames+1, B); see ``cut``.
-        cut: The share of the moves of free vertices, of all steps, that were cut short because they would have ended in a
-            collider or crossed one; with B > 1 copies one value per copy, (B,).
-        inside: The first vertex that each collider contains, if any, a tuple of :class:`Inside`: one that is not free, over
-            which the collider moves or which moves through it, or a free one between two colliders that close.
+        collider_forces: With ``record="reactions"``, a dictionary from the name of a collider to the force of the cloth on it,
+            friction included, (frames+1, 3) or (frames+1, B, 3) [N].
+        friction_forces: In the same form, the part of these forces that is friction, for colliders that have friction.
+        cuts: With a record, the fraction of the moves of free vertices in each frame that the filter of contact cut short,
+            (frames+1,) or (frames+1, B); see ``cut``.
+        cut: The fraction of the moves of free vertices, over all steps, that were cut short because they would have entered or
+            crossed a collider; with B > 1 copies one value per copy, (B,).
+        inside: A tuple of :class:`Inside`, one for each collider that contained a vertex, with its first such vertex. This is a
+            vertex that is not free, if the collider moves over it or it moves into the collider, or a free vertex between two
+            colliders that close on one another.
     """
 
     points: np.ndarray | FrameSequence
@@ -132,8 +133,8 @@ def simulate(
     """Runs a scene with a solver.
 
     For the run, the vertices of a large mesh are reordered if neighbours are far apart in memory, see
-    :func:`warpcloth.mesh.ordering.order_of_run`; the results have the order of the scene. While a frame is written the next
-    one is computed. Calls from several threads of a process take turns frame by frame, see :mod:`warpcloth.base.turns`.
+    :func:`warpcloth.mesh.ordering.order_of_run`; results keep the order of the scene. While a frame is written, the next one is
+    computed. Calls from several threads of a process take turns frame by frame, see :mod:`warpcloth.base.turns`.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
@@ -145,14 +146,14 @@ def simulate(
         frames: Number of frames after the first; by default that of the scene.
         copies: See :class:`warpcloth.model.model.Model`; ``output`` takes one copy.
         vary: See :class:`warpcloth.model.model.Model`.
-        single_file: Whether ``output`` is one file at the end, with nothing beside it.
+        single_file: Whether ``output`` ends as one file, without a folder of frames beside it.
         progress: Function that is called with (frame, frames) after each frame is stored, from frame 0, the start; or None.
         threads: See :class:`warpcloth.model.model.Model`.
         resume: Whether to continue the interrupted run to ``output`` after its last finished chunk of frames. The result equals
             that of an uninterrupted run bit for bit. All arguments but ``frames`` and ``single_file`` must be the same.
-        record: ``"energies"``, ``"reactions"`` or both, to have them in each frame of the :class:`Animation`, and as primvars
-            of ``output``. The motion is the same to the bit. Work of moving pins and colliders, of loads that change, and
-            against friction is summed in every step, which takes more time.
+        record: ``"energies"``, ``"reactions"`` or both. The :class:`Animation` then has them for each frame, and ``output`` has
+            them as primvars. The motion is the same bit for bit. The work of moving pins, moving colliders and changing loads,
+            and the work against friction, are summed in every step, which takes more time.
 
     Returns:
         :class:`Animation`. A run that diverges ends with its last good frame, and ``status`` says so. With several copies the
@@ -162,8 +163,8 @@ def simulate(
         BlockingIOError: If another process, or thread, is writing ``output``.
         Interrupted: A KeyboardInterrupt, if the user interrupts; the message says which frames are in ``output``.
         OSError: If a file cannot be written; the message also says which frames are in ``output``.
-        ValueError: If an argument breaks a rule, the scene's stage has changed and no longer fits the frames, or ``output`` has
-            no run to resume or another one.
+        ValueError: If an argument is not allowed, the scene's stage has changed and no longer fits the frames, or ``output``
+            has no run to resume, or another one.
 
     Examples:
         >>> import warpcloth as wc

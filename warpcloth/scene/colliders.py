@@ -14,19 +14,19 @@ _SAG = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """How cloth touches colliders: a pressure k(r − d) at a distance d below r, and kr²/(4d) below r/2.
+    """Contact of cloth with colliders: a pressure of k(r − d) at distances d < r, and of kr²/(4d) at d < r/2.
 
-    That is the gradient of U = Σ kA φ(d) over the vertices of area A, see :mod:`warpcloth.kernels.terms.contact`. A pressure p
-    leaves a gap of r − p/k, or kr²/(4p) where that is below r/2. Friction has the stiffness k too: a vertex that sticks moves
-    by up to μN/(kA) before it slides.
+    It derives from the energy U = Σ kA φ(d) of the vertices, A the area of a vertex; see
+    :mod:`warpcloth.kernels.terms.contact`. A pressure p leaves a gap of r − p/k, or of kr²/(4p) if p is above kr/2. Friction
+    also has the stiffness k: a vertex that sticks moves by up to μN/(kA) before it slides.
 
     Attributes:
         distance: Contact distance r [m].
-        stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default 10 w/r with the weight w of the cloth
-            per area, so that the weight of one layer leaves a gap of 0.9 r.
+        stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default 10 w/r, where w is the weight of the
+            cloth per area, so that one layer rests at a gap of 0.9 r.
 
     Raises:
-        ValueError: If a value breaks a rule.
+        ValueError: If a value is not allowed.
     """
 
     distance: float = 1e-3
@@ -43,14 +43,14 @@ class Collider:
     """The base of colliders.
 
     Attributes:
-        position: Where its centre is, (3,) [m], or at the frames 0 … F−1 of the scene, (F, 3).
-        rotation: Quaternion (x, y, z, w) by which it is turned, (4,), or at these frames, (F, 4). Between frames it moves
-            linearly and turns at one speed, by the shorter way; after the last it stands still.
+        position: Position of its centre, (3,) [m], or its positions at the frames 0 … F−1 of the scene, (F, 3).
+        rotation: Quaternion (x, y, z, w) by which it is rotated, (4,), or the quaternions at these frames, (F, 4). Between
+            frames it moves linearly and rotates at constant speed, by the smaller angle; after the last it stands still.
         friction: Coefficient μ of friction.
         name: Its name in messages and files; by default that of the class.
 
     Raises:
-        ValueError: If a value breaks a rule.
+        ValueError: If a value is not allowed.
     """
 
     position: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 0.0, 0.0))
@@ -164,8 +164,8 @@ class Plane(Collider):
     """The half-space below a plane.
 
     Attributes:
-        normal: The side on which the cloth is, (3,), turned by ``rotation``.
-        position: A point of the plane, (3,) or (F, 3) [m].
+        normal: Normal on the side of the cloth, (3,), rotated by ``rotation``.
+        position: A point on the plane, (3,) or (F, 3) [m].
     """
 
     normal: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 1.0, 0.0))
@@ -185,7 +185,7 @@ class Plane(Collider):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sphere(Collider):
-    """A ball about ``position``.
+    """A solid sphere about ``position``.
 
     Attributes:
         radius: Its radius [m].
@@ -204,12 +204,12 @@ class Sphere(Collider):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capsule(Collider):
-    """All that is nearer than ``radius`` to a segment, whose middle is ``position``.
+    """All points within ``radius`` of a segment whose middle is ``position``.
 
     Attributes:
         radius: Its radius [m].
         length: Length of the segment [m], without the caps.
-        axis: Direction of the segment (3,), turned by ``rotation``.
+        axis: Direction of the segment (3,), rotated by ``rotation``.
     """
 
     radius: float
@@ -233,7 +233,7 @@ class Capsule(Collider):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Box(Collider):
-    """A box about ``position``, with edges along the axes turned by ``rotation``.
+    """A box about ``position``, with edges along the axes, rotated by ``rotation``.
 
     Attributes:
         size: Lengths of its edges (3,) [m].

@@ -21,17 +21,17 @@ from .colliders import Collider, turned
 class MeshCollider(Collider):
     """A triangle mesh.
 
-    If its triangles close it is the solid that their fronts look away from. Otherwise it is a sheet without thickness, which is
-    touched from both sides. Vertices that are at one position at all frames count as one, so that seams do not open it. At
-    frames where all of it is at one position it is absent.
+    If its surface is closed, it is a solid behind the fronts of its triangles. Otherwise it is a sheet without thickness, which
+    collides on both sides. Vertices with the same position at all frames are merged, so that a seam does not make the surface
+    open. At frames where all of its vertices are at one position it is absent.
 
     Attributes:
-        points: Its vertices, (n, 3) [m], or at the frames 0 … F−1 of the scene, (F, n, 3), in the frame of ``position`` and
-            ``rotation``. Between frames they move linearly; after the last they stand still.
+        points: Its vertices, (n, 3) [m], or the vertices at the frames 0 … F−1 of the scene, (F, n, 3), in the frame of
+            ``position`` and ``rotation``. Between frames they move linearly; after the last they stand still.
         triangles: Vertices of each triangle (T, 3), counter-clockwise from the front.
 
     Raises:
-        ValueError: If a value breaks a rule.
+        ValueError: If a value is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -147,9 +147,9 @@ class MeshCollider(Collider):
         return np.array_equal(forth, back)
 
     def distances(self, points: np.ndarray, frame: int = 0) -> np.ndarray:
-        """Distances (…,) [m] of points (…, 3) [m] to the surface at a frame, below 0 inside of a closed one.
+        """Distances (…,) [m] of points (…, 3) [m] to the surface at a frame, negative inside a closed one.
 
-        Of triangles that are as near to within float32 it may take either.
+        If two triangles are equally near up to the rounding of float32, it may take either.
         """
         points = np.asarray(points, dtype=np.float64)
         away, vertices, faces, weights = self._away(points.reshape(-1, 3), frame)

@@ -31,11 +31,12 @@ class Pins:
 
     Attributes:
         vertices: Indices (p,), or a selection of the mesh such as ``"x<0.01"``.
-        keyframes: Positions (F, p, 3) [m] at frames 0 … F−1 of the scene, in the order of ``vertices``. Pins move
-            linearly between them and stand still after the last. Without keyframes they stay where they start. Along axes
-            that a pin does not hold they do not matter.
-        axes: The axes that the pins hold, such as ``"xz"``, or such a text for each pin (p,). A pin that holds ``"y"`` is a
-            roller that moves freely along x and z, and one that holds the normal of a plane is a symmetry.
+        keyframes: Positions (F, p, 3) [m] at frames 0 … F−1 of the scene, in the order of ``vertices``. Pins move linearly
+            between keyframes and stand still after the last. Without keyframes they stay where they start. Coordinates along
+            axes that a pin does not hold are ignored.
+        axes: The axes that the pins hold, such as ``"xz"``, or one such string for each pin (p,). A pin that holds ``"y"`` is a
+            roller, which moves freely along x and z. A pin that holds the normal of a plane keeps its vertex in that plane of
+            symmetry.
 
     Examples:
         >>> import warpcloth as wc
@@ -83,13 +84,13 @@ class Pins:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A cloth, what acts on it, and for how long, in SI units. ``dataclasses.replace`` returns a scene with other fields.
+    """A cloth, all that acts on it, and a duration, in SI units. ``dataclasses.replace`` returns a scene with other fields.
 
     Attributes:
         mesh: The :class:`Mesh`; its points are the rest shape.
         density: Mass per area [kg/m²]: each vertex has the mass of a third of each adjacent triangle. For an edge mesh, mass
             per length [kg/m]: each vertex has the mass of half of each adjacent edge.
-        masses: Mass of each vertex, (n,) [kg], in place of ``density``, else None; :attr:`vertex_masses` has the masses in
+        masses: Mass of each vertex, (n,) [kg], in place of ``density``; else None. :attr:`vertex_masses` has the masses in
             either case.
         positions: Positions at the start, (n, 3) [m]; by default the rest shape.
         velocities: Velocities at the start, (n, 3) [m/s]; by default 0. Those of pinned vertices are ignored.
@@ -101,16 +102,16 @@ class Scene:
         name: Name in reports and files.
         stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; an animation is then written as a
             layer over that stage.
-        free_axes: The axes of space along which each vertex may move, (n, 3) truth values; by default all. A locked coordinate
-            keeps its value, and its velocity is 0, which makes planes of symmetry and rails. A vertex without a free axis is
-            a pin that stands still. Values of pinned vertices are ignored.
+        free_axes: The axes of space along which each vertex may move, (n, 3) booleans; by default all. A locked coordinate
+            keeps its value, and its velocity is 0; planes of symmetry and rails are made this way. A vertex without a free axis
+            is a pin that stands still. Values of pinned vertices are ignored.
         loads: Forces, tractions and pressures on the cloth: :class:`Force`, :class:`Traction`, :class:`Pressure`.
-        colliders: What the cloth touches, such as :class:`warpcloth.Sphere`. Pinned vertices touch nothing.
-        contact: How it touches them, a :class:`warpcloth.Contact`, by default ``Contact()``, with its stiffness as a number;
-            without colliders it does not matter.
+        colliders: The colliders, such as :class:`warpcloth.Sphere`. Pinned vertices do not collide.
+        contact: The :class:`warpcloth.Contact` with all colliders, by default ``Contact()``; its stiffness is then computed. It
+            has no effect without colliders.
 
     Raises:
-        ValueError: If a value breaks a rule; the sentence names it.
+        ValueError: If a value is not allowed; the message names it.
 
     Examples:
         >>> import warpcloth as wc
@@ -139,7 +140,7 @@ class Scene:
 
     @property
     def declared(self) -> tuple[object, ...]:
-        """All that it declares besides the cloth itself; any of it may put energy into the cloth."""
+        """Everything that it declares besides the cloth itself. Any of this may add energy to the cloth."""
         return (self.pins, *self.terms, self.loads, *self.colliders)
 
     def __post_init__(self) -> None:
@@ -235,7 +236,8 @@ class Scene:
 
     @property
     def contact_terms(self) -> tuple[VertexContact, ...]:
-        """The terms that its colliders are: contact of the free vertices with each, and friction on those that have it."""
+        """The terms of its colliders: contact of the free vertices with each collider, and friction on colliders that have
+        it."""
         if not self.colliders or self.contact is None or self.contact.stiffness is None:
             return ()
         areas, mass = self._touching_areas, self._areal_mass
@@ -311,7 +313,7 @@ class Scene:
 
     @property
     def locked(self) -> np.ndarray | None:
-        """The locked coordinates of vertices that move along other axes, (n, 3) truth values; None if there are none."""
+        """The locked coordinates of vertices that move along other axes, (n, 3) booleans; None if there are none."""
         if self._unlocked is None:
             return None
         found = ~self._unlocked

@@ -45,10 +45,10 @@ class ADMM(ImplicitStep):
 
     With too large a weight the iteration stalls, with too small a one it oscillates. An iteration multiplies the error of a
     mode with s = h²ω² by (1 + r²s)/((1 + rs)(1 + r)), which is smallest for r = 1/√s. So ``"auto"`` is r = 1/(2hₑω) for each
-    element, where ω² is the largest eigenvalue of M⁻¹ s k A DᵀD of the element alone; the factor 2 is there because the highest
-    frequency of a whole net is about twice as high. The table has the measured iterations of one step until the distance to the
-    solution is 1e-4 of that from x̃, with ``"auto"``, with the best of 17 weights shared by all elements, from 1e-3 to 10, and
-    with r = 1:
+    element, where ω² is the largest eigenvalue of M⁻¹ s k A DᵀD of the element alone; the factor 2 accounts for the highest
+    frequency of a whole mesh, which is about twice as high. The table gives how many iterations a step takes, as measured,
+    until its distance to the solution is 1e-4 of the distance from x̃: with ``"auto"``, with the best of 17 weights from 1e-3
+    to 10 that all elements share, and with r = 1:
 
     =============================  =======  =======  =======
     hanging of 8 × 8, 1/240 s      "auto"   best     r = 1
@@ -69,9 +69,9 @@ class ADMM(ImplicitStep):
 
     With few iterations a small weight leaves the cloth soft, and in the next step the remaining error becomes a velocity.
     Therefore, with n iterations, ``"auto"`` is at least min(c/n, 1), where c is 2 for Euler, 4 for BDF2 and 20 for midpoint,
-    which damps that velocity least. With this bound ``hanging`` at 1e5 N/m and a cantilever have a smaller error
-    than with r = 1 over 2 to 100 iterations a step, and do not tear, as they do with a weight of 0.03. For energies that
-    are concave somewhere, hinges above all, it may not converge with a small weight.
+    which damps that velocity least. With this bound ``hanging`` at 1e5 N/m and a cantilever have a smaller error than with r =
+    1 over 2 to 100 iterations a step, and do not tear, as they do with a weight of 0.03. If an energy is concave somewhere, as
+    that of hinges is, it may not converge with a small weight.
 
     ``residual`` is the larger of the primal and the dual residual. Both are the largest acceleration of any vertex, relative to
     gravity (in m/s² without gravity): the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before), divided by the masses. The
@@ -80,12 +80,12 @@ class ADMM(ImplicitStep):
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
-        iterations: The most iterations in a step.
+        iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of both residuals.
         weight: r = W²/(kA) > 0 for all elements, or ``"auto"``.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -125,7 +125,7 @@ class ADMM(ImplicitStep):
             number("weight", self.weight, above=0.0)
 
     def bind(self, model: Model) -> Stepper:
-        """The solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
             ValueError: If a term has infinite stiffness, or cells.

@@ -40,40 +40,40 @@ class ConstrainedDynamics(ImplicitStep):
         [M̃, −Jᵀ; J, α̃][Δx; Δλ] = −[M(x − x̃) − Jᵀλ; C(x) + α̃λ]
 
     through (J M̃⁻¹Jᵀ + α̃)Δλ = −(C + α̃λ) + J M̃⁻¹(M(x − x̃) − Jᵀλ). Springs and hinges have the published scalar C; other
-    terms have the rows C = y − p(y) with p fixed in an iteration, as in projective dynamics; limits have none inside their
-    range, and friction that slides those of a softer spring to its anchor. The system admits any stiffness. The fixed point is
+    terms have the rows C = y − p(y) with p fixed in an iteration, as in projective dynamics. A limit has no rows inside its
+    range, and sliding friction has those of a softer spring to its anchor. The system admits any stiffness. The fixed point is
     the x(t+h) of :class:`warpcloth.Newton`, and for infinite stiffness the point of C = 0 that is nearest to x̃.
 
-    One iteration with M̃ = M is the method as published. It leaves out −λ∂²C, so that a spring overshoots perpendicular to
-    itself once its tension is above about m l/h², and more iterations need a safeguard. Geometric stiffness (Tournier et al.
-    2015) adds the positive part of that matrix to M̃; here exactly, as rows B of compliance 1 with BᵀB = [−λ∂²C]₊, which keep M
+    One iteration with M̃ = M is the method as published. It leaves out −λ∂²C, so a spring overshoots perpendicular to itself if
+    its tension is above about m l/h². More iterations therefore need a safeguard. Geometric stiffness (Tournier et al. 2015)
+    adds the positive part of that matrix to M̃; here exactly, as rows B of compliance 1 with BᵀB = [−λ∂²C]₊, which keep M
     diagonal and conserve linear momentum to rounding. A line search is possible because Δx, a Gauss–Newton step, is a descent
     direction of 1/(2h²)‖x − x̃‖²_M + U.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
-        iterations: The most iterations in a step.
+        iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of the residual, the larger of two accelerations, relative to gravity (or without gravity to its
             value at the first iterate): the largest unbalanced one of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest by
             which a single constraint would meet C + α̃λ = 0 in a step.
         stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
         linear: ``"cg"``, or ``"factorised"`` on the host.
 
-    Both linear solvers take redundant constraints: every α̃ is at least ε^0.7 of the diagonal of J W Jᵀ, so that the smallest of
-    all possible λ is found, and hard constraints keep a gap of that fraction of the move that they cause in a step (1e-11, in
-    float32 1e-5). Constraints that contradict one another meet half-way; the status says so, and their gap is the residual. A
-    constraint between pins alone is left out, because it can move nothing. A hard spring of rest length 0 has no direction and
-    may not converge; XPBD takes it.
+    Both linear solvers take redundant constraints: every α̃ is at least ε^0.7 of the diagonal of J W Jᵀ, so that the smallest
+    of all possible λ is found, and hard constraints keep a gap of that fraction of the move that they cause in a step (1e-11,
+    in float32 1e-5). Constraints that contradict one another end at a compromise; the status says so, and their violation is
+    the residual. A constraint between pins alone is left out, because it can move nothing. A hard spring of rest length 0 has
+    no direction and may not converge; XPBD takes it.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
     """
 
     name = "constrained-dynamics"
     needs, locks = (MERGED_DAMPING, ROWS, STEADY_ROWS), True
     facts = Facts(
         method="implicit steps with hard or compliant constraints, solved for positions and Lagrange multipliers",
-        suits="constraints of any stiffness, met at the point nearest to x̃; bodies hung from one another",
+        suits="constraints of any stiffness, met at the point nearest to x̃; bodies that hang from one another",
         weakness="slow with thousands of constraints; one iteration overshoots",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 1}, cpu=(8, 16, 32), cuda=(16, 32, 64)),),
         runs=(
@@ -103,7 +103,7 @@ class ConstrainedDynamics(ImplicitStep):
         number("tolerance", self.tolerance, above=0.0)
 
     def bind(self, model: Model) -> Stepper:
-        """The solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
             ValueError: If a term has no constraint, or infinite stiffness where that is not allowed.

@@ -34,7 +34,7 @@ class Explicit(Step):
         above_limit: ``"refuse"`` or ``"allow"``: whether a step that is unstable about the rest shape is refused.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -81,7 +81,7 @@ class Explicit(Step):
         return replace(self, above_limit="allow")
 
     def bind(self, model: Model) -> Stepper:
-        """The solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Warns:
             UserWarning: If the step is above the limit in motion, see :func:`step_limits`, which takes hinges and membranes

@@ -21,32 +21,32 @@ class HierarchicalPBD(Step):
     """Hierarchical position based dynamics (Müller 2008, *Hierarchical position based dynamics*).
 
     A sweep of :class:`warpcloth.PBD` carries information over one or a few constraints, so that finer cloth stretches more.
-    Here a step first sweeps over levels of fewer vertices, from the coarsest on. The vertices that a level drops then follow by
-    dᵢ = Σ (dⱼ/Lᵢⱼ) / Σ (1/Lᵢⱼ) over the kept vertices j that they are linked to, d = x − x̃. The sweeps of PBD over all terms
-    come last. Each level costs a quarter of the next finer one in a sheet, a half in a chain.
+    Here a step first sweeps over levels with fewer vertices, the coarsest first. The vertices that a level leaves out then
+    follow by dᵢ = Σ (dⱼ/Lᵢⱼ) / Σ (1/Lᵢⱼ) over the vertices j of the level that they are linked to, d = x − x̃. The sweeps of
+    PBD over all terms come last. Each level costs a quarter of the next finer one in a sheet, a half in a chain.
 
     The constraints of a level are one-sided: ‖xᵢ − xⱼ‖ ≤ L with L the length of the shortest path over finer bounds. So cloth
-    that meets the finer bounds is not moved, and the levels hinder neither folds nor shear of a net. Springs, limits with σ_max
-    and membranes give bounds; bending, attachments and damping take part in the last sweeps only, and without bounds the solver
-    is PBD. A bound has the stiffness of its path in series, scaled so that a level keeps Σ kL² of the finer one; it is infinite
-    where the cloth's is. A vertex of a level has the mass of the vertices that follow it too, Mⱼ = mⱼ + Σ wᵢⱼ mᵢ, so that
-    linear momentum is conserved; angular momentum is not.
+    that meets the finer bounds is not moved, and the levels do not resist folding, or shear of a net. Springs, limits with
+    σ_max and membranes give bounds; bending, attachments and damping take part in the last sweeps only. Without bounds the
+    solver is PBD. The stiffness of a bound is that of its path in series, scaled so that a level keeps Σ kL² of the finer one;
+    it is infinite if that of the cloth is. A vertex of a level has the mass of the vertices that follow it too, Mⱼ = mⱼ + Σ wᵢⱼ
+    mᵢ, so that linear momentum is conserved; angular momentum is not.
 
     It has drawbacks. Soft cloth is stiffer than with PBD, because the corrections of all levels add up: a chain of 80 springs
-    whose exact stretch is 40 % stretches by 4.7 % with PBD (4 × 20 sweeps a frame) and by 1.1 % here. Cloth that starts far
-    stretched is flung, because a step closes all of the gap. Vertices that follow a level move unevenly, most of all near pins,
-    and the last sweeps must smooth that. So levels pay if large errors extend over many vertices; if x̃ is near the constraints
-    already, PBD alone leaves smaller errors. Repeating the levels in a step was no better in the same time.
+    whose exact stretch is 40 % stretches by 4.7 % with PBD (4 × 20 sweeps a frame) and by 1.1 % here. Cloth that starts with
+    large stretch is flung, because one step corrects all of it. Vertices that follow a level move unevenly, most of all near
+    pins, and the last sweeps must smooth that. So levels help if large errors extend over many vertices. If x̃ already nearly
+    meets the constraints, PBD alone leaves smaller errors. Repeating the levels in a step was no better in the same time.
 
     Attributes:
         dt, substeps: See :class:`Step`.
         iterations: Sweeps over all terms a step, Gauss–Seidel by colour.
         coarse_iterations: Sweeps over each level.
-        levels: The most levels above the finest; 0 is PBD, None means all levels that have bounds.
-        relaxation: ω > 0, a factor of every move of a sweep.
+        levels: Maximum number of levels above the finest; 0 is PBD, None means all levels that have bounds.
+        relaxation: ω > 0, a factor on every move of a sweep.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
     """
 
     name = "hierarchical-pbd"
@@ -79,7 +79,7 @@ class HierarchicalPBD(Step):
         return True
 
     def bind(self, model: Model) -> Stepper:
-        """The solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
             ValueError: If a term has no projection, scalar constraint or ``prox``.

@@ -19,7 +19,7 @@ from .step import ImplicitStep
 class Newton(ImplicitStep):
     """Implicit Euler: x(t+h) minimises 1/(2h²)‖x − x̃‖²_M + U(x), x̃ = x + h v + h² g (Baraff and Witkin 1998).
 
-    It does not leave a state in exact balance that is not a minimum, such as a straight chain under compression. Each step
+    It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Each step
     multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved, angular momentum is not.
 
     Attributes:
@@ -27,15 +27,16 @@ class Newton(ImplicitStep):
         tolerance: Tolerance of the residual, which is the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, divided by
             gravity (or without gravity by the largest at x̃). If rounding leaves a larger residual, as in stiff cloth in
             float32, a step ends when no progress is possible, and its result says so.
-        iterations: The most Newton iterations in a step.
-        hessian: Treatment of an indefinite Hessian (Choi and Ko 2002 for springs). ``"clamp"`` and ``"absolute"`` change the
-            block of each element in every iteration, ``"adaptive"`` clamps only in iterations whose matrix is found to be
-            indefinite, ``"raw"`` changes nothing.
-        linear: ``"cg"``, conjugate gradients to the accuracy that the Newton iteration needs, or ``"factorised"`` on the host,
-            which is 3 to 6 times slower for ``hanging`` with 32² and 64² vertices, but takes any stiffness.
+        iterations: Maximum number of Newton iterations in a step.
+        hessian: Treatment of an indefinite Hessian (Choi and Ko 2002 for springs). ``"clamp"`` and ``"absolute"`` make the
+            block of each element semi-definite in every iteration; ``"adaptive"`` clamps only in iterations whose matrix is
+            found to be indefinite; ``"raw"`` changes nothing.
+        linear: ``"cg"`` solves by conjugate gradients, to the accuracy that the Newton iteration needs. ``"factorised"``
+            factorises on the host, which is 3 to 6 times slower for ``hanging`` with 32² and 64² vertices, but takes any
+            stiffness.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -75,7 +76,7 @@ class Newton(ImplicitStep):
         whole("iterations", self.iterations, 1)
 
     def bind(self, model: Model) -> Stepper:
-        """The solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
             ValueError: If a term has infinite stiffness.

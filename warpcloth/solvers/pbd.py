@@ -18,17 +18,18 @@ from .step import Step
 class PBD(Step):
     """Position based dynamics (Müller et al. 2006).
 
-    A sweep moves the vertices of each constraint by W GᵀΔλ, Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y), with inverse masses W and
-    α̃ = 1/(kAh²). For infinite stiffness k, the classical method, they move fully onto the constraint. For finite stiffness they
-    move by the fraction s = w/(w + α̃), w = G W Gᵀ, by which an element alone would move in a step. If every sweep corrects by
-    s, cloth becomes stiffer with iterations n and with 1/h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest. If
-    every sweep corrects by s′ = 1 − (1−s)^(1/n), all sweeps together correct by s, and the mass stretches by g h²(1−s)/s = mg/k
-    for any n; where constraints share vertices, the result still depends on n.
+    A sweep moves the vertices of each constraint by W GᵀΔλ, Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y), with inverse masses W and α̃ =
+    1/(kAh²). For infinite stiffness k, the classical method, they move fully onto the constraint. For finite stiffness they
+    move by the fraction s = w/(w + α̃), w = G W Gᵀ, by which a single element would move in a step. If every sweep corrects by
+    s, cloth becomes stiffer with more iterations n and smaller h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest.
+    If every sweep corrects by s′ = 1 − (1−s)^(1/n), all sweeps together correct by s, and the mass stretches by g h²(1−s)/s =
+    mg/k for any n; where constraints share vertices, the result still depends on n.
 
-    Jacobi sweeps add up all corrections and then move. With the sum times ω they diverge iff ω λ_max(D⁻¹JWJᵀ) > 2. Averaged by
-    vertex, (Σx_new + αx)/(n + α) with the n constraints of the vertex, they converge for every α ≥ 0, but do not conserve
-    momentum. Averaged by constraint, where all vertices of a constraint have the factor 1/max n, they conserve linear momentum.
-    Gauss–Seidel sweeps conserve linear momentum too and converge in fewer sweeps; their order changes the result.
+    Jacobi sweeps add up all corrections and then move the vertices. If they move by ω times the sum, they diverge iff ω
+    λ_max(D⁻¹JWJᵀ) > 2. If corrections are averaged by vertex, (Σx_new + αx)/(n + α) with the n constraints of the vertex,
+    sweeps converge for every α ≥ 0, but do not conserve momentum. If they are averaged by constraint, with the factor 1/max n
+    for all vertices of a constraint, sweeps conserve linear momentum. Gauss–Seidel sweeps also conserve linear momentum, and
+    converge in fewer sweeps; their order changes the result.
 
     Attributes:
         dt, substeps: See :class:`Step`.
@@ -36,12 +37,12 @@ class PBD(Step):
         sweep: Jacobi ``"vertex-averaged"``, ``"constraint-averaged"`` or plain ``"jacobi"``; Gauss–Seidel ``"coloured"``, or
             ``"sequential"``: elements in the order of the scene, by one thread; on a GPU it suits small scenes only.
         alpha: α ≥ 0, weight of the old position when averaging by vertex.
-        relaxation: ω > 0, a factor of every move.
-        correction: Whether constraints of finite stiffness are corrected by s in each sweep, ``"per-sweep"``, or by s in a
-            step, ``"per-step"``, which is s′ in each sweep.
+        relaxation: ω > 0, a factor on every move.
+        correction: ``"per-sweep"`` corrects constraints of finite stiffness by s in each sweep, ``"per-step"`` by s in each
+            step, which is s′ in each sweep.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -57,7 +58,7 @@ class PBD(Step):
     closes, multipliers = True, False  # λ does not add up over the sweeps of a step
     facts = Facts(
         method="position based dynamics, by Gauss–Seidel or Jacobi sweeps over the constraints",
-        suits="cloth that only has to look like cloth",
+        suits="cloth that only has to look plausible",
         weakness="its stiffness depends on the number of iterations and on the step",
         benchmarks=(
             Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),
@@ -97,7 +98,7 @@ class PBD(Step):
         return self.sweep == "coloured"
 
     def bind(self, model: Model) -> Stepper:
-        """The solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
             ValueError: If a term has no projection, scalar constraint or ``prox``.

@@ -33,31 +33,31 @@ ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")
 class ProjectiveDynamics(ImplicitStep):
     """Implicit Euler by alternating local and global steps, from x = x̃ (Liu et al. 2013, Bouaziz et al. 2014).
 
-    For energies ½kA‖y − p(y)‖², y = Gx: with the projections p of all elements fixed, the objective of implicit Euler is least
-    where S x = (M/h²) x̃ + Σ k A Gᵀp, with the matrix S = M/h² + Σ k A GᵀG. It is the same for all three coordinates and all
-    steps, and is factorised once. As ∂u/∂y = y − p(y), one iteration is d ← d − S⁻¹∇φ(d) with d = x − x̃, so that later
+    For energies ½kA‖y − p(y)‖², y = Gx: with the projections p of all elements fixed, the objective of implicit Euler has its
+    minimum at S x = (M/h²) x̃ + Σ k A Gᵀp, with the matrix S = M/h² + Σ k A GᵀG. S is the same for all three coordinates and
+    all steps, and is factorised once. As ∂u/∂y = y − p(y), one iteration is d ← d − S⁻¹∇φ(d) with d = x − x̃, so that later
     iterations correct the rounding of a solve. The objective φ never rises, and the fixed point is the x(t+h) of
     :class:`warpcloth.Newton`.
 
     Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
     error perpendicular to it shrinks by the factor k(L/l)/(m/h² + k) in each iteration; the error along it is gone after one.
-    Hence the accelerations. If the accelerated iterate has a larger φ than the plain one from the same point, the plain one is
-    taken. Chebyshev needs a bound of that factor and takes 1 − min m/(h²D), D the row sums of |S|.
+    The accelerations make up for this. If the accelerated iterate has a larger φ than the plain one from the same point, the
+    plain one is taken. Chebyshev needs a bound of that factor and takes 1 − min m/(h²D), D the row sums of |S|.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
-        iterations: The most iterations in a step.
+        iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of the residual, as for :class:`warpcloth.Newton`: the largest unbalanced acceleration of any
             vertex, divided by gravity (or without gravity by the largest at x̃).
         acceleration: ``"none"``; ``"chebyshev"`` (Wang 2015); ``"anderson"`` (Peng et al. 2018), in the norm of the matrix;
             ``"l-bfgs"`` (Liu et al. 2017), with the matrix as first Hessian.
         window: Number of iterations that Anderson and L-BFGS use.
         linear: ``"factorised"``, or ``"jacobi"``, which replaces the matrix by the diagonal of its row sums Dᵢ = Σⱼ|Sᵢⱼ| (Wang
-            2015 for Chebyshev). As D ≥ S, φ still falls, only more slowly. An iteration then carries information to
+            2015 for Chebyshev). Because D ≥ S, φ still falls, but more slowly. An iteration then carries information to
             neighbouring vertices only, and linear momentum is not conserved before convergence.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -100,7 +100,7 @@ class ProjectiveDynamics(ImplicitStep):
         whole("window", self.window, 1)
 
     def bind(self, model: Model) -> Stepper:
-        """The solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
             ValueError: If a term has infinite stiffness, or an energy that is not a squared distance to a set.

@@ -226,7 +226,7 @@ class Stepper:
         the model, and is read in place.
 
         Raises:
-            ValueError: If an argument breaks a rule, or positions or velocities are given with ``integrator="bdf2"``.
+            ValueError: If an argument is not allowed, or positions or velocities are given with ``integrator="bdf2"``.
         """
         if self._reset is None:
             self._reset = Reset(self)

@@ -94,7 +94,7 @@ class Step:
         return False
 
     def bind(self, model: Model) -> Stepper:
-        """Returns the solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
             ValueError: If a term lacks what the solver needs.
@@ -184,23 +184,23 @@ class Step:
 
 @dataclass(frozen=True)
 class ImplicitStep(Step):
-    """The step of a solver that minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x), where ``integrator`` says what hₑ and x̃ are.
+    """The step of a solver that minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x); ``integrator`` determines hₑ and x̃.
 
     On x″ = −ω²x implicit Euler, of first order, multiplies the energy by 1/(1 + ω²h²) in each step. Midpoint, of second order,
     conserves the energy, and does not damp the noise of stiff springs. BDF2, of second order, multiplies the energy by about
     1 − ω⁴h⁴/2 if ωh is small, and damps stiff modes almost at once. All three are stable for every h if the motion is linear
     and steps converge; in free fall, midpoint and BDF2 are exact. Midpoint needs enough iterations, and steps that resolve
     rotations: with 4 substeps a frame ``hanging`` diverges with projective dynamics and ADMM, and on finer meshes with XPBD.
-    With midpoint the sweeps of XPBD alternate in direction, because in one fixed order they diverged at every step tried. When
-    BDF2 is bound it takes two steps of Euler to find its past state; the scene may start out of balance, and damping may be as
-    large as one likes.
+        With midpoint the sweeps of XPBD alternate in direction, because in one fixed order they diverged at every step tried.
+        When a solver with BDF2 is bound, it takes two steps of Euler to find the past state; the scene may start far from
+        equilibrium, and with any damping.
 
     Attributes:
         dt, substeps: See :class:`Step`.
         integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, see :mod:`warpcloth.numerics.integrators`.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
     """
 
     integrator: Literal["euler", "midpoint", "bdf2"] = "euler"

@@ -35,13 +35,13 @@ class XPBD(ImplicitStep):
     implicit Euler by the change of ∇C within the step. Terms that have only one of the two forms use that one: dihedral bending
     the scalar form, quadratic bending and attachments the vector form.
 
-    One hanging mass stretches by mg/k at rest for any iterations and step. With few iterations cloth is too soft, and finer
-    cloth is softer; more substeps help better than more iterations (Macklin et al. 2019, *Small steps*): ``hanging`` with
-    32² vertices stretches by 26 % with 4 × 20 a frame and by 5 % with 80 × 1. Infinite stiffness is α̃ = 0: constraints are met,
-    but not at the positions nearest to x̃, because λ keeps parts of earlier directions.
+    One hanging mass stretches by mg/k at rest, with any number of iterations and any step. With few iterations cloth is too
+    soft, and finer cloth is softer; more substeps help more than more iterations (Macklin et al. 2019, *Small steps*):
+    ``hanging`` with 32² vertices stretches by 26 % with 4 × 20 a frame and by 5 % with 80 × 1. Infinite stiffness is α̃ = 0:
+    constraints are met, but not at the positions nearest to x̃, because λ keeps parts of earlier directions.
 
-    With midpoint, Gauss–Seidel sweeps alternate between forward and backward. Always in one order, their one-sided error feeds
-    energy into the motion: ``hanging`` with 32² vertices then diverges in most settings. Alternating sweeps converge more
+    With midpoint, Gauss–Seidel sweeps alternate between forward and backward. In one fixed order, their one-sided error would
+    add energy to the motion: ``hanging`` with 32² vertices would diverge in most settings. Alternating sweeps converge more
     slowly, so the integrators that damp keep one order.
 
     ``residual`` says how far from implicit Euler a step ended: the largest unbalanced acceleration ‖∇ᵢ‖/mᵢ relative to gravity
@@ -51,14 +51,14 @@ class XPBD(ImplicitStep):
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
         iterations: Sweeps a step; with midpoint an even number.
-        sweep: Gauss–Seidel ``"coloured"``, or ``"sequential"``: elements in the order of the scene, by one thread, on a GPU for
-            small scenes only; or Jacobi ``"constraint-averaged"``: each Δλ divided by the largest number of constraints at any
-            of its vertices, which takes some thirty times as many sweeps on ``hanging``.
+        sweep: Gauss–Seidel ``"coloured"``; Gauss–Seidel ``"sequential"``, which takes elements in the order of the scene, by
+            one thread, and on a GPU suits small scenes only; or Jacobi ``"constraint-averaged"``, which divides each Δλ by the
+            largest number of constraints at any of its vertices and takes about thirty times as many sweeps on ``hanging``.
         form: ``"vector"`` or ``"scalar"``.
-        relaxation: ω > 0, a factor of every Δλ.
+        relaxation: ω > 0, a factor on every Δλ.
 
     Raises:
-        ValueError: If an option breaks a rule.
+        ValueError: If an option is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -120,7 +120,7 @@ class XPBD(ImplicitStep):
         return self.sweep == "coloured"
 
     def bind(self, model: Model) -> Stepper:
-        """The solver on ``model``, all scratch allocated.
+        """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
             ValueError: If a term has no projection, scalar constraint or ``prox``, or infinite stiffness with an integrator

@@ -18,7 +18,7 @@ class CorotatedMembrane(Membrane):
     has a projection.
 
     Attributes:
-        stiffness: k = Et = 2μ [N/m], Young's modulus times thickness: for a strip that is pulled, force per width and strain.
+        stiffness: k = Et = 2μ [N/m], Young's modulus times thickness: the force per width and strain of a strip that is pulled.
             One or (T,); ``math.inf`` for solvers that take hard constraints.
         damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
         name: To tell two terms of one kind apart.

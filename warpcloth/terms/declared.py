@@ -98,7 +98,7 @@ class Declared:
             selections, indices and arrays are relative to that part.
 
     Raises:
-        ValueError: If a value breaks a rule. The lengths of arrays are checked when the scene is built.
+        ValueError: If a value is not allowed. The lengths of arrays are checked when the scene is built.
     """
 
     term: ClassVar[Term]

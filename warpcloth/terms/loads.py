@@ -24,7 +24,7 @@ class Load:
         name: To tell two loads of one kind apart.
 
     Raises:
-        ValueError: If a value breaks a rule; a scene checks vertices and the lengths of arrays.
+        ValueError: If a value is not allowed; a scene checks vertices and the lengths of arrays.
     """
 
     quantity: ClassVar[str]
@@ -114,7 +114,8 @@ class Force(Load):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Traction(Load):
-    """Tractions on the edges between vertices, which keep their direction; half of t L acts at each end, L the rest length.
+    """Tractions on the edges between vertices, which keep their direction. Half of t L acts at each end of an edge of rest
+    length L.
 
     Attributes:
         vertices: An edge of the mesh is pulled if both of its ends are among these.
@@ -134,11 +135,12 @@ class Traction(Load):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pressure(Load):
-    """Pressure on triangles, along their normals as they turn: p A n/3 at each corner, A and n those of the moving triangle.
+    """Pressure on triangles, along their normals: a force p A n/3 on each corner, with area A and normal n of the moving
+    triangle.
 
-    The normal is that of the corners in their order, right-handed. Pressure on cloth with free edges has no energy, so steps
-    take its force where they begin: explicit steps at x, implicit ones of Euler at x too, of midpoint at x + ½h v, and of BDF2
-    at 2xₙ − xₙ₋₁, which keeps the order of each of them.
+    The corners turn counter-clockwise about the normal. On cloth with free edges, pressure does not derive from an energy, so
+    its force is computed before a step: at x for explicit steps and implicit Euler, at x + ½h v for midpoint, and at 2xₙ − xₙ₋₁
+    for BDF2. Each integrator keeps its order.
 
     Attributes:
         vertices: A triangle is pressed if all of its corners are among these.

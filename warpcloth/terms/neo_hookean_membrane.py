@@ -15,8 +15,8 @@ class NeoHookeanMembrane(IsotropicMembrane):
     F (3×2) is the deformation gradient, J = ‖f₁×f₂‖, and A the rest area of a triangle. It recovers from any deformation.
 
     Attributes:
-        stiffness: k = Et [N/m], Young's modulus times thickness: for a strip that is pulled a little, force per width and
-            strain. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
+        stiffness: k = Et [N/m], Young's modulus times thickness: the force per width and strain of a strip that is pulled a
+            little. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
         name: To tell two terms of one kind apart.

@@ -24,13 +24,13 @@ class RigidCluster(Declared):
 
     Bodies that share a vertex are joined there. A vertex of several bodies has its whole mass in each of them. In the fit, a
     pinned vertex weighs a thousand times as much as all others of its body, so that the body turns about it. A body whose
-    vertices lie on a line has no orientation about that line. Newton's method takes κM for the Hessian, which also resists
-    rigid motion: steps with κh² near 1 or above take more iterations, and ``equilibrium`` of bodies that move far may use up
-    its iterations.
+    vertices lie on a line has no orientation about that line. Newton's method uses κM as the Hessian, which also resists rigid
+    motion: steps with κh² near 1 or above take more iterations, and ``equilibrium`` may use up its iterations if bodies move
+    far.
 
     Attributes:
-        vertices: Indices of the bodies, one after the other, (E,); or a list of an array for each body; or a selection such as
-            ``"x < 0.1"`` for one body, or a list of them.
+        vertices: Vertex indices of the bodies, one body after the other, (E,); or a list with one array per body; or a
+            selection such as ``"x < 0.1"`` for one body, or a list of selections.
         sizes: Numbers of vertices of the bodies, (C,), if ``vertices`` is one array of several bodies.
         stiffness: κ [1/s²], one or (C,): the square of the frequency at which a vertex swings about its position in the body;
             infinite for solvers that take hard constraints.

@@ -17,12 +17,12 @@ class Spring(Damped):
     """Springs between vertex pairs, U = Σ ½k(l − L)² (Provot 1995).
 
     Attributes:
-        pairs: Pairs of vertices (E, 2), or a kind, or a tuple of kinds, in which each pair is one spring. Kinds are ``"edges"``
-            of the mesh, and on a grid ``"structural"`` (along rows and columns), ``"shear"`` (both diagonals of each cell) and
-            ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge). Arrays of the other fields have one
-            value per pair, in this order: given pairs keep theirs; ``"edges"`` (and ``"structural"`` without a grid) have that
-            of ``mesh.edges``, which for an edge mesh is the order in which its edges were given; all other kinds, and several
-            kinds together, are in lexicographic order, the smaller index first.
+        pairs: Pairs of vertices (E, 2), a kind, or a tuple of kinds; a pair of several kinds is one spring. Kinds are
+            ``"edges"`` of the mesh, and on a grid ``"structural"`` (along rows and columns), ``"shear"`` (both diagonals of
+            each cell) and ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge). Arrays of the other
+            fields have one value per pair. Given pairs keep their order. ``"edges"`` (and ``"structural"`` without a grid) have
+            the order of ``mesh.edges``, which for an edge mesh is the order in which its edges were given. All other kinds, and
+            several kinds together, are in lexicographic order, the smaller index first.
         stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
         rest_lengths: L [m], one or (E,); by default the lengths in the rest shape.
         damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.

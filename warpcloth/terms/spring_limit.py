@@ -15,11 +15,11 @@ from .spring import pairs_on
 
 @dataclass(frozen=True, kw_only=True)
 class SpringLimit(Limit):
-    """Limits on the distance l of vertex pairs, U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L] (Provot 1995).
+    """Limits on the distance l between two vertices, U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L] (Provot 1995).
 
     Attributes:
         least, most: σ_min, σ_max, ratios to the rest length L, each one or (E,); at least one of the two is required.
-        pairs: Which vertices, and in which order, as in :class:`warpcloth.Spring`.
+        pairs: Pairs of vertices, and their order, as in :class:`warpcloth.Spring`.
         stiffness: k [N/m], one or (E,): a pair beyond its limit is a spring of this stiffness. Infinite for solvers that take
             hard constraints, such as PBD; finite for solvers that need forces.
         name: To tell two terms of one kind apart.
