@@ -228,9 +228,26 @@ def add_collider_work(dtype):
     ∇U is that of contact and friction, ∇H that of friction alone; δ is the move of the collider's material at the vertex. Both
     are those where the step takes its forces, ``now``. With ``before`` the mean is taken of the products there and where the
     step began, as the trapezoidal rule has it; ∇U and ∇H are then kept for the next step.
+
+    Contact acts within the ``distance``. A step in which the two come nearer or part by more has them in contact for a part of
+    it only, in which they share a move: the work of contact is then that of the part of Δx which δ has too.
     """
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
+
+    @wp.func
+    def work_on(pulls: collider_pulls(dtype), i: int, moved: vec3, distance: dtype):
+        """∇U·δ."""
+        contact = pulls.all[i]
+        rubbed = wp.float64(0.0)
+        if pulls.friction.shape[0] > 0:
+            contact = contact - pulls.friction[i]
+            rubbed = product(pulls.friction[i], pulls.move[i])
+        work = product(contact, pulls.move[i])
+        shared = product(contact, moved)
+        if wp.abs(work - shared) > wp.float64(wp.length(contact) * distance):
+            work = wp.clamp(shared, wp.min(work, wp.float64(0.0)), wp.max(work, wp.float64(0.0)))
+        return work + rubbed
 
     @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
     def add(
@@ -238,22 +255,24 @@ def add_collider_work(dtype):
         x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         now: collider_pulls(dtype),
+        # parameters
+        distance: dtype,
         # in and out
         before: collider_pulls(dtype),
         of_collider: wp.array(dtype=wp.float64),
         against_friction: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
-        slip = x[i] - x_before[i]
-        work = product(now.all[i], now.move[i])
+        moved = x[i] - x_before[i]
+        work = work_on(now, i, moved, distance)
         rubbed = wp.float64(0.0)
         if now.friction.shape[0] > 0:
-            rubbed = product(now.friction[i], slip - now.move[i])
+            rubbed = product(now.friction[i], moved - now.move[i])
         if before.all.shape[0] > 0:
-            work = wp.float64(0.5) * (work + product(before.all[i], before.move[i]))
+            work = wp.float64(0.5) * (work + work_on(before, i, moved, distance))
             before.all[i] = now.all[i]
             if now.friction.shape[0] > 0:
-                rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], slip - before.move[i]))
+                rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], moved - before.move[i]))
                 before.friction[i] = now.friction[i]
         of_collider[i] = of_collider[i] - work
         against_friction[i] = against_friction[i] + rubbed

@@ -134,6 +134,24 @@ def test_work_of_colliders_is_the_change_of_energy_to_the_order_of_the_scheme(sc
     assert run.cut == 0.0
 
 
+@pytest.mark.parametrize("name", ["newton", "xpbd"])
+def test_a_collider_that_jumps_does_the_work_that_the_cloth_gets(name, device):
+    """Of 5.1 m in a step it pushes for the last 0.1 m: by m v/h, 0 at first, it does ½ m v² to r over this way."""
+    start = np.array([[0.0, -5.0, 0.0], [0.0, -5.0, 0.0], [0.0, 0.1, 0.0]])
+    scene = wc.Scene(
+        wc.Mesh.chain(2),
+        masses=[1.0, 2.0],
+        positions=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
+        gravity=(0.0, 0.0, 0.0),
+        colliders=[wc.Plane(position=start)],
+        contact=wc.Contact(distance=R, stiffness=1e9),
+    )
+    solver = replace(SOLVERS[name], substeps=1)
+    energies = wc.simulate(scene, solver, device=device, dtype="float64", frames=4, record="energies").energies
+    np.testing.assert_allclose(energies["work of colliders"][2:], energies["kinetic"][2:], rtol=R / 0.1)
+    assert energies["kinetic"][2] == pytest.approx(1.5 * (0.1 * scene.fps) ** 2, rel=2.0 * R / 0.1)
+
+
 def test_forces_of_an_implicit_step_balance_its_momentum(device):
     """Of pins and a ball together, where the ball takes no friction, which is of another N than that of the step."""
     scene = pushed(0.0)

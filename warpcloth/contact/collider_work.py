@@ -56,7 +56,8 @@ class ColliderWork:
             self._launch_moves(c, self._x_step, colliders.poses.at, int(2.0 * colliders.part), now.move)
             if self._at_end:
                 self._launch_moves(c, colliders.x_before, colliders.poses.before, 0, before.move)
-            model.launch(self._add, model.count, [colliders.x_before, self._x, now], [before, *self._sums])
+            given = [colliders.x_before, self._x, now, model.colliders.distance]
+            model.launch(self._add, model.count, given, [before, *self._sums])
 
     def _launch_moves(self, c, x, poses, when, out):
         """The moves of the material of collider c at positions x, half steps after the step began."""
