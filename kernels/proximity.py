@@ -1,0 +1,529 @@
+"""Factories of the kernels that find the pairs of a vertex and a triangle, and of two edges, that are near one another.
+
+Boxes about all triangles and edges of all copies, the *items*, triangles first, are sorted into the cells of a grid by their
+centres (count, scan, fill). A box no larger than a cell is in level 0, and the cells of each level are twice as large as those
+of the one before. So only the 27 cells about a centre, in the levels of its own box and of larger ones, can have boxes that
+meet it. Cells are hashed to buckets so that neighbours along x are neighbours there: 9 runs of entries instead of 27.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .mesh_colliders import geometry
+from .rotation import epsilon
+from .vectors import types
+
+LEVELS = wp.constant(30)  # of the grid; the last has one cell
+MOST = wp.constant(1 << 30)  # pairs that are counted
+FARTHEST = 1e9  # cells from the origin; all beyond are in the outermost
+MODULE = "warpcloth.proximity"
+
+
+@cache
+def surfaces(dtype):
+    """The struct of one copy of the cloths: n ``vertices``, its triangles and edges, and of each vertex the rest position [m] and
+    the number of its connected piece, −1 of a vertex of no element; the contact ``distance`` and the ``skin`` [m]."""
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Surface:
+        vertices: wp.int32
+        triangles: wp.array(dtype=wp.vec3i)
+        edges: wp.array(dtype=wp.vec2i)
+        rest: wp.array(dtype=vec3)
+        piece: wp.array(dtype=wp.int32)
+        distance: dtype
+        skin: dtype
+
+    return Surface
+
+
+@cache
+def grids(dtype):
+    """The struct of the grid: ``side`` of a cell of level 0 [m], in each of 2ᵏ buckets the entries from ``first`` on.
+
+    An entry is an item, its box and its cell (x, y, z, kind, copy and level in one). ``counts`` and ``keys`` are scratch.
+    ``levels`` has a bit for each level that there is of triangles, and one of edges.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Grid:
+        side: dtype
+        levels: wp.array(dtype=wp.int32)
+        counts: wp.array(dtype=wp.int32)
+        keys: wp.array(dtype=wp.int32)
+        first: wp.array(dtype=wp.int32)
+        items: wp.array(dtype=wp.int32)
+        lower: wp.array(dtype=vec3)
+        upper: wp.array(dtype=vec3)
+        cells: wp.array(dtype=wp.vec4i)
+
+    return Grid
+
+
+@cache
+def pair_lists(dtype):
+    """The struct of the pairs: ``counts`` (2,) that were found, and in no order (row, item) of those within the capacity.
+
+    Rows are vertices and then edges; row i has the items from ``first`` [i] on, sorted. ``row_counts`` and ``corner_counts``
+    are scratch, 0 where nothing runs.
+    """
+
+    @wp.struct
+    class PairList:
+        counts: wp.array(dtype=wp.int32)
+        found: wp.array(dtype=wp.vec2i)
+        row_counts: wp.array(dtype=wp.int32)
+        first: wp.array(dtype=wp.int32)
+        items: wp.array(dtype=wp.int32)
+        stencils: wp.array(dtype=wp.vec4i)
+        distances: wp.array(dtype=dtype)
+        corner_counts: wp.array(dtype=wp.int32)
+
+    return PairList
+
+
+@cache
+def closest_points(dtype, of_edges: bool):
+    """The device function (x₀, x₁, x₂, x₃) → (w, y): y = Σ wᵢ xᵢ is the shortest vector between two primitives.
+
+    From the nearest point of triangle x₁ x₂ x₃ to vertex x₀, or from that of the edge x₂ x₃ to that of the edge x₀ x₁.
+    """
+    vec3, mat33 = types(dtype)
+    vec4 = wp.types.vector(4, dtype)
+    _corners, from_triangle, _carry = geometry(dtype)
+    zero, one = dtype(0.0), dtype(1.0)
+
+    @wp.func
+    def on_segment(along: dtype, squared: dtype):
+        """The parameter of the nearest point of a segment, 0 of one without length."""
+        return wp.where(squared > zero, wp.clamp(along / squared, zero, one), zero)
+
+    @wp.func
+    def of_two_edges(a: vec3, b: vec3, c: vec3, d: vec3):
+        """Ericson 2004, *Real-time collision detection*, 5.1.9, and s once more, as parallel edges leave it to rounding."""
+        e = b - a
+        f = d - c
+        r = a - c
+        ee = wp.dot(e, e)
+        ff = wp.dot(f, f)
+        ef = wp.dot(e, f)
+        er = wp.dot(e, r)
+        fr = wp.dot(f, r)
+        det = ee * ff - ef * ef
+        s = zero
+        if det > zero:
+            s = wp.clamp((ef * fr - er * ff) / det, zero, one)
+        t = on_segment(ef * s + fr, ff)
+        s = on_segment(ef * t - er, ee)
+        return vec4(one - s, s, t - one, -t), r + s * e - t * f
+
+    @wp.func
+    def of_vertex(p: vec3, a: vec3, b: vec3, c: vec3):
+        d, away, w = from_triangle(p, mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]))
+        return vec4(one, -w[0], -w[1], -w[2]), d * away
+
+    return of_two_edges if of_edges else of_vertex
+
+
+@cache
+def boxes(dtype):
+    """Device functions of items and their boxes: ``corners_of``, ``box_of``, ``level_of``, ``cell_at``."""
+    vec3, _ = types(dtype)
+    half, farthest = dtype(0.5), dtype(FARTHEST)
+
+    @wp.func
+    def corners_of(surface: surfaces(dtype), item: int, triangles: int):
+        """The vertices of an item, of an edge the last twice, and its copy; there are so many triangles in all copies."""
+        if item < triangles:
+            copy = item // surface.triangles.shape[0]
+            v = surface.triangles[item - copy * surface.triangles.shape[0]]
+        else:
+            copy = (item - triangles) // surface.edges.shape[0]
+            e = surface.edges[item - triangles - copy * surface.edges.shape[0]]
+            v = wp.vec3i(e[0], e[1], e[1])
+        first = copy * surface.vertices
+        return wp.vec3i(first + v[0], first + v[1], first + v[2]), copy
+
+    @wp.func
+    def box_of(surface: surfaces(dtype), a: vec3, b: vec3, c: vec3):
+        """The box about three points that meets all boxes within the distance and the skin, with a margin for rounding."""
+        low = wp.min(wp.min(a, b), c)
+        high = wp.max(wp.max(a, b), c)
+        more = half * (surface.distance + surface.skin)
+        more += dtype(4.0) * epsilon(more) * wp.max(wp.max(wp.abs(low)), wp.max(wp.abs(high)))
+        edge = vec3(more, more, more)
+        return low - edge, high + edge
+
+    @wp.func
+    def level_of(side: dtype, low: vec3, high: vec3):
+        """The level of a box, or −1 of one that is not finite."""
+        size = wp.max(high - low)
+        level = wp.int32(-1)
+        if size < dtype(wp.inf):
+            level = wp.int32(0)
+            while level < LEVELS and size > side:
+                size *= half
+                level += 1
+        return level
+
+    @wp.func
+    def cell_at(side: dtype, low: vec3, high: vec3, level: int):
+        cell = wp.vec3i()
+        if level < LEVELS:
+            scale = half / (side * dtype(1 << level))
+            for i in range(3):
+                cell[i] = wp.int32(wp.floor(wp.clamp(scale * (low[i] + high[i]), -farthest, farthest)))
+        return cell
+
+    return corners_of, box_of, level_of, cell_at
+
+
+@wp.func
+def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
+    key = wp.uint32(x) + wp.uint32(y) * wp.uint32(73856093) + wp.uint32(z) * wp.uint32(19349663)
+    return wp.int32((key + wp.uint32(code) * wp.uint32(83492791)) & wp.uint32(buckets - 1))
+
+
+@cache
+def count_items(dtype):
+    """Kernel over items: how many each bucket has, the bucket of each or −1, and the levels that there are."""
+    vec3, _ = types(dtype)
+    corners_of, box_of, level_of, cell_at = boxes(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def count_each_item(
+        # elements
+        surface: surfaces(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        # parameters
+        triangles: int,
+        # in and out
+        grid: grids(dtype),
+    ):
+        item = wp.tid()
+        v, copy = corners_of(surface, item, triangles)
+        low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
+        level = level_of(grid.side, low, high)
+        key = wp.int32(-1)
+        if level >= 0:
+            kind = wp.where(item < triangles, 0, 1)
+            if (grid.levels[kind] & (1 << level)) == 0:
+                wp.atomic_or(grid.levels, kind, 1 << level)
+            cell = cell_at(grid.side, low, high, level)
+            key = bucket_of(cell[0], cell[1], cell[2], (2 * copy + kind) * 32 + level, grid.counts.shape[0])
+            wp.atomic_add(grid.counts, key, 1)
+        grid.keys[item] = key
+
+    return count_each_item
+
+
+@cache
+def fill_buckets(dtype):
+    """Kernel over items, in turns that leave ``counts`` 0: the entries of the buckets."""
+    vec3, _ = types(dtype)
+    corners_of, box_of, level_of, cell_at = boxes(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def fill_each_bucket(
+        # elements
+        surface: surfaces(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        # parameters
+        triangles: int,
+        # in and out
+        grid: grids(dtype),
+    ):
+        item = grid.keys.shape[0] - 1 - wp.tid()  # so that the CPU, which goes backwards in each bucket, leaves them sorted
+        key = grid.keys[item]
+        if key < 0:
+            return
+        v, copy = corners_of(surface, item, triangles)
+        low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
+        level = level_of(grid.side, low, high)
+        cell = cell_at(grid.side, low, high, level)
+        slot = grid.first[key] + wp.atomic_sub(grid.counts, key, 1) - 1
+        kind = wp.where(item < triangles, 0, 1)
+        grid.items[slot] = item
+        grid.lower[slot] = low
+        grid.upper[slot] = high
+        grid.cells[slot] = wp.vec4i(cell[0], cell[1], cell[2], (2 * copy + kind) * 32 + level)
+
+    return fill_each_bucket
+
+
+@cache
+def cutoffs(dtype, of_edges: bool):
+    """The device function (surface, stencil) → contact distance of a pair [m]: half its rest distance, if that is less and both are
+    of one piece."""
+    closest = closest_points(dtype, of_edges)
+
+    @wp.func
+    def cutoff(surface: surfaces(dtype), s: wp.vec4i):
+        n = surface.vertices
+        found = surface.distance
+        if surface.piece[s[0] % n] == surface.piece[s[3] % n]:
+            _w, y = closest(surface.rest[s[0] % n], surface.rest[s[1] % n], surface.rest[s[2] % n], surface.rest[s[3] % n])
+            found = wp.min(found, dtype(0.5) * wp.length(y))
+        return found
+
+    return cutoff
+
+
+@cache
+def stencils(dtype, of_edges: bool):
+    """The device function (surface, vertex or item, item, triangles) → the vertices of a pair."""
+    corners_of, _box_of, _level_of, _cell_at = boxes(dtype)
+
+    @wp.func
+    def stencil_of(surface: surfaces(dtype), i: int, item: int, triangles: int):
+        v, _copy = corners_of(surface, item, triangles)
+        s = wp.vec4i(i, v[0], v[1], v[2])
+        if wp.static(of_edges):
+            own, _same = corners_of(surface, i, triangles)
+            s = wp.vec4i(own[0], own[1], v[0], v[1])
+        return s
+
+    return stencil_of
+
+
+@cache
+def find_pairs(dtype, of_edges: bool):
+    """Kernel over vertices, or edges: the pairs with triangles, or with edges of higher index in the same level and any above."""
+    vec3, _ = types(dtype)
+    corners_of, box_of, level_of, cell_at = boxes(dtype)
+    closest, cutoff, stencil_of = closest_points(dtype, of_edges), cutoffs(dtype, of_edges), stencils(dtype, of_edges)
+    KIND = wp.constant(int(of_edges))
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def find_each_pair(
+        # elements
+        surface: surfaces(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        grid: grids(dtype),
+        # parameters
+        triangles: int,
+        # out
+        pairs: pair_lists(dtype),
+    ):
+        i = wp.tid()  # a vertex, or an item
+        row = i
+        copy = i // surface.vertices
+        if wp.static(of_edges):
+            row += x.shape[0]
+            i += triangles
+            v, of_item = corners_of(surface, i, triangles)
+            copy = of_item
+            a = x[v[0]]
+            b = x[v[1]]
+        else:
+            if surface.piece[i - copy * surface.vertices] < 0:
+                return
+            a = x[i]
+            b = a
+        low, high = box_of(surface, a, b, b)
+        level = level_of(grid.side, low, high)
+        if level < 0 or pairs.counts[KIND] >= MOST:
+            return
+        lowest = level
+        buckets = grid.counts.shape[0]
+        radius = surface.distance + surface.skin
+        present = grid.levels[KIND] >> level
+        while present != 0:
+            if (present & 1) != 0:
+                code = (2 * copy + KIND) * 32 + level
+                cell = cell_at(grid.side, low, high, level)
+                for r in range(9):
+                    cy = cell[1] + r // 3 - 1
+                    cz = cell[2] + r % 3 - 1
+                    run = bucket_of(cell[0] - 1, cy, cz, code, buckets)
+                    begin = grid.first[run]
+                    end = grid.first[wp.min(run + 3, buckets)]
+                    # A run that passes the last bucket goes on at the first.
+                    for at in range(begin, end + grid.first[wp.max(run + 3 - buckets, 0)]):
+                        slot = wp.where(at < end, at, at - end)
+                        other = grid.items[slot]
+                        if wp.static(of_edges):
+                            if level == lowest and other <= i:
+                                continue
+                        l = grid.lower[slot]
+                        u = grid.upper[slot]
+                        if l[0] > high[0] or u[0] < low[0] or l[1] > high[1] or u[1] < low[1]:
+                            continue
+                        if l[2] > high[2] or u[2] < low[2]:
+                            continue
+                        at_cell = grid.cells[slot]
+                        if at_cell[1] != cy or at_cell[2] != cz or at_cell[3] != code:
+                            continue
+                        if wp.abs(at_cell[0] - cell[0]) > 1:
+                            continue
+                        s = stencil_of(surface, i, other, triangles)
+                        shared = s[0] == s[1] or s[0] == s[2] or s[0] == s[3]
+                        if wp.static(of_edges):
+                            shared = s[0] == s[2] or s[0] == s[3] or s[1] == s[2] or s[1] == s[3]
+                        if shared:
+                            continue
+                        _w, y = closest(x[s[0]], x[s[1]], x[s[2]], x[s[3]])
+                        d = wp.length(y)
+                        if d < radius:
+                            if d < surface.skin + cutoff(surface, s):
+                                slot = wp.atomic_add(pairs.counts, KIND, 1)
+                                if wp.static(of_edges):
+                                    slot += pairs.counts[0]
+                                if slot < pairs.found.shape[0]:
+                                    wp.atomic_add(pairs.row_counts, row, 1)
+                                    pairs.found[slot] = wp.vec2i(row, other)
+            present = present >> 1
+            level += 1
+
+    return find_each_pair
+
+
+@wp.func
+def sort(values: wp.array(dtype=wp.int32), first: int, end: int):
+    """Sorts a range (Shell 1959); one that is sorted already costs a comparison an entry and gap."""
+    gap = wp.int32(1)
+    while 3 * gap + 1 < end - first:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for k in range(first + gap, end):
+            value = values[k]
+            at = k
+            while at >= first + gap and values[at - gap] > value:
+                values[at] = values[at - gap]
+                at -= gap
+            values[at] = value
+        gap = gap // 3
+
+
+@wp.func
+def kept(counts: wp.array(dtype=wp.int32), capacity: int):
+    """How many pairs there are within the capacity."""
+    return wp.min(wp.min(counts[0], capacity) + counts[1], capacity)
+
+
+@cache
+def fill_rows(dtype):
+    """Kernel over the capacity, in turns that leave ``row_counts`` 0: the items of each row."""
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def fill_each_row(
+        # in and out
+        pairs: pair_lists(dtype),
+    ):
+        capacity = pairs.found.shape[0]
+        k = capacity - 1 - wp.tid()
+        if k < kept(pairs.counts, capacity):
+            row = pairs.found[k][0]
+            slot = pairs.first[row] + wp.atomic_sub(pairs.row_counts, row, 1) - 1
+            pairs.items[slot] = pairs.found[k][1]
+
+    return fill_each_row
+
+
+@cache
+def write_pairs(dtype):
+    """Kernel over rows: their pairs in order, with the contact distance of each, and the number of corners of each vertex."""
+    of_vertex, of_edges = (stencils(dtype, each) for each in (False, True))
+    vertex_cutoff, edge_cutoff = (cutoffs(dtype, each) for each in (False, True))
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def write_each_pair(
+        # elements
+        surface: surfaces(dtype),
+        # parameters
+        vertices: int,
+        triangles: int,
+        # out
+        pairs: pair_lists(dtype),
+    ):
+        row = wp.tid()
+        first = pairs.first[row]
+        end = pairs.first[row + 1]
+        if first == end:
+            return
+        sort(pairs.items, first, end)
+        for k in range(first, end):
+            if row < vertices:
+                s = of_vertex(surface, row, pairs.items[k], triangles)
+                d = vertex_cutoff(surface, s)
+            else:
+                s = of_edges(surface, row - vertices + triangles, pairs.items[k], triangles)
+                d = edge_cutoff(surface, s)
+            pairs.stencils[k] = s
+            pairs.distances[k] = d
+            for corner in range(4):
+                wp.atomic_add(pairs.corner_counts, s[corner], 1)
+
+    return write_each_pair
+
+
+@cache
+def fill_corners(dtype):
+    """Kernel over the capacity, in turns that leave ``corner_counts`` 0: the corners of pairs at each vertex, 4·pair + corner."""
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def fill_each_corner(
+        # in and out
+        pairs: pair_lists(dtype),
+        # state in
+        first: wp.array(dtype=wp.int32),
+        # out
+        corners: wp.array(dtype=wp.int32),
+    ):
+        capacity = pairs.found.shape[0]
+        k = capacity - 1 - wp.tid()
+        if k < kept(pairs.counts, capacity):
+            for corner in range(4):
+                v = pairs.stencils[k][corner]
+                corners[first[v] + wp.atomic_sub(pairs.corner_counts, v, 1) - 1] = 4 * k + corner
+
+    return fill_each_corner
+
+
+@cache
+def sort_corners():
+    """Kernel over vertices: the corners of each in order."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def sort_each(
+        # elements
+        first: wp.array(dtype=wp.int32),
+        # in and out
+        corners: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        sort(corners, first[i], first[i + 1])
+
+    return sort_each
+
+
+@cache
+def find_motion(dtype):
+    """Kernel over vertices: moved = 1 if one has left, by more than half the skin, its position in ``found`` and the motion of the
+    vertex ``centre`` of its copy since then."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def find_each_motion(
+        # state in
+        x: wp.array(dtype=vec3),
+        found: wp.array(dtype=vec3),
+        # parameters
+        vertices: int,
+        centre: int,
+        most: dtype,
+        # out
+        moved: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        c = i // vertices * vertices + centre
+        if not (wp.length((x[i] - found[i]) - (x[c] - found[c])) <= most):
+            moved[0] = 1
+
+    return find_each_motion

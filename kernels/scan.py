@@ -1,0 +1,73 @@
+"""Kernels of sums from the first element on: of chunks, of the chunks' sums, and within each chunk."""
+
+from functools import cache
+
+import warp as wp
+
+MODULE = "warpcloth.scan"
+
+
+@cache
+def sum_chunks():
+    """Kernel over chunks: the sum of each."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def sum_each(
+        # state in
+        values: wp.array(dtype=wp.int32),
+        # parameters
+        size: int,
+        # out
+        sums: wp.array(dtype=wp.int32),
+    ):
+        c = wp.tid()
+        total = wp.int32(0)
+        for i in range(c * size, wp.min((c + 1) * size, values.shape[0])):
+            total += values[i]
+        sums[c] = total
+
+    return sum_each
+
+
+@cache
+def add_chunks():
+    """Kernel of one thread: the sum before each chunk in place of its own."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def add_all(
+        # in and out
+        sums: wp.array(dtype=wp.int32),
+    ):
+        total = wp.int32(0)
+        for c in range(sums.shape[0]):
+            value = sums[c]
+            sums[c] = total
+            total += value
+
+    return add_all
+
+
+@cache
+def write_sums():
+    """Kernel over chunks: out (n+1,) = the sum of the values before each, and of all."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def write_each(
+        # state in
+        values: wp.array(dtype=wp.int32),
+        sums: wp.array(dtype=wp.int32),
+        # parameters
+        size: int,
+        # out
+        out: wp.array(dtype=wp.int32),
+    ):
+        c = wp.tid()
+        total = sums[c]
+        n = values.shape[0]
+        for i in range(c * size, wp.min((c + 1) * size, n)):
+            out[i] = total
+            total += values[i]
+            if i == n - 1:
+                out[n] = total
+
+    return write_each
