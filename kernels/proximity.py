@@ -299,7 +299,8 @@ def find_pairs(dtype, of_edges: bool):
     closest, cutoff, stencil_of = closest_points(dtype, of_edges), cutoffs(dtype, of_edges), stencils(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    # A module of its own: a graph of the CPU finds kernels of one module by their names, which both kinds share.
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}.{KIND}", enable_backward=False)
     def find_each_pair(
         # elements
         surface: surfaces(dtype),
