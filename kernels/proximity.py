@@ -1,15 +1,16 @@
 """Factories of the kernels that find the pairs of a vertex and a triangle, and of two edges, that are near one another.
 
 Boxes about all triangles and edges of all copies, the *items*, triangles first, are sorted into the cells of a grid by their
-centres (count, scan, fill). A box no larger than a cell is in level 0, and the cells of each level are twice as large as those
-of the one before. So only the 27 cells about a centre, in the levels of its own box and of larger ones, can have boxes that
-meet it. Cells are hashed to buckets so that neighbours along x are neighbours there: 9 runs of entries instead of 27.
+centres (count, scan, fill). Level l has boxes whose halves are no larger than ``size``·2ˡ, so a box can only meet those whose
+centres are so far off its own sides at most, in its level and above. Cells are hashed to buckets such that a row along x is a
+run of buckets; therefore they are a quarter as long as wide (measured on waves: 0.75 of the time of cubes).
 """
 
 from functools import cache
 
 import warp as wp
 
+from .memory import load
 from .mesh_colliders import geometry
 from .rotation import epsilon
 from .vectors import types
@@ -22,43 +23,46 @@ MODULE = "warpcloth.proximity"
 
 @cache
 def surfaces(dtype):
-    """The struct of one copy of the cloths: n ``vertices``, its triangles and edges, and of each vertex the rest position [m] and
-    the number of its connected piece, −1 of a vertex of no element; the contact ``distance`` and the ``skin`` [m]."""
+    """The struct of the cloths: the vertices of each item, of an edge the last twice, with 2·copy + kind.
+
+    A copy has n ``vertices``; ``rest`` is the rest position of each [m] and ``piece`` its connected piece, −1 of a vertex of no
+    element. The contact ``distance``, the ``skin``, and how ``far`` apart at rest two elements of a pair are surely twice the
+    distance apart, in m.
+    """
     vec3, _ = types(dtype)
 
     @wp.struct
     class Surface:
+        items: wp.array(dtype=wp.vec4i)
         vertices: wp.int32
-        triangles: wp.array(dtype=wp.vec3i)
-        edges: wp.array(dtype=wp.vec2i)
         rest: wp.array(dtype=vec3)
         piece: wp.array(dtype=wp.int32)
         distance: dtype
         skin: dtype
+        far: dtype
 
     return Surface
 
 
 @cache
 def grids(dtype):
-    """The struct of the grid: ``side`` of a cell of level 0 [m], in each of 2ᵏ buckets the entries from ``first`` on.
+    """The struct of the grid: half the ``size`` of the largest boxes of level 0 [m], in 2ᵏ buckets the entries from ``first`` on.
 
-    An entry is an item, its box and its cell (x, y, z, kind, copy and level in one). ``counts`` and ``keys`` are scratch.
-    ``levels`` has a bit for each level that there is of triangles, and one of edges.
+    An entry is a box and (item, y, z, code), with y and z of the cell and kind, copy and level in one code. ``counts`` and
+    ``keys`` are scratch. ``levels`` has a bit for each level that there is of triangles, and one of edges.
     """
     vec3, _ = types(dtype)
 
     @wp.struct
     class Grid:
-        side: dtype
+        size: dtype
         levels: wp.array(dtype=wp.int32)
         counts: wp.array(dtype=wp.int32)
         keys: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
-        items: wp.array(dtype=wp.int32)
+        entries: wp.array(dtype=wp.vec4i)
         lower: wp.array(dtype=vec3)
         upper: wp.array(dtype=vec3)
-        cells: wp.array(dtype=wp.vec4i)
 
     return Grid
 
@@ -130,22 +134,9 @@ def closest_points(dtype, of_edges: bool):
 
 @cache
 def boxes(dtype):
-    """Device functions of items and their boxes: ``corners_of``, ``box_of``, ``level_of``, ``cell_at``."""
+    """Device functions of boxes: ``box_of``, ``level_of``, ``cell_at``, ``cells_about``."""
     vec3, _ = types(dtype)
     half, farthest = dtype(0.5), dtype(FARTHEST)
-
-    @wp.func
-    def corners_of(surface: surfaces(dtype), item: int, triangles: int):
-        """The vertices of an item, of an edge the last twice, and its copy; there are so many triangles in all copies."""
-        if item < triangles:
-            copy = item // surface.triangles.shape[0]
-            v = surface.triangles[item - copy * surface.triangles.shape[0]]
-        else:
-            copy = (item - triangles) // surface.edges.shape[0]
-            e = surface.edges[item - triangles - copy * surface.edges.shape[0]]
-            v = wp.vec3i(e[0], e[1], e[1])
-        first = copy * surface.vertices
-        return wp.vec3i(first + v[0], first + v[1], first + v[2]), copy
 
     @wp.func
     def box_of(surface: surfaces(dtype), a: vec3, b: vec3, c: vec3):
@@ -158,27 +149,46 @@ def boxes(dtype):
         return low - edge, high + edge
 
     @wp.func
-    def level_of(side: dtype, low: vec3, high: vec3):
+    def level_of(size: dtype, low: vec3, high: vec3):
         """The level of a box, or −1 of one that is not finite."""
-        size = wp.max(high - low)
+        own = half * wp.max(high - low)
         level = wp.int32(-1)
-        if size < dtype(wp.inf):
+        if own < dtype(wp.inf):
             level = wp.int32(0)
-            while level < LEVELS and size > side:
-                size *= half
+            while level < LEVELS and own > size:
+                own *= half
                 level += 1
         return level
 
     @wp.func
-    def cell_at(side: dtype, low: vec3, high: vec3, level: int):
+    def cell_of(size: dtype, p: vec3):
+        q = vec3(dtype(2.0) * p[0], half * p[1], half * p[2]) / size
         cell = wp.vec3i()
-        if level < LEVELS:
-            scale = half / (side * dtype(1 << level))
-            for i in range(3):
-                cell[i] = wp.int32(wp.floor(wp.clamp(scale * (low[i] + high[i]), -farthest, farthest)))
+        for i in range(3):
+            cell[i] = wp.int32(wp.floor(wp.clamp(q[i], -farthest, farthest)))
         return cell
 
-    return corners_of, box_of, level_of, cell_at
+    @wp.func
+    def cell_at(size: dtype, low: vec3, high: vec3, level: int):
+        """The cell of the centre of a box."""
+        found = wp.vec3i()
+        if level < LEVELS:
+            found = cell_of(size * dtype(1 << level), half * (low + high))
+        return found
+
+    @wp.func
+    def cells_about(size: dtype, low: vec3, high: vec3, level: int):
+        """The first and the last of the cells of a level that have the centres of boxes that meet a box."""
+        first = wp.vec3i()
+        last = wp.vec3i()
+        if level < LEVELS:
+            most = size * dtype(1 << level)
+            edge = vec3(most, most, most)
+            first = cell_of(most, low - edge)
+            last = cell_of(most, high + edge)
+        return first, last
+
+    return box_of, level_of, cell_at, cells_about
 
 
 @wp.func
@@ -191,7 +201,7 @@ def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
 def count_items(dtype):
     """Kernel over items: how many each bucket has, the bucket of each or −1, and the levels that there are."""
     vec3, _ = types(dtype)
-    corners_of, box_of, level_of, cell_at = boxes(dtype)
+    box_of, level_of, cell_at, _about = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def count_each_item(
@@ -199,22 +209,19 @@ def count_items(dtype):
         surface: surfaces(dtype),
         # state in
         x: wp.array(dtype=vec3),
-        # parameters
-        triangles: int,
         # in and out
         grid: grids(dtype),
     ):
         item = wp.tid()
-        v, copy = corners_of(surface, item, triangles)
+        v = surface.items[item]
         low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
-        level = level_of(grid.side, low, high)
+        level = level_of(grid.size, low, high)
         key = wp.int32(-1)
         if level >= 0:
-            kind = wp.where(item < triangles, 0, 1)
-            if (grid.levels[kind] & (1 << level)) == 0:
-                wp.atomic_or(grid.levels, kind, 1 << level)
-            cell = cell_at(grid.side, low, high, level)
-            key = bucket_of(cell[0], cell[1], cell[2], (2 * copy + kind) * 32 + level, grid.counts.shape[0])
+            if (grid.levels[v[3] & 1] & (1 << level)) == 0:
+                wp.atomic_or(grid.levels, v[3] & 1, 1 << level)
+            cell = cell_at(grid.size, low, high, level)
+            key = bucket_of(cell[0], cell[1], cell[2], v[3] * 32 + level, grid.counts.shape[0])
             wp.atomic_add(grid.counts, key, 1)
         grid.keys[item] = key
 
@@ -225,7 +232,7 @@ def count_items(dtype):
 def fill_buckets(dtype):
     """Kernel over items, in turns that leave ``counts`` 0: the entries of the buckets."""
     vec3, _ = types(dtype)
-    corners_of, box_of, level_of, cell_at = boxes(dtype)
+    box_of, level_of, cell_at, _about = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def fill_each_bucket(
@@ -233,70 +240,57 @@ def fill_buckets(dtype):
         surface: surfaces(dtype),
         # state in
         x: wp.array(dtype=vec3),
-        # parameters
-        triangles: int,
         # in and out
         grid: grids(dtype),
     ):
-        item = grid.keys.shape[0] - 1 - wp.tid()  # so that the CPU, which goes backwards in each bucket, leaves them sorted
+        item = wp.tid()
         key = grid.keys[item]
         if key < 0:
             return
-        v, copy = corners_of(surface, item, triangles)
+        v = surface.items[item]
         low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
-        level = level_of(grid.side, low, high)
-        cell = cell_at(grid.side, low, high, level)
+        level = level_of(grid.size, low, high)
+        cell = cell_at(grid.size, low, high, level)
         slot = grid.first[key] + wp.atomic_sub(grid.counts, key, 1) - 1
-        kind = wp.where(item < triangles, 0, 1)
-        grid.items[slot] = item
+        grid.entries[slot] = wp.vec4i(item, cell[1], cell[2], v[3] * 32 + level)
         grid.lower[slot] = low
         grid.upper[slot] = high
-        grid.cells[slot] = wp.vec4i(cell[0], cell[1], cell[2], (2 * copy + kind) * 32 + level)
 
     return fill_each_bucket
 
 
 @cache
 def cutoffs(dtype, of_edges: bool):
-    """The device function (surface, stencil) → contact distance of a pair [m]: half its rest distance, if that is less and both are
-    of one piece."""
+    """The device function (surface, stencil, first vertex of the copy) → contact distance of a pair [m].
+
+    It is half the rest distance, if that is less and both are of one piece.
+    """
     closest = closest_points(dtype, of_edges)
 
     @wp.func
-    def cutoff(surface: surfaces(dtype), s: wp.vec4i):
-        n = surface.vertices
+    def cutoff(surface: surfaces(dtype), s: wp.vec4i, first: int):
         found = surface.distance
-        if surface.piece[s[0] % n] == surface.piece[s[3] % n]:
-            _w, y = closest(surface.rest[s[0] % n], surface.rest[s[1] % n], surface.rest[s[2] % n], surface.rest[s[3] % n])
-            found = wp.min(found, dtype(0.5) * wp.length(y))
+        a = s[0] - first
+        d = s[3] - first
+        if surface.piece[a] == surface.piece[d]:
+            if not (wp.length(surface.rest[a] - surface.rest[d]) > surface.far):
+                _w, y = closest(surface.rest[a], surface.rest[s[1] - first], surface.rest[s[2] - first], surface.rest[d])
+                found = wp.min(found, dtype(0.5) * wp.length(y))
         return found
 
     return cutoff
 
 
 @cache
-def stencils(dtype, of_edges: bool):
-    """The device function (surface, vertex or item, item, triangles) → the vertices of a pair."""
-    corners_of, _box_of, _level_of, _cell_at = boxes(dtype)
-
-    @wp.func
-    def stencil_of(surface: surfaces(dtype), i: int, item: int, triangles: int):
-        v, _copy = corners_of(surface, item, triangles)
-        s = wp.vec4i(i, v[0], v[1], v[2])
-        if wp.static(of_edges):
-            own, _same = corners_of(surface, i, triangles)
-            s = wp.vec4i(own[0], own[1], v[0], v[1])
-        return s
-
-    return stencil_of
-
-
-@cache
 def find_pairs(dtype, of_edges: bool):
-    """Kernel over vertices, or edges: the pairs with triangles, or with edges of higher index in the same level and any above."""
+    """Kernel over vertices, or edges: the pairs with triangles, or with edges, in the same level and any above.
+
+    Of two edges of one level that finds the other whose cell comes after along z, or whose index is higher.
+    """
     vec3, _ = types(dtype)
-    corners_of, box_of, level_of, cell_at = boxes(dtype)
-    closest, cutoff, stencil_of = closest_points(dtype, of_edges), cutoffs(dtype, of_edges), stencils(dtype, of_edges)
+    box_of, level_of, cell_at, cells_about = boxes(dtype)
+    number, corner = load(wp.int32), load(vec3)
+    closest, cutoff = closest_points(dtype, of_edges), cutoffs(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
     # A module of its own: a graph of the CPU finds kernels of one module by their names, which both kinds share.
@@ -312,73 +306,74 @@ def find_pairs(dtype, of_edges: bool):
         # out
         pairs: pair_lists(dtype),
     ):
-        i = wp.tid()  # a vertex, or an item
-        row = i
-        copy = i // surface.vertices
+        i = wp.tid()
         if wp.static(of_edges):
-            row += x.shape[0]
-            i += triangles
-            v, of_item = corners_of(surface, i, triangles)
-            copy = of_item
-            a = x[v[0]]
-            b = x[v[1]]
+            own = surface.items[triangles + i]
+            copy = own[3] >> 1
         else:
+            copy = i // surface.vertices
+            own = wp.vec4i(i, i, i, 0)
             if surface.piece[i - copy * surface.vertices] < 0:
                 return
-            a = x[i]
-            b = a
+        a = x[own[0]]
+        b = x[own[1]]
         low, high = box_of(surface, a, b, b)
-        level = level_of(grid.side, low, high)
+        level = level_of(grid.size, low, high)
         if level < 0 or pairs.counts[KIND] >= MOST:
             return
         lowest = level
+        layer = cell_at(grid.size, low, high, level)[2]
         buckets = grid.counts.shape[0]
         radius = surface.distance + surface.skin
         present = grid.levels[KIND] >> level
         while present != 0:
             if (present & 1) != 0:
                 code = (2 * copy + KIND) * 32 + level
-                cell = cell_at(grid.side, low, high, level)
-                for r in range(9):
-                    cy = cell[1] + r // 3 - 1
-                    cz = cell[2] + r % 3 - 1
-                    run = bucket_of(cell[0] - 1, cy, cz, code, buckets)
-                    begin = grid.first[run]
-                    end = grid.first[wp.min(run + 3, buckets)]
-                    # A run that passes the last bucket goes on at the first.
-                    for at in range(begin, end + grid.first[wp.max(run + 3 - buckets, 0)]):
-                        slot = wp.where(at < end, at, at - end)
-                        other = grid.items[slot]
-                        if wp.static(of_edges):
-                            if level == lowest and other <= i:
+                one, two = cells_about(grid.size, low, high, level)
+                if wp.static(of_edges):
+                    if level == lowest:
+                        one[2] = layer
+                width = two[0] - one[0] + 1
+                for cz in range(one[2], two[2] + 1):
+                    for cy in range(one[1], two[1] + 1):
+                        run = bucket_of(one[0], cy, cz, code, buckets)
+                        begin = number(grid.first, run)
+                        end = number(grid.first, wp.min(run + width, buckets))
+                        # A run that passes the last bucket goes on at the first.
+                        for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
+                            slot = wp.where(at < end, at, at - end)
+                            l = corner(grid.lower, slot)
+                            u = corner(grid.upper, slot)
+                            if l[0] > high[0] or u[0] < low[0] or l[1] > high[1] or u[1] < low[1] or l[2] > high[2] or u[2] < low[2]:
                                 continue
-                        l = grid.lower[slot]
-                        u = grid.upper[slot]
-                        if l[0] > high[0] or u[0] < low[0] or l[1] > high[1] or u[1] < low[1]:
-                            continue
-                        if l[2] > high[2] or u[2] < low[2]:
-                            continue
-                        at_cell = grid.cells[slot]
-                        if at_cell[1] != cy or at_cell[2] != cz or at_cell[3] != code:
-                            continue
-                        if wp.abs(at_cell[0] - cell[0]) > 1:
-                            continue
-                        s = stencil_of(surface, i, other, triangles)
-                        shared = s[0] == s[1] or s[0] == s[2] or s[0] == s[3]
-                        if wp.static(of_edges):
-                            shared = s[0] == s[2] or s[0] == s[3] or s[1] == s[2] or s[1] == s[3]
-                        if shared:
-                            continue
-                        _w, y = closest(x[s[0]], x[s[1]], x[s[2]], x[s[3]])
-                        d = wp.length(y)
-                        if d < radius:
-                            if d < surface.skin + cutoff(surface, s):
-                                slot = wp.atomic_add(pairs.counts, KIND, 1)
-                                if wp.static(of_edges):
-                                    slot += pairs.counts[0]
-                                if slot < pairs.found.shape[0]:
-                                    wp.atomic_add(pairs.row_counts, row, 1)
-                                    pairs.found[slot] = wp.vec2i(row, other)
+                            entry = grid.entries[slot]
+                            other = surface.items[entry[0]]
+                            if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
+                                continue
+                            s = wp.vec4i(own[0], own[1], other[0], other[1])
+                            k = entry[0] - triangles
+                            if wp.static(of_edges):
+                                if level == lowest and cz == layer and k <= i:
+                                    continue
+                            elif other[2] == own[0]:
+                                continue
+                            else:
+                                s = wp.vec4i(own[0], other[0], other[1], other[2])
+                            if entry[1] != cy or entry[2] != cz or entry[3] != code:
+                                continue
+                            _w, y = closest(x[s[0]], x[s[1]], x[s[2]], x[s[3]])
+                            d = wp.length(y)
+                            if d < radius:
+                                if d < surface.skin or d < surface.skin + cutoff(surface, s, copy * surface.vertices):
+                                    slot = wp.atomic_add(pairs.counts, KIND, 1)
+                                    row = i
+                                    if wp.static(of_edges):
+                                        slot += pairs.counts[0]
+                                        row = wp.min(i, k) + x.shape[0]
+                                        k = wp.max(i, k)
+                                    if slot < pairs.found.shape[0]:
+                                        wp.atomic_add(pairs.row_counts, row, 1)
+                                        pairs.found[slot] = wp.vec2i(row, k + triangles)
             present = present >> 1
             level += 1
 
@@ -387,10 +382,15 @@ def find_pairs(dtype, of_edges: bool):
 
 @wp.func
 def sort(values: wp.array(dtype=wp.int32), first: int, end: int):
-    """Sorts a range (Shell 1959); one that is sorted already costs a comparison an entry and gap."""
-    gap = wp.int32(1)
-    while 3 * gap + 1 < end - first:
-        gap = 3 * gap + 1
+    """Sorts a range (Shell 1959)."""
+    gap = wp.int32(0)
+    for k in range(first + 1, end):
+        if values[k - 1] > values[k]:
+            gap = 1
+            break
+    if gap > 0:
+        while 3 * gap + 1 < end - first:
+            gap = 3 * gap + 1
     while gap > 0:
         for k in range(first + gap, end):
             value = values[k]
@@ -430,7 +430,6 @@ def fill_rows(dtype):
 @cache
 def write_pairs(dtype):
     """Kernel over rows: their pairs in order, with the contact distance of each, and the number of corners of each vertex."""
-    of_vertex, of_edges = (stencils(dtype, each) for each in (False, True))
     vertex_cutoff, edge_cutoff = (cutoffs(dtype, each) for each in (False, True))
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -450,12 +449,15 @@ def write_pairs(dtype):
             return
         sort(pairs.items, first, end)
         for k in range(first, end):
+            v = surface.items[pairs.items[k]]
+            vertex = (v[3] >> 1) * surface.vertices
             if row < vertices:
-                s = of_vertex(surface, row, pairs.items[k], triangles)
-                d = vertex_cutoff(surface, s)
+                s = wp.vec4i(row, v[0], v[1], v[2])
+                d = vertex_cutoff(surface, s, vertex)
             else:
-                s = of_edges(surface, row - vertices + triangles, pairs.items[k], triangles)
-                d = edge_cutoff(surface, s)
+                own = surface.items[row - vertices + triangles]
+                s = wp.vec4i(own[0], own[1], v[0], v[1])
+                d = edge_cutoff(surface, s, vertex)
             pairs.stencils[k] = s
             pairs.distances[k] = d
             for corner in range(4):

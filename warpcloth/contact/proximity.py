@@ -41,17 +41,16 @@ class Proximity:
     def __init__(self, model, distance, skin):
         self.model, self.distance, self.skin = model, distance, skin
         mesh, n, device = model.scene.mesh, model.per_copy, model.device
-        triangles, edges = model.in_model(mesh.triangles), model.in_model(mesh.edges)
-        self._triangles, self._edges = len(triangles) * model.copies, len(edges) * model.copies
-        piece, points = self._pieces(edges)
+        self._triangles, self._edges = len(mesh.triangles) * model.copies, len(mesh.edges) * model.copies
+        piece, points = self._pieces(model.in_model(mesh.edges))
         self._kept = {  # whose memory the struct does not keep
-            "triangles": wp.array(triangles, dtype=wp.vec3i, device=device),
-            "edges": wp.array(edges, dtype=wp.vec2i, device=device),
+            "items": wp.array(self._items(), dtype=wp.vec4i, device=device),
             "rest": model.array(points, model.vec3),
             "piece": wp.array(piece, dtype=wp.int32, device=device),
         }
         self._surface = kernels.surfaces(model.dtype)()
-        for name, value in ({"vertices": n, "distance": distance, "skin": skin} | self._kept).items():
+        far = 2.0 * (distance + mesh.edge_lengths.max())
+        for name, value in ({"vertices": n, "distance": distance, "skin": skin, "far": far} | self._kept).items():
             setattr(self._surface, name, value)
         self._allocate_grid()
         self._centre = int(np.linalg.norm(model.rest_points - model.rest_points.mean(axis=0), axis=1).argmin())
@@ -72,6 +71,16 @@ class Proximity:
         self._mirror = Mirror(self.counts)
         self._allocate(max(1024, 4 * model.count))
 
+    def _items(self):
+        """The vertices of the triangles of all copies, and then of the edges, with 2·copy + kind, (items, 4) int32."""
+        model, mesh = self.model, self.model.scene.mesh
+        kinds = []
+        for kind, elements in enumerate((mesh.triangles, mesh.edges[:, [0, 1, 1]])):
+            copy = np.repeat(np.arange(model.copies), len(elements))
+            vertices = np.tile(model.in_model(elements), (model.copies, 1)) + copy[:, None] * model.per_copy
+            kinds.append(np.column_stack([vertices, 2 * copy + kind]))
+        return np.concatenate(kinds).astype(np.int32)
+
     def _pieces(self, edges):
         """The connected piece of each vertex, −1 of one of no element, and rest points about the middle of each piece."""
         n, points = self.model.per_copy, self.model.rest_points
@@ -83,14 +92,14 @@ class Proximity:
 
     def _allocate_grid(self):
         model, items = self.model, self._triangles + self._edges
-        side = 1.05 * model.scene.mesh.edge_lengths.max() + self.distance + self.skin
+        size = 0.5 * (1.05 * model.scene.mesh.edge_lengths.max() + self.distance + self.skin)
         buckets = 1 << max(4, (items - 1).bit_length())
-        count = {"levels": 2, "counts": buckets, "keys": items, "first": buckets + 1, "items": items}
+        count = {"levels": 2, "counts": buckets, "keys": items, "first": buckets + 1}
         self._grid_arrays = {k: wp.zeros(size, dtype=wp.int32, device=model.device) for k, size in count.items()}
-        for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("cells", wp.vec4i)):
+        for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("entries", wp.vec4i)):
             self._grid_arrays[name] = wp.zeros(items, dtype=kind, device=model.device)
         self._grid = kernels.grids(model.dtype)()
-        for name, value in ({"side": side} | self._grid_arrays).items():
+        for name, value in ({"size": size} | self._grid_arrays).items():
             setattr(self._grid, name, value)
         self._buckets = Scan(model, buckets)
 
@@ -126,9 +135,9 @@ class Proximity:
         wp.copy(self._found, x)
         self.counts.zero_()
         self._grid_arrays["levels"].zero_()
-        self._launch(kernels.count_items, items, [surface, x, self._triangles], [grid])
+        self._launch(kernels.count_items, items, [surface, x], [grid])
         self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
-        self._launch(kernels.fill_buckets, items, [surface, x, self._triangles], [grid])
+        self._launch(kernels.fill_buckets, items, [surface, x], [grid])
         for of_edges, count in ((False, N if self._triangles else 0), (True, self._edges)):
             if count:
                 self.model.launch(self._pairs_of[of_edges], count, [surface, x, grid, self._triangles], [pairs])
