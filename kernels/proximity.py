@@ -16,7 +16,7 @@ from .rotation import epsilon
 from .vectors import types
 
 LEVELS = wp.constant(30)  # of the grid; the last has one cell
-MOST = wp.constant(1 << 30)  # pairs that are counted
+MOST = wp.constant(1 << 29)  # pairs of a kind that are counted
 FARTHEST = 1e9  # cells from the origin; all beyond are in the outermost
 MODULE = "warpcloth.proximity"
 
@@ -46,10 +46,11 @@ def surfaces(dtype):
 
 @cache
 def grids(dtype):
-    """The struct of the grid: half the ``size`` of the largest boxes of level 0 [m], in 2ᵏ buckets the entries from ``first`` on.
+    """The struct of the grid: half the ``size`` of the largest boxes of level 0 [m], and 2ᵏ buckets of entries.
 
-    An entry is a box and (item, y, z, code), with y and z of the cell and kind, copy and level in one code. ``counts`` and
-    ``keys`` are scratch. ``levels`` has a bit for each level that there is of triangles, and one of edges.
+    Bucket b has the entries from first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell and
+    kind, copy and level in one code. ``counts`` and ``keys`` are scratch. ``levels`` has a bit for each level that there is of
+    triangles, and one of edges.
     """
     vec3, _ = types(dtype)
 
@@ -319,7 +320,7 @@ def find_pairs(dtype, of_edges: bool):
         b = x[own[1]]
         low, high = box_of(surface, a, b, b)
         level = level_of(grid.size, low, high)
-        if level < 0 or pairs.counts[KIND] >= MOST:
+        if level < 0:
             return
         lowest = level
         layer = cell_at(grid.size, low, high, level)[2]
@@ -344,7 +345,14 @@ def find_pairs(dtype, of_edges: bool):
                             slot = wp.where(at < end, at, at - end)
                             l = corner(grid.lower, slot)
                             u = corner(grid.upper, slot)
-                            if l[0] > high[0] or u[0] < low[0] or l[1] > high[1] or u[1] < low[1] or l[2] > high[2] or u[2] < low[2]:
+                            if (
+                                l[0] > high[0]
+                                or u[0] < low[0]
+                                or l[1] > high[1]
+                                or u[1] < low[1]
+                                or l[2] > high[2]
+                                or u[2] < low[2]
+                            ):
                                 continue
                             entry = grid.entries[slot]
                             other = surface.items[entry[0]]
@@ -365,6 +373,8 @@ def find_pairs(dtype, of_edges: bool):
                             d = wp.length(y)
                             if d < radius:
                                 if d < surface.skin or d < surface.skin + cutoff(surface, s, copy * surface.vertices):
+                                    if pairs.counts[KIND] >= MOST:
+                                        return
                                     slot = wp.atomic_add(pairs.counts, KIND, 1)
                                     row = i
                                     if wp.static(of_edges):
@@ -468,14 +478,14 @@ def write_pairs(dtype):
 
 @cache
 def fill_corners(dtype):
-    """Kernel over the capacity, in turns that leave ``corner_counts`` 0: the corners of pairs at each vertex, 4·pair + corner."""
+    """Kernel over the capacity, in turns that leave ``corner_counts`` 0: 4·pair + corner of the pairs at each vertex."""
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def fill_each_corner(
-        # in and out
-        pairs: pair_lists(dtype),
         # state in
         first: wp.array(dtype=wp.int32),
+        # in and out
+        pairs: pair_lists(dtype),
         # out
         corners: wp.array(dtype=wp.int32),
     ):
@@ -507,9 +517,71 @@ def sort_corners():
 
 
 @cache
+def pieces(dtype):
+    """The struct of the connected pieces of all copies: the piece of each vertex, or −1, and the vertex in the middle of each.
+
+    If a copy has more than one, ``per_copy``, each also has a box, and the largest motion of a vertex relative to that in its
+    middle [m].
+    """
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Pieces:
+        piece: wp.array(dtype=wp.int32)
+        centre: wp.array(dtype=wp.int32)
+        per_copy: wp.int32
+        lower: wp.array(dtype=vec3)
+        upper: wp.array(dtype=vec3)
+        motion: wp.array(dtype=dtype)
+
+    return Pieces
+
+
+@cache
+def begin_boxes(dtype):
+    """Kernel over pieces: the vertex in the middle is the box."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def begin_each_box(
+        # state in
+        x: wp.array(dtype=vec3),
+        # in and out
+        pieces: pieces(dtype),
+    ):
+        p = wp.tid()
+        pieces.lower[p] = x[pieces.centre[p]]
+        pieces.upper[p] = x[pieces.centre[p]]
+
+    return begin_each_box
+
+
+@cache
+def extend_boxes(dtype):
+    """Kernel over vertices: the boxes of their pieces have them."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def extend_each_box(
+        # state in
+        x: wp.array(dtype=vec3),
+        # in and out
+        pieces: pieces(dtype),
+    ):
+        i = wp.tid()
+        p = pieces.piece[i]
+        if p >= 0:
+            if wp.max(wp.max(pieces.lower[p] - x[i], x[i] - pieces.upper[p])) > dtype(0.0):  # few are
+                wp.atomic_min(pieces.lower, p, x[i])
+                wp.atomic_max(pieces.upper, p, x[i])
+
+    return extend_each_box
+
+
+@cache
 def find_motion(dtype):
-    """Kernel over vertices: moved = 1 if one has left, by more than half the skin, its position in ``found`` and the motion of the
-    vertex ``centre`` of its copy since then."""
+    """Kernel over vertices: moved = 1 if one has moved on from ``found``, relative to the middle of its piece, by more than
+    ``most``."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -518,15 +590,52 @@ def find_motion(dtype):
         x: wp.array(dtype=vec3),
         found: wp.array(dtype=vec3),
         # parameters
-        vertices: int,
-        centre: int,
         most: dtype,
+        # in and out
+        pieces: pieces(dtype),
         # out
         moved: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        c = i // vertices * vertices + centre
-        if not (wp.length((x[i] - found[i]) - (x[c] - found[c])) <= most):
-            moved[0] = 1
+        p = pieces.piece[i]
+        if p >= 0:
+            c = pieces.centre[p]
+            own = wp.length((x[i] - found[i]) - (x[c] - found[c]))
+            if not (own <= most):
+                moved[0] = 1
+            if pieces.per_copy > 1:
+                if own > pieces.motion[p]:
+                    wp.atomic_max(pieces.motion, p, own)
 
     return find_each_motion
+
+
+@cache
+def compare_motions(dtype):
+    """Kernel over pieces: moved = 1 if it and a later one of its copy may have come nearer by more than ``most``, and than what
+    their boxes were farther apart than ``radius``, the distance within which pairs are listed."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def compare_each_motion(
+        # state in
+        x: wp.array(dtype=vec3),
+        found: wp.array(dtype=vec3),
+        pieces: pieces(dtype),
+        # parameters
+        radius: dtype,
+        most: dtype,
+        # out
+        moved: wp.array(dtype=wp.int32),
+    ):
+        p = wp.tid()
+        c = pieces.centre[p]
+        for q in range(p + 1, (p // pieces.per_copy + 1) * pieces.per_copy):
+            a = pieces.centre[q]
+            nearer = wp.length((x[a] - found[a]) - (x[c] - found[c])) + pieces.motion[p] + pieces.motion[q]
+            gap = wp.max(pieces.lower[p] - pieces.upper[q], pieces.lower[q] - pieces.upper[p])
+            gap = wp.max(gap, vec3())
+            if not (nearer <= most + wp.max(wp.length(gap) - radius, dtype(0.0))):
+                moved[0] = 1
+
+    return compare_each_motion

@@ -46,7 +46,7 @@ def between_edges(a, b, c, d):
 def all_pairs(mesh, x):
     """All pairs that share no vertex: (VT stencils, distances now, at rest), and those of edges."""
     points, kinds = mesh.points, []
-    v, t = (each.ravel() for each in np.indices((len(points), len(mesh.triangles))))
+    v, t = (each.ravel() for each in np.meshgrid(np.unique(mesh.triangles), np.arange(len(mesh.triangles)), indexing="ij"))
     e, f = np.triu_indices(len(mesh.edges), 1)
     for s, measure in (
         (np.column_stack([v, mesh.triangles[t]]), from_triangle),
@@ -70,60 +70,64 @@ def pieces(mesh):
         piece = new
 
 
-def found_by(model, x, distance, skin):
-    """The lists of a detection at x, with as much room as it takes."""
-    found = Proximity(model, distance, skin)
-    positions = model.array(x, model.vec3)
+def proximity(mesh, distance, skin, device, **options):
+    pins = mesh.isolated if len(mesh.isolated) else None
+    model = Model(wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)], pins=pins), device=device, **options)
+    return model, Proximity(model, distance, skin)
+
+
+def detect(found, x):
+    """A detection with as much room as it takes; its stencils of either kind."""
+    positions = found.model.array(x, found.model.vec3)
     found.launch(positions)
     while found.overflowed:
         found.grow()
         found.launch(positions)
     vt, ee = found.counts.numpy()
-    stencils, distances = found.stencils.numpy()[: vt + ee], found.distances.numpy()[: vt + ee]
-    first, corners = found.first.numpy(), found.corners.numpy()[: 4 * (vt + ee)]
+    return np.split(found.stencils.numpy()[: vt + ee], [vt])
+
+
+def rows(stencils):
+    return {tuple(row) for row in stencils.tolist()}
+
+
+def found_by(found, x):
+    """The stencils and distances of either kind, with the incidences as they must be."""
+    kinds, N = detect(found, x), found.model.count
+    vt = len(kinds[0])
+    stencils = np.concatenate(kinds)
+    first, corners = found.first.numpy(), found.corners.numpy()[: stencils.size]
     vertices = stencils.reshape(-1)[corners]
-    assert first[-1] == 4 * (vt + ee)
-    np.testing.assert_array_equal(vertices, np.repeat(np.arange(model.count), np.diff(first)))
-    assert (np.sort(corners) == np.arange(4 * (vt + ee))).all() and (np.diff(corners)[np.diff(vertices) == 0] > 0).all()
-    return (stencils[:vt], distances[:vt]), (stencils[vt:], distances[vt:])
+    assert first[-1] == stencils.size
+    np.testing.assert_array_equal(vertices, np.repeat(np.arange(N), np.diff(first)))
+    assert (np.sort(corners) == np.arange(stencils.size)).all() and (np.diff(corners)[np.diff(vertices) == 0] > 0).all()
+    return zip(kinds, np.split(found.distances.numpy()[: len(stencils)], [vt]), strict=True)
 
 
 def check(mesh, x, distance, skin, dtype="float32", device="cpu", **options):
-    """That a model finds the pairs of ``x`` and no others, but those at the limit to rounding; how many there are."""
-    model = Model(wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)]), device=device, dtype=dtype, **options)
-    exact = x.astype(model.numpy_dtype).astype(np.float64)
-    own = exact if model.order is None else exact[model.order]
-    copies = np.tile(own, (model.copies, 1))
-    piece, rounding, counts = (
-        pieces(mesh),
-        64 * np.finfo(model.numpy_dtype).eps * (np.abs(x).max() + np.abs(mesh.points).max()),
-        [],
-    )
-    for (stencils, distances), (s, now, rest) in zip(
-        found_by(model, copies, distance, skin), all_pairs(mesh, exact), strict=True
-    ):
+    """That a model finds the pairs of ``x`` and no others, in order, but those at the limit to rounding; how many there are."""
+    model, found = proximity(mesh, distance, skin, device, dtype=dtype, **options)
+    x, n = x.astype(model.numpy_dtype).astype(np.float64), len(x)
+    order = np.arange(n) if model.order is None else model.order
+    rounding = 64 * np.finfo(model.numpy_dtype).eps * (np.abs(x).max() + np.ptp(mesh.points, axis=0).max())
+    piece, counts = pieces(mesh), []
+    lists = found_by(found, np.tile(x[order], (model.copies, 1)))
+    for (stencils, distances), (s, now, rest) in zip(lists, all_pairs(mesh, x), strict=True):
         cutoff = np.where(piece[s[:, 0]] == piece[s[:, 3]], np.minimum(distance, rest / 2), distance)
-        n, count = len(mesh.points), len(stencils) // model.copies
-        assert count * model.copies == len(stencils)
-        for copy in range(1, model.copies):
-            np.testing.assert_array_equal(stencils[copy * count : (copy + 1) * count], stencils[:count] + copy * n)
-        mine = stencils[:count] if model.order is None else model.order[stencils[:count]]
-
-        def keyed(rows, edges=len(counts) == 1):
-            if edges:
-                ends = [tuple(sorted((tuple(sorted(row[:2])), tuple(sorted(row[2:]))))) for row in rows.tolist()]
-            else:
-                ends = [(row[0], tuple(sorted(row[1:]))) for row in rows.tolist()]
-            return ends
-
-        want = dict(zip(keyed(s), zip(now - cutoff - skin, cutoff, strict=True), strict=True))
-        have = dict(zip(keyed(mine), distances[:count], strict=True))
-        assert len(have) == count
-        for pair in want.keys() | have.keys():
-            gap, expected = want[pair]
-            assert (gap < rounding) if pair in have else (gap > -rounding), (pair, gap)
-            if pair in have:
-                np.testing.assert_allclose(have[pair], expected, atol=rounding)
+        gap = now - cutoff - skin
+        count = len(stencils) // model.copies
+        copies = np.arange(model.copies)[:, None, None] * n
+        np.testing.assert_array_equal(stencils, (stencils[:count] + copies).reshape(-1, 4))
+        weights = float(n) ** np.arange(4)  # of a stencil, as one number
+        have, want = order[stencils[:count]] @ weights, s @ weights
+        index = np.argsort(want)
+        index = index[np.searchsorted(want, have, sorter=index).clip(max=max(len(want) - 1, 0))]
+        np.testing.assert_array_equal(want[index], have)
+        assert (gap[index] < rounding).all()
+        assert np.isin(np.flatnonzero(gap < -rounding), index).all()
+        np.testing.assert_allclose(distances, np.tile(cutoff[index], model.copies), rtol=1e-5, atol=rounding)
+        if model.order is None:
+            assert (np.diff(index) > 0).all()
         counts.append(count)
     return counts
 
@@ -141,9 +145,135 @@ def folded(mesh, rng, gap, times=3):
     return x + rng.uniform(-0.5, 0.5, x.shape) * gap
 
 
+def scaled(mesh, scale):
+    return wc.Mesh(mesh.points * scale, triangles=mesh.triangles)
+
+
+GRID = wc.Mesh.grid(9, 11, pattern="alternating")
+STRIPS = wc.Mesh.grid(3, 60, size=(1.0, 0.03))  # whose triangles are 1000 times as long as wide
+LAYERS = wc.Mesh.join({"low": GRID, "high": wc.Mesh(GRID.points + np.array([0.013, 0.005, 0.02]), triangles=GRID.triangles)})
+SMALL = wc.Mesh.grid(5, 6, size=0.3)
+SHEETS = wc.Mesh.join({"one": SMALL, "other": SMALL})
+UNEVEN = wc.Mesh(np.sign(GRID.points - 0.5) * np.abs(GRID.points - 0.5) ** 4 * 8 + 0.5, triangles=GRID.triangles)
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_folded_cloth_has_the_pairs_of_all_pairs(dtype, device):
+@pytest.mark.parametrize(
+    ("mesh", "gap", "options"),
+    [
+        pytest.param(GRID, 0.02, {}, id="grid"),
+        pytest.param(GRID, 0.02, {"copies": 3}, id="copies"),
+        pytest.param(GRID, 0.02, {"order": np.random.default_rng(0).permutation(99)}, id="order"),
+        pytest.param(LAYERS, 0.02, {}, id="pieces"),
+        pytest.param(STRIPS, 0.02, {}, id="needles"),
+        pytest.param(UNEVEN, 0.02, {}, id="uneven"),
+        pytest.param(scaled(GRID, 1e6), 2e4, {}, id="huge"),
+        pytest.param(scaled(GRID, 1e-6), 2e-8, {}, id="tiny"),
+        pytest.param(GRID, 5.0, {}, id="all of one cell"),
+    ],
+)
+def test_the_pairs_are_those_among_all_pairs(mesh, gap, options, dtype, device):
+    """Of cloth at rest, folded, turned and far from the origin, and that has shrunk to a point, or was blown up."""
     rng = np.random.default_rng(3)
-    mesh = wc.Mesh.grid(9, 11, pattern="alternating")
-    counts = [check(mesh, folded(mesh, rng, 0.02), 0.02, 0.01, dtype, device) for _ in range(3)]
-    assert np.min(counts) > 20
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    x = folded(mesh, rng, gap)
+    far = x @ turn + 20.0 * np.ptp(mesh.points, axis=0).max()
+    for points in (x, far):
+        assert min(check(mesh, points, gap, gap / 2, dtype, device, **options)) > 20
+    check(mesh, mesh.points, gap, gap / 2, dtype, device, **options)
+    if options == {} and gap == 0.02:
+        check(mesh, np.zeros_like(x), gap, gap / 2, dtype, device)
+        check(mesh, 30.0 * x, gap, gap / 2, dtype, device)
+        x[5] += 1e5
+        check(mesh, x, gap, gap / 2, dtype, device)
+
+
+def test_chains_have_pairs_of_edges_alone(device):
+    """A chain that turns back on itself, and a second beside it; vertices of no edge take no part."""
+    rng = np.random.default_rng(0)
+    chain = wc.Mesh.chain(40)
+    mesh = wc.Mesh.join({"one": chain, "other": wc.Mesh(chain.points + 0.005, edges=chain.edges)})
+    x = np.cumsum(rng.uniform(-0.02, 0.02, mesh.points.shape), axis=0)
+    counts = check(mesh, x, 0.01, 0.005, device=device)
+    assert counts[0] == 0 and counts[1] > 20
+    alone = wc.Mesh(np.concatenate([GRID.points, GRID.points[:5] + 0.001]), triangles=GRID.triangles)
+    x = np.concatenate([folded(GRID, rng, 0.02), alone.points[-5:]])
+    assert check(alone, x, 0.02, 0.01, device=device) == check(GRID, x[:-5], 0.02, 0.01, device=device)
+
+
+def test_lists_grow_and_repeat_their_bits(device):
+    """A list that is too long is known, its part within the capacity has pairs alone, and ten replays give the same lists."""
+    mesh = wc.Mesh.grid(16, 16)
+    model, found = proximity(mesh, 0.1, 0.05, device, copies=2)
+    points = folded(mesh, np.random.default_rng(0), 0.01)
+    x = model.array(np.tile(points, (2, 1)), model.vec3)
+    found.launch(x)
+    assert found.overflowed and found.counts.numpy().sum() > 2 * found.capacity
+    full = found.stencils.numpy()
+    counts = found.counts.numpy()
+    found.grow()
+    with wp.ScopedCapture(device=device) as capture:
+        found.launch(x)
+    lists = []
+    for _ in range(10):
+        wp.capture_launch(capture.graph)
+        lists.append(
+            [each.numpy().copy() for each in (found.counts, found.stencils, found.distances, found.first, found.corners)]
+        )
+    assert not found.overflowed and (lists[0][0] == counts).all()
+    for others in lists[1:]:
+        for one, other in zip(lists[0], others, strict=True):
+            assert one.tobytes() == other.tobytes()
+    assert rows(full) <= rows(lists[0][1])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
+def test_coordinates_that_are_lost_give_no_pairs(value, device):
+    """And keep no other pair away; an edge that ends farther than any distance is still near at its other end."""
+    model, found = proximity(GRID, 0.02, 0.01, device)
+    points = folded(GRID, np.random.default_rng(3), 0.02)
+    before = rows(np.concatenate(detect(found, points)))
+    assert not found.moved(model.array(points, model.vec3)).numpy()[0]
+    points[50, 1] = value
+    assert found.moved(model.array(points, model.vec3)).numpy()[0]
+    after = rows(np.concatenate(detect(found, points)))
+    of_others = {row for row in before if 50 not in row}
+    assert {row for row in after if 50 not in row} == of_others and len(of_others) < len(before)
+    assert np.isfinite(value) or after == of_others
+
+
+def test_no_pair_is_missing_while_nothing_has_moved(device):
+    """Sheets that fall together, or far from one another, need no detection; others need one before a pair is missing."""
+    rng = np.random.default_rng(1)
+    distance, skin = 0.02, 0.03
+    model, found = proximity(SHEETS, distance, skin, device, dtype="float64")
+    one, flags = len(SMALL.points), []
+
+    def moved(y):
+        return bool(found.moved(model.array(y, model.vec3)).numpy()[0])
+
+    for trial in range(40):
+        x = np.concatenate([folded(SMALL, rng, 0.02), folded(SMALL, rng, 0.02) + np.array([0.0, 0.1 * (trial % 2), 0.0])])
+        listed = [rows(stencils) for stencils in detect(found, x)]
+        assert not moved(x + rng.uniform(-100.0, 100.0, 3))  # float64 keeps the differences
+        y = x + rng.uniform(-5.0, 5.0, 3) + rng.uniform(-0.1, 0.1, x.shape) * skin
+        y[one:] += rng.uniform(-0.5, 0.5, 3) * skin
+        flags.append(moved(y))
+        if not flags[-1]:
+            for (s, now, rest), have in zip(all_pairs(SHEETS, y), listed, strict=True):
+                same = (s[:, 0] < one) == (s[:, 3] < one)
+                near = now < np.where(same, np.minimum(distance, rest / 2), distance)
+                assert rows(s[near]) <= have and near.any()
+    assert 5 < sum(flags) < 35
+    x[one:] += np.array([0.0, 3.0, 0.0])
+    found.launch(model.array(x, model.vec3))
+    x[one:] -= np.array([0.0, 2.0, 0.0])
+    assert not moved(x)
+    x[one:] -= np.array([0.0, 1.15, 0.0])
+    assert moved(x)
+    x[one:] += np.array([0.0, 1.15, 0.0])
+    assert not moved(x)
+    x[3, 0] += 0.4 * skin
+    assert not moved(x) and found.moved(model.array(x, model.vec3), 0.25).numpy()[0]
+    x[3, 0] += 0.2 * skin
+    assert moved(x)

@@ -1,4 +1,4 @@
-"""Pairs of vertices and triangles, and of edges, of the cloths that are near one another: found on the device, in a fixed order."""
+"""Pairs of vertices and triangles, and of edges, that are near one another: found on the device, in a fixed order."""
 
 import numpy as np
 import warp as wp
@@ -15,7 +15,7 @@ BYTES_OF_A_PAIR = 56
 
 
 class Proximity:
-    """The pairs of a vertex and a triangle, and of two edges, of each copy of a model that are nearer than a distance and a skin.
+    """The pairs of a vertex and a triangle, and of two edges, that are near one another in a copy of a model.
 
     A pair is found if it is nearer than r_c + skin. r_c is the contact distance, but at most half of what two elements of one
     connected piece are apart at rest. Pairs that share a vertex do not count, nor do coordinates that are not finite. Meshes of
@@ -42,7 +42,7 @@ class Proximity:
         self.model, self.distance, self.skin = model, distance, skin
         mesh, n, device = model.scene.mesh, model.per_copy, model.device
         self._triangles, self._edges = len(mesh.triangles) * model.copies, len(mesh.edges) * model.copies
-        piece, points = self._pieces(model.in_model(mesh.edges))
+        piece, points = self._connected(model.in_model(mesh.edges))
         self._kept = {  # whose memory the struct does not keep
             "items": wp.array(self._items(), dtype=wp.vec4i, device=device),
             "rest": model.array(points, model.vec3),
@@ -53,7 +53,7 @@ class Proximity:
         for name, value in ({"vertices": n, "distance": distance, "skin": skin, "far": far} | self._kept).items():
             setattr(self._surface, name, value)
         self._allocate_grid()
-        self._centre = int(np.linalg.norm(model.rest_points - model.rest_points.mean(axis=0), axis=1).argmin())
+        self._set_pieces(piece, points)
         self._found = wp.clone(model.positions)
         self.flag = wp.zeros(1, dtype=wp.int32, device=device)
         self._rows = Scan(model, model.count + self._edges)
@@ -64,7 +64,7 @@ class Proximity:
                 (kernels.count_items, kernels.fill_buckets, kernels.fill_rows, kernels.write_pairs, kernels.fill_corners),
                 model.dtype,
             ),
-            ((kernels.find_motion,), model.dtype),
+            ((kernels.begin_boxes, kernels.extend_boxes, kernels.find_motion, kernels.compare_motions), model.dtype),
             ((kernels.sort_corners,),),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
@@ -81,7 +81,7 @@ class Proximity:
             kinds.append(np.column_stack([vertices, 2 * copy + kind]))
         return np.concatenate(kinds).astype(np.int32)
 
-    def _pieces(self, edges):
+    def _connected(self, edges):
         """The connected piece of each vertex, −1 of one of no element, and rest points about the middle of each piece."""
         n, points = self.model.per_copy, self.model.rest_points
         joined = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(n, n))
@@ -90,9 +90,31 @@ class Proximity:
         middle = np.stack([np.bincount(piece, axis, count) for axis in points.T], axis=1) / sizes[:, None]
         return np.where(sizes[piece] > 1, piece, -1).astype(np.int32), points - middle[piece]
 
+    def _set_pieces(self, piece, points):
+        """Numbers the pieces of all copies, and takes the vertex nearest to the middle of each."""
+        model = self.model
+        used, numbers = np.unique(piece[piece >= 0], return_inverse=True)
+        number = np.full(model.per_copy, -1)
+        number[piece >= 0] = numbers
+        by_distance = np.lexsort((np.linalg.norm(points, axis=1), number))
+        centre = by_distance[np.searchsorted(number[by_distance], np.arange(len(used)))]
+        copy = np.arange(model.copies)[:, None]
+        arrays = {
+            "piece": np.where(number < 0, -1, number + copy * len(used)),
+            "centre": centre + copy * model.per_copy,
+        }
+        self._piece_arrays = {k: wp.array(v.ravel(), dtype=wp.int32, device=model.device) for k, v in arrays.items()}
+        if len(used) > 1:
+            for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("motion", model.dtype)):
+                self._piece_arrays[name] = wp.zeros(model.copies * len(used), dtype=kind, device=model.device)
+        self._pieces = kernels.pieces(model.dtype)()
+        for name, value in ({"per_copy": len(used)} | self._piece_arrays).items():
+            setattr(self._pieces, name, value)
+
     def _allocate_grid(self):
         model, items = self.model, self._triangles + self._edges
-        size = 0.5 * (1.05 * model.scene.mesh.edge_lengths.max() + self.distance + self.skin)
+        lengths = model.scene.mesh.edge_lengths
+        size = 0.5 * (min(1.05 * lengths.max(), 2.0 * np.median(lengths)) + self.distance + self.skin)
         buckets = 1 << max(4, (items - 1).bit_length())
         count = {"levels": 2, "counts": buckets, "keys": items, "first": buckets + 1}
         self._grid_arrays = {k: wp.zeros(size, dtype=wp.int32, device=model.device) for k, size in count.items()}
@@ -133,6 +155,9 @@ class Proximity:
         surface, grid, pairs, N = self._surface, self._grid, self._pairs, self.model.count
         items, own = self._triangles + self._edges, self._arrays
         wp.copy(self._found, x)
+        if self._pieces.per_copy > 1:
+            self._launch(kernels.begin_boxes, len(self._pieces.centre), [x], [self._pieces])
+            self._launch(kernels.extend_boxes, N, [x], [self._pieces])
         self.counts.zero_()
         self._grid_arrays["levels"].zero_()
         self._launch(kernels.count_items, items, [surface, x], [grid])
@@ -145,18 +170,29 @@ class Proximity:
         self._launch(kernels.fill_rows, self.capacity, [], [pairs])
         self._launch(kernels.write_pairs, N + self._edges, [surface, N, self._triangles], [pairs])
         self._vertices.launch(own["corner_counts"], self.first)
-        self._launch(kernels.fill_corners, self.capacity, [pairs, self.first], [self.corners])
+        self._launch(kernels.fill_corners, self.capacity, [self.first], [pairs, self.corners])
         self._launch(kernels.sort_corners, N, [self.first], [self.corners])
 
-    def moved(self, x):
+    def moved(self, x, part=0.5):
         """Launches flag = 1 where pairs may be missing at x (N,), else 0, and returns it; for :func:`warp.capture_if`.
 
-        That is if a vertex has moved by more than half the skin since the last detection, apart from the motion that a vertex in
-        the middle of its copy has made.
+        It is 0 while each vertex has moved by at most a ``part`` of the skin since the last detection, relative to the vertex
+        in the middle of its connected piece. Two pieces may have come nearer by twice that, and by as much as their boxes were
+        farther apart than the contact distance and the skin. So sheets that fall together, or far apart, need no detection.
+
+        Args:
+            x: Positions [m].
+            part: At most ½, at which no pair within its r_c is missing where the flag is 0. With less, vertices may still move
+                by a ½ − ``part`` of the skin each, relative to one another, before one is.
         """
         self.flag.zero_()
-        given = [x, self._found, self.model.per_copy, self._centre, 0.5 * self.skin]
-        self._launch(kernels.find_motion, self.model.count, given, [self.flag])
+        several = self._pieces.per_copy > 1
+        if several:
+            self._pieces.motion.zero_()
+        self._launch(kernels.find_motion, self.model.count, [x, self._found, part * self.skin], [self._pieces, self.flag])
+        if several:
+            given = [x, self._found, self._pieces, self.distance + self.skin, 2.0 * part * self.skin]
+            self._launch(kernels.compare_motions, len(self._pieces.centre), given, [self.flag])
         return self.flag
 
     @property
@@ -165,10 +201,12 @@ class Proximity:
         return self._mirror.read().sum(dtype=np.int64) > self.capacity
 
     @in_turn
-    def grow(self):
-        """Allocates room for half as many more pairs as were found. What was recorded with the old arrays must be recorded anew.
+    def grow(self, count=None):
+        """Allocates room for half as many pairs more than a ``count``, by default those that the last detection found.
+
+        What was recorded with the old arrays must be recorded anew.
 
         Raises:
             ValueError: There is no memory for it.
         """
-        self._allocate(int(1.5 * self._mirror.read().sum(dtype=np.int64)))
+        self._allocate(int(1.5 * (self._mirror.read().sum(dtype=np.int64) if count is None else count)))
