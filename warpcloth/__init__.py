@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the table below, as type checkers read it
     from .analysis.analysis import analyze as analyze
     from .analysis.compare import Comparison as Comparison
     from .analysis.compare import compare as compare
+    from .analysis.intersections import intersections as intersections
     from .analysis.samples import Analysis as Analysis
     from .base import checks as checks
     from .deformation.arap import Arap as Arap
@@ -56,6 +57,7 @@ _MODULES = {
     "analyze": "analysis.analysis",
     "Comparison": "analysis.compare",
     "compare": "analysis.compare",
+    "intersections": "analysis.intersections",
     "Analysis": "analysis.samples",
     "checks": "base",
     "Arap": "deformation.arap",

@@ -12,6 +12,7 @@ from PIL import Image, ImageSequence
 
 import warpcloth as wc
 from support.command_line import refused, run
+from warpcloth.cli import check as checking
 from warpcloth.cli import render as drawing
 from warpcloth.picture import render as rendering
 from warpcloth.picture.colour import Scale, to_linear
@@ -373,6 +374,37 @@ def test_values_of_ones_own_and_of_vertices_are_colours(folder, tmp_path):
     wc.render(folder / "cloth.npy", path, mesh=MESH, colour="stretch_2", **SMALL)
     with pytest.raises(ValueError, match=r"colour has shape \(2, 3\); it must be \(6, 16\) of vertices or \(6, 18\)"):
         wc.render(MOTION, path, mesh=MESH, colour=np.zeros((2, 3)), **SMALL)
+
+
+def test_colours_of_ones_own(tmp_path):
+    """Of triangles: the halves of a sheet in two hues, without a bar; and those of what intersects."""
+    path, half = tmp_path / "out.png", MESH.points[MESH.triangles].mean(axis=1)[:, 0] > MESH.points[:, 0].mean()
+    colours = np.where(half[:, None], (0.7, 0.0, 0.0), (0.0, 0.0, 0.7))
+    view = {"azimuth": 0.0, "elevation": 60.0, "ground": False, "size": (64, 36), "samples": 1}
+    wc.render(MESH, path, colour=colours[None], **view)
+    found = picture(path)
+    red, blue = (np.argwhere(found[:, :, k] > 2 * found[:, :, 2 - k] + 40) for k in (0, 2))
+    assert min(len(red), len(blue)) > 50 and blue[:, 1].mean() + 8 < red[:, 1].mean()
+    with pytest.raises(ValueError, match=r"colour has shape \(1, 5, 3\); it must be \(1, 16, 3\) of vertices or \(1, 18, 3\)"):
+        wc.render(MESH, path, colour=np.zeros((1, 5, 3)), **view)
+
+
+def test_a_still_of_what_intersects(tmp_path, capfd, monkeypatch):
+    """A corner of a sheet is put through it; the picture of a stage has what is beside it too."""
+    pytest.importorskip("igl")
+    monkeypatch.setattr(checking, "SIZE", (160, 90))
+    points = np.stack([MESH.points, MESH.points])
+    points[1, [0, 1, 4]] = 0.2 * points[1, [0, 1, 4]] + 0.8 * MESH.points.mean(axis=0) + 0.02
+    points[1, [0, 1, 4], np.argmin(np.ptp(MESH.points, axis=0))] = 0.2, -0.2, -0.2
+    np.savez(tmp_path / "a.npz", points=points, triangles=MESH.triangles)
+    with AnimationWriter(tmp_path / "a.usdc", MESH, FPS) as writer:
+        for each in points:
+            writer.append(each, np.zeros_like(each))
+    for name in ("a.npz", "a.usdc"):
+        code, out, _err = run(capfd, "check", tmp_path / name, "--still", tmp_path / "out.png")
+        found = picture(tmp_path / "out.png")
+        assert code == 1 and "out.png" in out and "most in frame 1" in out
+        assert (found[:, :, 0] > 2 * found[:, :, 2] + 40).sum() > 20
 
 
 @pytest.mark.parametrize("values", [np.full(16, np.nan), np.where(np.arange(16) % 2, np.inf, 1.0), np.arange(16) > 3])

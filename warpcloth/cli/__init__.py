@@ -1,10 +1,10 @@
-"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures, compares
+"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures, compares, checks
 and draws animations, charts and benchmarks methods.
 
 Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
-saved), 2 wrong use (one line on stderr), 130 interrupted by Ctrl-C and 143 by SIGTERM, as in shells (a line says what is
-saved). Any other error ends with 2 and one line as well, because most come from a scene file; ``--debug`` prints the traceback
-above the line.
+saved) or, of `check`, something was found, 2 wrong use (one line on stderr), 130 interrupted by Ctrl-C and 143 by SIGTERM, as
+in shells (a line says what is saved). Any other error ends with 2 and one line as well, because most come from a scene file;
+``--debug`` prints the traceback above the line.
 
 Help and completion answer without Warp: modules of commands import what loads it where they use it, and `main` imports it all
 at once before it runs a command. No other part of the package defers an import of its own modules.
@@ -22,7 +22,7 @@ import numpy as np
 
 from ..base.interrupts import Interrupts
 from ..base.version import installed_version
-from . import analyze, bench, chart, choose, compare, deform, info, options, render, run, scenes
+from . import analyze, bench, chart, check, choose, compare, deform, info, options, render, run, scenes
 from .terminal import DTYPES, Printable, say, show_warning
 
 
@@ -137,6 +137,8 @@ def _parser():
     analyze.add_arguments(analyzes)
     compares = add("compare", compare.compare, "Measure the distance between two animations.", epilog=compare.EPILOG)
     compare.add_arguments(compares)
+    checks = add("check", check.check, "Find what intersects in an animation, exactly.", epilog=check.EPILOG)
+    check.add_arguments(checks)
     renders = add("render", render.render, "Draw a picture or a film of an animation.", epilog=render.EPILOG)
     render.add_arguments(renders)
     charts = commands.add_parser("chart", help=chart.TEXT, description=chart.TEXT, allow_abbrev=False)
@@ -179,8 +181,9 @@ def _parser():
     runs.add_argument(
         "--frames", type=int, metavar="N", help="number of frames after the start (default: those of the scene's duration)"
     )
-    for sub in (runs, infos, deforms, analyzes, compares, renders, chooses, benches):
-        sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+    for sub in (runs, infos, deforms, analyzes, compares, checks, renders, chooses, benches):
+        if sub is not checks:
+            sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     for sub in (runs, benches):
         sub.add_argument("--threads", type=int, default=1, metavar="N", help="number of CPU threads (default: 1)")
@@ -203,7 +206,7 @@ def _parser():
         action="store_true",
         help="continue the interrupted run to this output from its last checkpoint; there is one every ten frames",
     )
-    for sub in (runs, deforms, analyzes):
+    for sub in (runs, deforms, analyzes, checks):
         sub.add_argument("--single-file", action="store_true", help="write one file instead of a file and a folder of frames")
     lists = add("scenes", scenes.scenes, "List scenes and their parameters.")
     lists.add_argument(

@@ -116,3 +116,23 @@ class GivenScalar:
     def rows(self, frames):
         for frame in frames:
             yield np.asarray(self.values[frame], dtype=np.float64)
+
+
+class GivenColours:
+    """Colours that the user gives, linear Rec. 709, (F, n, 3) of vertices or (F, T, 3) of triangles."""
+
+    unit, name = "1", ""
+
+    def __init__(self, values, subject):
+        shape = subject.shapes[subject.coloured]
+        self.values, counts = values, (shape.count, len(shape.triangles))
+        if self.values.shape[0] != len(subject) or self.values.shape[1] not in counts or self.values.shape[2] != 3:
+            rule = f"({len(subject)}, {counts[0]}, 3) of vertices or ({len(subject)}, {counts[1]}, 3) of triangles"
+            raise ValueError(f"colour has shape {self.values.shape}; it must be {rule} in all frames")
+
+    def scale(self, others, given, colormap):
+        """None, as colours need no scale."""
+
+    def rows(self, frames):
+        for frame in frames:
+            yield np.asarray(self.values[frame], dtype=np.float64)

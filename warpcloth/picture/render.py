@@ -19,7 +19,7 @@ from ..mesh.mesh import Mesh
 from .camera import Camera
 from .colour import check_colormap
 from .films import SHORTEST, STILL, check_film, check_times, open_film
-from .measured import GivenScalar, MeasuredScalar
+from .measured import GivenColours, GivenScalar, MeasuredScalar
 from .overlay import Overlay
 from .raycast import BACKGROUND, RayCaster
 from .subjects import located, subject_of
@@ -82,7 +82,8 @@ def render(
         size: Width and height [px].
         samples: Rays through each pixel.
         colour: A number that ``warpcloth analyze`` measures, such as "stretch_1", shown with a colour bar; or values (F, n) of
-            vertices or (F, T) of triangles, also as ``{"text above the bar": values}``; None is the plain colour of cloth.
+            vertices or (F, T) of triangles, also as ``{"text above the bar": values}``; or linear Rec. 709 colours, (F, n, 3)
+            or (F, T, 3); None is the plain colour of cloth.
         colour_range: Lowest and highest value of the colour scale; by default from all frames of the source, as in `analyze`.
         colormap: Name of a colour map of matplotlib.
         measuring: Options of :class:`warpcloth.Analyzer` for the colour, by name, such as ``{"neighbourhood": "1-ring"}``.
@@ -276,7 +277,10 @@ def _colours(subjects, colour, given, colormap, rest, device, measuring):
         arrays = [given_values] if len(subjects) == 1 else list(given_values)
         if len(arrays) != len(subjects):
             raise ValueError(f"colour has {len(arrays)} arrays; it must have one for each of the {len(subjects)} sources")
-        values = [GivenScalar(array, each, title) for array, each in zip(arrays, subjects, strict=True)]
+        values = [
+            GivenColours(array, each) if np.ndim(array) == 3 else GivenScalar(array, each, title)
+            for array, each in zip(arrays, subjects, strict=True)
+        ]
     return values, values[0].scale(values[1:], given, colormap)
 
 
@@ -355,7 +359,7 @@ class _Picture:
 
     def _painted(self, shape, values):
         """Colours of vertices (n, 3), or of the corners of triangles (T, 3, 3)."""
-        colours = self._scale.linear(values)
+        colours = values if values.ndim == 2 else self._scale.linear(values)
         return colours if len(values) == shape.count else np.repeat(colours[:, None], 3, axis=1)
 
 

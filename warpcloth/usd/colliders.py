@@ -12,7 +12,7 @@ from ..scene.mesh_collider import MeshCollider, first_extended
 from .attributes import Values, holders
 from .modules import Usd, UsdGeom, UsdPhysics
 from .solids import SOLIDS
-from .stage import face_corners, frame_codes, local_to_metres, moving_space, placed, refuse_moving_topology, space_codes
+from .stage import face_corners, local_to_metres, moving_space, placed, refuse_moving_topology, space_codes
 from .values import array_of, check_composed, refuse_unknown, time_codes_of, token_of, value_of
 
 # Approximations of a mesh that UsdPhysics has, and those that are taken as none: they make a mesh cheaper for rigid bodies, and
@@ -24,7 +24,7 @@ _SIZES = ("size", "radius", "height")
 _SAME = 1e-5
 
 
-def read_colliders(stage, cloth, surroundings, frames, fps):
+def read_colliders(stage, cloths, surroundings, codes):
     """The colliders of a stage, in the order of its prims.
 
     A collider is a shape with PhysicsCollisionAPI or with `warpcloth:collider`, on itself or on the Xform above it. It does not
@@ -33,10 +33,9 @@ def read_colliders(stage, cloth, surroundings, frames, fps):
 
     Args:
         stage: The stage, as it is posed.
-        cloth: The prim of the cloth, which is none of them.
-        surroundings: Its `StageMesh`.
-        frames: Frames of the scene.
-        fps: Frames per second.
+        cloths: The prims of the cloth, which are none of them.
+        surroundings: The `StageMesh` of one.
+        codes: Function that gives the time codes of the frames from those of the samples of a collider.
 
     Returns:
         list: The `Collider` of each.
@@ -50,13 +49,13 @@ def read_colliders(stage, cloth, surroundings, frames, fps):
         with errors_at(f"{surroundings.path}, prim {prim.GetPath()}"):
             if prim.IsA(UsdGeom.PointInstancer):
                 walk.PruneChildren()
-                if any(map(_collides, Usd.PrimRange(prim, Usd.TraverseInstanceProxies()))):
+                if any(map(collides, Usd.PrimRange(prim, Usd.TraverseInstanceProxies()))):
                     raise ValueError("has a collider as a prototype, which must be instanced by references to be taken")
-            wanted = prim != cloth and _collides(prim)
+            wanted = prim not in cloths and collides(prim)
         if wanted:
             check_composed(prim, surroundings.path)
             with errors_at(f"{surroundings.path}, prim {prim.GetPath()}"):
-                found.append(_Reader(stage, prim, surroundings, frames, fps).collider())
+                found.append(_Reader(stage, prim, surroundings, codes).collider())
     return found
 
 
@@ -77,7 +76,7 @@ def _mark(prim):
     return next(iter([*found, *(each.GetCollisionEnabledAttr() for each in of_physics)]), None)
 
 
-def _collides(prim):
+def collides(prim):
     """Whether a prim is a shape that is a collider; refuses prims that are marked as colliders and are none."""
     mark = _mark(prim)
     if mark and mark.ValueMightBeTimeVarying():
@@ -99,13 +98,12 @@ class _Reader:
         As those of :func:`read_colliders`, ``prim`` being that of the collider.
     """
 
-    def __init__(self, stage, prim, surroundings, frames, fps):
+    def __init__(self, stage, prim, surroundings, codes):
         self.prim, self.kind, self.path = prim, str(prim.GetTypeName()), surroundings.path
         self.values = Values(stage, prim, "collider")
         self.metres = surroundings.meters_per_unit
         sampled = [] if self.kind == "Plane" else self._shape_codes
-        # One frame more than the scene has, so that all steps within it have a keyframe after them.
-        self.codes = frame_codes([*space_codes(prim), *sampled], surroundings, frames + 1, fps)
+        self.codes = codes([*space_codes(prim), *sampled])
 
     @cached_property
     def _shape_codes(self):

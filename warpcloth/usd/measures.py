@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from .layers import (
     scene_layer,
 )
 from .modules import Sdf, Usd, UsdGeom, UsdShade
-from .stage import read_stage_mesh
+from .stage import METADATA_KEY, read_stage_mesh
 from .targets import DISPLAY_COLOUR, Interpolation, check_primvars
 
 
@@ -55,7 +55,7 @@ class MeasureWriter(ChunkWriter):
         primvars: Mapping[str, Interpolation],
         coloured: str | None = None,
         directions: Mapping[str, Interpolation] | None = None,
-        source: StageMesh | None = None,
+        source: StageMesh | Sequence[StageMesh] | None = None,
         fps: float = 24.0,
         up_axis: UpAxis | None = None,
         chunk: int = 10,
@@ -70,7 +70,8 @@ class MeasureWriter(ChunkWriter):
             primvars: "vertex", a value for each vertex, or "uniform", one for each triangle, by name of each primvar.
             coloured: Name of the primvar that displayColor shows, or None: no colours.
             directions: "vertex" or "uniform" by name of each set of segments, or None.
-            source: The `StageMesh` that was measured, or None.
+            source: The `StageMesh` that was measured, or several of one stage, whose meshes are one after another in ``mesh``;
+                or None.
             fps: Frames per second, also time codes per second; a source has its own.
             up_axis: "Y" or "Z", by default that of the mesh; a source has its own.
             chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
@@ -93,25 +94,38 @@ class MeasureWriter(ChunkWriter):
         if coloured is not None and coloured not in primvars:
             raise ValueError(f"coloured is {coloured!r}; it must be one of {', '.join(map(repr, primvars)) or 'none'}, or None")
         self._with_points, self._stage = source is None, None
+        self._sources = [] if source is None else [source] if isinstance(source, StageMesh) else list(source)
+        if len(self._sources) > 1 and directions:
+            raise ValueError("directions: are of one prim, must be none of several sources")
         if source is None:
             self._checked("points of the rest shape", mesh.points)
             rest, target, facts = _scene(mesh, up_axis, primvars, coloured)
+            own = [target]
             facts |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
             stage, path, files, refit = Usd.Stage.Open(rest), None, (), None
             material = UsdShade.Material.Get(stage, "/World/Looks/Cloth")
         else:
-            rest, target, stage = _over(source, mesh, primvars, coloured)
-            facts, path, files = _facts_of(stage, source), source.path, files_of_stage(stage)
-            material = _show_colours(stage, source, with_mesh=bool(coloured)) if coloured or directions else None
+            meshes = [mesh] if len(self._sources) == 1 else [each.mesh for each in self._sources]
+            rest = Sdf.Layer.CreateAnonymous(".usdc")
+            over = [_over(rest, *each, primvars, coloured) for each in zip(self._sources, meshes, strict=True)]
+            own, (target, stage) = [target for target, _ in over], over[0]
+            first = self._sources[0]
+            facts, path, files = _facts_of(stage, first), first.path, files_of_stage(stage)
+            for each, (_, of) in zip(self._sources, over, strict=True):
+                material = _show_colours(of, each, with_mesh=bool(coloured)) if coloured or directions else None
             self._stage = stage
 
             def refit():
-                artist_prim(read_stage_mesh(source.path, source.prim, type(source.mesh), time=0.0), mesh)
+                for each, found in zip(self._sources, meshes, strict=True):
+                    artist_prim(read_stage_mesh(each.path, each.prim, type(each.mesh), time=0.0), found)
 
         self._directions = dict(directions)
         self._nowhere = middle(mesh)
         targets = define_directions(stage, target.prim, mesh, directions, material, self._nowhere) if directions else []
-        self._put_on(rest, [target, *targets], facts, metadata, path, files, refit)
+        self._own = len(own)
+        self._put_on(rest, [*own, *targets], facts, metadata, path, files, refit)
+        if len(own) > 1:  # readers that look for one cloth would take the first
+            del self._root_metadata["customLayerData"][METADATA_KEY]["prim"]
 
     def append(
         self,
@@ -146,16 +160,28 @@ class MeasureWriter(ChunkWriter):
             colours = self._checked("colours", colours, target.primvars[target.coloured])
         _check_given("points", points, self._with_points)
         vectors = {} if points is None else {"points": self._checked("points", points)}
-        values = [target.samples(vectors, primvars, colours), *self._curves(time, directions or {})]
+        values = [*self._samples(vectors, primvars, colours), *self._curves(time, directions or {})]
         samples = zip(self._targets, values, strict=True)
         self._append(time, {f"{t.prim}.{name}": value for t, own in samples for name, value in own.items()})
+
+    def _samples(self, vectors, primvars, colours):
+        """Samples of the prims, each with its part of the values."""
+        starts = {"vertex": 0, "uniform": 0}
+        for k, target in enumerate(self._targets[: self._own]):
+            mesh = self._sources[k].mesh if self._own > 1 else None
+            ends = self._counts if mesh is None else {"vertex": len(mesh.points), "uniform": len(mesh.triangles)}
+            parts = {kind: slice(start, start + ends[kind]) for kind, start in starts.items()}
+            own = {name: values[parts[target.primvars[name]]] for name, values in primvars.items()}
+            shown = None if colours is None else colours[parts[target.primvars[target.coloured]]]
+            yield target.samples(vectors, own, shown)
+            starts = {kind: part.stop for kind, part in parts.items()}
 
     def _curves(self, time, directions):
         """Samples of the curves, in the space that they have at a time."""
         if directions.keys() != self._directions.keys():
             names = [", ".join(map(repr, given)) or "none" for given in (directions, self._directions)]
             raise ValueError(f"directions: {names[0]} at frame {self.frames}, must be {names[1]}")
-        for target, (name, interpolation) in zip(self._targets[1:], self._directions.items(), strict=True):
+        for target, (name, interpolation) in zip(self._targets[self._own :], self._directions.items(), strict=True):
             both = [
                 self._checked(f"{part} of directions[{name!r}]", values, interpolation, unknown=True)
                 for part, values in zip(("centres", "vectors"), directions[name], strict=True)
@@ -181,16 +207,15 @@ def _scene(mesh, up_axis, primvars, coloured):
     return rest, target, facts
 
 
-def _over(source, mesh, primvars, coloured):
-    """A layer of primvars over the artist's prim, the `Target`, and the stage with that layer as its edit target."""
+def _over(rest, source, mesh, primvars, coloured):
+    """Adds primvars over the artist's prim to a layer; returns the `Target`, and a stage with the layer as its edit target."""
     stage, artist = artist_prim(source, mesh)
     target = artist_target(artist, source, primvars, vectors=(), coloured=coloured)
-    rest = Sdf.Layer.CreateAnonymous(".usdc")
     Sdf.CreatePrimInLayer(rest, target.prim)
     declare_primvars(rest, artist, target, source.path)
     stage.GetSessionLayer().subLayerPaths.append(rest.identifier)
     stage.SetEditTarget(Usd.EditTarget(rest))
-    return rest, target, stage
+    return target, stage
 
 
 def _facts_of(stage, source):

@@ -15,6 +15,7 @@ from ..mesh.selection import distinct_vertices
 from ..scene.colliders import Contact
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..terms import TERMS, QuadraticBending, Spring
+from ..terms.limit import Limit
 from ..terms.loads import LOADS
 from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of, own_names
 from .chunks import export
@@ -71,7 +72,11 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
             stage = posed(stage, first, first + (duration + 1.0 / fps) * surroundings.time_codes_per_second)
             cloth = stage.GetPrimAtPath(surroundings.prim)
             scene = _scene(stage, cloth, surroundings, fps, duration)
-        colliders = read_colliders(stage, cloth, scene.stage, scene.frames, fps)
+
+        def codes(samples):  # one frame more than the scene has, so that all steps within it have a keyframe after them
+            return frame_codes(samples, scene.stage, scene.frames + 1, fps)
+
+        colliders = read_colliders(stage, [cloth], scene.stage, codes)
         with errors_at(where):
             return replace(scene, colliders=colliders) if colliders else scene
 
@@ -109,6 +114,28 @@ def _scene(stage, cloth, surroundings, fps, duration):
     for term in terms:
         term.elements(mesh, scene.positions)  # refuses now, when the file is known, what would be refused later
     return scene
+
+
+def read_limits(stage, cloth, surroundings):
+    """The limits of stretch that a cloth's prim declares, and the mesh that they are of.
+
+    Args:
+        stage: The stage.
+        cloth: The prim.
+        surroundings: Its `StageMesh`.
+
+    Returns:
+        list: The `Limit` of each.
+        Mesh: The mesh.
+
+    Raises:
+        ValueError: As :func:`read_scene`.
+    """
+    with errors_at(f"{surroundings.path}, prim {cloth.GetPath()}"):
+        values = Values(stage, cloth)
+        kinds = {key: kind_of(values, key) for key in values.terms}
+        found = [_term(values, key) for key, kind in kinds.items() if issubclass(TERMS[kind], Limit)]
+        return found, _exact_mesh(values, cloth, surroundings) if found else surroundings.mesh
 
 
 def _refuse_missing(mass, term):

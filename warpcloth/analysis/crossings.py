@@ -1,0 +1,146 @@
+"""Triangles that intersect, found by exact predicates: signs of determinants that rounding does not change."""
+
+from importlib.util import find_spec
+
+import numpy as np
+
+
+class Crossings:
+    """Finds the pairs of triangles of a mesh that intersect, frame by frame.
+
+    Triangles are closed sets: those without a common vertex intersect where they touch. Those with a common vertex or edge
+    intersect only if they have more in common than that. Both by the exact orientations of libigl (Shewchuk 1997, *Adaptive
+    precision floating-point arithmetic and fast robust geometric predicates*).
+
+    Args:
+        triangles: (T, 3), with one index for each vertex.
+
+    Raises:
+        ImportError: libigl is not installed.
+    """
+
+    def __init__(self, triangles: np.ndarray) -> None:
+        if not find_spec("igl"):
+            raise ImportError("intersections need libigl: pip install -e '.[check]' in the checkout")
+        self._triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+        a, b, c = self._triangles.T
+        self._proper = (a != b) & (b != c) & (c != a)
+        self._fans, self._hinges, self._twins = _neighbours(self._triangles, np.flatnonzero(self._proper))
+
+    def pairs(self, points: np.ndarray, judged: np.ndarray) -> np.ndarray:
+        """The pairs that intersect, (P, 2), the smaller index first, sorted.
+
+        Args:
+            points: (n, 3) [m], finite in the triangles that are judged.
+            judged: Which triangles to look at, (T,): those that have an area.
+        """
+        from igl.predicates import find_self_intersections
+
+        judged = judged & self._proper
+        points, own = np.ascontiguousarray(points, dtype=np.float64), np.flatnonzero(judged)
+        found = [np.empty((0, 2), np.int64)]
+        if len(own):
+            apart = own[find_self_intersections(points, self._triangles[own])[1].reshape(-1, 2)]
+            # It tests neighbours in rounded numbers, within 1e-8, and they are tested here.
+            corners = self._triangles[apart]
+            found.append(apart[~(corners[:, 0, :, None] == corners[:, 1, None]).any(axis=(1, 2))])
+        for candidates, cross in ((self._fans, _fans_cross), (self._hinges, _hinges_overlap)):
+            rows, corners = candidates
+            kept = judged[rows].all(axis=1)
+            found.append(rows[kept][cross(points[corners[kept]])])
+        found.append(self._twins[judged[self._twins].all(axis=1)])
+        pairs = np.sort(np.concatenate(found), axis=1)
+        return pairs[np.lexsort(pairs.T[::-1])]
+
+
+def have_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Which triangles (T, 3) of finite points (n, 3) have an area, exactly, (T,)."""
+    corners = points[triangles]
+    found = np.zeros(len(triangles), dtype=bool)
+    for axis in range(3):
+        flat = corners.copy()
+        flat[:, :, axis] = 0.0
+        found |= _side(*flat.transpose(1, 0, 2), np.broadcast_to(np.eye(3)[axis], (len(flat), 3))) != 0
+    return found
+
+
+def _side(a, b, c, d):
+    """On which side of the planes through a, b, c the points d (k, 3) are: 1, -1 or 0, exactly, (k,)."""
+    from igl.predicates import orient3d
+
+    return orient3d(*(np.ascontiguousarray(each) for each in (a, b, c, d))) if len(a) else np.zeros(0, np.int32)
+
+
+def _fans_cross(corners):
+    """Which pairs of triangles (v, a, b), (v, c, d) have more than the vertex v in common, of corners (k, 5, 3).
+
+    Near v they are cones. Each has a ray in the plane of the other if the other two corners are on different sides of that,
+    and the two rays are one or opposite, by the signs.
+    """
+    v, a, b, c, d = corners.transpose(1, 0, 2)
+    of_first = [_side(v, c, d, each) for each in (a, b)]
+    of_second = [_side(v, a, b, each) for each in (c, d)]
+    rises, falls = ([(low <= 0) & (high >= 0) for low, high in (each, each[::-1])] for each in (of_first, of_second))
+    found = (rises[0] & falls[1]) | (rises[1] & falls[0])
+    flat = (of_first[0] == 0) & (of_first[1] == 0)
+    found[flat] = _sectors_overlap(*(each[flat] for each in (v, a, b, c, d)))
+    return found
+
+
+def _sectors_overlap(v, a, b, c, d):
+    """As :func:`_fans_cross`, of triangles in one plane."""
+    above = _above(v, a, b)
+
+    def holds(left, right, ray):
+        turn = _side(v, left, right, above)
+        return (turn * _side(v, left, ray, above) >= 0) & (turn * _side(v, ray, right, above) >= 0)
+
+    return holds(a, b, c) | holds(a, b, d) | holds(c, d, a) | holds(c, d, b)
+
+
+def _hinges_overlap(corners):
+    """Which pairs of triangles (u, v, a), (u, v, b) are folded flat upon one another, of corners (k, 4, 3)."""
+    u, v, a, b = corners.transpose(1, 0, 2)
+    found = _side(u, v, a, b) == 0
+    u, v, a, b = (each[found] for each in (u, v, a, b))
+    above = _above(u, v, a)
+    found[found] = _side(u, v, a, above) == _side(u, v, b, above)
+    return found
+
+
+def _above(a, b, c):
+    """Points (k, 3) that are in none of the planes through a, b, c: steps from a along the axis that is steepest to them."""
+    normal = np.cross(b - a, c - a)
+    rows, axis = np.arange(len(a)), np.abs(normal).argmax(axis=1) if len(a) else np.zeros(0, int)
+    found = a.copy()
+    found[rows, axis] += np.linalg.norm(b - a, axis=1) + np.linalg.norm(c - a, axis=1)
+    return found
+
+
+def _neighbours(triangles, own):
+    """Pairs of triangles (T, 3) with one, two and three vertices in common, of those with the indices ``own``.
+
+    Returns:
+        The pairs (k, 2) of those with one, and with two, each with the vertices in common and then the others of both
+        (k, 5), (k, 4); the pairs with three.
+    """
+    count = len(triangles)
+    corners = triangles[own].ravel()
+    order = np.argsort(corners, kind="stable")
+    vertex, owner = corners[order], own[order // 3]
+    starts = np.flatnonzero(np.diff(vertex, prepend=-1))
+    sizes = np.diff(starts, append=len(vertex))
+    rows = np.arange(len(vertex))
+    later = np.repeat(starts + sizes, sizes) - rows - 1  # corners after each at its vertex
+    first = np.repeat(rows, later)
+    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
+    keys, common = np.unique(owner[first] * count + owner[second], return_counts=True)
+    pairs = np.stack([keys // count, keys % count], axis=1)
+    found = []
+    for shared in (1, 2):
+        some = pairs[common == shared]
+        a, b = triangles[some[:, 0]], triangles[some[:, 1]]
+        in_both, in_first = (a[:, :, None] == b[:, None]).any(axis=2), (b[:, :, None] == a[:, None]).any(axis=2)
+        parts = [a[in_both].reshape(-1, shared), a[~in_both].reshape(-1, 3 - shared), b[~in_first].reshape(-1, 3 - shared)]
+        found.append((some, np.concatenate(parts, axis=1)))
+    return *found, pairs[common == 3]

@@ -1,0 +1,109 @@
+"""The meshes of a stage that may cross each other, with its colliders and the limits of stretch that it declares."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..mesh.mesh import Mesh, Surface
+from ..mesh.stage_mesh import StageMesh
+from ..scene.colliders import Collider
+from ..terms.limit import Limit
+from .colliders import collides, errors_at, read_colliders
+from .drawn import read_drawn
+from .layers import files_of_stage
+from .modules import UsdGeom
+from .scene import read_limits
+from .stage import find_prim, read_stage_mesh, triangles_of_faces
+from .values import sentences
+
+
+@dataclass(frozen=True, eq=False)
+class StageSurface:
+    """A mesh of a stage.
+
+    Attributes:
+        stage: The `StageMesh`; its mesh, a `Surface`, is the rest shape.
+        points: Function that gives the points (n, 3) [m] in world space at a time code.
+        faces: The face of the prim that each triangle is cut from (T,).
+        limits: The limits that the prim declares, and the mesh that they are of.
+    """
+
+    stage: StageMesh
+    points: Callable[[float], np.ndarray]
+    faces: np.ndarray
+    limits: tuple[list[Limit], Mesh]
+
+
+@dataclass(frozen=True, eq=False)
+class StageSurfaces:
+    """The meshes of a stage, read by `read_surfaces`.
+
+    Attributes:
+        surfaces: The meshes.
+        codes: Time codes of the frames (F,): those of all meshes.
+        rate: Time codes a second.
+        colliders: The colliders, whose keyframes are these frames.
+        others: Paths of the meshes that it shows beside these and the colliders.
+        files: Real paths of the files of the stage.
+        stage: The stage, whose prims are invalid once it is gone.
+    """
+
+    surfaces: list[StageSurface]
+    codes: np.ndarray
+    rate: float
+    colliders: list[Collider]
+    others: tuple[str, ...]
+    files: tuple[str, ...]
+    stage: object
+
+
+def read_surfaces(path, prims=None):
+    """Reads the meshes of a stage that are cloths as `read_drawn` has it and no colliders, or those that are named.
+
+    Args:
+        path: A .usd, .usda, .usdc or .usdz file.
+        prims: Paths or names of prims, or None.
+
+    Returns:
+        StageSurfaces: Of the points nothing but the first frame is read yet.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no stage, or shows no such mesh; there is no such prim, or it is no mesh; a prim is broken.
+    """
+    drawn = read_drawn(path)
+    with sentences(path):
+        shown = {each.path: each for each in drawn.prims}
+        found = {name: drawn.stage.GetPrimAtPath(name) for name in shown}
+        found = {name: prim for name, prim in found.items() if prim.IsA(UsdGeom.Mesh)}
+        free = [name for name, prim in found.items() if not collides(prim)]
+        if prims is None:
+            found = {name: found[name] for name in free if shown[name].cloth}
+            if not found:
+                raise ValueError(f"{path}: shows no Mesh prim that is cloth and no collider; name those to be checked as prim")
+        else:
+            named = {str(prim.GetPath()): prim for prim in (find_prim(drawn.stage, path, each) for each in prims)}
+            for name in named:
+                if name not in found:
+                    raise ValueError(f"{path}, prim {name}: is no mesh that a viewer shows, must be one to be checked")
+            found = named
+        codes = sorted({code for name in found for code in shown[name].codes}) or [0.0]
+        surfaces = []
+        for name, prim in found.items():
+            stage = read_stage_mesh(path, name, Surface, codes[0])
+            counts = triangles_of_faces(prim)
+            with errors_at(f"{path}, prim {name}"):
+                if shown[name].count != len(stage.mesh.points):
+                    count = len(stage.mesh.points)
+                    raise ValueError(f"{shown[name].count} points at time code {codes[0]:g}, must be {count} as at rest")
+            faces = np.repeat(np.arange(len(counts)), counts)
+            surfaces.append(StageSurface(stage, shown[name].points, faces, read_limits(drawn.stage, prim, stage)))
+
+        def frames(samples):
+            return codes if samples else codes[:1]
+
+        colliders = read_colliders(drawn.stage, list(found.values()), surfaces[0].stage, frames)
+        others = tuple(name for name in free if name not in found)
+        files = tuple(sorted(files_of_stage(drawn.stage)))
+        return StageSurfaces(surfaces, np.array(codes), drawn.rate, colliders, others, files, drawn.stage)
