@@ -362,5 +362,17 @@ def test_the_command_and_bad_input(tmp_path, capfd, monkeypatch):
     ):
         with pytest.raises(ValueError, match=message):
             call()
+    pairs, seen = Crossings.pairs, []
+
+    def interrupted(self, *given):
+        seen.append(pairs(self, *given))
+        if len(seen) > 1:
+            raise KeyboardInterrupt
+        return seen[-1]
+
+    monkeypatch.setattr(Crossings, "pairs", interrupted)
+    code, out, err = run(capfd, "check", path, "-o", tmp_path / "cut.usdc")
+    assert (code, out) == (130, "") and "interrupted after 1 of 2 frames; frames 0 to 0 are in" in err
+    assert len(wc.usd.FrameSequence(tmp_path / "cut.usdc")) == 1
     monkeypatch.setattr(crossings, "find_spec", lambda name: None)
     refused(capfd, ["check", path], "intersections need libigl: pip install -e '.[check]' in the checkout")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.checks import number, whole
+from ..base.texts import numbered
 from ..base.types import FilePath, Progress
 from ..mesh.mesh import Mesh
 from ..mesh.sequences import HasPoints, Sequence
@@ -161,7 +162,8 @@ class Checker:
             number("stretch", stretch, above=0.0)
         self.cloths, self.indices = cloths, range(0, len(cloths.labels), every)
         self.limits = [*cloths.limits, *([] if stretch is None else [edge_limit(cloths.mesh, stretch)])]
-        self.colliders = _by_name(cloths.colliders if colliders is None else colliders)
+        colliders = cloths.colliders if colliders is None else colliders
+        self.colliders = dict(zip(numbered(each.label for each in colliders), colliders, strict=True))
         self._crossings = Crossings(self._index[cloths.mesh.triangles])
 
     @property
@@ -238,15 +240,3 @@ class Checker:
             _, first, group = np.unique(together, return_index=True, return_inverse=True)
             found[own] = own[first[group.ravel()]]
         return found
-
-
-def _by_name(colliders):
-    """Colliders by their labels, numbered where one is taken."""
-    found: dict[str, Collider] = {}
-    for collider in colliders:
-        name, number = collider.label, 1
-        while name in found:
-            number += 1
-            name = f"{collider.label} {number}"
-        found[name] = collider
-    return found

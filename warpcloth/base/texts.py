@@ -37,6 +37,18 @@ def camel_case(name):
     return first + "".join(word.capitalize() for word in others)
 
 
+def numbered(labels, taken=()):
+    """The labels, numbered where one occurs twice or is taken."""
+    found = []
+    for label in labels:
+        name, number = label, 1
+        while name in found or name in taken:
+            number += 1
+            name = f"{label} {number}"
+        found.append(name)
+    return found
+
+
 def assignments(texts):
     """A dict from texts of the form ``name=value``.
 

@@ -69,18 +69,19 @@ def check(arguments):
     check_apart(files.values(), [*cloths.files, arguments.file])
     checker = Checker(cloths, stretch=arguments.stretch, every=arguments.every)
     found = []
-    with closing(Progress(len(checker), first="checking")) as progress, _writer(arguments, cloths) as writer:
-        try:
+    opened = _writer(arguments, cloths)
+    try:
+        with closing(Progress(len(checker), first="checking")) as progress, opened as writer:
             for each in checker:
                 found.append(each)
                 if writer is not None:
                     _append(writer, cloths, each)
                 progress(len(found), len(checker))
-        except KeyboardInterrupt:
-            saved = "nothing was saved" if writer is None else writer.saved()
-            raise Interrupted(f"interrupted after {len(found)} of {len(checker)} frames; {saved}") from None
-        if writer is not None:
-            writer.close(single_file=arguments.single_file)
+            if writer is not None:
+                writer.close(single_file=arguments.single_file)
+    except KeyboardInterrupt:
+        saved = opened.saved() if arguments.output else "nothing was saved"
+        raise Interrupted(f"interrupted after {len(found)} of {len(checker)} frames; {saved}") from None
     if arguments.csv:
         write_table(arguments.csv, _COLUMNS, (row for each in found for row in _rows(cloths, checker, each)))
     worst = max(found, key=lambda each: (len(each.pairs), each.vertices_inside))

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..base.checks import shown
+from ..base.texts import numbered
 from ..base.turns import in_turn
 from ..contact.collider_work import ColliderWork
 from ..contact.present import ColliderPulls, PresentContact
@@ -47,7 +48,7 @@ def _term_names(scene):
     """Names of the terms, and of contact and friction: their labels, numbered where one is taken; facets share theirs."""
     terms = [*scene.terms, *scene.contact_terms]
     first = [k for k, term in enumerate(terms) if not getattr(term, "facet", 0)]
-    names = _numbered((terms[k].label for k in first), _other_names(scene))
+    names = numbered((terms[k].label for k in first), _other_names(scene))
     return [names[np.searchsorted(first, k, side="right") - 1] for k in range(len(terms))]
 
 
@@ -59,18 +60,7 @@ def _other_names(scene):
 
 def collider_names(scene: Scene) -> list[str]:
     """Names of the colliders of a scene: their labels, numbered where one is taken."""
-    return _numbered(collider.label for collider in scene.colliders)
-
-
-def _numbered(labels, taken=()):
-    found = []
-    for label in labels:
-        name, number = label, 1
-        while name in found or name in taken:
-            number += 1
-            name = f"{label} {number}"
-        found.append(name)
-    return found
+    return numbered(collider.label for collider in scene.colliders)
 
 
 class Evaluation:
