@@ -290,7 +290,7 @@ def find_pairs(dtype, of_edges: bool):
     """
     vec3, _ = types(dtype)
     box_of, level_of, cell_at, cells_about = boxes(dtype)
-    number, corner = load(wp.int32), load(vec3)
+    number, corner, four = load(wp.int32), load(vec3), load(wp.vec4i)
     closest, cutoff = closest_points(dtype, of_edges), cutoffs(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
@@ -354,8 +354,8 @@ def find_pairs(dtype, of_edges: bool):
                                 or u[2] < low[2]
                             ):
                                 continue
-                            entry = grid.entries[slot]
-                            other = surface.items[entry[0]]
+                            entry = four(grid.entries, slot)
+                            other = four(surface.items, entry[0])
                             if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
                                 continue
                             s = wp.vec4i(own[0], own[1], other[0], other[1])
@@ -369,7 +369,7 @@ def find_pairs(dtype, of_edges: bool):
                                 s = wp.vec4i(own[0], other[0], other[1], other[2])
                             if entry[1] != cy or entry[2] != cz or entry[3] != code:
                                 continue
-                            _w, y = closest(x[s[0]], x[s[1]], x[s[2]], x[s[3]])
+                            _w, y = closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
                             d = wp.length(y)
                             if d < radius:
                                 if d < surface.skin or d < surface.skin + cutoff(surface, s, copy * surface.vertices):

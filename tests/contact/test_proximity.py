@@ -277,3 +277,10 @@ def test_no_pair_is_missing_while_nothing_has_moved(device):
     assert not moved(x) and found.moved(model.array(x, model.vec3), 0.25).numpy()[0]
     x[3, 0] += 0.2 * skin
     assert moved(x)
+    batch, found = proximity(SHEETS, distance, skin, device, copies=2)
+    both = np.concatenate([x, x])
+    found.launch(batch.array(both, batch.vec3))
+    both[len(x) :] += np.array([0.0, 5.0, 0.0])
+    assert not found.moved(batch.array(both, batch.vec3)).numpy()[0]
+    both[-1, 0] += 0.6 * skin
+    assert found.moved(batch.array(both, batch.vec3)).numpy()[0]
