@@ -14,7 +14,8 @@ from .terms.contact import local_gap, turned
 from .vectors import types
 
 local_gap_of, turned_by, slope_of, DELTA = local_gap, turned, contact.slope, contact.DELTA
-ROUNDS = wp.constant(4)  # in which a vertex between moving colliders is looked at again
+ROUNDS = wp.constant(6)  # in which a vertex that colliders stop is looked at again
+SLIDING = wp.constant(2)  # of these, in which it slides; then its way is only shortened, which ends
 MARCHES = wp.constant(32)  # planes that a vertex meets on its way past a collider, at most
 
 
@@ -26,13 +27,14 @@ def pose_types(dtype):
 
 @cache
 def shapes(dtype):
-    """The struct of the shapes of C colliders, see :mod:`.terms.contact`: half sizes of the core, and radius."""
+    """The struct of the shapes of C colliders, see :mod:`.terms.contact`: half sizes of the core, radius, and friction μ."""
     vec3, _ = types(dtype)
 
     @wp.struct
     class Shapes:
         core: wp.array(dtype=vec3)
         radius: wp.array(dtype=dtype)
+        friction: wp.array(dtype=dtype)
 
     return Shapes
 
@@ -312,21 +314,100 @@ def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex:
 
 
 @cache
-def outside(dtype):
-    """The device function (x, end, …) → where a free vertex ends that moves from x to ``end``, and whether it was cut short.
+def sliding(dtype):
+    """Device functions of a vertex that a surface stops, ``along`` and ``velocity``."""
+    vec3, _ = types(dtype)
+    zero = dtype(0.0)
 
-    In the frame of a collider it moves along a segment, of which :func:`kept_part` remains. A vertex that would come nearer
-    than ``least`` stops where it is nearer than ``landing`` beyond, at most. ``notes`` counts it, and has it if colliders leave
-    no way out.
+    @wp.func
+    def along(move: vec3, n: vec3, friction: dtype):
+        """The part of a move along a surface of normal n, and the push by which that takes the part towards it.
+
+        Friction takes μ times as much as the push from the first, and never turns it back (Coulomb).
+        """
+        push = wp.max(-wp.dot(move, n), zero) * n
+        left = move + push
+        l, most = wp.length(left), friction * wp.length(push)
+        if most > zero:
+            left *= wp.max(l - most, zero) / wp.max(l, most)
+        return left, push
+
+    @wp.func
+    def velocity(v: vec3, move: vec3, change: vec3, push: vec3, h: dtype):
+        """The velocity after a step whose ``move`` has had this change, by a push and friction.
+
+        Along the push it is that of the move. Of Euler it is v + change/h, but midpoint, where v is twice the mean velocity of
+        the step less that at its start, would throw the vertex back.
+        """
+        size = wp.dot(push, push)
+        found = v + (change - push) / h
+        if size > zero:
+            found += wp.dot((move + change) / h - v, push) / size * push
+        return found
+
+    return along, velocity
+
+
+@cache
+def stopped_by_shape(dtype):
+    """The device function (X, move, …) → where a move from X ends in the frame of a convex collider, its change and push.
+
+    A move that would come nearer than ``least`` stops where it is nearer than ``landing`` beyond, at most, and with
+    ``slides`` goes on along the plane through that point, as all of the collider is behind it, lifted to twice ``least`` or it
+    would stop for rounding. The fourth value is whether it was stopped.
+    """
+    vec3, _ = types(dtype)
+    kept = kept_part(dtype)
+    along, _velocity = sliding(dtype)
+
+    @wp.func
+    def stopped(
+        X: vec3,
+        move: vec3,
+        core: vec3,
+        radius: dtype,
+        friction: dtype,
+        least: dtype,
+        landing: dtype,
+        slides: bool,
+    ):
+        end = X + move
+        change = vec3()
+        push = vec3()
+        hit = kept(X, move, core, radius, least) < dtype(1.0)
+        if hit:
+            t = kept(X, move, core, radius, least + landing)
+            end = X + t * move
+            change = (t - dtype(1.0)) * move
+            push = change
+            if slides:
+                d, n = local_gap_of(end, core, radius)
+                left, push = along(-change, n, friction)
+                end += left + wp.max(dtype(2.0) * least - d, dtype(0.0)) * n
+                change += left
+        return end, change, push, hit
+
+    return stopped
+
+
+@cache
+def outside(dtype):
+    """The device function (x, end, v, …) → where a free vertex ends that moves from x to ``end``, and its velocity there.
+
+    In the frame of a collider it moves along a segment, and where that comes too near as :func:`stopped_by_shape` has it. The
+    third value is whether one has stopped it. ``notes`` counts that, and has the vertex if colliders leave no way out.
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
-    kept = kept_part(dtype)
+    stopped = stopped_by_shape(dtype)
+    _along, velocity = sliding(dtype)
 
     @wp.func
     def end_outside(
         x: vec3,
         end: vec3,
+        v: vec3,
+        h: dtype,
         i: int,
         step: int,
         shape: shapes(dtype),
@@ -337,29 +418,43 @@ def outside(dtype):
         notes: FilterNotes,
     ):
         copy = i // per_copy
+        move = end - x
         rounded = least + dtype(8.0) * epsilon(least) * wp.max(wp.abs(end))
+        change = vec3()
+        push = vec3()
         cuts = wp.int32(0)
         last = wp.int32(0)
         rounds = wp.int32(0)
         while rounds <= cuts and rounds < ROUNDS:  # another one after each that has cut
             rounds += 1
             for c in range(shape.radius.shape[0]):
+                pose = poses.after[copy, c]
                 X = to_local(poses.before[copy, c], x)
-                way = to_local(poses.after[copy, c], end) - X
-                t = kept(X, way, shape.core[c], shape.radius[c], rounded)
-                if t < dtype(1.0):
-                    t = kept(X, way, shape.core[c], shape.radius[c], rounded + landing)
-                    end = to_space(poses.after[copy, c], X + t * way)
+                X, less, by, hit = stopped(
+                    X,
+                    to_local(pose, end) - X,
+                    shape.core[c],
+                    shape.radius[c],
+                    shape.friction[c],
+                    rounded,
+                    landing,
+                    rounds <= SLIDING,
+                )
+                if hit:
+                    end = to_space(pose, X)
+                    change += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], less)
+                    push += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], by)
                     cuts = rounds
                     last = c
         if cuts > 0:
+            v = velocity(v, move, change, push, h)
             wp.atomic_add(notes.cut, copy, wp.int64(1))
         if cuts == ROUNDS:
             for c in range(shape.radius.shape[0]):
                 d, _n = local_gap_of(to_local(poses.after[copy, c], end), shape.core[c], shape.radius[c])
                 if d <= dtype(0.0):
                     note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, last)
-        return end, cuts > 0
+        return end, v, cuts > 0
 
     return end_outside
 
@@ -400,8 +495,7 @@ def entry(dtype):
 def filter_step(dtype):
     """Kernel over vertices, at the end of a step: no free vertex is inside a collider, and none has crossed its surface.
 
-    What :func:`outside` cuts off x is also cut off v, over h, and off ``move``, which may be None. Others are noted by
-    :func:`entry`.
+    Free ones end as :func:`outside` has it, with ``move``, which may be None. Others are noted by :func:`entry`.
     """
     vec3, _ = types(dtype)
     end_outside, note_entry = outside(dtype), entry(dtype)
@@ -428,13 +522,12 @@ def filter_step(dtype):
         i = wp.tid()
         now = notes.steps[i // per_copy]
         if inverse_mass[i] > dtype(0.0):
-            end, short = end_outside(x_before[i], x[i], i, now, shape, poses, per_copy, least, landing, notes)
+            end, after, short = end_outside(x_before[i], x[i], v[i], h, i, now, shape, poses, per_copy, least, landing, notes)
             if short:
-                change = end - x[i]
-                x[i] = end
-                v[i] = v[i] + change / h
                 if move:
-                    move[i] = move[i] + change
+                    move[i] = move[i] + (end - x[i])
+                x[i] = end
+                v[i] = after
         else:
             note_entry(x_before[i], x[i], i, now, shape, poses, per_copy, least, notes)
 
@@ -443,7 +536,7 @@ def filter_step(dtype):
 
 @cache
 def hold_locked(dtype):
-    """Kernel over vertices: undoes what the filter did along axes on which a vertex does not move, from where it was before."""
+    """Kernel over vertices: undoes what the filter did along axes on which a vertex does not move, to what was before."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -451,23 +544,20 @@ def hold_locked(dtype):
         # elements
         mobility: wp.array(dtype=vec3),
         # state in
-        wanted: wp.array(dtype=vec3),
-        # parameters
-        h: dtype,
+        x_before: wp.array(dtype=vec3),
+        v_before: wp.array(dtype=vec3),
         # in and out
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        change = vec3()
         for axis in range(3):
             if mobility[i][axis] == dtype(0.0):
-                change[axis] = wanted[i][axis] - x[i][axis]
-        x[i] = x[i] + change
-        v[i] = v[i] + change / h
-        if move:
-            move[i] = move[i] + change
+                if move:
+                    move[i][axis] = move[i][axis] + x_before[i][axis] - x[i][axis]
+                x[i][axis] = x_before[i][axis]
+                v[i][axis] = v_before[i][axis]
 
     return hold
 

@@ -16,7 +16,19 @@ from functools import cache
 
 import warp as wp
 
-from .colliders import ROUNDS, FilterNotes, kept_part, local_gap_of, note_inside, of_pose, pose_types, shapes
+from .colliders import (
+    ROUNDS,
+    SLIDING,
+    FilterNotes,
+    kept_part,
+    local_gap_of,
+    note_inside,
+    of_pose,
+    pose_types,
+    shapes,
+    sliding,
+    stopped_by_shape,
+)
 from .rotation import epsilon
 from .terms import contact
 from .terms.contact import turned
@@ -29,7 +41,7 @@ AHEAD = wp.constant(10)  # steps for which they are to last
 FACETS = 3  # the most, of a vertex and a mesh
 MARCHES = wp.constant(32)  # separating planes between a vertex and a triangle on its way, at most
 CARRIES = wp.constant(16)  # of a vertex by triangles that move, in a step
-SLIDES = wp.constant(3)  # surfaces along which a prediction slides
+SLIDES = wp.constant(3)  # surfaces along which a prediction or a vertex slides
 BEYOND = wp.constant(0.02)  # of r: how far in front of the facets found so far the nearest point of the next must be
 ALIKE = wp.constant(0.9)  # cosine between the normals of two facets that are one
 
@@ -139,15 +151,20 @@ def geometry(dtype):
 
     @wp.func
     def nearer_side(p: vec3, a: vec3, b: vec3, best: dtype):
-        """Squared distance to the segment from a to b and where on it, if below ``best``; else −1."""
+        """Squared distance to the segment from a to b, where on it, and from there to p, if below ``best``; else −1.
+
+        Where that is short, rounding must not tilt it along the segment, whose ends may be far.
+        """
         e = b - a
         l = wp.dot(e, e)
         t = zero
         if l > zero:
             t = wp.clamp(wp.dot(p - a, e) / l, zero, one)
         y = p - a - t * e
+        if t > zero and t < one:
+            y -= wp.dot(y, e) / l * e
         s = wp.dot(y, y)
-        return wp.where(s < best, s, -one), t
+        return wp.where(s < best, s, -one), t, y
 
     @wp.func
     def from_triangle(p: vec3, t: mat33):
@@ -171,22 +188,24 @@ def geometry(dtype):
             flat = size <= zero
             ta = vec3(one, zero, zero)
             if w[2] < zero or flat:
-                s, at = nearer_side(p, a, b, best)
+                s, at, y = nearer_side(p, a, b, best)
                 if s >= zero:
                     best = s
                     ta = vec3(one - at, at, zero)
+                    away = y
             if w[0] < zero or flat:
-                s, at = nearer_side(p, b, c, best)
+                s, at, y = nearer_side(p, b, c, best)
                 if s >= zero:
                     best = s
                     ta = vec3(zero, one - at, at)
+                    away = y
             if w[1] < zero or flat:
-                s, at = nearer_side(p, c, a, best)
+                s, at, y = nearer_side(p, c, a, best)
                 if s >= zero:
                     best = s
                     ta = vec3(at, zero, one - at)
+                    away = y
             w = ta
-            away = (p - a) - w[1] * (b - a) - w[2] * (c - a)
             d = wp.length(away)
             if d > zero:
                 away = away / d
@@ -305,7 +324,7 @@ def queries(dtype):
                 d, n, w = from_triangle(p + done * way, t + done * moves)
             else:
                 k = MARCHES
-        return done, n, w
+        return done, d, n, w
 
     @wp.func
     def sweep(
@@ -324,9 +343,11 @@ def queries(dtype):
     ):
         """The part of a move that keeps ``least`` or where it starts, and what stops it: normal, triangle or −1, weights.
 
-        The move begins at the part ``start`` of the time from ``halves`` to ``after`` and ends with it.
+        The move begins at the part ``start`` of the time from ``halves`` to ``after`` and ends with it. Of triangles that stop
+        it at once, as do several of a plane, it is the nearest.
         """
         kept = one
+        nearest = dtype(wp.inf)
         away = vec3()
         weights = vec3()
         face = wp.int32(-1)
@@ -353,9 +374,11 @@ def queries(dtype):
                 moves = t_after - t
                 t += start * moves
                 moves = (one - start) * moves
-            part, n, w = march(p, way, t, moves, least, kept)
-            if part < kept and not absent:
+            part, d, n, w = march(p, way, t, moves, least, kept)
+            at_once = kept == zero and d < nearest and wp.dot(n, wp.transpose(moves) * w - way) > zero
+            if (part < kept or at_once) and not absent:
                 kept = part
+                nearest = d
                 away = n
                 weights = w
                 face = k
@@ -773,11 +796,13 @@ def anchor_on_mesh(dtype, bounded: bool):
 def filter_meshes(dtype):
     """Kernel over vertices, at the end of a step, as :func:`.colliders.filter_step`, of which some colliders are meshes.
 
-    A vertex that a mesh which deforms has stopped goes on with the triangle that has stopped it.
+    A vertex that a mesh has stopped goes on with the triangle that has stopped it, and slides along it until another stops it.
+    Each part of its way is tested against all triangles, so it crosses none.
     """
     vec3, _mat33 = types(dtype)
     to_local, to_space = of_pose(dtype)
-    kept_of = kept_part(dtype)
+    kept_of, stopped_by = kept_part(dtype), stopped_by_shape(dtype)
+    along, velocity = sliding(dtype)
     corners, from_triangle, carry = geometry(dtype)
     _nearest, sweep, has_list, is_alone, _listed = queries(dtype)
     zero, one = dtype(0.0), dtype(1.0)
@@ -790,14 +815,21 @@ def filter_meshes(dtype):
         copy: int,
         p: vec3,
         end: vec3,
+        friction: dtype,
         least: dtype,
         free: int,
+        slides: int,
         lists: near_lists(dtype),
         i: int,
     ):
-        """Where a move from p to ``end`` ends, and whether something stops it: 1; 2 if it gets past that, of what is free."""
+        """Where a move from p to ``end`` ends, its change and push, and whether something stops it.
+
+        That is 1, or 2 if it gets past that, of what is free.
+        """
         per_frame = motion.per_frame
         before = 2 * motion.steps[copy]
+        change = vec3()
+        push = vec3()
         hit = wp.int32(0)
         moving = wp.bool(True)
         done = zero
@@ -819,20 +851,35 @@ def filter_meshes(dtype):
             else:
                 rounds += 1
                 kept = wp.min(kept, most)
-                p += kept * (end - p)
+                left = end - p
+                p += kept * left
+                left *= one - kept
                 done += kept * (one - done)
                 end = p
+                by = -left
                 thick = least
-                moving = face >= 0 and mesh.frames[c] > 1
+                moving = face >= 0 and (mesh.frames[c] > 1 or rounds <= slides)
                 if moving:
                     t = corners(mesh, c, face, before, per_frame)
-                    t_end = corners(mesh, c, face, before + 2, per_frame)
-                    t += done * (t_end - t)
+                    t_end = t
+                    if mesh.frames[c] > 1:
+                        t_end = corners(mesh, c, face, before + 2, per_frame)
+                        t += done * (t_end - t)
                     d, n, w = from_triangle(p, t)
-                    end = wp.transpose(t_end) * w + d * carry(n, t, t_end)
+                    if mesh.frames[c] > 1:
+                        n = carry(n, t, t_end)
+                        end = wp.transpose(t_end) * w + d * n
+                        left -= end - p
+                        by = -left
+                change -= left
+                if moving and rounds <= slides:
+                    left, by = along(left, n, friction)
+                    end += left + wp.max(dtype(2.0) * least - d, zero) * n
+                    change += left
+                push += by
         if rounds == CARRIES:
             hit = 2
-        return hit, end
+        return end, change, push, hit
 
     @wp.kernel(module="unique", enable_backward=False)
     def filter_vertices(
@@ -861,47 +908,60 @@ def filter_meshes(dtype):
         end = x[i]
         free = wp.where(inverse_mass[i] > zero, 1, 0)
         rounding = dtype(8.0) * epsilon(motion.least) * wp.max(wp.abs(end))
-        rounded = motion.least + rounding
         most = wp.where(count > 1 and free > 0, ROUNDS, 1)
+        change = vec3()
+        push = vec3()
         cuts = wp.int32(0)
         last = wp.int32(0)
         rounds = wp.int32(0)
         while rounds <= cuts and rounds < most:  # another one after each that has cut
             rounds += 1
             for c in range(count):
+                pose = motion.after[copy, c]
                 p = to_local(motion.before[copy, c], x0)
-                way = to_local(motion.after[copy, c], end) - p
+                way = to_local(pose, end) - p
+                hit = wp.int32(0)
+                found = p
+                less = vec3()
+                by = vec3()
                 if mesh.frames[c] > 0:
                     near = wp.max(rounding, dtype(8.0) * epsilon(motion.least) * wp.max(wp.abs(p)))
                     least = wp.where(free > 0, motion.least + near, near)
-                    hit = wp.int32(0)
-                    found = p
+                    slides = wp.where(rounds <= SLIDING, SLIDES, 0)
                     if not is_alone(lists, c, i, step, p, wp.length(way)):
-                        hit, found = stopped(mesh, c, motion, copy, p, p + way, least, free, lists, i)
-                    if hit > 0 and free > 0:
-                        end = to_space(motion.after[copy, c], found)
-                        cuts = rounds
-                        last = c
+                        found, less, by, hit = stopped(
+                            mesh, c, motion, copy, p, p + way, shape.friction[c], least, free, slides, lists, i
+                        )
                     if hit > free:
                         note_inside(notes, copy, c, step, vertex, per_copy, wp.where(free > 0, c, count))
                 elif free > 0:
-                    t = kept_of(p, way, shape.core[c], shape.radius[c], rounded)
-                    if t < one:
-                        t = kept_of(p, way, shape.core[c], shape.radius[c], rounded + motion.landing)
-                        end = to_space(motion.after[copy, c], p + t * way)
-                        cuts = rounds
-                        last = c
+                    found, less, by, short = stopped_by(
+                        p,
+                        way,
+                        shape.core[c],
+                        shape.radius[c],
+                        shape.friction[c],
+                        motion.least + rounding,
+                        motion.landing,
+                        rounds <= SLIDING,
+                    )
+                    hit = wp.where(short, 1, 0)
                 else:
                     d, _n = local_gap_of(p, shape.core[c], shape.radius[c])
                     deep = -wp.max(rounding, dtype(8.0) * epsilon(motion.least) * wp.max(wp.abs(p)))
                     if d > deep and kept_of(p, way, shape.core[c], shape.radius[c], deep) < one:
                         note_inside(notes, copy, c, step, vertex, per_copy, count)
+                if hit > 0 and free > 0:
+                    end = to_space(pose, found)
+                    change += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], less)
+                    push += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], by)
+                    cuts = rounds
+                    last = c
         if cuts > 0:
-            change = end - x[i]
-            x[i] = end
-            v[i] = v[i] + change / motion.h
+            v[i] = velocity(v[i], x[i] - x0, change, push, motion.h)
             if move:
-                move[i] = move[i] + change
+                move[i] = move[i] + (end - x[i])
+            x[i] = end
             wp.atomic_add(notes.cut, copy, wp.int64(1))
         if cuts == ROUNDS:
             for c in range(count):

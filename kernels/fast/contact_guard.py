@@ -19,8 +19,8 @@ from ..vectors import types
 def guard_struct(dtype):
     """The struct of contact of vertices with C colliders.
 
-    ``stiffness`` is kA (C, N) [N/m], ``friction`` μ (C,). ``balls`` have a center and a radius, infinite for pins, of the
-    colliders before step ``found`` (N,), from which the surface of none moves on by more than ``drift`` a step [m].
+    ``stiffness`` is kA (C, N) [N/m]. ``balls`` have a center and a radius, infinite for pins, of the colliders before step
+    ``found`` (N,), from which the surface of none moves on by more than ``drift`` a step [m].
     """
     _pose, anchor_type = pose_types(dtype)
 
@@ -29,7 +29,6 @@ def guard_struct(dtype):
         shape: shapes(dtype)
         poses: step_poses(dtype)
         stiffness: wp.array2d(dtype=dtype)
-        friction: wp.array(dtype=dtype)
         anchors: wp.array2d(dtype=anchor_type)
         balls: wp.array(dtype=wp.types.vector(4, dtype))
         found: wp.array(dtype=wp.int32)
@@ -87,7 +86,7 @@ def touching_step(dtype, symplectic: bool):
             X = to_local(pose, x)
             d, n = local_gap_of(X, guard.shape.core[c], guard.shape.radius[c])
             depth = wp.max(guard.distance - d, dtype(0.0))
-            most = guard.friction[c] * depth
+            most = guard.shape.friction[c] * depth
             slip = vec3()
             if depth > dtype(0.0):
                 pull = depth * n
@@ -102,7 +101,7 @@ def touching_step(dtype, symplectic: bool):
                     l = wp.length(slip)
                     pull -= wp.where(l > most, most / wp.max(l, most), dtype(1.0)) * slip
                 force += guard.stiffness[c, i] * turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], pull)
-            if guard.friction[c] > dtype(0.0):
+            if guard.shape.friction[c] > dtype(0.0):
                 found = anchor_type()  # without contact 0, whatever the ball was
                 if most > dtype(0.0):
                     X = X - slip
@@ -110,11 +109,9 @@ def touching_step(dtype, symplectic: bool):
                 guard.anchors[c, i] = found
         after, _rest, velocity = step(x, vec3(), v, a + w * force, h)
         now = guard.steps[copy]
-        end, short = end_outside(
-            x, after, i, now, guard.shape, guard.poses, guard.per_copy, guard.least, guard.landing, guard.notes
+        end, velocity, _short = end_outside(
+            x, after, velocity, h, i, now, guard.shape, guard.poses, guard.per_copy, guard.least, guard.landing, guard.notes
         )
-        if short:
-            velocity += (end - after) / h
         radius = dtype(-1.0)  # the anchor of what is held is let go in a step of its own
         if held == 0:
             radius = dtype(wp.inf)

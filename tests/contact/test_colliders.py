@@ -200,6 +200,59 @@ def test_no_vertex_is_inside(name, what, dtype, device):
                 assert collider.distances(points, frame).min() > 0.0, (speed, frame, collider.label)
 
 
+@pytest.mark.parametrize("solver", ("explicit", "euler", "midpoint", "bdf2"))
+@pytest.mark.parametrize("speed", (10.0, 100.0))
+def test_an_impact_without_friction_gains_no_energy(solver, speed, device):
+    """Against a plane that is tilted, so that some vertices meet it long before others."""
+    scene = falling([SHAPES["plane"]], speed, gravity=(0.0, 0.0, 0.0), contact=wc.Contact(distance=R, stiffness=1.47e4))
+    solver = SOLVERS["explicit"] if solver == "explicit" else wc.Newton(substeps=2, integrator=solver, tolerance=1e-6)
+    animation = wc.simulate(scene, solver, dtype="float64", device=device, record=("energies",))
+    energies = sum(animation.energies.values())
+    assert animation.status.ok and len(energies) == 9
+    assert (energies < (1.0 + 1e-6) * energies[0]).all() and energies[-1] < 0.9 * energies[0]
+
+
+GROOVE = [wc.Plane(normal=(side, 0.3, 0.0)) for side in (-1.0, 1.0)]
+WEDGE = trimesh.Trimesh(
+    [(x, y, z) for z in (-9.0, 9.0) for x, y in ((0.0, 0.0), (0.3, 1.0), (-0.3, 1.0))],
+    [[0, 1, 4], [0, 4, 3], [0, 3, 5], [0, 5, 2]],
+)
+SLIDING = {
+    "groove": GROOVE,
+    "groove of triangles": [wc.MeshCollider(WEDGE.vertices * 9.0, WEDGE.faces)],
+    "groove that closes": [
+        replace(plane, rotation=[(0.0, 0.0, np.sin(side * k), np.cos(side * k)) for k in (0.0, 0.1)])
+        for plane, side in zip(GROOVE, (-0.3, 0.3), strict=True)
+    ],
+    "ball on a floor": [wc.Sphere(radius=0.1, position=(0.0, -0.3, 0.0)), wc.Plane(position=(0.0, -0.4, 0.0))],
+    "torus": [wc.MeshCollider(TORUS.vertices, TORUS.faces, position=(0.0, -0.3, 0.0), rotation=TILTED)],
+}
+
+
+@pytest.mark.parametrize("what", SLIDING)
+@pytest.mark.parametrize("dtype", ("float32", "float64"))
+def test_what_slides_stays_outside(what, dtype, device):
+    """Points that go in all directions at 100 m/s, by 0.1 m a step, so that what slides along one surface meets another."""
+    random = np.random.default_rng(0)
+    points, velocities = random.uniform((-0.3, -0.4, -0.3), (0.3, 1.0, 0.3), size=(2000, 3)), random.normal(size=(300, 3))
+    walls = GROOVE if what == "groove of triangles" else SLIDING[what]  # an open mesh has no inside
+    points = points[np.min([each.distances(points) for each in walls], axis=0) > 2.0 * R][:300]
+    scene = wc.Scene(
+        wc.Mesh(points, edges=np.arange(300).reshape(-1, 2)),
+        masses=np.full(300, 1e-3),
+        velocities=100.0 * velocities / np.linalg.norm(velocities, axis=1)[:, None],
+        colliders=SLIDING[what],
+        contact=wc.Contact(distance=R, stiffness=1.0),
+        fps=1000.0,
+    )
+    stepper = wc.Explicit(substeps=1).bind(scene.build(dtype=dtype, device=device))
+    for step in range(1, 41):
+        stepper.step()
+        found = stepper.state.x.numpy().astype(float)
+        assert min(each.distances(found, step).min() for each in walls) > 0.0, step
+    assert stepper.inside == [] and stepper.cut[0] > (0.2 if "groove" in what else 0.001)
+
+
 @each_solver
 @pytest.mark.parametrize("open", (False, True))
 def test_none_crosses_a_sheet_that_stands_in_the_way(name, open):

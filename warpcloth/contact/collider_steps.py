@@ -54,7 +54,8 @@ class ColliderSteps:
         declared = model.colliders
         pose_type, self._anchor_type = kernels.pose_types(model.dtype)
         self.shapes = kernels.shapes(model.dtype)()
-        self.shapes.core, self.shapes.radius = declared.core, declared.radius
+        self._friction = model.array(declared.friction, model.dtype)  # whose memory the struct does not keep
+        self.shapes.core, self.shapes.radius, self.shapes.friction = declared.core, declared.radius, self._friction
         self._dim, self.poses = (model.copies, len(declared.radius)), kernels.step_poses(model.dtype)()
         for name in ("before", "at", "after"):
             setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
@@ -79,7 +80,7 @@ class ColliderSteps:
             self.meshes = MeshSteps(model, self.poses, self.bounded, **given)
         self._filter = model.kernel(kernels.filter_step if self.meshes is None else mesh_kernels.filter_meshes, model.dtype)
         if model.mobility is not None:
-            self._wanted, self._hold = model.vectors(), model.kernel(kernels.hold_locked, model.dtype)
+            self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(kernels.hold_locked, model.dtype)
             self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
         self.terms = []
         for elements in model.terms:
@@ -168,7 +169,7 @@ class ColliderSteps:
         return max(collider.centred().most_move for collider in self.model.scene.colliders) / self.steps_per_frame
 
     def launch_end(self, x, v, move=None):
-        """Cuts the step short of vertices that would end in a collider or cross one, in x, v and ``move`` (N,)."""
+        """Keeps vertices that would end in a collider or cross one out of it, in x, v and ``move`` (N,)."""
         model = self.model
         if self.meshes is None:
             given = [model.inverse_mass, self.shapes, self.x_before, self.poses]
@@ -178,10 +179,11 @@ class ColliderSteps:
             given += [self.meshes.motion, self.meshes.lists, model.per_copy]
         out = [x, v, move, self.notes]
         if model.mobility is not None:
-            wp.copy(self._wanted, x)
+            for wanted, array in zip(self._wanted, (x, v), strict=True):
+                wp.copy(wanted, array)
         model.launch(self._filter, model.count, given, out)
         if model.mobility is not None:  # those who then end inside are noted like pins
-            model.launch(self._hold, model.count, [model.mobility, self._wanted, self.h], out[:-1])
+            model.launch(self._hold, model.count, [model.mobility, *self._wanted], out[:-1])
             model.launch(self._filter, model.count, [self._fixed, *given[1:]], out)
         self.launch_count()
 

@@ -44,7 +44,6 @@ class ContactGuard:
         data = self.data = kernels.guard_struct(model.dtype)()
         self._kept = {  # whose memory the struct does not keep
             "stiffness": model.array(stiffness, model.dtype),
-            "friction": model.array(declared.friction, model.dtype),
             "anchors": colliders.anchor_rows,
             "balls": model.array(balls, wp.types.vector(4, model.dtype)),
             "found": wp.zeros(model.count, dtype=wp.int32, device=model.device),
