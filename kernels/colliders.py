@@ -71,6 +71,27 @@ def of_pose(dtype):
 
 
 @cache
+def half_space(dtype):
+    """The device function (point, normal) → the pose of the half-space behind the plane with this point and normal."""
+    vec3, _ = types(dtype)
+    pose_type, _anchor = pose_types(dtype)
+
+    @wp.func
+    def pose_of(point: vec3, normal: vec3):
+        turn = vec3(normal[2], dtype(0.0), -normal[0])
+        w = dtype(1.0) + normal[1]
+        size = wp.sqrt(wp.dot(turn, turn) + w * w)
+        if w <= dtype(0.0) or size == dtype(0.0):
+            turn = vec3(dtype(1.0), dtype(0.0), dtype(0.0))
+            w = dtype(0.0)
+            size = dtype(1.0)
+        turn /= size
+        return pose_type(point[0], point[1], point[2], turn[0], turn[1], turn[2], w / size)
+
+    return pose_of
+
+
+@cache
 def move_colliders(dtype):
     """Kernel over (copies, colliders): the poses of a step, in a :func:`step_poses`, ``at`` being ``halves`` half steps on.
 
@@ -162,7 +183,7 @@ def pose_collider(dtype):
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
-    kept, rest_type = kept_part(dtype), wp.types.vector(contact.PARAMETERS, dtype)
+    kept, behind, rest_type = kept_part(dtype), half_space(dtype), wp.types.vector(contact.PARAMETERS, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_pose(
@@ -198,18 +219,7 @@ def pose_collider(dtype):
                 X = X + t * way
                 d, n = local_gap_of(X, core, radius)
                 position = to_space(pose, X - d * n)
-                normal = turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], n)
-                turn = vec3(normal[2], dtype(0.0), -normal[0])
-                w = dtype(1.0) + normal[1]
-                size = wp.sqrt(wp.dot(turn, turn) + w * w)
-                if w <= dtype(0.0) or size == dtype(0.0):
-                    turn = vec3(dtype(1.0), dtype(0.0), dtype(0.0))
-                    w = dtype(0.0)
-                    size = dtype(1.0)
-                for k in range(3):
-                    pose[k] = position[k]
-                    pose[3 + k] = turn[k] / size
-                pose[6] = w / size
+                pose = behind(position, turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], n))
                 core = vec3(dtype(wp.inf), dtype(wp.inf), dtype(wp.inf))
                 radius = dtype(0.0)
         r = rest[e]

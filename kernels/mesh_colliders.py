@@ -20,6 +20,7 @@ from .colliders import (
     ROUNDS,
     SLIDING,
     FilterNotes,
+    half_space,
     kept_part,
     local_gap_of,
     note_inside,
@@ -650,7 +651,7 @@ def pose_facets(dtype):
     """Kernel over the elements of one facet: their rest states, a half-space far away where a vertex has fewer facets."""
     vec3, _ = types(dtype)
     facet = facet_type(dtype)
-    rest_type = wp.types.vector(contact.PARAMETERS, dtype)
+    behind, rest_type = half_space(dtype), wp.types.vector(contact.PARAMETERS, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def pose(
@@ -668,18 +669,11 @@ def pose_facets(dtype):
         f = facets[stencil[e, 0], which]
         r = rest[e]
         if f[6] > dtype(0.0):
-            w = dtype(1.0) + f[4]
-            turn = vec3(f[5], dtype(0.0), -f[3])
-            size = wp.sqrt(wp.dot(turn, turn) + w * w)
-            if w <= dtype(0.0) or size == dtype(0.0):
-                turn = vec3(dtype(1.0), dtype(0.0), dtype(0.0))
-                w = dtype(0.0)
-                size = dtype(1.0)
+            p = behind(vec3(f[0], f[1], f[2]), vec3(f[3], f[4], f[5]))
+            for k in range(7):
+                r[k] = p[k]
             for k in range(3):
-                r[k] = f[k]
-                r[3 + k] = turn[k] / size
                 r[7 + k] = dtype(wp.inf)
-            r[6] = w / size
             r[10] = dtype(0.0)
             r[12] = f[6] * areas[e]
             rest[e] = r

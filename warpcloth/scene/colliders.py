@@ -139,7 +139,7 @@ class Collider:
     @property
     def poses(self) -> np.ndarray:
         """Position and quaternion (x, y, z, w) of the frame in which :attr:`core` is, (F, 7), F = 1 if it stands."""
-        rotations = _product(np.atleast_2d(self.rotation), _from_y(self.up))
+        rotations = _product(np.atleast_2d(self.rotation), from_y(self.up))
         lengths = np.linalg.norm(rotations, axis=1)
         lengths[np.abs(lengths - 1.0) < 1e-15] = 1.0  # so that the poses of a pose are those
         rotations = rotations / lengths[:, None]
@@ -262,13 +262,12 @@ def _direction(name, given):
     return values / length
 
 
-def _from_y(direction):
-    """The quaternion (x, y, z, w) that turns the y axis to a direction by the shortest way."""
-    x, y, z = direction
-    if y < -1.0 + 1e-12:
-        return np.array([1.0, 0.0, 0.0, 0.0])
-    found = np.array([z, 0.0, -x, 1.0 + y])
-    return found / np.linalg.norm(found)
+def from_y(directions):
+    """The quaternions (…, 4), (x, y, z, w), that turn the y axis to directions (…, 3) by the shortest way."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    found = np.stack([z, np.zeros_like(x), -x, 1.0 + y], axis=-1)
+    found[y < -1.0 + 1e-12] = [1.0, 0.0, 0.0, 0.0]
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
 
 
 def _product(p, q):

@@ -14,7 +14,7 @@ from ..base.types import Converted, default
 from ..kernels import nearest
 from ..kernels.mesh_colliders import FACETS, FAR
 from ..mesh.mesh import Mesh
-from .colliders import Collider, turned
+from .colliders import Collider, from_y, turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,10 +172,7 @@ class MeshCollider(Collider):
         """Poses (n, 7) of half-spaces that touch it, at the start, where it is nearest to points (n, 3) outside."""
         away = turned(self.poses[0, 3:], self._away(points, 0)[0])
         normals = away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None]
-        x, y, z = normals.T
-        turns = np.stack([z, 0.0 * x, -x, 1.0 + y], axis=1)
-        turns[1.0 + y < 1e-12] = [1.0, 0.0, 0.0, 0.0]
-        return np.concatenate([points - away, turns / np.linalg.norm(turns, axis=1)[:, None]], axis=1)
+        return np.concatenate([points - away, from_y(normals)], axis=1)
 
     def _normals(self, vertices, faces, weights):
         """The normals of the face, the side or the corner where the nearest points of faces (k,) are, (k, 3).
