@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from .project import nth_of_thread, spread_compliance, sweep_turn
 from .term import Term
 from .terms.attachment import weight
 from .vectors import types
@@ -39,12 +40,13 @@ def share_hessian(y: Any, rest: Any, policy: int):
 
 
 @cache
-def share(name):
-    """The :class:`.term.Term` of one vertex of a cell: its rest state is what the cell gives it, A∂u/∂x (3) and Au.
+def share(term: Term):
+    """The :class:`.term.Term` of one vertex of a cell of a term: its rest state is what the cell gives it, A∂u/∂x (3) and Au.
 
     The first vertex of a cell has all of the energy. The Hessian, which is not that of one vertex, is that of :func:`blocks`.
     """
-    return Term(name, 1, 1, 4, _rest_state, weight, measure, share_energy, share_gradient, share_hessian, cells=True)
+    given = _rest_state, weight, measure, share_energy, share_gradient, share_hessian
+    return Term(term.name, 1, 1, 4, *given, cells=True, cell=term)
 
 
 @cache
@@ -156,3 +158,111 @@ def blocks(term: Term, dtype, corrected: bool):
                 out[starts[c] + (last - first) * (i - first) + j - first] = block
 
     return blocks_of_cells
+
+
+@cache
+def constant_blocks(term: Term, dtype):
+    """Kernel over cells of n vertices: out[starts[c] + n·i + j] = k A wᵢ·wⱼ [N/m], in double precision."""
+    M, weights_type, rest_type = (
+        wp.constant(term.rows),
+        wp.types.vector(term.rows, dtype),
+        wp.types.vector(term.parameters, dtype),
+    )
+    area = term.measure
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def constant_blocks_of_cells(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=weights_type),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        c = wp.tid()
+        first, last = offsets[c], offsets[c + 1]
+        scale = wp.float64(stiffness[first]) * wp.float64(area(rest[c]))
+        for i in range(first, last):
+            for j in range(first, last):
+                total = wp.float64(0.0)
+                for m in range(M):
+                    total += wp.float64(weights[i][m]) * wp.float64(weights[j][m])
+                out[starts[c] + (last - first) * (i - first) + j - first] = scale * total
+
+    return constant_blocks_of_cells
+
+
+@cache
+def correct_cells(term: Term, dtype, multipliers: bool, per_step: bool, axes: bool = False):
+    """Kernel of a Gauss–Seidel sweep over cells of a quadratic energy, as :func:`.project.correct_in_place`.
+
+    The rows of y are constraints one after the other: Δλ = −(y + α̃λ)/(Σ wᵢ² /mᵢ + α̃), each of which sees the moves of those
+    before it.
+    """
+    vec3, _ = types(dtype)
+    M, weights_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype)
+    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    spread, area, mass_type = spread_compliance(dtype), term.measure, vec3 if axes else dtype
+
+    @wp.func
+    def by_axis(inverse_mass: mass_type):
+        if wp.static(axes):
+            return inverse_mass
+        else:
+            return vec3(inverse_mass, inverse_mass, inverse_mass)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def correct(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=weights_type),
+        cell_rest: wp.array(dtype=rest_type),
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        # state in
+        inverse_mass: wp.array(dtype=mass_type),
+        x: wp.array(dtype=vec3),
+        # parameters
+        turn: sweep_turn(dtype),
+        # in and out
+        lambdas: wp.array(dtype=lambda_type),
+        d: wp.array(dtype=vec3),
+    ):
+        for k in range(wp.abs(turn.each)):
+            c = nth_of_thread(turn.first, turn.each, wp.tid(), k)
+            first, last = offsets[c], offsets[c + 1]
+            compliance = dtype(1.0) / (stiffness[first] * area(cell_rest[c]) * turn.h * turn.h)
+            for n in range(M):
+                m = n
+                if turn.each < 0:
+                    m = M - 1 - n
+                y = vec3()
+                total = vec3()
+                for e in range(first, last):
+                    w = weights[e][m]
+                    y += w * x[stencil[e, 0]]
+                    total += (w * w) * by_axis(inverse_mass[stencil[e, 0]])
+                for e in range(first, last):
+                    y += weights[e][m] * d[stencil[e, 0]]
+                if wp.static(multipliers):
+                    y += compliance * lambdas[c][m]
+                more = vec3()
+                for axis in range(3):
+                    if total[axis] > dtype(0.0) and wp.isfinite(compliance):
+                        own = compliance
+                        if wp.static(per_step):
+                            own = spread(total[axis], compliance, turn.sweeps)
+                        more[axis] = -turn.relaxation * y[axis] / (total[axis] + own)
+                if wp.static(multipliers):
+                    after = lambdas[c]
+                    after[m] = after[m] + more
+                    lambdas[c] = after
+                for e in range(first, last):
+                    v = stencil[e, 0]
+                    mobility = by_axis(inverse_mass[v])
+                    if wp.max(mobility) > dtype(0.0):
+                        d[v] = d[v] + weights[e][m] * wp.cw_mul(mobility, more)
+
+    return correct

@@ -67,6 +67,7 @@ class Term:
             factors (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it
             does not), and how stiff a spring between them would be, kₑ = 1; or None.
         cells: Whether elements of K = 1 are the vertices of cells of any size, see :class:`warpcloth.model.model.Cells`.
+        cell: Of the share that a vertex has of a cell the :class:`Term` of the cell, see :mod:`.sparse`; else None.
         project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or where there is a
             ``prox`` too, any p with ∂u/∂y = y − p(y); or None.
         prox: (v, rest, compliance) → argmin u(y) + ‖y − v‖²/(2·compliance) (M, 3), compliance 0 or more, in closed form, the
@@ -102,6 +103,7 @@ class Term:
     dead_zone: bool = False
     max_lengths: Callable | None = None
     cells: bool = False
+    cell: Any = None
     project: Any = None
     prox: Any = None
     prox_from: Any = None
@@ -118,6 +120,13 @@ class Term:
     bounded: Any = None
 
     @property
+    def whole(self):
+        """The term of the cells that it is a share of, or itself."""
+        return self.cell or self
+
+    @property
     def moves(self):
-        """Whether it has a local step: a projection, a scalar constraint or a prox."""
+        """Whether it has a local step: a projection, a scalar constraint, a prox; of cells with weights a quadratic energy."""
+        if self.vertices == 0:
+            return self.quadratic
         return any(function is not None for function in (self.project, self.constraint, self.prox))

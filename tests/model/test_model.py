@@ -701,7 +701,8 @@ NUMBERS = [(kind, field) for kind, energy in KINDS.items() if kind in DECLARED f
 def test_any_number_of_a_term_varies(kind, field, by_element):
     """Each copy has the arrays of a scene with its numbers, to the bit."""
     term, random = DECLARED[kind](MESH), np.random.default_rng(7)
-    count = len(term.stencil(MESH)) if by_element else None
+    found = term.elements(MESH, MESH.points)
+    count = len(found.stencil if found.cells is None else found.cells[1:]) if by_element else None
     shape = (COPIES, *([count] if by_element else []), *term.quantities()[field].shape)
     values = random.uniform(0.5, 0.9, shape) + (0.5 if field == "most" else 0.0)
     batch = scene(terms=[term]).build(copies=COPIES, dtype="float64", vary={f"{kind}.{field}": values}).terms[0]
@@ -711,6 +712,9 @@ def test_any_number_of_a_term_varies(kind, field, by_element):
             of_batch, of_one = (getattr(elements, name) for elements in (batch, alone))
             if of_one is not None:
                 assert (of_batch.numpy().reshape(COPIES, alone.count, -1)[b] == of_one.numpy().reshape(alone.count, -1)).all()
+        if alone.cells:
+            weights = batch.cells.weights.numpy().reshape(COPIES, alone.count, -1)[b]
+            assert (weights == alone.cells.weights.numpy()).all()
 
 
 def test_copies_without_differences_are_alike(device):

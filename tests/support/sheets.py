@@ -23,6 +23,7 @@ TERMS = {
     "Neo-Hookean": [wc.NeoHookeanMembrane(stiffness=100.0)],
     "quadratic bending": [wc.QuadraticBending(stiffness=1e-3)],
     "damped quadratic bending": [wc.QuadraticBending(stiffness=1e-3, damping=1e-5)],
+    "plate bending": [wc.PlateBending(stiffness=1e-3, poisson_ratio=0.3, weft_ratio=2.0)],
     "dihedral bending": [wc.DihedralBending(stiffness=1e-3, damping=1e-5)],
     "attachments": [wc.Attachment(vertices="corners", stiffness=10.0, damping=0.1)],
     "clusters": [wc.RigidCluster(vertices=[[0, 1, 2, 7], [20, 21, 28]], stiffness=1e3)],

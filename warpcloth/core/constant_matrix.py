@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..kernels import assemble
+from ..kernels import assemble, sparse
 from ..model.host_values import host_values
 
 
@@ -16,6 +16,23 @@ def constant_blocks(model, elements):
     return blocks.numpy().reshape(-1, K, K)
 
 
+def constant_entries(model, elements):
+    """The rows and columns of the entries of k A GᵀG of all elements of one copy, and their numbers (B, m) [N/m]."""
+    if elements.term.cell is None:
+        stencil = host_values(elements.stencil)[: elements.per_copy]
+        K = stencil.shape[1]
+        blocks = constant_blocks(model, elements)
+        return np.repeat(stencil, K, axis=1).ravel(), np.tile(stencil, K).ravel(), blocks.reshape(model.copies, -1)
+    cells = elements.cells
+    starts, count = cells.blocks()
+    blocks = wp.zeros(count, dtype=wp.float64, device=model.device)
+    given = [cells.offsets, starts, cells.weights, elements.stiffness, cells.rest]
+    model.launch(model.kernel(sparse.constant_blocks, cells.term, model.dtype), cells.count, given, [blocks])
+    rows, columns = cells.pairs(elements)
+    one = count // model.copies
+    return rows[:one], columns[:one], blocks.numpy().reshape(model.copies, one)
+
+
 def constant_matrices(model, s):
     """s·M + Σ k A GᵀG of each copy, y = Gx, as scipy matrices (n, n) [N/m]; rows of pins are those of the identity."""
     from scipy.sparse import coo_matrix
@@ -26,11 +43,8 @@ def constant_matrices(model, s):
     vertices = np.arange(n)
     rows, columns, values = [vertices], [vertices], [diagonal]
     for elements in model.terms:
-        stencil = host_values(elements.stencil)[: elements.per_copy]
-        K = stencil.shape[1]
-        rows.append(np.repeat(stencil, K, axis=1).ravel())
-        columns.append(np.tile(stencil, K).ravel())
-        values.append(constant_blocks(model, elements).reshape(B, -1))
+        for found, more in zip((rows, columns, values), constant_entries(model, elements), strict=True):
+            found.append(more)
     rows, columns, values = np.concatenate(rows), np.concatenate(columns), np.concatenate(values, axis=1)
     free = free[:n]  # pins are those of the scene, in every copy
     keep = (free[rows] & free[columns]) | (np.arange(len(rows)) < n)

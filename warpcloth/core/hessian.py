@@ -42,17 +42,12 @@ class _SparseBlocks:
     def __init__(self, model, elements, corrected):
         self.model, self.elements, cells = model, elements, elements.cells
         self._kernel = model.kernel(sparse.blocks, cells.term, model.dtype, corrected)
-        ends = np.cumsum(np.diff(host_values(cells.offsets)).astype(np.int64) ** 2)
-        self._starts = wp.array(np.append(0, ends[:-1]).astype(np.int32), dtype=wp.int32, device=model.device)
-        self.blocks = wp.zeros(int(ends[-1]), dtype=model.mat33, device=model.device)
+        self._starts, count = cells.blocks()
+        self.blocks = wp.zeros(count, dtype=model.mat33, device=model.device)
 
     def pairs(self):
         """The row and the column of each block."""
-        vertices = np.split(
-            host_values(self.elements.stencil)[:, 0].astype(np.int64), host_values(self.elements.cells.offsets)[1:-1]
-        )
-        rows = [np.repeat(cell, len(cell)) for cell in vertices]
-        return np.concatenate(rows), np.concatenate([np.tile(cell, len(cell)) for cell in vertices])
+        return self.elements.cells.pairs(self.elements)
 
     def launch(self, x, correction, policy):
         cells, elements = self.elements.cells, self.elements

@@ -56,10 +56,10 @@ class BlockStep:
         self.model, self.state, self._guard = model, state, guard
         window = window or Window(guard.terms if guard else model.terms, model.inverse_mass, model.pins, model.keyframes)
         self._pins = window.pins, window.keyframes, count
-        refreshed, others = ([each for each in window.terms if (each.refresh is not None) == apart] for apart in (True, False))
+        terms = [as_pairs(model, elements) for elements in window.terms]
+        pairs = tuple(now.label for now, before in zip(terms, window.terms, strict=True) if now is not before)
+        refreshed, swept = ([each for each in terms if (each.refresh is not None) == apart] for apart in (True, False))
         self._refreshed, self._gradient = Gradient(model, terms=refreshed), wp.zeros_like(state[0])
-        swept = [as_pairs(model, elements) for elements in others]
-        pairs = tuple(now.label for now, before in zip(swept, others, strict=True) if now is not before)
         self.record = StepRecord("blocks", pairs=pairs, compensated=compensated)
         vertices, swept, arrays, numbers = block_layout(swept, len(state[0]) // model.copies, model.copies)
         damped = [elements.damping is not None for elements in swept]

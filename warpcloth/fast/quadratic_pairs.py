@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from ..core.constant_matrix import constant_entries
 from ..kernels.assemble import constant_blocks
 from ..kernels.fast.quadratic_pair import QUADRATIC_PAIR
 from ..model.host_values import host_values
@@ -65,11 +66,26 @@ def _without_zeros(blocks, K):
     return np.where((small[:, :, None] | small[:, None]).reshape(blocks.shape), 0.0, blocks)
 
 
+def _entries_of_cells(model, elements):
+    """As :func:`matrix_entries`, of cells with weights, all entries of the pattern."""
+    rows, columns, values = constant_entries(model, elements)
+    keys, where = np.unique(rows * model.per_copy + columns, return_inverse=True)
+    numbers = np.stack([np.bincount(where, each, len(keys)) for each in values])
+    rows, columns = np.divmod(keys, model.per_copy)
+    apart = rows != columns
+    return rows[apart], columns[apart], numbers[:, apart]
+
+
 def as_pairs(model, elements):
     """The pairs of vertices that have the same forces as elements of a quadratic energy, or these where they are no faster."""
-    if not elements.term.quadratic or elements.damping is not None or elements.refresh:
+    if not elements.term.whole.quadratic or elements.damping is not None:
         return elements
-    rows, columns, numbers = matrix_entries(model, elements)
+    if elements.term.cell:
+        rows, columns, numbers = _entries_of_cells(model, elements)
+    elif elements.refresh:
+        return elements
+    else:
+        rows, columns, numbers = matrix_entries(model, elements)
     upper = rows < columns
     per_copy = int(upper.sum())
     if not 0 < per_copy <= PAIRS * elements.per_copy:
@@ -83,4 +99,6 @@ def as_pairs(model, elements):
         stencil=wp.array(stencil, dtype=wp.int32, device=model.device),
         stiffness=model.array(-numbers[:, upper].ravel(), model.dtype),
         rest=wp.zeros(len(stencil), dtype=wp.types.vector(1, model.dtype), device=model.device),
+        refresh=None,
+        cells=None,
     )

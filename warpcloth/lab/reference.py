@@ -204,7 +204,7 @@ def _method(scene):
     if fewest < _MOST_EXPLICIT:
         return _Method(lambda s: Explicit(substeps=s), max(4, int(fewest) + 1), 1)
     for elements in model.terms:
-        if elements.cells:
+        if elements.cells and not elements.term.whole.quadratic:
             warnings.warn(
                 f"{elements.label} makes the reference of {scene.name} slow: Newton's method takes many iterations for bodies; "
                 f"with less stiffness, below {_MOST_EXPLICIT} explicit steps a frame, it is faster",

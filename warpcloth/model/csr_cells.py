@@ -43,10 +43,7 @@ class Cells:
 
     def reordered(self, order):
         """The cells with those of index ``order`` in that order, and that of their elements."""
-        firsts, sizes = host_values(self.offsets)[order], self.sizes[order]
-        ends = np.cumsum(sizes)
-        of_elements = np.arange(ends[-1]) + np.repeat(firsts - (ends - sizes), sizes)
-        offsets = keep(np.append(0, ends).astype(np.int32), wp.int32, self.offsets.device)
+        offsets, of_elements = _reordered(self, order)
         return replace(self, offsets=offsets, shape=reordered(self.shape, of_elements)), of_elements
 
     @property
@@ -89,6 +86,37 @@ class SparseCells:
         rest = part(self.rest, slice(first * C, (first + count) * C))
         return replace(self, offsets=part(self.offsets, slice(count * C + 1)), weights=part(self.weights, elements), rest=rest)
 
+    def reordered(self, order):
+        """The cells with those of index ``order`` in that order, and that of their elements."""
+        offsets, of_elements = _reordered(self, order)
+        rest, weights = reordered(self.rest, order), reordered(self.weights, of_elements)
+        return replace(self, offsets=offsets, rest=rest, weights=weights), of_elements
+
+    @property
+    def sizes(self):
+        """Elements of each cell, (B·C,)."""
+        return np.diff(host_values(self.offsets))
+
+    def blocks(self):
+        """Where the n² blocks of each cell of n vertices begin, (B·C,) int32 on the device, and the end of the last."""
+        ends = np.cumsum(self.sizes.astype(np.int64) ** 2)
+        starts = np.append(0, ends[:-1]).astype(np.int32)
+        return wp.array(starts, dtype=wp.int32, device=self.offsets.device), int(ends[-1])
+
+    def pairs(self, elements):
+        """The row and the column of each of these blocks; ``elements`` are those of the cells."""
+        vertices = np.split(host_values(elements.stencil)[:, 0].astype(np.int64), host_values(self.offsets)[1:-1])
+        rows = [np.repeat(cell, len(cell)) for cell in vertices]
+        return np.concatenate(rows), np.concatenate([np.tile(cell, len(cell)) for cell in vertices])
+
+
+def _reordered(cells, order):
+    """Offsets of cells with those of index ``order`` in that order, and the indices of their elements."""
+    firsts, sizes = host_values(cells.offsets)[order], cells.sizes[order]
+    ends = np.cumsum(sizes)
+    of_elements = np.arange(ends[-1]) + np.repeat(firsts - (ends - sizes), sizes)
+    return keep(np.append(0, ends).astype(np.int32), wp.int32, cells.offsets.device), of_elements
+
 
 def rigid_cells(model, elements):
     """:class:`Cells` of :class:`warpcloth.terms.declared.Elements`, and their rest state with the masses, (B, E, P)."""
@@ -116,7 +144,7 @@ def rigid_cells(model, elements):
 
 def sparse_cells(model, elements, rest):
     """:class:`SparseCells` of elements with rest states (B, C, P), and the rest states of their shares, (B, E, 4)."""
-    E, M, P = *elements.weights.shape, elements.term.parameters
+    (E, M), P = elements.weights.shape[-2:], elements.term.parameters
     weights = np.broadcast_to(elements.weights, (model.copies, E, M))
     cells = SparseCells(
         elements.term,

@@ -165,7 +165,7 @@ def elements_on(model, term, positions, vary):
         if one.weights is None:
             cells, rest = rigid_cells(model, one)
         else:
-            cells, rest, declared = *sparse_cells(model, one, rest), share(one.term.name)
+            cells, rest, declared = *sparse_cells(model, one, rest), share(one.term)
         if stiffness.shape[1] > 1:
             stiffness = np.repeat(stiffness, np.diff(one.cells), axis=1)
     rest_type = wp.types.vector(declared.parameters, model.dtype)

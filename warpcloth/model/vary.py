@@ -65,8 +65,8 @@ class Vary:
             positions: Where the vertices of each copy start, (B, n, 3) [m].
 
         Returns:
-            (elements, rest, stiffness, damping): :class:`warpcloth.terms.declared.Elements` of the first copy, rest states
-            (B, E, P), stiffness and damping (B, 1) or (B, E), of cells (B, C).
+            (elements, rest, stiffness, damping): :class:`warpcloth.terms.declared.Elements` of the first copy, with weights
+            (B, E, M) where they may differ, rest states (B, E, P), stiffness and damping (B, 1) or (B, E), of cells (B, C).
         """
         one = term.elements(mesh, positions[0])
         count = len(one.stencil) if one.cells is None else len(one.cells) - 1
@@ -83,14 +83,16 @@ class Vary:
             raise ValueError(f"{one.label} changes during a run and cannot be damped; leave its damping out")
         if not (given or self.has("positions")):
             return one, np.repeat(one.rest[None], self.copies, axis=0), stiffness, damping
-        rest = []
+        found = []
         for copy in range(self.copies):
             try:
                 declared = replace(term, **{name: values[copy] for name, values in given.items()})
-                rest.append(declared.elements(mesh, positions[copy]).rest)
+                found.append(declared.elements(mesh, positions[copy]))
             except ValueError as error:
                 raise ValueError(f"{error}, in copy {copy}") from error
-        return one, np.stack(rest), stiffness, damping
+        if one.weights is not None:
+            one = replace(one, weights=np.stack([each.weights for each in found]))
+        return one, np.stack([each.rest for each in found]), stiffness, damping
 
     def _of_term(self, term, field, count):
         """A field of a term, (B, *shape) or (B, count, *shape), or None where it does not vary."""

@@ -11,6 +11,7 @@ from ..core.thread_pool import ThreadPool
 from ..fast.plan import plan
 from ..kernels import project as kernels
 from ..kernels.clusters import correct_clusters
+from ..kernels.sparse import correct_cells
 from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 
@@ -70,7 +71,7 @@ class _Sweep:
         self.correction, self.elements = model.vectors() if correction is None else correction, list(model.terms)
         self._keys = []
         for elements in model.terms:
-            term = elements.term
+            term = elements.term.whole
             only = term.project is None and term.prox is None
             self._keys.append((term, model.dtype, only or (scalar and term.constraint is not None)))
         self.multipliers = [
@@ -98,6 +99,12 @@ class JacobiSweep(_Sweep):
 
     def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None, backend="auto"):
         super().__init__(model, x, h, relaxation, scalar, multipliers, None)
+        for elements in model.terms:
+            if elements.term.cell:
+                raise ValueError(
+                    f"sweep is {kind!r} with {elements.label}, whose elements differ in their number of vertices; it must be "
+                    '"coloured" or "sequential"'
+                )
         given = x, h, self.correction, self.multipliers, self._keys, *self._weights(kind, alpha), spread
         sweeps = plan(model, backend).jacobi_sweeps(*given)
         self.launch_start, self.launch, self.parts = sweeps.launch_start, sweeps.launch, sweeps.parts
@@ -120,6 +127,13 @@ class JacobiSweep(_Sweep):
                 firsts = host_values(elements.cells.offsets)[:-1]
                 largest[i] = np.repeat(np.maximum.reduceat(largest[i], firsts), elements.cells.sizes)
         return [model.array(self.relaxation / each, model.dtype) for each in largest], model.constant(1.0, model.count)
+
+
+def _correction(elements, dtype, key):
+    """The factory of the kernel that sweeps over the elements, and the first of its arguments."""
+    if elements.term.cell:
+        return correct_cells, elements.term.cell, dtype
+    return (correct_clusters, dtype) if elements.cells else (kernels.correct_in_place, *key)
 
 
 class GaussSeidelSweep(_Sweep):
@@ -158,9 +172,7 @@ class GaussSeidelSweep(_Sweep):
         self._refreshed = [elements for elements in refreshed if elements.refresh.when == EVALUATION]
         more = multipliers, spread is not None, model.mobility is not None
         self._kernels = [
-            model.kernel(correct_clusters, model.dtype, *more)
-            if elements.cells
-            else model.kernel(kernels.correct_in_place, *key, *more)
+            model.kernel(*_correction(elements, model.dtype, key), *more)
             for elements, key in zip(model.terms, self._keys, strict=True)
         ]
 
@@ -193,7 +205,11 @@ class GaussSeidelSweep(_Sweep):
         for i in range(len(self.elements))[::way]:
             elements = self.elements[i]
             cells = elements.cells
-            of_cells = [cells.offsets, cells.shape] if cells else []
+            of_elements = elements.arguments
+            if elements.term.cell:
+                of_elements = [cells.offsets, cells.weights, cells.rest, elements.stencil, elements.stiffness]
+            elif cells:
+                of_elements = [cells.offsets, cells.shape, *of_elements]
             each = (cells or elements).per_copy if self.ordered else 1
             for first, count in self.ranges[i][::way]:
                 before, part = pool.part(count // each)
@@ -202,7 +218,7 @@ class GaussSeidelSweep(_Sweep):
                 turn = kernels.sweep_turn(model.dtype)()
                 turn.first, turn.each = first + before * each, way * each_thread
                 turn.h, turn.sweeps, turn.relaxation = self.h, self.spread, self.relaxation
-                given = [*of_cells, *elements.arguments, model.local_mobility, self.x, turn]
+                given = [*of_elements, model.local_mobility, self.x, turn]
                 if part:
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
                 pool.launch_barrier(model)

@@ -9,6 +9,7 @@ import warp as wp
 from ..base.checks import number, whole
 from ..core.capture import Mirror, Segment
 from ..core.constant_matrix import constant_matrices
+from ..core.gradient import Gradient
 from ..core.status import Residual
 from ..core.sums import Sums
 from ..core.transpose import Transpose
@@ -39,7 +40,8 @@ class ADMM(ImplicitStep):
     - u += Dx − z.
     - (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once.
 
-    The fixed point is that of
+    Quadratic energies whose elements differ in their number of vertices, such as :class:`warpcloth.PlateBending`, are not
+    split: their matrix is part of that of the last step. The fixed point is that of
     :class:`warpcloth.ProjectiveDynamics` and the x(t+h) of :class:`warpcloth.Newton`. Only the product WD matters:
     if D is scaled and W inversely, the iterates stay the same.
 
@@ -76,7 +78,8 @@ class ADMM(ImplicitStep):
     ``residual`` is the larger of the primal and the dual residual. Both are the largest acceleration of any vertex, relative to
     gravity (in m/s² without gravity): the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before), divided by the masses. The
     first factor gives the primal residual at least the stiffness k, by which the forces of U at Dx and at z differ: otherwise
-    a small weight would look like convergence.
+    a small weight would look like convergence. With energies that are not split, the dual residual is no less than
+    the unbalanced acceleration of the last step.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
@@ -128,7 +131,7 @@ class ADMM(ImplicitStep):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term has infinite stiffness, or cells.
+            ValueError: If a term has infinite stiffness, or is of rigid clusters.
         """
         self.refuse(model)
         return self._on(ADMMStepper, model)
@@ -146,23 +149,26 @@ class ADMMStepper(ImplicitStepper):
     def __init__(self, options, model):
         super().__init__(options, model)
         model = self.model
-        scales = [curvatures(model, elements) for elements in model.terms]
-        ratios = [self._ratios_of(*each) for each in zip(model.terms, scales, strict=True)]
+        self._whole = [elements for elements in model.terms if elements.term.cells]
+        self._terms = [elements for elements in model.terms if not elements.term.cells]
+        scales = [curvatures(model, elements) for elements in self._terms]
+        ratios = [self._ratios_of(*each) for each in zip(self._terms, scales, strict=True)]
         factors = [scale * ratio for scale, ratio in zip(scales, ratios, strict=True)]
         self._inertia, self._sums = Inertia(model, 1.0 / self.he**2), Sums(model)
-        weighed = model.with_terms(elements.weighed(factor) for elements, factor in zip(model.terms, factors, strict=True))
-        self._factors = factorise_copies(model, constant_matrices(weighed, self._inertia.s))
+        weighed = [elements.weighed(factor) for elements, factor in zip(self._terms, factors, strict=True)]
+        self._factors = factorise_copies(model, constant_matrices(model.with_terms(weighed + self._whole), self._inertia.s))
+        self._gradient = Gradient(model, corrected=True, terms=self._whole) if self._whole else None
         self.factorise_seconds = self._factors.seconds
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
-        self._primal, self._dual = (Mirror(model.scalars()) for _ in range(2))
+        self._primal, self._dual, self._unbalanced = (Mirror(model.scalars()) for _ in range(3))
         self._active = Mirror(model.scalars(wp.int32))
-        self._split = [self._split_of(*each) for each in zip(model.terms, ratios, scales, strict=True)]
+        self._split = [self._split_of(*each) for each in zip(self._terms, ratios, scales, strict=True)]
         factories = kernels.start_admm, kernels.split
         self._kernels = [
-            [model.kernel(factory, elements.term, model.dtype) for factory in factories] for elements in model.terms
+            [model.kernel(factory, elements.term, model.dtype) for factory in factories] for elements in self._terms
         ]
         sums = kernels.scatter_admm, kernels.gather_admm
-        self._sums_of = [Transpose(model, elements, *sums, elements.term, model.dtype) for elements in model.terms]
+        self._sums_of = [Transpose(model, elements, *sums, elements.term, model.dtype) for elements in self._terms]
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._scale = GravityScale(model).or_else(1.0)
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
@@ -178,7 +184,10 @@ class ADMMStepper(ImplicitStepper):
     def measure(self):
         self._local()
         self.primal = np.where(self._iterating, self._primal.read() / self._scale, self.primal)
-        self.dual = np.where(self._iterating, self._dual.read() / self._scale, self.dual)
+        dual = self._dual.read()
+        if self._gradient is not None:
+            dual = np.maximum(dual, self._unbalanced.read())
+        self.dual = np.where(self._iterating, dual / self._scale, self.dual)
         return np.maximum(self.primal, self.dual), {}  # keeps NaN
 
     def iterate(self, active):
@@ -217,12 +226,16 @@ class ADMMStepper(ImplicitStepper):
         sums = [self._gaps, self._changes, self._force]
         for array in sums:
             array.zero_()
-        model.refresh(EVALUATION, Moment(self.state.x, self.correction))
+        model.refresh(EVALUATION, Moment(self.state.x, self.correction), self._terms)
         for (elements, of, (_start, split)), transpose in zip(self._each(), self._sums_of, strict=True):
             given = [elements.stencil, elements.rest, self.state.x, self.correction, kernels.STEPS]
             model.launch(split, elements.count, given, [of])
             transpose.add(of, *sums)
+        if self._gradient is not None:
+            self._gradient.add(self.state.x, self._force, self.correction)
         self._inertia.add(self.correction, self._force)
+        if self._gradient is not None:
+            self._sums.largest(model.inverse_mass, self._force, self._unbalanced.array)
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
             model.lock(forces)
             self._sums.largest(model.inverse_mass, forces, largest.array)
@@ -233,4 +246,4 @@ class ADMMStepper(ImplicitStepper):
         model.launch(self._plain_step, model.count, given, [self.correction])
 
     def _each(self):
-        return zip(self.model.terms, self._split, self._kernels, strict=True)
+        return zip(self._terms, self._split, self._kernels, strict=True)

@@ -9,6 +9,7 @@ from .corotated_membrane import CorotatedMembrane
 from .declared import Declared
 from .dihedral_bending import DihedralBending
 from .neo_hookean_membrane import NeoHookeanMembrane
+from .plate_bending import PlateBending
 from .quadratic_bending import QuadraticBending
 from .rigid_cluster import RigidCluster
 from .spring import Spring
@@ -21,6 +22,7 @@ __all__ = [
     "CorotatedMembrane",
     "DihedralBending",
     "NeoHookeanMembrane",
+    "PlateBending",
     "QuadraticBending",
     "RigidCluster",
     "Spring",

@@ -27,11 +27,16 @@ class Need:
 
 
 FINITE = Need(lambda elements: not elements.hard, "{label} with infinite stiffness", "give a finite stiffness")
-ELEMENTS = Need(lambda elements: not elements.term.cells, "{label}, whose bodies are no elements by themselves")
-PROJECTION = Need(lambda elements: elements.term.project is not None, "{label}, whose energy is no squared distance to a set")
+ELEMENTS = Need(
+    lambda elements: not elements.term.cells or elements.term.whole.quadratic,
+    "{label}, whose bodies are no elements by themselves",
+)
+PROJECTION = Need(
+    lambda elements: elements.term.whole.project is not None, "{label}, whose energy is no squared distance to a set"
+)
 # A projection, or contact, whose Hessian is added to that of projections.
 PROJECTION_OR_CONTACT = Need(
-    lambda elements: elements.term.project is not None or elements.term.bounded is not None, PROJECTION.lack
+    lambda elements: elements.term.whole.project is not None or elements.term.bounded is not None, PROJECTION.lack
 )
 NORMAL_FORCE = Need(
     lambda elements: elements.term is not FRICTION,
@@ -39,9 +44,9 @@ NORMAL_FORCE = Need(
     "leave friction at 0",
 )
 # A projection, a scalar constraint or a prox.
-LOCAL_STEP = Need(lambda elements: elements.term.moves, "{label}, whose energy is no distance to a constraint")
+LOCAL_STEP = Need(lambda elements: elements.term.whole.moves, "{label}, whose energy is no distance to a constraint")
 ROWS = Need(
-    lambda elements: elements.term.project is not None or elements.term.constraint is not None,
+    lambda elements: elements.term.vertices > 0 and (elements.term.project is not None or elements.term.constraint is not None),
     "{label}, whose energy is no square of a constraint",
 )
 # Where the projection changes from iteration to iteration, λ would keep parts of earlier directions.

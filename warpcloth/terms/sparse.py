@@ -14,7 +14,8 @@ class Sparse(Declared):
     """An energy U = Σ_c k A u(y_c) of cells with any number of vertices, y = Dx linear in all of them.
 
     A subclass defines ``operator`` and ``rest``, and no ``stencil``. Its ``term`` has ``vertices`` 0 and ``weight`` None.
-    Explicit and Newton take it.
+    Explicit and Newton take it; of a quadratic energy, whose ``term`` has ``cells``, ``project``, ``linear`` and ``quadratic``,
+    all solvers but ConstrainedDynamics do.
     """
 
     def operator(self, mesh):

@@ -1,0 +1,183 @@
+"""Second derivatives of a function on a mesh, for each triangle, from gradients that are single-valued on edges.
+
+For a function f of the vertices,
+
+    κ_T = 1/A Σ_e l_e sym(n_e ⊗ g_e)
+
+over the edges e of a triangle T, n_e the outward normal. g_e is the gradient in the middle of e. Its part along the edge is
+the difference of the two ends. Its part across the edge is the mean of the two triangles at e, each from a quadratic function
+through its own corners: through the opposite vertices of its three neighbours too, or where these do not fix it, as at the
+boundary, fitted by least squares to all vertices of the triangles around. So κ_T of a quadratic function is exact on flat
+meshes. The triangles around are unfolded into the plane of T: of a curved mesh only the lengths of edges count.
+"""
+
+import numpy as np
+
+_RANK = 1e-2  # smallest singular value over the largest below which six vertices do not fix a quadratic function
+_RINGS = 4  # of triangles around, at most, until they do
+
+
+def side_axes(mesh):
+    """Two axes in the plane of each triangle, the first along its first side, (T, 2, 3) unit vectors."""
+    x = mesh.points[mesh.triangles]
+    side, other = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
+    side = side / np.linalg.norm(side, axis=1)[:, None]
+    across = np.cross(np.cross(side, other), side)
+    return np.stack([side, across / np.linalg.norm(across, axis=1)[:, None]], axis=1)
+
+
+def curvature_operator(mesh):
+    """K as a scipy sparse matrix (3T, n): rows from 3t to 3t + 3 of K f are κ₁₁, κ₂₂, κ₁₂ of triangle t [unit of f, 1/m²].
+
+    The axes are those of :func:`side_axes`.
+
+    Args:
+        mesh: The :class:`warpcloth.Mesh`, of triangles.
+
+    Raises:
+        ValueError: More than two triangles share an edge, or two triangles have the same three vertices.
+    """
+    from scipy.sparse import csr_array
+
+    p = np.einsum("tai,tki->tka", side_axes(mesh), mesh.points[mesh.triangles] - mesh.points[mesh.triangles[:, :1]])
+    area, T, n = mesh.triangle_areas, len(p), len(mesh.points)
+    partner = _partners(mesh)
+    side = np.roll(p, -1, axis=1) - p  # from corner k to k + 1
+    length = np.linalg.norm(side, axis=2)
+    along = side / length[..., None]
+    outward = np.stack([along[..., 1], -along[..., 0]], axis=2)
+    inner = np.flatnonzero(partner.ravel() >= 0)
+    own = np.ones(3 * T)
+    own[inner] = 0.5
+    rows, columns = np.append(np.arange(3 * T), inner), np.append(np.arange(3 * T), partner.ravel()[inner])
+    # The outward normal of one triangle is the inward one of the other.
+    mean = csr_array((np.append(own, np.full(len(inner), -0.5)), (rows, columns)), shape=(3 * T, 3 * T))
+    across = mean @ _normal_derivatives(mesh, p, outward, length, partner)
+    ends = np.stack([mesh.triangles, np.roll(mesh.triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+    slopes = np.stack([-1.0 / length, 1.0 / length], axis=2).ravel()
+    tangential = csr_array((slopes, (np.repeat(np.arange(3 * T), 2), ends.ravel())), shape=(3 * T, n))
+
+    def summed(direction):
+        """Σ l/A sym(n ⊗ direction) of the sides of each triangle, (3T, 3T)."""
+        both = outward[..., :, None] * direction[..., None, :]
+        both = (both + both.swapaxes(2, 3)) * (0.5 * length / area[:, None])[..., None, None]
+        entries = both[:, :, [0, 1, 0], [0, 1, 1]].swapaxes(1, 2)  # (T, 3 entries, 3 sides)
+        columns = np.broadcast_to(3 * np.arange(T)[:, None, None] + np.arange(3), entries.shape)
+        return csr_array((entries.ravel(), columns.ravel(), np.arange(0, 9 * T + 1, 3)), shape=(3 * T, 3 * T))
+
+    return summed(outward) @ across + summed(along) @ tangential
+
+
+def _partners(mesh):
+    """The side 3t + k of the other triangle at each side (T, 3), −1 at the boundary; side k runs from corner k to k + 1."""
+    order, first, count = mesh._sides
+    if len(mesh.hinges):  # which refuses what is no surface
+        shared = first[count == 2]
+        one, two = order[shared], order[shared + 1]
+    else:
+        one = two = np.zeros(0, dtype=int)
+    partner = np.full(3 * len(mesh.triangles), -1)
+    partner[one], partner[two] = two, one
+    return partner.reshape(-1, 3)
+
+
+def _beyond(a, b, inside, ab, ac, bc):
+    """Points in the plane at distances ac and bc from a and b (…, 2), on the other side of ab than ``inside``."""
+    along = (b - a) / np.asarray(ab)[..., None]
+    s = np.asarray((ac**2 - bc**2 + ab**2) / (2.0 * ab))
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    normal = normal * -np.sign(np.einsum("...i,...i", normal, inside - a))[..., None]
+    return a + s[..., None] * along + np.sqrt(np.maximum(ac**2 - s**2, 0.0))[..., None] * normal
+
+
+def _bubbles(points, origin, slope):
+    """The barycentric coordinates λ_k of points (…, J, 2), and the functions λ_k λ_{k+1}, which are 0 at the corners.
+
+    Args:
+        points: NaN where there is none; all is 0 there.
+        origin: The first corner (…, 2).
+        slope: Gradients of λ (…, 3, 2).
+    """
+    there = np.isfinite(points[..., :1])
+    of_corners = np.einsum("...ji,...ki->...jk", points - origin[..., None, :], slope)
+    of_corners[..., 0] += 1.0
+    of_corners = np.where(there, of_corners, 0.0)
+    return of_corners, of_corners * np.roll(of_corners, -1, axis=-1)
+
+
+def _fixes(bubbles):
+    """Whether values at these points, and at the corners, fix a quadratic function (…,)."""
+    sizes = np.linalg.svd(bubbles, compute_uv=False)
+    return sizes[..., 2:].sum(axis=-1) > _RANK * sizes[..., 0]
+
+
+def _normal_derivatives(mesh, p, outward, length, partner):
+    """The outward derivative in the middle of each side, of the quadratic of its own triangle, (3T, n).
+
+    That is the linear function through the corners, and three bubbles that are fitted to what the values around have beyond it.
+    """
+    from scipy.sparse import coo_array
+
+    corners, T = mesh.triangles.astype(np.int64), len(p)
+    height = 2.0 * mesh.triangle_areas[:, None] / np.roll(length, -1, axis=1)
+    slope = -np.roll(outward, -1, axis=1) / height[..., None]  # λ_k falls to 0 on side k + 1
+    linear = np.einsum("tki,tji->tkj", outward, slope)  # ∂λ_j/∂n on side k
+    ends = 0.5 * (np.eye(3) + np.roll(np.eye(3), 1, axis=1))  # λ_j in the middle of side k
+    bubble = ends * np.roll(linear, -1, axis=2) + np.roll(ends, -1, axis=1) * linear  # ∂(λ_m λ_{m+1})/∂n
+    rows, columns, values = [], [], []
+
+    def add(triangles, vertices, points):
+        """The derivatives of some triangles by the values at vertices (t, J) at points (t, J, 2), NaN where there is none."""
+        of_corners, bubbles = _bubbles(points, p[triangles, 0], slope[triangles])
+        fit = bubble[triangles] @ np.linalg.pinv(bubbles, rcond=1e-8)  # (t, 3, J)
+        sides = (3 * triangles[:, None] + np.arange(3))[..., None]
+        for of, given in ((vertices, fit), (corners[triangles], linear[triangles] - fit @ of_corners)):
+            used = np.broadcast_to(np.isfinite(points[:, None, :, 0]), given.shape) if of is vertices else slice(None)
+            rows.append(np.broadcast_to(sides, given.shape)[used].ravel())
+            columns.append(np.broadcast_to(of[:, None], given.shape)[used].ravel())
+            values.append(given[used].ravel())
+
+    inner = np.flatnonzero((partner >= 0).all(axis=1))
+    other, side = np.divmod(partner[inner], 3)
+    third, x, here = corners[other, (side + 2) % 3], mesh.points, p[inner]
+    to_third = [np.linalg.norm(x[third] - x[np.roll(corners[inner], turn, axis=1)], axis=2) for turn in (0, -1)]
+    points = _beyond(here, np.roll(here, -1, axis=1), np.roll(here, -2, axis=1), length[inner], *to_third)
+    fixed = _fixes(_bubbles(points, here[:, 0], slope[inner])[1])
+    if fixed.any():
+        add(inner[fixed], third[fixed], points[fixed])
+    rest = np.setdiff1d(np.arange(T), inner[fixed])
+    if len(rest):
+        patches = [_unfolded(mesh, p[t], t, partner, slope[t]) for t in rest.tolist()]
+        most = max(map(len, patches))
+        vertices, points = np.zeros((len(rest), most), dtype=np.int64), np.full((len(rest), most, 2), np.nan)
+        for i, patch in enumerate(patches):
+            if patch:
+                vertices[i, : len(patch)], points[i, : len(patch)] = list(patch), list(patch.values())
+        add(rest, vertices, points)
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return coo_array(entries, shape=(3 * T, len(mesh.points))).tocsr()
+
+
+def _unfolded(mesh, p, t, partner, slope):
+    """The vertices around triangle t in its plane, {vertex: (2,)}: rings of triangles until they fix a quadratic function."""
+    triangles, x = mesh.triangles, mesh.points
+    own = triangles[t].tolist()
+    found = dict(zip(own, p, strict=True))
+    for _ring in range(_RINGS):
+        core, queue, seen = set(found), [t], {t}
+        for at in queue:
+            for k in range(3):
+                beyond, side = divmod(int(partner[at, k]), 3)
+                if partner[at, k] < 0 or beyond in seen or core.isdisjoint(triangles[beyond].tolist()):
+                    continue
+                seen.add(beyond)
+                queue.append(beyond)
+                c = int(triangles[beyond, (side + 2) % 3])
+                if c not in found:
+                    a, b, inside = np.roll(triangles[at], -k).tolist()
+                    ab, ac, bc = (np.linalg.norm(x[i] - x[j]) for i, j in ((a, b), (a, c), (b, c)))
+                    found[c] = _beyond(found[a], found[b], found[inside], ab, ac, bc)
+        around = {vertex: point for vertex, point in found.items() if vertex not in own}
+        if len(around) > 2 and _fixes(_bubbles(np.array(list(around.values())), p[0], slope)[1]):
+            break
+    return around

@@ -1,0 +1,112 @@
+"""Bending of a plate, isotropic or along warp and weft, that does not depend on the pattern of the mesh."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+
+from ..base.checks import numeric, refuse
+from ..kernels.term import Term
+from ..kernels.terms import PLATE_BENDING
+from ..mesh.curvature import curvature_operator, side_axes
+from ..mesh.mesh import Mesh
+from .declared import quantity
+from .sparse import Sparse
+
+_ABOVE_0 = quantity("must be finite and above 0", lambda values: (values > 0.0) & np.isfinite(values))
+Own = TypeVar("Own", bound="PlateBending")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlateBending(Sparse):
+    """Bending of a plate that is flat at rest, U = Σ ½A(D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂²). Forces are linear in x.
+
+    κ are the second derivatives of the positions along warp and weft, for each triangle. They are exact for surfaces of
+    constant curvature on any mesh, and deflections converge to those of the plate with the square of the edge length. The
+    stiffness is given by D₁, Poisson's ratio ν = D₁₂/√(D₁D₂), and two ratios: D₂/D₁ and D₆₆/D₁. An isotropic plate has
+    D₂ = D₁ = D and D₆₆ = ½(1 − ν)D. Of a mesh that is curved at rest only the lengths of edges count.
+
+    Attributes:
+        stiffness: D₁ [N·m], the bending stiffness along warp, one or (T,).
+        poisson_ratio: ν, above −1 and below 1, one or (T,).
+        weft_ratio: D₂/D₁, one or (T,).
+        twist_ratio: D₆₆/D₁, one or (T,); ½(1 − ν)√(D₂/D₁) if None.
+        warp: Vector along the warp, (3,) or (T,3), of which each triangle takes the part in its plane. None: where s of the
+            texture coordinates grows and t does not, which an isotropic plate does not need.
+        name: To tell two terms of one kind apart.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> wc.PlateBending(stiffness=1e-5, poisson_ratio=0.3).operator(wc.Mesh.grid(3, 3)).shape
+        (24, 9)
+    """
+
+    term: ClassVar[Term] = PLATE_BENDING
+
+    poisson_ratio: float | Sequence[float] | np.ndarray = field(
+        default=0.0,
+        metadata=quantity("must be above -1 and below 1", lambda ratio: (ratio > -1.0) & (ratio < 1.0)),
+    )
+    weft_ratio: float | Sequence[float] | np.ndarray = field(default=1.0, metadata=_ABOVE_0)
+    twist_ratio: float | Sequence[float] | np.ndarray | None = field(default=None, metadata=_ABOVE_0)
+    warp: Sequence[float] | np.ndarray | None = field(
+        default=None, metadata=quantity("must be finite", np.isfinite, shape=(3,))
+    )
+
+    @classmethod
+    def from_stiffnesses(
+        cls: type[Own], warp: float, weft: float, coupling: float, twist: float, direction: Any = None, **fields: Any
+    ) -> Own:
+        """Returns the plate of D₁, D₂, D₁₂ and D₆₆ [N·m], numbers or (T,); ``direction`` is the vector along the warp.
+
+        Raises:
+            ValueError: If D₁, D₂ or D₆₆ is not above 0, or D₁₂² is not below D₁D₂.
+        """
+        given = {"warp": warp, "weft": weft, "coupling": coupling, "twist": twist}
+        D1, D2, D12, D66 = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in given.items())
+        for name, values in (("warp", D1), ("weft", D2), ("twist", D66)):
+            refuse(f"{cls.__name__}.{name}", values, ~((values > 0.0) & np.isfinite(values)), "must be finite and above 0")
+        if not (D12**2 < D1 * D2).all():
+            raise ValueError(f"{cls.__name__}.coupling is {coupling}; its square must be below that of warp times weft")
+        ratios = {"weft_ratio": D2 / D1, "poisson_ratio": D12 / np.sqrt(D1 * D2), "twist_ratio": D66 / D1}
+        return cls(stiffness=D1, **ratios, warp=direction, **fields)
+
+    def operator(self, mesh: Mesh) -> Any:
+        from scipy.sparse import csr_array
+
+        T = len(mesh.triangles)
+        if not T or not len(mesh.hinges):
+            raise ValueError(f"{self.label} has no elements on this mesh of {T} triangles; leave it out")
+        ratio, weft = self.of_elements("poisson_ratio", T), self.of_elements("weft_ratio", T)
+        twist = 0.5 * (1.0 - ratio) * np.sqrt(weft) if self.twist_ratio is None else self.of_elements("twist_ratio", T)
+        root = np.zeros((T, 3, 3))  # of C/D₁
+        root[:, 0, 0], root[:, 0, 1] = 1.0, ratio * np.sqrt(weft)
+        root[:, 1, 1], root[:, 2, 2] = np.sqrt(weft * (1.0 - ratio**2)), 2.0 * np.sqrt(twist)
+        c, s = self._warp(mesh).T  # κ along warp and weft from that along the axes of each triangle
+        turn = np.stack([c * c, s * s, 2.0 * c * s, s * s, c * c, -2.0 * c * s, -c * s, c * s, c * c - s * s], axis=1)
+        columns = np.broadcast_to(3 * np.arange(T)[:, None, None] + np.arange(3), root.shape)
+        entries = (root @ turn.reshape(-1, 3, 3)).ravel(), columns.ravel(), np.arange(0, 9 * T + 1, 3)
+        return csr_array(entries, shape=(3 * T, 3 * T)) @ curvature_operator(mesh)
+
+    def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
+        return mesh.triangle_areas[:, None]
+
+    def _warp(self, mesh):
+        """The unit vector along the warp by the two axes of each triangle, (T, 2)."""
+        axes, T = side_axes(mesh), len(mesh.triangles)
+        if self.warp is not None:
+            warp = np.broadcast_to(self.of_elements("warp", T), (T, 3))
+        elif self.twist_ratio is None and (np.asarray(self.weft_ratio) == 1.0).all():  # isotropic
+            return np.broadcast_to([1.0, 0.0], (T, 2))
+        elif mesh.texture_coordinates is None:
+            raise ValueError(f"{self.label}.warp is None on a mesh without texture coordinates; it must be a vector")
+        else:
+            x, st = mesh.points[mesh.triangles], mesh.texture_coordinates[mesh.triangles]
+            sides, ((s1, t1), (s2, t2)) = x[:, 1:] - x[:, :1], (st[:, 1:] - st[:, :1]).transpose(1, 2, 0)
+            warp = np.sign(s1 * t2 - s2 * t1)[:, None] * (t2[:, None] * sides[:, 0] - t1[:, None] * sides[:, 1])
+        found = np.einsum("tai,ti->ta", axes, warp)
+        size = np.linalg.norm(found, axis=1)
+        for t in np.flatnonzero(~(size > 1e-6 * np.linalg.norm(warp, axis=1)))[:1]:
+            raise ValueError(f"{self.label}.warp has no direction in triangle {t}; it must have a part in its plane")
+        return found / size[:, None]
