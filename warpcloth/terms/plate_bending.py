@@ -20,12 +20,15 @@ Own = TypeVar("Own", bound="PlateBending")
 
 @dataclass(frozen=True, kw_only=True)
 class PlateBending(Sparse):
-    """Bending of a plate that is flat at rest, U = Σ ½A(D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂²). Forces are linear in x.
+    """Plate bending, U = Σ ½AκᵀCκ.
 
-    κ are the second derivatives of the positions along warp and weft, for each triangle. They are exact for surfaces of
-    constant curvature on any mesh, and deflections converge to those of the plate with the square of the edge length. The
-    stiffness is given by D₁, Poisson's ratio ν = D₁₂/√(D₁D₂), and two ratios: D₂/D₁ and D₆₆/D₁. An isotropic plate has
-    D₂ = D₁ = D and D₆₆ = ½(1 − ν)D. Of a mesh that is curved at rest only the lengths of edges count.
+    κᵀCκ is D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂², with κ the second derivatives of the positions along warp and weft, for
+    each triangle. They are exact for surfaces of constant curvature on any mesh, and deflections converge to those of the
+    plate with the square of the edge length. Forces are linear in x. The plate is flat at rest: of a mesh that is curved at
+    rest only the lengths of edges count.
+
+    The stiffness is given by D₁, Poisson's ratio ν = D₁₂/√(D₁D₂), and two ratios: D₂/D₁ and D₆₆/D₁. An isotropic plate has
+    D₂ = D₁ = D and D₆₆ = ½(1 − ν)D.
 
     Attributes:
         stiffness: D₁ [N·m], the bending stiffness along warp, one or (T,).
