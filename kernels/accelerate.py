@@ -160,7 +160,7 @@ def combine(dtype):
 def accept(dtype):
     """Kernel over vertices: d becomes the accelerated candidate where its φ is no more than the plain one's, else that.
 
-    A φ that is NaN is never chosen. The step is s of the slot.
+    A φ that is NaN is never chosen. The step is s of the slot; it is 0 in copies that have ``stayed``, which may be None.
     """
     vec3, _ = types(dtype)
 
@@ -171,6 +171,7 @@ def accept(dtype):
         accelerated: wp.array(dtype=vec3),
         plain_energy: wp.array(dtype=wp.float64),
         energy: wp.array(dtype=wp.float64),
+        stayed: wp.array(dtype=wp.int32),
         # parameters
         slot: wp.array(dtype=wp.int32),
         per_copy: int,
@@ -182,10 +183,41 @@ def accept(dtype):
         i = wp.tid()
         copy = i // per_copy
         chosen = wp.where(energy[copy] <= plain_energy[copy], accelerated[i], plain[i])
+        if stayed:
+            if stayed[copy] == 1:
+                chosen = d[i]
         s[slot[0], i] = chosen - d[i]
         d[i] = chosen
 
     return accept_candidate
+
+
+@cache
+def note_lowest():
+    """Kernel over copies: whether φ rises in both steps, by more than ``noise`` of it, so that d stays; else its lowest so far.
+
+    A φ that is NaN does not count as a rise, so that it is seen.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def note(
+        # state in
+        plain_energy: wp.array(dtype=wp.float64),
+        energy: wp.array(dtype=wp.float64),
+        # parameters
+        noise: wp.float64,
+        # in and out
+        lowest: wp.array(dtype=wp.float64),
+        # out
+        stayed: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        now = wp.where(energy[copy] <= plain_energy[copy], energy[copy], plain_energy[copy])
+        stayed[copy] = wp.where(now > lowest[copy] + noise * wp.abs(lowest[copy]), 1, 0)
+        if now < lowest[copy]:
+            lowest[copy] = now
+
+    return note
 
 
 @cache

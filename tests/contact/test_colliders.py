@@ -324,6 +324,26 @@ def test_all_meet_at_one_minimiser(name, friction, gravity, mesh):
     assert np.abs(found[1] - found[0]).max() < 1e-8
 
 
+@pytest.mark.parametrize("acceleration", ("chebyshev", "anderson", "l-bfgs"))
+def test_iterations_of_projective_dynamics_lower_the_objective(acceleration, device):
+    """φ = ‖d‖²_M/2h² + U, deep in contact, where rough solutions alone raise it; to the rounding that a `Search` takes, √ε."""
+    solver = wc.ProjectiveDynamics(substeps=1, iterations=40, tolerance=1e-12, acceleration=acceleration)
+    stepper = solver.bind(stretched(981.0, 0.3).build(device=device, dtype="float64"))
+    energy_of, energy = Energy(stepper.model, stepper.sums, corrected=True), stepper.model.scalars()
+    measure, found = stepper.measure, []
+
+    def note():
+        d = stepper.correction.numpy()
+        energy.zero_()
+        energy_of.add(stepper.state.x, energy, stepper.correction)
+        found.append(energy.numpy()[0] + 0.5 * (stepper.model.mass.numpy()[:, None] * d**2).sum() / stepper.h**2)
+        return measure()
+
+    stepper.measure = note
+    stepper.step()
+    assert len(found) == 41 and (np.diff(found) <= 1.5e-8 * np.abs(found[:-1])).all() and found[-1] < 0.5 * found[0]
+
+
 @pytest.mark.parametrize(
     "name",
     (

@@ -15,9 +15,10 @@ class AcceleratedStep:
     Args:
         stepper: The :class:`warpcloth.solvers.projective_dynamics.ProjectiveDynamicsStepper`.
         method: What proposes, of :mod:`warpcloth.numerics.acceleration`.
+        falls: Whether an iterate stays where it is if φ rises in both steps; else the plain one never lets φ rise.
     """
 
-    def __init__(self, stepper, method):
+    def __init__(self, stepper, method, falls=False):
         model = stepper.model
         self.stepper, self.method, B, device = stepper, method, model.copies, model.device
         m = method.window
@@ -28,9 +29,14 @@ class AcceleratedStep:
         self.products = Mirror(wp.zeros((B, 4 * m), dtype=wp.float64, device=device))
         self.coefficients = Mirror(wp.zeros((B, 1 + 2 * m), dtype=wp.float64, device=device))
         self.plain_energy, self.energy = (Mirror(model.scalars()) for _ in range(2))
+        self._lowest = model.scalars() if falls else None
+        self._stayed = Mirror(model.scalars(wp.int32)) if falls else None
+        # A rise of φ, relative, that is taken for rounding, as in a line search.
+        self._noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
         self.energy_of = Energy(model, stepper.sums, corrected=True)
         of_vertices = kernels.note_change, kernels.partial_products, kernels.combine, kernels.accept
-        self._launch = model.launcher((of_vertices, model.dtype), ((kernels.finish_products, kernels.next_slot),))
+        of_copies = kernels.finish_products, kernels.next_slot, *([kernels.note_lowest] if falls else [])
+        self._launch = model.launcher((of_vertices, model.dtype), (of_copies,))
         self._note = Segment(device, self._launch_note)
 
     def start(self):
@@ -47,9 +53,16 @@ class AcceleratedStep:
         self.coefficients.write(np.where(active[:, None], proposed, 0.0))
         self._iteration += 1
 
+    def stayed(self):
+        """Which copies stayed where they were in the last iteration, (B,) truth values."""
+        return self._stayed.read() == 1
+
     def launch_start(self):
-        """The first pair goes to the first slot."""
+        """The first pair goes to the first slot, and d = 0 is the lowest point so far."""
         self.slot.zero_()
+        if self._lowest is not None:
+            self._stayed.array.zero_()
+            self._launch_energy(self.stepper.correction, self._lowest)
 
     def _launch_note(self):
         stepper, model = self.stepper, self.stepper.model
@@ -69,7 +82,10 @@ class AcceleratedStep:
         self._launch_energy(self.plain, self.plain_energy.array)
         self._launch_energy(self.accelerated, self.energy.array)
         self._launch(kernels.next_slot, 1, [self.method.window], [self.slot])
-        given = [self.plain, self.accelerated, self.plain_energy.array, self.energy.array, self.slot, n]
+        energies = [self.plain_energy.array, self.energy.array]
+        if self._lowest is not None:
+            self._launch(kernels.note_lowest, model.copies, [*energies, self._noise], [self._lowest, self._stayed.array])
+        given = [self.plain, self.accelerated, *energies, self._stayed and self._stayed.array, self.slot, n]
         self._launch(kernels.accept, N, given, [d, self.s])
 
     def _launch_energy(self, d, out):

@@ -138,7 +138,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._gravity_scale = GravityScale(model)
         method = accelerated(options.acceleration, model, options.window, self.slowest)
-        self._accelerated = method and AcceleratedStep(self, method)
+        self._accelerated = method and AcceleratedStep(self, method, falls=self._contact is not None)
         self._start = Segment(model.device, self._launch_start)
         self._move = Segment(model.device, self._launch_move)
         self.ready()
@@ -148,6 +148,8 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._scale = self._gravity_scale.or_else(self._acceleration.read())
         if self._accelerated:
             self._accelerated.start()
+            if self._contact:
+                self._contact.start()
 
     def measure(self):
         return self._acceleration.read() / self._scale, {}
@@ -156,6 +158,8 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._active.write(active)
         self._linear.solve(self.gradient, self.w)
         if self._contact:
+            if self._accelerated:
+                self._contact.note(self._accelerated.stayed())
             self._contact.correct(self.correction, self.gradient, self.w, active)
         if self._accelerated:
             self._accelerated.propose(active)
