@@ -45,6 +45,7 @@ if TYPE_CHECKING:  # the table below, as type checkers read it
     from .scene.mesh_collider import MeshCollider as MeshCollider
     from .scene.scene import Pins as Pins
     from .scene.scene import Scene as Scene
+    from .scene.self_contact import SelfContact as SelfContact
     from .solvers import *  # noqa: F403
     from .terms import *  # noqa: F403
     from .terms.loads import Force as Force
@@ -84,6 +85,7 @@ _MODULES = {
     "MeshCollider": "scene.mesh_collider",
     "Pins": "scene.scene",
     "Scene": "scene.scene",
+    "SelfContact": "scene.self_contact",
     "Force": "terms.loads",
     "Pressure": "terms.loads",
     "Traction": "terms.loads",

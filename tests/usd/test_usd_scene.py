@@ -186,10 +186,15 @@ def contact_alone():
     return wc.Scene(mesh(), density=0.1, terms=[SPRING], contact=wc.Contact(stiffness=math.inf))
 
 
+def self_contact():
+    return wc.Scene(mesh(), density=0.1, terms=[SPRING], self_contact=wc.SelfContact(distance=1 / 300))
+
+
 SCENES = [
     loads,
     colliders,
     contact_alone,
+    self_contact,
     rollers,
     symmetry,
     every_term,
@@ -296,7 +301,7 @@ def test_the_comparison_can_fail():
 def test_every_field_has_a_row():
     known = {row.field for row in attributes()}
     # The prim, other rows, other rows, a GeomSubset, the file, the stage's rate, other rows, other prims
-    elsewhere = {"mesh", "terms", "loads", "pins", "stage", "fps", "contact", "colliders"}
+    elsewhere = {"mesh", "terms", "loads", "pins", "stage", "fps", "contact", "self_contact", "colliders"}
     assert {field.name for field in fields(wc.Scene)} <= known | elsewhere
     assert {f"contact.{field.name}" for field in fields(wc.Contact)} <= known
     for term in TERMS.values():

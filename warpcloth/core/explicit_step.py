@@ -43,13 +43,15 @@ class ExplicitStep:
         symplectic: Whether x is updated with v after the step.
         count: Number of steps that moving pins have made (B,) int32, or None.
         compensated: Whether x is updated by compensated summation.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose forces are added, or None.
 
     Attributes:
         residual: Position residual of compensated summation (N,) [m], or None.
         record: :class:`StepRecord`.
     """
 
-    def __init__(self, model, state, h, symplectic, count, compensated=False):
+    def __init__(self, model, state, h, symplectic, count, compensated=False, pairs=None):
+        self.pairs = pairs
         self.model, self.state, self.record = model, state, StepRecord("core", compensated=compensated)
         self.residual = model.vectors() if compensated else None
         self._pins = model.pins, model.keyframes, count
@@ -69,6 +71,10 @@ class ExplicitStep:
             model.refresh(STEP, Moment(x, steps=self._pins[-1], per_frame=self._per_frame))
             model.refresh(STEP, Moment(x), self._damped)
             self._elastic.add(x, self._gradient, self.residual)
+            if self.pairs is not None:
+                self.pairs.launch_begin(x)
+                self.pairs.launch_forces(x)
+                self.pairs.add_gradient(self._gradient)
             if self._damped:
                 model.launch(self._move_ahead, model.count, [v, self._given[-1]], [self._ahead])
                 self._dissipative.add(x, self._gradient, self._ahead)

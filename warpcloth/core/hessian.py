@@ -66,6 +66,9 @@ class Hessian:
     A locked coordinate keeps its entry of the diagonal, or 1 where that is not above 0, and nothing else of its row and column
     (Baraff and Witkin 1998), so that it stays and the rest do not notice.
 
+    The blocks of ``pairs``, a :class:`warpcloth.contact.self_steps.SelfSteps`, are in ``values`` on the diagonal alone;
+    :meth:`multiply` has them all.
+
     Attributes:
         offsets, columns: Block rows (N+1,) and the column of each block.
         diagonal: Index of each diagonal block (N,).
@@ -76,7 +79,8 @@ class Hessian:
     """
 
     @in_turn
-    def __init__(self, model, policy=0, corrected=False, terms=None):
+    def __init__(self, model, policy=0, corrected=False, terms=None, pairs=None):
+        self.pairs = pairs
         self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
         self.model, self.terms = model, model.terms if terms is None else terms
         device = model.device
@@ -124,6 +128,9 @@ class Hessian:
         for of_term, gather in zip(self._of_terms, self.gathers, strict=True):
             of_term.launch(x, correction, self.policy)
             model.launch(self._add_blocks, len(self.values), [*gather, of_term.blocks.flatten()], [self.values])
+        if self.pairs is not None:
+            self.pairs.launch_forces(x, correction)
+            self.pairs.add_diagonal(self.diagonal, self.values)
         if self._rows is not None:
             lock = model.kernel(linear.lock_blocks, model.dtype)
             model.launch(lock, len(self.values), [self._rows, self.columns, model.mobility], [self.values])
@@ -141,13 +148,15 @@ class Hessian:
         """Finds the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""
         self._multiply = self.model.kernel(linear.multiply, self.model.dtype)
         self._invert_diagonal = self.model.kernel(linear.invert_diagonal, self.model.dtype)
-        contact = any(elements.collider is not None for elements in self.terms)
+        contact = self.pairs is not None or any(elements.collider is not None for elements in self.terms)
         self._lost = 16.0 * float(np.finfo(self.model.numpy_dtype).eps) * contact
 
     def multiply(self, p, q, active):
         """q = A p for the copies that are ``active`` (B,)."""
         given = [self.offsets, self.columns, self.values, p, active, self.per_copy]
         self.model.launch(self._multiply, self.count, given, [q])
+        if self.pairs is not None:
+            self.pairs.add_products(p, q, active)
 
     def invert_diagonal(self, out):
         """out = the inverse diagonal blocks."""

@@ -46,7 +46,7 @@ class Plan:
         of_backend = {"core": Gradient, "blocks": Gradient, "gather": GatherGradient}
         return of_backend[self.backend](self.model, corrected, terms)
 
-    def explicit_step(self, state, h, symplectic, count, pool, colliders=None):
+    def explicit_step(self, state, h, symplectic, count, pool, colliders=None, pairs=None):
         """Returns a :class:`warpcloth.core.explicit_step.ExplicitStep`, or a faster class with the same methods.
 
         Args:
@@ -57,12 +57,15 @@ class Plan:
             pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares them.
             colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of a model that has some, for faster classes
                 to take contact themselves, or None to leave it to the terms and to the end of each step, as it is with meshes.
+            pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact, which the plain steps take, or None.
 
         Raises:
             ValueError: If threads cannot share the steps; it names the term.
         """
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
-        if pool.threads > 1:
+        if pairs is not None:
+            steps = ExplicitStep(*given[:-1], pairs=pairs)
+        elif pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
             steps = SubdomainSteps(*given, pool)
         else:

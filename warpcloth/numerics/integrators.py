@@ -146,6 +146,8 @@ class BDF2(Euler):
         stepper.state.start_here("move before", "v before")
         if stepper.colliders is not None:
             stepper.colliders.start_again()
+        if stepper.pairs is not None:
+            stepper.pairs.start_again()
         wp.copy(x, model.positions)
         wp.copy(v, model.velocities)
 

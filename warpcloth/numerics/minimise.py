@@ -38,6 +38,7 @@ class Minimiser:
         linear: ``"cg"`` or ``"factorised"``.
         s: Weight of the inertia, 1/h² [1/s²].
         linear_iterations: The most iterations of a conjugate gradient solve.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
 
     Attributes:
         correction: d (N,) [m].
@@ -46,13 +47,13 @@ class Minimiser:
         iterations: Newton iterations of the last :meth:`minimise`.
     """
 
-    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000):
-        self.model, self.base = model, base
+    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None):
+        self.model, self.base, self.pairs = model, base, pairs
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
-        self.search = Search(model, base, self.sums, s)
+        self.search = Search(model, base, self.sums, s, pairs)
         self.correction = self.search.correction
-        self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
+        self.hessian = Hessian(model, POLICIES[hessian], corrected=True, pairs=pairs)
         if linear == "cg":
             self.linear = ConjugateGradients(self.hessian, self.sums, linear_iterations)
         else:
@@ -70,11 +71,12 @@ class Minimiser:
         self.edge = float(np.median(model.scene.mesh.edge_lengths))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
         self._launch = model.launcher(((negate, rounding), model.dtype))
-        self._record()
+        self.record()
         self.gravity_scale, self._given_scale = GravityScale(model), None
         self.residual, self.iterations = np.zeros(model.copies), 0
 
-    def _record(self):
+    def record(self):
+        """Records what an iteration launches."""
         device = self.model.device
         self._clear = Segment(device, self._launch_clear)
         self._assemble = Segment(device, self._launch_assemble)
@@ -84,7 +86,7 @@ class Minimiser:
     def set_objective(self, s, load):
         """Another s and load; what was recorded holds the old ones and is recorded again."""
         self.search.inertia.s, self.search.inertia.load = s, load
-        self._record()
+        self.record()
 
     def minimise(self, tolerance, iterations, scale=None):
         """Iterates until every vertex is in balance, or nothing is left to gain in the model's precision.
@@ -183,6 +185,8 @@ class Minimiser:
         self._launch_norms()
 
     def _launch_assemble(self):
+        if self.pairs is not None:
+            self.pairs.launch_relist(self.base, self.correction, self.search.launch_again)
         self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
         hessian, model = self.hessian, self.model
         self._launch(negate, model.count, [self.search.gradient], [self.right])
@@ -196,6 +200,9 @@ class Minimiser:
         self.linear.solve(self.right, self.search.direction, self.active)
 
     def _launch_search(self):
+        if self.pairs is not None:
+            given = self.search.gradient, self.linear.preconditioner, self.right, self.search.direction
+            self.pairs.launch_limit(self.sums, *given)
         self.search.launch(self.active)
         self._launch_norms()
 

@@ -21,6 +21,7 @@ class Search:
         base: The positions of d = 0, (N,) vectors [m]; the caller's array, read only.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: See :class:`warpcloth.numerics.inertia.Inertia`.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
 
     Attributes:
         correction: d (N,) [m].
@@ -30,8 +31,9 @@ class Search:
             found.
     """
 
-    def __init__(self, model, base, sums, s):
+    def __init__(self, model, base, sums, s, pairs=None):
         self.model, self.base, self.sums, self.inertia = model, base, sums, Inertia(model, s)
+        self.pairs = pairs
         self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), Energy(model, sums, corrected=True)
         self.correction, self.trial, self.gradient, self.direction = (model.vectors() for _ in range(4))
 
@@ -49,7 +51,10 @@ class Search:
 
     def launch_start(self):
         """d = 0, with its φ and ∇φ."""
-        self.correction.zero_()
+        if self.pairs is None:
+            self.correction.zero_()
+        else:
+            self.pairs.launch_first(self.base, self.correction)
         self.launch_again()
 
     def launch_again(self):
@@ -75,9 +80,14 @@ class Search:
         given = [self.correction, self.direction, self.step, n]
         self._launch(kernels.set_trial, N, given, [self.trial, self.gradient])
         self.gradient_of.add(self.base, self.gradient, self.trial)
+        if self.pairs is not None:
+            self.pairs.launch_forces(self.base, self.trial)
+            self.pairs.add_gradient(self.gradient)
         self.inertia.add(self.trial, self.gradient)
         self.sums.sum(self.inertia.work, n, self.trial_energy)
         self.energy_of.add(self.base, self.trial_energy, self.trial)
+        if self.pairs is not None:
+            self.pairs.add_energy(self.sums, self.trial_energy)
         self.sums.dot(self.gradient, self.direction, self.trial_slope)
 
     def _try_step(self):

@@ -144,6 +144,7 @@ class GaussSeidelSweep(_Sweep):
         kind: One of :data:`IN_PLACE`.
         spread: The number of sweeps that finite stiffness is spread over, or None.
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares sweeps by colour; None for one thread.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs are swept last; or None.
 
     Attributes:
         ranges: The (first, count) of the elements that each launch takes, of each term.
@@ -161,8 +162,11 @@ class GaussSeidelSweep(_Sweep):
         spread=None,
         correction=None,
         pool=None,
+        pairs=None,
     ):
+        self.pairs = pairs
         super().__init__(model, x, h, relaxation, scalar, multipliers, correction)
+        self.multipliers_add = multipliers
         self.pool, self.spread, self.ordered = pool or ThreadPool(1), spread or 1, kind == "sequential"
         self.ranges = [[(0, (elements.cells or elements).count)] for elements in model.terms]
         if kind == "coloured" and model.terms:
@@ -188,6 +192,8 @@ class GaussSeidelSweep(_Sweep):
 
     def launch_start(self):
         """Launches d = 0, λ = 0, once x̃ is there."""
+        if self.pairs is not None:
+            self.pairs.multipliers.zero_()
         for array in (self.correction, *self.multipliers):
             if array is not None:
                 array.zero_()
@@ -202,6 +208,8 @@ class GaussSeidelSweep(_Sweep):
         if self._refreshed:
             pool.launch_alone(model, lambda: model.refresh(EVALUATION, Moment(self.x, self.correction), self._refreshed))
         way = -1 if backward else 1
+        if backward:
+            self._sweep_pairs(backward)
         for i in range(len(self.elements))[::way]:
             elements = self.elements[i]
             cells = elements.cells
@@ -222,3 +230,9 @@ class GaussSeidelSweep(_Sweep):
                 if part:
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
                 pool.launch_barrier(model)
+        if not backward:
+            self._sweep_pairs(backward)
+
+    def _sweep_pairs(self, backward):
+        if self.pairs is not None:
+            self.pairs.launch_sweep(self.x, self.correction, self.h, self.multipliers_add, backward)

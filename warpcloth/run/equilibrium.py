@@ -161,7 +161,9 @@ def equilibrium(
 
 
 def _with_colliders_at_rest(scene):
-    """The scene with moving colliders where their last keyframe has them; refuses friction."""
+    """The scene with moving colliders where their last keyframe has them; refuses friction and self-contact."""
+    if scene.self_contact is not None:
+        raise ValueError("equilibrium cannot take self_contact; run the scene with damping until it rests")
     for collider in scene.colliders:
         if collider.facets:
             raise ValueError(f"the collider {collider.label} is a mesh, which only steps take; run the scene until it rests")

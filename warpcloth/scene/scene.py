@@ -19,6 +19,7 @@ from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
 from .colliders import Collider, Contact, default_stiffness, refuse_inside
 from .mesh_collider import MeshCollider
+from .self_contact import SelfContact
 
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
@@ -109,6 +110,8 @@ class Scene:
         colliders: The colliders, such as :class:`warpcloth.Sphere`. Pinned vertices do not collide.
         contact: The :class:`warpcloth.Contact` with all colliders, by default ``Contact()``; its stiffness is then computed. It
             has no effect without colliders.
+        self_contact: The :class:`warpcloth.SelfContact` of the cloth with itself; its stiffness is then computed. None if cloth
+            passes through cloth.
 
     Raises:
         ValueError: If a value is not allowed; the message names it.
@@ -137,6 +140,7 @@ class Scene:
     loads: Converted[Load | Iterable[Load], Loads] = default(())
     colliders: Converted[Iterable[Collider], tuple[Collider, ...]] = default(())
     contact: Contact | None = None
+    self_contact: SelfContact | None = None
 
     @property
     def declared(self) -> tuple[object, ...]:
@@ -176,6 +180,7 @@ class Scene:
         self._check_masses()
         keep("colliders", self._checked_colliders())
         keep("contact", self._checked_contact())
+        keep("self_contact", self._checked_self_contact())
         self.refuse_inside(self.positions)
 
     def _checked_terms(self):
@@ -218,6 +223,26 @@ class Scene:
         if not weight > 0.0:
             raise ValueError("contact.stiffness has no default without gravity; give one [Pa/m]")
         return replace(contact, stiffness=default_stiffness(weight, contact.distance))
+
+    def _checked_self_contact(self):
+        declared = self.self_contact
+        if declared is None:
+            return None
+        if not isinstance(declared, SelfContact):
+            raise ValueError(f"self_contact is {shown(declared)}; it must be a SelfContact or None")
+        if not len(self.mesh.triangles):
+            raise ValueError("self_contact is given for a mesh without triangles; it must be None")
+        for collider in self.colliders:
+            if collider.moves or isinstance(collider, MeshCollider):
+                raise ValueError(
+                    f"self_contact is given with the collider {collider.label}; colliders must then stand still and be no mesh"
+                )
+        if declared.stiffness is not None:
+            return declared
+        weight = self._areal_mass * float(np.linalg.norm(self.gravity))
+        if not weight > 0.0:
+            raise ValueError("self_contact.stiffness has no default without gravity; give one [Pa/m]")
+        return replace(declared, stiffness=default_stiffness(weight, declared.distance))
 
     @property
     def _touching_areas(self):
@@ -360,6 +385,8 @@ class Scene:
         if self.colliders and self.contact is not None and self.contact.stiffness is not None:
             lines += [f"  {_described(collider)}" for collider in self.colliders]
             lines.append(f"  contact: distance {self.contact.distance:g} m, stiffness {self.contact.stiffness:.4g} Pa/m")
+        if self.self_contact is not None:
+            lines.append(f"  {_described(self.self_contact)}")
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
 
 

@@ -46,7 +46,7 @@ class Explicit(Step):
 
     name = "explicit"
     needs = (FINITE,)
-    limited = locks = True
+    limited = locks = touches_itself = True
     facts = Facts(
         method="symplectic Euler, or forward Euler; a step above the stability limit is refused",
         suits="cloth so soft that 100 to 1000 steps a frame suffice: no other method is then cheaper or more accurate",
@@ -129,7 +129,7 @@ def step_limits(model):
     max over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is 2·Σk/m, a bound in any
     motion; for quadratic bending it is such a bound too. The Hessian of dihedral bending grows as the cloth folds or is
     compressed, and those of membranes grow as they stretch. The second limit takes these at rest, so for scenes with them it is
-    not a bound. Both limits take strain and spring limits, which have no stiffness at rest, as reached.
+    not a bound. Both limits take strain and spring limits, which have no stiffness at rest, as reached, and add self-contact.
 
     Returns:
         (rest, motion); infinite where nothing is stiff.
@@ -139,7 +139,7 @@ def step_limits(model):
     """
     Explicit.refuse(model)
     found = [(_at_rest(*stiff), _in_motion(*stiff)) for stiff in map(_linearised, _unlike(model))]
-    return tuple(min(limits) for limits in zip(*found, strict=True))
+    return tuple(_with_pairs(model, min(limits)) for limits in zip(*found, strict=True))
 
 
 @in_turn
@@ -150,7 +150,20 @@ def limit_in_motion(model):
         ValueError: If a stiffness is infinite.
     """
     Explicit.refuse(model)
-    return min(_in_motion(*_linearised(one)) for one in _unlike(model))
+    return _with_pairs(model, min(_in_motion(*_linearised(one)) for one in _unlike(model)))
+
+
+def _with_pairs(model, h):
+    """The step limit h [s] as self-contact leaves it: that of 4/h² + 4kA/m, as if each vertex had a layer on either side.
+
+    By Gershgorin, the pairs of which it is the vertex and those of the other layer have 2kA on each side.
+    """
+    declared = model.scene.self_contact
+    if declared is None:
+        return h
+    w = model.in_scene_order(model.inverse_mass.numpy()).reshape(model.copies, -1).max(axis=0)
+    stiff = 4.0 * declared.stiffness * float((w * model.scene.mesh.vertex_areas).max())
+    return float(1.0 / (0.5 / h + np.sqrt(0.25 / h**2 + 0.25 * stiff)))
 
 
 def _unlike(model):
@@ -250,7 +263,8 @@ class ExplicitStepper(LaunchedStepper):
         super().__init__(options, model, None)
         symplectic = options.scheme == "symplectic"
         self.plan = plan(self.model, backend)
-        self._steps = self.plan.explicit_step(tuple(self.state), self.h, symplectic, self.count, self.pool, self.colliders)
+        given = tuple(self.state), self.h, symplectic, self.count, self.pool, self.colliders, self.pairs
+        self._steps = self.plan.explicit_step(*given)
         self.state.add("position residual", self._steps.residual)
         self.record((lambda: self.launch_steps(1), 1))
 

@@ -23,8 +23,11 @@ class ImplicitStepper(Stepper):
         self.find_twin()
         if self.clear_steps is not None:
             self.clear_steps.record()
-        self._finish = Segment(self.model.device, lambda: self.launch_finish(self.correction))
+        self._record_end()
         self.integrator.start()
+
+    def _record_end(self):
+        self._finish = Segment(self.model.device, lambda: self.launch_finish(self.correction))
 
     def follow_contact(self):
         super().follow_contact()
@@ -33,7 +36,7 @@ class ImplicitStepper(Stepper):
 
     def step(self):
         if self.clear_steps is None:
-            self._iterate()
+            self.take(self._iterate)
         else:
             self.clear_steps.step(self._iterate)
 

@@ -50,6 +50,7 @@ class Newton(ImplicitStep):
     name = "newton"
     needs = (FINITE,)
     residual, locks = Residual(UNBALANCED, "times its value at the start of the step"), True
+    touches_itself = True
     facts = Facts(
         method="implicit steps by Newton's method with a line search",
         suits="convergence studies, equilibria, small stiff cloth; the reference for the others",
@@ -82,6 +83,8 @@ class Newton(ImplicitStep):
             ValueError: If a term has infinite stiffness.
         """
         self.refuse(model)
+        if self.linear == "factorised" and model.scene.self_contact is not None:
+            raise ValueError('Newton with linear="factorised" cannot take self_contact; linear="cg" can')
         return self._on(NewtonStepper, model)
 
 
@@ -95,10 +98,17 @@ class NewtonStepper(ImplicitStepper):
     def __init__(self, options, model):
         super().__init__(options, model)
         model = self.model
-        self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.he**2)
+        if self.pairs is not None:
+            self.pairs.iterates()
+        self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.he**2, pairs=self.pairs)
         self.correction = self.minimiser.correction
         self._predict = Segment(model.device, self.launch_prediction)
         self.ready()
+
+    def record_again(self):
+        self._predict = Segment(self.model.device, self.launch_prediction)
+        self.minimiser.record()
+        self._record_end()
 
     def start(self):
         self._predict()

@@ -55,6 +55,7 @@ class PBD(Step):
 
     name = "pbd"
     needs, locks = (MERGED_DAMPING, LOCAL_STEP, NORMAL_FORCE), True
+    touches_itself = True
     closes, multipliers = True, False  # λ does not add up over the sweeps of a step
     facts = Facts(
         method="position based dynamics, by Gauss–Seidel or Jacobi sweeps over the constraints",
@@ -104,6 +105,7 @@ class PBD(Step):
             ValueError: If a term has no projection, scalar constraint or ``prox``.
         """
         self.refuse(model)
+        self.refuse_unordered(model)
         return self._on(PBDStepper, model)
 
 
@@ -122,7 +124,7 @@ class PBDStepper(LaunchedStepper):
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         given = model, self.state.x, self.h, options.sweep, options.relaxation
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool)
+            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool, pairs=self.pairs)
         else:
             self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread)
         self.model = model.with_terms(self.sweep.elements)

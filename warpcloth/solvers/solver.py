@@ -7,6 +7,7 @@ import warp as wp
 
 from ..base.turns import in_turn, methods_in_turn
 from ..contact.collider_steps import ColliderSteps
+from ..contact.self_steps import SelfSteps
 from ..core.capture import Segment
 from ..core.reset import Reset
 from ..core.state import State
@@ -32,6 +33,7 @@ class Stepper:
         he: Effective step hₑ of the integrator [s], else h.
         steps_per_frame: Steps a frame.
         colliders: :class:`warpcloth.contact.collider_steps.ColliderSteps`, or None if the scene has none.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None if cloth passes through itself.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 for methods that have none.
         iterations: Iterations or sweeps of the last step; 1 for methods that do not iterate.
@@ -67,6 +69,9 @@ class Stepper:
             part = 0.0 if integrator is None else 0.5 if integrator == "midpoint" else 1.0
             self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
             self.model = model = model.with_terms(self.colliders.terms)
+        self.pairs, self._kept = None, None
+        if model.scene.self_contact is not None:
+            self.pairs = SelfSteps(model, self.state, self.h, integrator is None)
         if integrator is not None:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he
@@ -83,7 +88,9 @@ class Stepper:
     def find_twin(self):
         """Makes ``clear_steps`` if there are colliders, unless the residual of a twin has another meaning."""
         model = self._bound_to
-        if model.colliders is None or self.options.residual_on(model) != self.options.residual_on(model.without_colliders()):
+        if model.colliders is None or self.pairs is not None:
+            return
+        if self.options.residual_on(model) != self.options.residual_on(model.without_colliders()):
             return
         twin = type(self).__new__(type(self))
         twin._motion, twin.lead = tuple(self.state), self
@@ -109,8 +116,12 @@ class Stepper:
 
     @property
     def cut(self):
-        """The share of the moves of free vertices that contact with colliders cut short so far, (B,)."""
-        return np.zeros(self.model.copies) if self.colliders is None else self.colliders.share
+        """The share of the moves of free vertices that contact cut short so far, (B,)."""
+        found = np.zeros(self.model.copies)
+        for contact in (self.colliders, self.pairs):
+            if contact is not None:
+                found += contact.share
+        return found
 
     @property
     def inside(self):
@@ -181,6 +192,8 @@ class Stepper:
     def launch_prediction(self):
         """Updates what changes where a step begins, then sets x = x̃ and moves the pins to the end of the step."""
         self.model.refresh(STEP, self.integrator.moment)
+        if self.pairs is not None:
+            self.pairs.launch_begin(self.state.x)
         self.integrator.launch_prediction()
 
     def launch_finish(self, correction):
@@ -188,12 +201,35 @@ class Stepper:
         self.integrator.launch_finish(correction)
         if self.colliders is not None:
             self.colliders.launch_end(*self.state, self.state.arrays.get("move before"))
+        if self.pairs is not None:
+            self.pairs.launch_end(*self.state, self.state.arrays.get("move before"))
 
     def launch_end_of(self, pins, keyframes, count, x, v):
         """The end of an explicit step in x and v (N,): pins move on, and vertices are kept out of colliders."""
         self.launch_pins_of(pins, keyframes, count, x, v)
         if self.colliders is not None:
             self.colliders.launch_end(x, v)
+        if self.pairs is not None:
+            self.pairs.launch_end(x, v)
+
+    def take(self, steps):
+        """Calls ``steps``, and again from the same state with more room as long as not all pairs that are near had some."""
+        if self.pairs is None:
+            steps()
+            return
+        if self._kept is None:
+            self._kept = self.state.copy()
+        self._kept.assign(self.state)
+        steps()
+        while self.pairs.overflowed:
+            self.pairs.grow()
+            self.record_again()
+            self.state.assign(self._kept)
+            steps()
+
+    def record_again(self):
+        """Records what steps launch anew, where arrays of pairs are others."""
+        raise NotImplementedError  # every solver that takes self-contact has its own
 
     def step(self):
         """One step of h."""
@@ -311,14 +347,20 @@ class LaunchedStepper(Stepper):
             for _ in range(times):
                 of_threads[thread]()
 
+    def record_again(self):
+        self._record_step()
+
     def step(self):
-        self._replay(self._step)
+        self.take(lambda: self._replay(self._step))
 
     def prepare_frame(self):
         if self._frame is None:
             self._frame = self._record_frame()
 
     def frame(self):
+        self.take(self._replay_frame)
+
+    def _replay_frame(self):
         self.prepare_frame()
         self._replay(self._frame)
 

@@ -60,6 +60,7 @@ class Step:
         name: Its name on the command line and in benchmarks and charts; each record has its own.
         needs: Its needs of every term, of :mod:`warpcloth.terms.needs`; the first that is not met is named.
         facts: The :class:`warpcloth.solvers.facts.Facts` by which it is measured and drawn.
+        touches_itself: Whether it takes a scene with self-contact.
         locks: Whether it takes a scene that locks coordinates, by ``free_axes`` or the axes of pins.
         limited: Whether it refuses steps above a limit, which :meth:`step_limits` then finds.
 
@@ -71,6 +72,7 @@ class Step:
     staggered: ClassVar[bool] = False
     closes: ClassVar[bool] = False
     locks: ClassVar[bool] = False
+    touches_itself: ClassVar[bool] = False
     residual: ClassVar[Residual | None] = None
     name: ClassVar[str | None] = None
     needs: ClassVar[tuple[Need, ...]] = ()
@@ -123,10 +125,30 @@ class Step:
                 f"{cls.__name__} cannot take a vertex that is locked along some axes, by free_axes or its pin; "
                 f"{listed(able)} can"
             )
+        if model.scene.self_contact is not None:
+            cls._refuse_self_contact(model)
         if needs is None:
             refuse_unmet(model.terms, cls.__name__, cls.needs, {record.__name__: record.needs for record in SOLVERS.values()})
         else:
             refuse_unmet(model.terms, f"{cls.__name__} with {options}", needs, {instead: ()})
+
+    def refuse_unordered(self, model):
+        """Refuses self-contact with sweeps other than Gauss–Seidel."""
+        if model.scene.self_contact is not None and not self.ordered:
+            raise ValueError(
+                f"{type(self).__name__} with sweep={self.sweep!r} cannot take self_contact; "
+                "sweep='coloured' or 'sequential' can"
+            )
+
+    @classmethod
+    def _refuse_self_contact(cls, model):
+        if not cls.touches_itself:
+            able = [record.__name__ for record in SOLVERS.values() if record.touches_itself]
+            raise ValueError(f"{cls.__name__} cannot take self_contact; {listed(able)} can")
+        if model.mobility is not None:
+            raise ValueError("self_contact is given with vertices that are locked along some axes, which it cannot take")
+        if model.threads > 1:
+            raise ValueError(f"threads is {model.threads} with self_contact, which takes 1")
 
     @classmethod
     def step_limits(cls, model: Model) -> tuple[float, float]:

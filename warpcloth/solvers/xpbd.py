@@ -72,6 +72,7 @@ class XPBD(ImplicitStep):
 
     name = "xpbd"
     needs, locks = (MERGED_DAMPING, LOCAL_STEP), True
+    touches_itself = True
     residual, multipliers = Residual(UNBALANCED, "m/s²"), True  # λ adds up over the sweeps of a step
     facts = Facts(
         method="PBD with compliance; converges to an implicit step with more sweeps",
@@ -128,6 +129,7 @@ class XPBD(ImplicitStep):
         """
         self.refuse(model)
         self.refuse_hard(model)
+        self.refuse_unordered(model)
         return self._on(XPBDStepper, model)
 
 
@@ -144,7 +146,10 @@ class XPBDStepper(LaunchedStepper):
         model = self.model
         given = model, self.state.x, self.he, options.sweep, options.relaxation
         more = {"scalar": options.form == "scalar", "multipliers": True}
-        self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool) if options.ordered else JacobiSweep(*given, **more)
+        if options.ordered:
+            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool, pairs=self.pairs)
+        else:
+            self.sweep = JacobiSweep(*given, **more)
         self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
@@ -181,6 +186,9 @@ class XPBDStepper(LaunchedStepper):
         if self._gradient is not None:
             self._force.zero_()
             self._gradient.add(self.state.x, self._force, d)
+            if self.pairs is not None:
+                self.pairs.launch_forces(self.state.x, d)
+                self.pairs.add_gradient(self._force)
         self._launch_momentum(1.0)
         model.lock(self._force)
         self._sums.largest(model.inverse_mass, self._force, self._acceleration)

@@ -87,6 +87,9 @@ ATTRIBUTES = (
     # How it touches colliders.
     Attribute("contact.distance", "warpcloth:contact:distance", "cloth", ("double",)),
     Attribute("contact.stiffness", "warpcloth:contact:stiffness", "cloth", ("double",)),
+    # How it touches itself.
+    Attribute("self_contact.distance", "warpcloth:selfContact:distance", "cloth", ("double",)),
+    Attribute("self_contact.stiffness", "warpcloth:selfContact:stiffness", "cloth", ("double",)),
     # A selection or indices. The others are pinned too.
     Attribute("pins.vertices", "warpcloth:pins", "cloth", ("string", "int[]")),
     Attribute("(pin weights)", "primvars:pins", "cloth", ("float[]",)),

@@ -14,6 +14,7 @@ from ..mesh.parts import Part
 from ..mesh.selection import distinct_vertices
 from ..scene.colliders import Contact
 from ..scene.scene import DOWN, EARTH, Pins, Scene
+from ..scene.self_contact import SelfContact
 from ..terms import TERMS, QuadraticBending, Spring
 from ..terms.limit import Limit
 from ..terms.loads import LOADS
@@ -104,7 +105,8 @@ def _scene(stage, cloth, surroundings, fps, duration):
         pins=Pins(vertices, keyframes, values.get("pins.axes") or "xyz"),
         free_axes=_free_axes(values),
         loads=[_load(values, key, surroundings, round(duration * fps), fps) for key in values.loads],
-        contact=_contact(values),
+        contact=_of_fields(Contact, "contact", values),
+        self_contact=_of_fields(SelfContact, "self_contact", values),
         gravity=_gravity(stage, values, surroundings.up_axis),
         duration=duration,
         fps=fps,
@@ -376,11 +378,11 @@ def _free_axes(values):
     return free_axes.astype(bool)
 
 
-def _contact(values):
-    """How it touches colliders, or None."""
-    given = {name: values.get(f"contact.{name}") for name in ("distance", "stiffness")}
-    given = {name: float(value) for name, value in given.items() if value is not None}
-    return Contact(**given) if given else None
+def _of_fields(kind, name, values):
+    """The record of distance and stiffness that values have under a name, or None."""
+    given = {field: values.get(f"{name}.{field}") for field in ("distance", "stiffness")}
+    given = {field: float(value) for field, value in given.items() if value is not None}
+    return kind(**given) if given else None
 
 
 def _gravity(stage, values, up_axis):
@@ -471,10 +473,11 @@ def _scene_values(scene):
     mesh = scene.mesh
     given = {"name": scene.name, "duration": scene.duration, "gravity": scene.gravity}
     given |= {"masses": scene.masses} if scene.density is None else {"density": scene.density}
-    if scene.contact is not None:
-        given["contact.distance"] = scene.contact.distance
-    if scene.contact is not None and scene.contact.stiffness is not None:
-        given["contact.stiffness"] = scene.contact.stiffness
+    for name, contact in (("contact", scene.contact), ("self_contact", scene.self_contact)):
+        if contact is not None:
+            given[f"{name}.distance"] = contact.distance
+        if contact is not None and contact.stiffness is not None:
+            given[f"{name}.stiffness"] = contact.stiffness
     if not np.array_equal(scene.positions, mesh.points):
         given["positions"] = scene.positions
     if scene.velocities.any():

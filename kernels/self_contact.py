@@ -1,0 +1,939 @@
+"""Factories of the kernels of contact of cloth with itself, by pairs of a vertex and a triangle or of two edges.
+
+A pair has four vertices and y = Σ wᵢxᵢ, the vector between its nearest points: w = (1, −β₁, −β₂, −β₃) of a vertex and a
+triangle, (1 − s, s, −(1 − t), −t) of two edges. U = Σ kA φ(d), d = ±‖y‖, φ that of contact with colliders
+(:mod:`.terms.contact`). The nearest points minimise ‖y‖, so their motion adds nothing to ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin).
+Of the second derivative the part kA φ″ wᵢwⱼnnᵀ is kept, which is semi-definite. d is below 0 where a pair went through: where y
+points against n of the start of the step.
+
+A, an area, is fixed within a step. All is computed in float64, whatever the model has: the points are then exact.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .terms import contact
+from .vectors import types
+
+potential, slope, bend, gap_after = contact.potential, contact.slope, contact.bend, contact.gap_after
+# Of a vertex on the edge between triangles, they share its area by how much farther than the nearest they are, over r.
+SHARING = wp.constant(wp.float64(0.25))
+# sin² of the angle between edges below which they are taken as parallel, and count less.
+PARALLEL = wp.constant(wp.float64(1e-3))
+# The share of the way to the plane between two sides that a step may make.
+KEPT = wp.constant(wp.float64(0.9))
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+CLAMPED = wp.constant(wp.float64(0.05))  # the least share of the gap between two sides that either has
+SIDE = wp.constant(wp.float64(0.5))
+PLANAR = wp.constant(wp.float64(1e-12))
+
+
+@cache
+def near_pairs(dtype):
+    """The struct of the pairs that are near, see :class:`warpcloth.contact.proximity.Proximity`: how many of a vertex and of
+    edges, the pairs of each vertex, and where their contact begins [m]."""
+
+    @wp.struct
+    class Pairs:
+        stencils: wp.array(dtype=wp.vec4i)
+        counts: wp.array(dtype=wp.int32)
+        first: wp.array(dtype=wp.int32)
+        corners: wp.array(dtype=wp.int32)
+        distances: wp.array(dtype=dtype)
+
+    return Pairs
+
+
+@wp.struct
+class StepPairs:
+    """Of pairs at the start of a step: n, d, w and kA [N/m]."""
+
+    normal: wp.array(dtype=wp.vec3d)
+    gap: wp.array(dtype=wp.float64)
+    weights: wp.array(dtype=wp.vec4d)
+    stiffness: wp.array(dtype=wp.float64)
+
+
+@wp.struct
+class PairForces:
+    """Of pairs at some positions: n, w, kAφ [J], kAφ′ [N] and kAφ″ [N/m]."""
+
+    normal: wp.array(dtype=wp.vec3d)
+    weights: wp.array(dtype=wp.vec4d)
+    energy: wp.array(dtype=wp.float64)
+    slope: wp.array(dtype=wp.float64)
+    bend: wp.array(dtype=wp.float64)
+
+
+@wp.struct
+class Planes:
+    """Of pairs a plane between their sides: n with its offset, and how near to it each side may come [m]."""
+
+    plane: wp.array(dtype=wp.vec4d)
+    margin: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def nearest_on_segment(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
+    """The t from 0 to 1 of the point a + t(b − a) nearest to p."""
+    ab = b - a
+    square = wp.dot(ab, ab)
+    t = ZERO
+    if square > ZERO:
+        t = wp.clamp(wp.dot(p - a, ab) / square, ZERO, ONE)
+    return t
+
+
+@wp.func
+def vertex_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """w of the point of a triangle nearest to p, and whether it is inside of the triangle (Ericson 2005, section 5.1.5)."""
+    ab = b - a
+    ac = c - a
+    ap = p - a
+    d1 = wp.dot(ab, ap)
+    d2 = wp.dot(ac, ap)
+    bp = p - b
+    d3 = wp.dot(ab, bp)
+    d4 = wp.dot(ac, bp)
+    cp = p - c
+    d5 = wp.dot(ab, cp)
+    d6 = wp.dot(ac, cp)
+    va = d3 * d6 - d5 * d4
+    vb = d5 * d2 - d1 * d6
+    vc = d1 * d4 - d3 * d2
+    total = va + vb + vc
+    w = wp.vec4d(ONE, -ONE, ZERO, ZERO)
+    inside = wp.int32(0)
+    if va > ZERO and vb > ZERO and vc > ZERO and total > ZERO:
+        w = wp.vec4d(ONE, -va / total, -vb / total, -vc / total)
+        inside = 1
+    else:  # the nearest of the points of the edges
+        t = nearest_on_segment(p, a, b)
+        away = p - a - t * ab
+        least = wp.dot(away, away)
+        w = wp.vec4d(ONE, t - ONE, -t, ZERO)
+        t = nearest_on_segment(p, a, c)
+        away = p - a - t * ac
+        square = wp.dot(away, away)
+        if square < least:
+            least = square
+            w = wp.vec4d(ONE, t - ONE, ZERO, -t)
+        t = nearest_on_segment(p, b, c)
+        away = p - b - t * (c - b)
+        square = wp.dot(away, away)
+        if square < least:
+            w = wp.vec4d(ONE, ZERO, t - ONE, -t)
+    return w, inside
+
+
+@wp.func
+def edge_edge(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """w of the nearest points of two edges ab and cd, and whether both are inside of their edges."""
+    ab = b - a
+    cd = d - c
+    ca = a - c
+    e = wp.dot(ab, ab)
+    f = wp.dot(cd, cd)
+    g = wp.dot(ab, cd)
+    determinant = e * f - g * g
+    w = wp.vec4d(ONE, ZERO, -ONE, ZERO)
+    inside = wp.int32(0)
+    if determinant > PLANAR * e * f:
+        s = (g * wp.dot(cd, ca) - f * wp.dot(ab, ca)) / determinant
+        t = (e * wp.dot(cd, ca) - g * wp.dot(ab, ca)) / determinant
+        if s > ZERO and s < ONE and t > ZERO and t < ONE:
+            w = wp.vec4d(ONE - s, s, t - ONE, -t)
+            inside = 1
+    if inside == 0:  # the nearest of an end of one and a point of the other
+        t = nearest_on_segment(a, c, d)
+        away = a - c - t * cd
+        least = wp.dot(away, away)
+        w = wp.vec4d(ONE, ZERO, t - ONE, -t)
+        t = nearest_on_segment(b, c, d)
+        away = b - c - t * cd
+        square = wp.dot(away, away)
+        if square < least:
+            least = square
+            w = wp.vec4d(ZERO, ONE, t - ONE, -t)
+        s = nearest_on_segment(c, a, b)
+        away = a + s * ab - c
+        square = wp.dot(away, away)
+        if square < least:
+            least = square
+            w = wp.vec4d(ONE - s, s, -ONE, ZERO)
+        s = nearest_on_segment(d, a, b)
+        away = a + s * ab - d
+        square = wp.dot(away, away)
+        if square < least:
+            w = wp.vec4d(ONE - s, s, ZERO, -ONE)
+    return w, inside
+
+
+@wp.func
+def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """w, y and whether the nearest points of a pair are inside; points are relative to the first, which keeps their digits."""
+    zero = wp.vec3d()
+    w = wp.vec4d()
+    inside = wp.int32(0)
+    if of_vertex:
+        w, inside = vertex_triangle(zero, b - a, c - a, d - a)
+    else:
+        w, inside = edge_edge(zero, b - a, c - a, d - a)
+    y = w[1] * (b - a) + w[2] * (c - a) + w[3] * (d - a)
+    return w, y, inside
+
+
+@wp.func
+def signed_gap(y: wp.vec3d, normal: wp.vec3d, inside: int):
+    """d and n of a pair, by its ``normal`` where the step began: d is below 0 where it has gone through."""
+    d = wp.length(y)
+    n = normal
+    if d > ZERO:
+        n = y / d
+        along = wp.dot(n, normal)
+        if along < -SIDE or (inside == 1 and along < ZERO):
+            d = -d
+            n = -n
+    return d, n
+
+
+@wp.func
+def apart(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, r: wp.float64):
+    """Whether the balls about the first vertex of each side, which hold the side, are farther apart than r."""
+    found = wp.bool(False)
+    if of_vertex:
+        size = wp.max(wp.length(c - b), wp.length(d - b))
+        found = wp.length(a - b) > size + r
+    else:
+        found = wp.length(a - c) > wp.length(b - a) + wp.length(d - c) + r
+    return found
+
+
+@cache
+def vertex_of(dtype):
+    """The device functions (x, correction, i) → xᵢ or xᵢ + dᵢ in float64, and (v) → v in float64."""
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def exact(v: vec3):
+        return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+
+    @wp.func
+    def at(x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3), i: int):
+        found = exact(x[i])
+        if correction:
+            found += exact(correction[i])
+        return found
+
+    return at, exact
+
+
+@cache
+def module_of(dtype):
+    return f"warpcloth.self_contact.{dtype.__name__}"
+
+
+@cache
+def begin_pairs(dtype):
+    """Kernel over pairs, where a step begins: n, d and w at x."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def begin_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        # out
+        step: StepPairs,
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        s = pairs.stencils[e]
+        w, y, _inside = nearest(e < pairs.counts[0], exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        d = wp.length(y)
+        step.gap[e] = d
+        step.weights[e] = w
+        step.normal[e] = y / wp.max(d, wp.float64(1e-300))
+
+    return begin_each_pair
+
+
+@wp.func
+def share_a_vertex(a: wp.vec4i, b: wp.vec4i):
+    """Whether the triangles of two pairs share a vertex."""
+    found = wp.bool(False)
+    for i in range(1, 4):
+        for j in range(1, 4):
+            if a[i] == b[j]:
+                found = True
+    return found
+
+
+@wp.func
+def part_of_area(gap: wp.float64, least: wp.float64, r: wp.float64):
+    return wp.max(ONE - (gap - least) / (SHARING * r), ZERO)
+
+
+@cache
+def set_areas(dtype):
+    """Kernel over pairs, where a step begins: kA.
+
+    Half the area of a vertex goes to triangles on each side of it. Triangles that meet share it where the nearest point is
+    about as near to several of them. A pair of edges, (A₁ + … + A₄)/12, counts only as far as it is nearer than the pairs of
+    its vertices on the same side, and less if it is nearly parallel: where two layers lie flat on one another, the areas of all
+    pairs add up to that of a layer, and crossed folds have contact too.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def set_each_area(
+        # elements
+        pairs: near_pairs(dtype),
+        areas: wp.array(dtype=wp.float64),
+        # state in
+        x: wp.array(dtype=vec3),
+        # parameters
+        stiffness: wp.float64,
+        # in and out
+        step: StepPairs,
+    ):
+        e = wp.tid()
+        triangles = pairs.counts[0]
+        if e >= triangles + pairs.counts[1]:
+            return
+        s = pairs.stencils[e]
+        r = wp.float64(pairs.distances[e])
+        n = step.normal[e]
+        gap = step.gap[e]
+        area = ZERO
+        if e < triangles:
+            v = s[0]
+            least = gap
+            for k in range(pairs.first[v], pairs.first[v + 1]):
+                other = pairs.corners[k] // 4
+                if pairs.corners[k] == 4 * other and other < triangles:
+                    if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                        least = wp.min(least, step.gap[other])
+            own = part_of_area(gap, least, r)
+            if own > ZERO:
+                total = ZERO
+                for k in range(pairs.first[v], pairs.first[v + 1]):
+                    other = pairs.corners[k] // 4
+                    if pairs.corners[k] == 4 * other and other < triangles:
+                        if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                            total += part_of_area(step.gap[other], least, r)
+                area = SIDE * areas[v] * own / total
+        else:
+            least = wp.float64(wp.inf)
+            for i in range(4):
+                sign = wp.where(i < 2, ONE, -ONE)
+                v = s[i]
+                for k in range(pairs.first[v], pairs.first[v + 1]):
+                    other = pairs.corners[k] // 4
+                    if pairs.corners[k] == 4 * other and other < triangles:
+                        if sign * wp.dot(n, step.normal[other]) > SIDE:
+                            least = wp.min(least, step.gap[other])
+            nearer = ONE
+            if least < wp.float64(wp.inf):
+                nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)
+            if nearer > ZERO:
+                ab = exact(x[s[1]]) - exact(x[s[0]])
+                cd = exact(x[s[3]]) - exact(x[s[2]])
+                normal = wp.cross(ab, cd)
+                z = wp.min(wp.dot(normal, normal) / (PARALLEL * wp.dot(ab, ab) * wp.dot(cd, cd)), ONE)
+                total = areas[s[0]] + areas[s[1]] + areas[s[2]] + areas[s[3]]
+                area = nearer * z * (wp.float64(2.0) - z) * total / wp.float64(12.0)
+        step.stiffness[e] = stiffness * area
+
+    return set_each_area
+
+
+@cache
+def find_forces(dtype, bounded: bool):
+    """Kernel over pairs: kAφ, kAφ′ and kAφ″ at x, or x + correction, with w and n; of ``bounded`` contact φ = ½(r − d)²."""
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+
+    @wp.kernel(module=f"{module_of(dtype)}.{bounded}", enable_backward=False)
+    def find_forces_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        # out
+        forces: PairForces,
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        forces.energy[e] = ZERO
+        forces.slope[e] = ZERO
+        forces.bend[e] = ZERO
+        k = step.stiffness[e]
+        r = wp.float64(pairs.distances[e])
+        if k == ZERO:
+            return
+        s = pairs.stencils[e]
+        a = at(x, correction, s[0])
+        b = at(x, correction, s[1])
+        c = at(x, correction, s[2])
+        d = at(x, correction, s[3])
+        of_vertex = e < pairs.counts[0]
+        if apart(of_vertex, a, b, c, d, r):
+            return
+        w, y, inside = nearest(of_vertex, a, b, c, d)
+        gap, n = signed_gap(y, step.normal[e], inside)
+        if gap < r:
+            forces.normal[e] = n
+            forces.weights[e] = w
+            if wp.static(bounded):
+                forces.energy[e] = SIDE * k * (r - gap) * (r - gap)
+                forces.slope[e] = k * (gap - r)
+                forces.bend[e] = k
+            else:
+                forces.energy[e] = k * potential(gap, r)
+                forces.slope[e] = k * slope(gap, r)
+                forces.bend[e] = k * bend(gap, r)
+
+    return find_forces_of_pairs
+
+
+@cache
+def add_forces(dtype):
+    """Kernel over vertices: out += ∂U/∂x, in the order of the pairs."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def add_forces_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        forces: PairForces,
+        # in and out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        total = wp.vec3d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if forces.slope[e] != ZERO:
+                total += forces.weights[e][pairs.corners[k] - 4 * e] * forces.slope[e] * forces.normal[e]
+        out[i] = out[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+
+    return add_forces_of_pairs
+
+
+@cache
+def sum_energies(dtype):
+    """Kernel over vertices: the energies of the pairs of which a vertex is the first [J]."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def sum_energies_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        forces: PairForces,
+        # out
+        energies: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        total = ZERO
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            if pairs.corners[k] % 4 == 0:
+                total += forces.energy[pairs.corners[k] // 4]
+        energies[i] = total
+
+    return sum_energies_of_pairs
+
+
+@cache
+def add_diagonal(dtype):
+    """Kernel over vertices: adds Σ kAφ″ wᵢ²nnᵀ to the diagonal blocks of a Hessian; nothing to those of pins."""
+    _, mat33 = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def add_diagonal_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        diagonal: wp.array(dtype=wp.int32),
+        # state in
+        forces: PairForces,
+        # in and out
+        values: wp.array(dtype=mat33),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] == dtype(0.0):
+            return
+        total = wp.mat33d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if forces.bend[e] != ZERO:
+                w = forces.weights[e][pairs.corners[k] - 4 * e]
+                total += forces.bend[e] * w * w * wp.outer(forces.normal[e], forces.normal[e])
+        values[diagonal[i]] = values[diagonal[i]] + mat33(total)
+
+    return add_diagonal_of_pairs
+
+
+@cache
+def add_products(dtype):
+    """Kernel over vertices: q += Σ kAφ″ wᵢ n Σⱼ wⱼ nᵀpⱼ over the other corners j of its pairs, of copies that are active."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def add_products_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        forces: PairForces,
+        p: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # in and out
+        q: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] == dtype(0.0) or active[i // per_copy] == 0:
+            return
+        total = wp.vec3d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if forces.bend[e] != ZERO:
+                corner = pairs.corners[k] - 4 * e
+                s = pairs.stencils[e]
+                w = forces.weights[e]
+                n = forces.normal[e]
+                along = ZERO
+                for j in range(4):
+                    if j != corner and inverse_mass[s[j]] > dtype(0.0):
+                        along += w[j] * wp.dot(n, exact(p[s[j]]))
+                total += forces.bend[e] * w[corner] * along * n
+        q[i] = q[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+
+    return add_products_of_pairs
+
+
+@cache
+def sweep_pairs(dtype):
+    """Kernel of one thread: each pair in turn takes its force away, and gets that of the prox at the gap that is left.
+
+    With d̂ = n·Σwᵢxᵢ without the force of the pair and W = Σ wᵢ²/mᵢ, λ = (d* − d̂)/W, where d* solves
+    (d* − d̂)/W = −kAhₑ²φ′(d*) in closed form, and Δxᵢ = wᵢ λ n/mᵢ. M(x − x̃) = Σ wᵢλn then holds with the n and w that pairs have
+    at x, and a fixed point is the minimiser of the step. Without ``multipliers`` nothing is taken away (PBD).
+    """
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sweep_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        # parameters
+        h: wp.float64,
+        hard: bool,
+        backward: bool,
+        # in and out
+        multipliers: wp.array(dtype=wp.float64),
+        forces: PairForces,
+        correction: wp.array(dtype=vec3),
+    ):
+        count = wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0])
+        for turn in range(count):
+            e = turn
+            if backward:
+                e = count - 1 - turn
+            k = step.stiffness[e]
+            if k > ZERO:
+                r = wp.float64(pairs.distances[e])
+                s = pairs.stencils[e]
+                before = ZERO
+                if multipliers:
+                    before = multipliers[e]
+                a = at(x, correction, s[0])
+                b = at(x, correction, s[1])
+                c = at(x, correction, s[2])
+                d = at(x, correction, s[3])
+                of_vertex = e < pairs.counts[0]
+                if before != ZERO or not apart(of_vertex, a, b, c, d, r):
+                    w, y, inside = nearest(of_vertex, a, b, c, d)
+                    gap, n = signed_gap(y, step.normal[e], inside)
+                    if before != ZERO or gap < r:
+                        W = ZERO
+                        left = gap
+                        for i in range(4):
+                            m = wp.float64(inverse_mass[s[i]])
+                            W += w[i] * w[i] * m
+                            if before != ZERO:
+                                left -= w[i] * forces.weights[e][i] * m * before * wp.dot(n, forces.normal[e])
+                        after = ZERO
+                        if W > ZERO and left < r:
+                            compliance = wp.float64(wp.inf)
+                            if not hard:
+                                compliance = W * k * h * h
+                            after = (gap_after(left, r, compliance) - left) / W
+                        for i in range(4):
+                            m = wp.float64(inverse_mass[s[i]])
+                            if m > ZERO:
+                                move = w[i] * after * n
+                                if before != ZERO:
+                                    move -= forces.weights[e][i] * before * forces.normal[e]
+                                move = m * move
+                                correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+                        if multipliers:
+                            multipliers[e] = after
+                            forces.weights[e] = w
+                            forces.normal[e] = n
+
+    return sweep_each_pair
+
+
+@cache
+def wanted_move(dtype):
+    """The device function (x, target, direction, i) → the wanted move of a vertex: its direction, or to its target."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.func
+    def wanted(x: wp.array(dtype=vec3), target: wp.array(dtype=vec3), direction: wp.array(dtype=vec3), i: int):
+        found = wp.vec3d()
+        if direction:
+            found = exact(direction[i])
+        else:
+            found = exact(target[i]) - exact(x[i])
+        return found
+
+    return wanted
+
+
+@cache
+def set_planes(dtype):
+    """Kernel over pairs: planes normal to y between their sides at x, at the share of the gap that their approaches ask for.
+
+    The ``common`` move of all vertices of a copy does not count as an approach.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+    wanted = wanted_move(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def set_each_plane(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        common: wp.array(dtype=wp.vec3d),
+        # parameters
+        per_copy: int,
+        least: wp.float64,
+        # out
+        planes: Planes,
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        s = pairs.stencils[e]
+        of_vertex = e < pairs.counts[0]
+        origin = exact(x[s[0]])
+        _w, y, _inside = nearest(of_vertex, origin, exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        n = y / wp.max(wp.length(y), wp.float64(1e-300))
+        lowest = wp.float64(wp.inf)
+        highest = -wp.float64(wp.inf)
+        first = ZERO
+        second = ZERO
+        far = ZERO
+        sides = wp.where(of_vertex, 1, 2)
+        for i in range(4):
+            point = exact(x[s[i]])
+            move = wanted(x, target, direction, s[i])
+            approach = wp.dot(n, move - common[s[i] // per_copy])
+            along = wp.dot(n, point - origin)
+            far = wp.max(far, wp.max(wp.max(wp.abs(point)), wp.max(wp.abs(point + move))))
+            if i < sides:
+                lowest = wp.min(lowest, along)
+                first = wp.max(first, -approach)
+            else:
+                highest = wp.max(highest, along)
+                second = wp.max(second, approach)
+        share = SIDE
+        if first + second > ZERO:
+            share = wp.clamp(second / (first + second), CLAMPED, ONE - CLAMPED)
+        offset = highest + share * (lowest - highest)
+        planes.plane[e] = wp.vec4d(n[0], n[1], n[2], offset)
+        # Between float32 numbers, which frames are stored as, 4 units in the last place remain.
+        ulp = wp.float64(1.1920929e-07) * far
+        planes.margin[e] = SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
+
+    return set_each_plane
+
+
+@cache
+def kept_share(dtype):
+    """The device function (…, x, i, move) → the shares of a move from xᵢ that its bound, and planes too, allow."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.func
+    def kept(pairs: near_pairs(dtype), planes: Planes, x: wp.array(dtype=vec3), i: int, move: wp.vec3d, most: wp.float64):
+        size = wp.length(move)
+        far = ONE
+        if size > most:
+            far = most / size
+        t = far
+        start = exact(x[i])
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            corner = pairs.corners[k] - 4 * e
+            plane = planes.plane[e]
+            n = wp.vec3d(plane[0], plane[1], plane[2])
+            sign = -ONE
+            if corner == 0 or (corner == 1 and e >= pairs.counts[0]):
+                sign = ONE
+            approach = -sign * wp.dot(n, move)
+            if approach > ZERO:
+                origin = exact(x[pairs.stencils[e][0]])
+                room = sign * (wp.dot(n, start - origin) - plane[3]) - planes.margin[e]
+                t = wp.min(t, KEPT * wp.max(room, ZERO) / approach)
+        return far, t
+
+    return kept
+
+
+@cache
+def keep_apart(dtype):
+    """Kernel over vertices: x ← x + u + t(δ − u), u the ``common`` move, t such that no plane of a pair comes too near.
+
+    ``most`` bounds t‖δ − u‖, by which no pair that is not listed can cross. ``cuts`` counts the vertices that planes cut short,
+    and those that only this bound did.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+    kept = kept_share(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def keep_each_apart(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        planes: Planes,
+        x_ref: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        common: wp.array(dtype=wp.vec3d),
+        # parameters
+        per_copy: int,
+        most: wp.float64,
+        # out
+        x: wp.array(dtype=vec3),
+        cuts: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        u = common[i // per_copy]
+        move = exact(target[i]) - exact(x_ref[i]) - u
+        far, t = kept(pairs, planes, x_ref, i, move, most)
+        if t < ONE:
+            end = exact(x_ref[i]) + u + t * move
+            x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
+            wp.atomic_add(cuts, wp.where(t < far, 0, 1), 1)
+        else:
+            x[i] = target[i]
+
+    return keep_each_apart
+
+
+@cache
+def limit_direction(dtype):
+    """Kernel over vertices: p ← u + t(p − u), as :func:`keep_apart`."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+    kept = kept_share(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def limit_each_direction(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        planes: Planes,
+        x: wp.array(dtype=vec3),
+        common: wp.array(dtype=wp.vec3d),
+        # parameters
+        per_copy: int,
+        most: wp.float64,
+        # in and out
+        direction: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        u = common[i // per_copy]
+        move = exact(direction[i]) - u
+        _far, t = kept(pairs, planes, x, i, move, most)
+        if t < ONE:
+            end = u + t * move
+            direction[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
+
+    return limit_each_direction
+
+
+@cache
+def precondition(dtype):
+    """Kernel over vertices: p = P r."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def precondition_each(
+        # state in
+        preconditioner: wp.array(dtype=mat33),
+        r: wp.array(dtype=vec3),
+        # out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        p[i] = preconditioner[i] * r[i]
+
+    return precondition_each
+
+
+@cache
+def take_descent(dtype):
+    """Kernel over vertices: p = the other direction, of copies of which the slope along p is not below 0."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def take_each_descent(
+        # state in
+        slope: wp.array(dtype=wp.float64),
+        other: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        # in and out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if not slope[i // per_copy] < ZERO:
+            p[i] = other[i]
+
+    return take_each_descent
+
+
+@cache
+def add_positions(dtype):
+    """Kernel over vertices: out = a + sign·b."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def add_each_position(
+        # state in
+        a: wp.array(dtype=vec3),
+        b: wp.array(dtype=vec3),
+        # parameters
+        sign: dtype,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        out[i] = a[i] + sign * b[i]
+
+    return add_each_position
+
+
+@cache
+def common_move(dtype):
+    """Kernel over copies: the mean of the moves of all vertices that are wanted [m]."""
+    vec3, _ = types(dtype)
+    wanted = wanted_move(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_common_move(
+        # state in
+        x: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        # out
+        common: wp.array(dtype=wp.vec3d),
+    ):
+        copy = wp.tid()
+        total = wp.vec3d()
+        for i in range(copy * per_copy, (copy + 1) * per_copy):
+            total += wanted(x, target, direction, i)
+        common[copy] = total / wp.float64(per_copy)
+
+    return find_common_move
+
+
+@cache
+def end_filter(dtype):
+    """Kernel over vertices: what the filter cut off x is cut off v, over h, and off ``move``, which may be None."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def end_each_filter(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        target: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        h: dtype,
+        # in and out
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        cut: wp.array(dtype=wp.int64),
+    ):
+        i = wp.tid()
+        change = x[i] - target[i]
+        if wp.length_sq(change) > dtype(0.0):
+            wp.atomic_add(cut, i // per_copy, wp.int64(1))
+            v[i] = v[i] + change / h
+            if move:
+                move[i] = move[i] + change
+
+    return end_each_filter
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def another_round(
+    # parameters
+    few: int,
+    near_rounds: int,
+    far_rounds: int,
+    # in and out
+    cuts: wp.array(dtype=wp.int32),
+    rounds: wp.array(dtype=wp.int32),
+    # out
+    proceed: wp.array(dtype=wp.int32),
+):
+    """Whether the filter goes on from a new list: planes cut many in one of the first rounds, or its bound does."""
+    rounds[0] = rounds[0] + 1
+    proceed[0] = 0
+    if (cuts[0] > few and rounds[0] < near_rounds) or (cuts[1] > 0 and rounds[0] < far_rounds):
+        proceed[0] = 1
+    cuts[0] = 0
+    cuts[1] = 0
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def note_most(
+    # state in
+    counts: wp.array(dtype=wp.int32),
+    # in and out
+    most: wp.array(dtype=wp.int32),
+):
+    """The largest number of pairs in any list."""
+    most[0] = wp.max(most[0], counts[0] + counts[1])

@@ -1,0 +1,295 @@
+"""Contact of cloth with itself: its energy, its minimiser, and that no step ends with cloth that went through cloth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpcloth as wc
+from warpcloth.contact.self_steps import SelfSteps, crossings
+from warpcloth.core.sums import Sums
+
+SLOW = pytest.mark.slow
+SOLVERS = {
+    "explicit": wc.Explicit(substeps=80),
+    "newton": wc.Newton(substeps=2, iterations=30),
+    "xpbd": wc.XPBD(substeps=4, iterations=10),
+    "pbd": wc.PBD(substeps=4, iterations=10),
+}
+REFUSE = {
+    "projective_dynamics": wc.ProjectiveDynamics(substeps=1),
+    "admm": wc.ADMM(substeps=1),
+    "hierarchical_pbd": wc.HierarchicalPBD(substeps=1),
+    "constrained_dynamics": wc.ConstrainedDynamics(substeps=1),
+}
+FAST = [pytest.param(*given, marks=SLOW) for given in ((10.0, "float32"), (10.0, "float64"), (100.0, "float64"))]
+each_solver = pytest.mark.parametrize("name", SOLVERS)
+
+
+def layers(count=2, n=6, gap=0.02, speed=0.0, turn=0.0, distance=5e-3, stiffness=1e5, size=0.5, **fields):
+    """Sheets above one another, each turned by some degrees more; those above the first move down and the first up."""
+    grid, parts = wc.Mesh.grid(n, n, size=size), []
+    centre = grid.points.mean(axis=0)
+    for layer in range(count):
+        c, s = np.cos(np.radians(turn * layer)), np.sin(np.radians(turn * layer))
+        parts.append((grid.points - centre) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) + [0.0, gap * layer, 0.0])
+    triangles = np.concatenate([grid.triangles + layer * n * n for layer in range(count)])
+    velocities = np.zeros((count * n * n, 3))
+    velocities[:, 1] = np.where(np.arange(count * n * n) < n * n, speed, -speed)
+    fields = {"gravity": np.zeros(3), "fps": 24.0, "duration": 1.0, **fields}
+    terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)]
+    return wc.Scene(
+        wc.Mesh(np.concatenate(parts), triangles),
+        density=0.15,
+        terms=terms,
+        velocities=velocities,
+        self_contact=wc.SelfContact(distance=distance, stiffness=stiffness),
+        **fields,
+    )
+
+
+def folded(n=13, gap=0.02, **fields):
+    """A sheet of 0.5 m folded in two about a half circle."""
+    grid, radius = wc.Mesh.grid(n, n, size=0.5), 0.5 * gap + 0.03
+    s, half = grid.points[:, 0] - 0.25, 0.5 * np.pi * radius
+    bent = np.abs(s) < half
+    x = np.where(bent, radius * np.cos(s / radius), half - np.abs(s))
+    y = np.where(bent, radius * np.sin(s / radius), np.sign(s) * radius)
+    fields = {"fps": 24.0, "duration": 1.0, **fields}
+    return wc.Scene(
+        grid,
+        density=0.15,
+        terms=[wc.Spring(stiffness=100.0, pairs=("structural", "shear")), wc.QuadraticBending(stiffness=1e-5)],
+        positions=np.stack([x, y, grid.points[:, 2]], axis=1),
+        self_contact=wc.SelfContact(distance=5e-3, stiffness=1e4),
+        **fields,
+    )
+
+
+def steps_of(scene, device, bounded=False, h=1.0 / 24.0):
+    """The :class:`SelfSteps` of a scene in float64, in no solver, and its model."""
+    model = scene.build(device=device, dtype="float64")
+    return SelfSteps(model, wc.Explicit(substeps=1000, above_limit="allow").bind(model).state, h, bounded), model
+
+
+def crossed(points, triangles):
+    """How many pairs of triangles intersect in points as stored, by the exact predicates of libigl."""
+    predicates = pytest.importorskip("igl.predicates")
+    stored = np.asarray(points, dtype=np.float32).astype(np.float64)
+    return len(predicates.find_self_intersections(stored, triangles.astype(np.int64))[1])
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+@pytest.mark.parametrize("gap", [4e-3, 1.2e-3])
+def test_forces_are_the_gradient_and_balance(bounded, gap, device):
+    """By central differences with an error of O(η²) = 1e-10 of the third derivative, and ΣF = 0, Σ x × F = 0 to rounding."""
+    scene = layers(turn=17.0, gap=gap)
+    pairs, model = steps_of(scene, device, bounded)
+    rng, sums = np.random.default_rng(1), Sums(model)
+    x = scene.positions + 2e-4 * rng.normal(size=scene.positions.shape)
+    pairs.launch_begin(model.array(x, model.vec3))
+
+    def energy(x):
+        out = model.scalars()
+        pairs.launch_forces(model.array(x, model.vec3))
+        pairs.add_energy(sums, out)
+        return out.numpy()[0]
+
+    def gradient(x):
+        out = model.vectors()
+        pairs.launch_forces(model.array(x, model.vec3))
+        pairs.add_gradient(out)
+        return out.numpy()
+
+    force, size, eta = gradient(x), np.abs(gradient(x)).sum(), 1e-7
+    assert size > 1.0
+    for _ in range(3):
+        direction = rng.normal(size=x.shape)
+        slope = (energy(x + eta * direction) - energy(x - eta * direction)) / (2.0 * eta)
+        assert slope == pytest.approx((force * direction).sum(), abs=1e-5 * size)
+    assert np.abs(force.sum(axis=0)).max() < 1e-13 * size
+    assert np.abs(np.cross(x, force).sum(axis=0)).max() < 1e-13 * size
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_pressure_of_a_stack(count, device):
+    """p = Σ m f(m d) on the top layer over all layers within r, f = −kφ′; areas of all pairs add up to that of a layer."""
+    r, k, d = 5e-3, 1e5, 1.3e-3
+    pairs, model = steps_of(layers(count, gap=d, distance=r, stiffness=k), device)
+    pairs.launch_begin(model.positions)
+    out = model.vectors()
+    pairs.launch_forces(model.positions)
+    pairs.add_gradient(out)
+    top = -out.numpy()[-36:, 1].sum() / 0.25
+
+    def f(d):
+        return k * (r - d if d >= 0.5 * r else 0.25 * r * r / d) * (d < r)
+
+    assert top == pytest.approx(sum(f(m * d) for m in range(1, count)), rel=1e-9)
+
+
+def test_minimiser_is_the_same(device):
+    """With pairs in both stages of φ, and no vertex cut, Newton's method and sweeps end at one minimiser."""
+    ends = {}
+    for name, solver in (
+        ("newton", wc.Newton(substeps=10, tolerance=1e-13)),
+        ("xpbd", wc.XPBD(substeps=10, iterations=4000)),
+    ):
+        scene = layers(n=4, gap=2.2e-3, turn=17.0)
+        stepper = solver.bind(scene.build(device=device, dtype="float64"))
+        stepper.step()
+        assert stepper.cut == 0.0
+        ends[name] = stepper.state.x.numpy()
+    assert np.abs(ends["newton"] - scene.positions).max() > 1e-4
+    assert ends["newton"] == pytest.approx(ends["xpbd"], abs=1e-8)
+
+
+@each_solver
+@pytest.mark.parametrize(
+    ("speed", "dtype"),
+    [
+        (1.0, "float32"),
+        (100.0, "float32"),
+        *FAST,
+    ],
+)
+def test_thrown_at_each_other(name, speed, dtype, device):
+    """Two sheets, at ``speed`` each, with frames of 1/24 s, in which they would move 100 times as far as they are apart."""
+    scene = layers(turn=17.0, speed=speed)
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype=dtype))
+    for _ in range(8):
+        stepper.frame()
+        assert crossed(stepper.state.x.numpy(), scene.mesh.triangles) == 0
+
+
+@each_solver
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_folded_sheet_closes(name, dtype, device):
+    """Thrown shut: the two halves meet, and their layers do not cross."""
+    scene = folded(gravity=np.zeros(3))
+    closing = -3.0 * np.sign(scene.positions[:, 1:2]) * [0.0, 1.0, 0.0]
+    stepper = SOLVERS[name].bind(replace(scene, velocities=closing).build(device=device, dtype=dtype))
+    for _ in range(6):
+        stepper.frame()
+        assert crossed(stepper.state.x.numpy(), scene.mesh.triangles) == 0
+
+
+@each_solver
+def test_free_fall(name, device):
+    """A flat sheet falls as if nothing had been declared: at ½gt(t + h) in steps h, 2.6 m in 0.7 s."""
+    scene = replace(layers(1), gravity=np.array([0.0, -9.81, 0.0]))
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
+    for _ in range(17):
+        stepper.frame()
+    t = 17.0 / 24.0
+    moved = stepper.state.x.numpy() - scene.positions
+    assert stepper.cut == 0.0
+    assert moved == pytest.approx(np.tile([0.0, -0.5 * 9.81 * t * (t + stepper.h), 0.0], (36, 1)), abs=1e-11)
+
+
+@pytest.mark.parametrize("steps", [20, pytest.param(400, marks=SLOW)])
+def test_violent_steps(steps, device):
+    """Of random moves of up to a third of the sheet, from wherever the last ended, nothing crosses."""
+    scene = folded(gravity=np.zeros(3))
+    pairs, model = steps_of(scene, device)
+    rng, x, v = np.random.default_rng(2), wp.clone(model.positions), model.vectors()
+    unfiltered = 0
+    pairs.grow_to(200_000)
+    for step in range(steps):
+        pairs.launch_begin(x)
+        target = x.numpy() + 10.0 ** rng.uniform(-3.0, -0.8) * rng.normal(size=(model.count, 3))
+        unfiltered += crossed(target, scene.mesh.triangles) > 0
+        wp.copy(x, model.array(target, model.vec3))
+        pairs.launch_end(x, v)
+        assert not pairs.overflowed
+        assert crossed(x.numpy(), scene.mesh.triangles) == 0, step
+    assert unfiltered > 0.5 * steps
+    assert pairs.share > 0.5
+
+
+@each_solver
+def test_more_pairs_than_there_is_room_for(name, device):
+    """A list that overflows in the middle of a run changes no bit, nor does another run."""
+    scene, ends = layers(turn=17.0, speed=1.0), []
+    for capacity in (None, None, 8):
+        stepper = SOLVERS[name].bind(scene.build(device=device))
+        if capacity is not None:
+            stepper.pairs.grow_to(capacity)
+            stepper.record_again()
+        for _ in range(3):
+            stepper.frame()
+        ends.append(stepper.state.copy())
+    assert ends[0] == ends[1]
+    assert ends[0] == ends[2]
+
+
+@each_solver
+def test_copies(name, device):
+    """Each of two copies moves as one alone, to the bit, and again after it was put back."""
+    scene = layers(turn=17.0, speed=1.0)
+    alone, both = (SOLVERS[name].bind(scene.build(device=device, copies=copies)) for copies in (1, 2))
+    for again in (False, True):
+        if again:
+            both.reset([True, False])
+        for _ in range(2):
+            both.frame()
+            if not again:
+                alone.frame()
+        first, second = both.state.x.numpy().reshape(2, -1, 3)
+        assert (first == alone.state.x.numpy()).all()
+        assert (second == first).all() != again
+
+
+@each_solver
+def test_nothing_is_there_without(name, device):
+    stepper = SOLVERS[name].bind(replace(layers(), self_contact=None).build(device=device))
+    assert stepper.pairs is None
+    assert not any("pairs" in kernel for kernel in stepper.model.kernels)
+
+
+@pytest.mark.parametrize("name", REFUSE)
+def test_solvers_that_refuse(name, device):
+    with pytest.raises(ValueError, match="cannot take self_contact; Explicit, Newton, PBD or XPBD can"):
+        REFUSE[name].bind(layers().build(device=device))
+
+
+def test_what_is_refused(device):
+    with pytest.raises(ValueError, match='linear="factorised" cannot take self_contact; linear="cg" can'):
+        wc.Newton(substeps=1, linear="factorised").bind(layers().build(device=device))
+    with pytest.raises(ValueError, match="sweep='constraint-averaged' cannot take self_contact"):
+        wc.XPBD(substeps=1, sweep="constraint-averaged").bind(layers().build(device=device))
+    with pytest.raises(ValueError, match="equilibrium cannot take self_contact"):
+        wc.equilibrium(layers(), device=device)
+    with pytest.raises(ValueError, match="record is energies with self_contact"):
+        wc.simulate(layers(), wc.Newton(substeps=1), device=device, record="energies")
+    with pytest.raises(ValueError, match="locked along some axes"):
+        wc.Newton(substeps=1).bind(layers(free_axes=np.tile([True, True, False], (72, 1))).build(device=device))
+    with pytest.raises(ValueError, match=r"self_contact\.stiffness has no default without gravity"):
+        layers(stiffness=None)
+    with pytest.raises(ValueError, match="mesh without triangles"):
+        wc.Scene(wc.Mesh.chain(3), density=1.0, self_contact=wc.SelfContact())
+    with pytest.raises(ValueError, match="self_contact is 1; it must be a SelfContact or None"):
+        wc.Scene(wc.Mesh.grid(3, 3), density=1.0, self_contact=1)
+    with pytest.raises(ValueError, match="symplectic Euler is stable below"):
+        wc.Explicit(substeps=1).bind(layers(stiffness=1e7).build(device=device))
+    assert layers(stiffness=None, gravity=None).self_contact.stiffness == pytest.approx(10.0 * 0.15 * 9.81 / 5e-3)
+
+
+def test_starts_that_are_refused(device):
+    with pytest.raises(ValueError, match=r"vertex 0 and triangle .* start 1e-06 m apart; self_contact needs more than"):
+        wc.Newton(substeps=1).bind(layers(gap=1e-6).build(device=device))
+    scene = layers(turn=17.0)
+    through = scene.positions.copy()
+    through[40, 1] -= 0.04
+    with pytest.raises(ValueError, match=r"edge .* and triangle .* cross at the start"):
+        wc.Newton(substeps=1).bind(replace(scene, positions=through).build(device=device))
+
+
+def test_crossings():
+    """An edge through the middle of a triangle, beside it, and one with a vertex of it."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -1], [0.2, 0.2, 1], [0.8, 0.8, -1], [0.8, 0.8, 1]])
+    edges, triangles = np.array([[3, 4], [5, 6], [0, 4]]), np.tile([[[0, 1, 2]]], (3, 1, 1))
+    ((edge, triangle),) = crossings(points, edges, triangles)
+    assert edge.tolist() == [3, 4]
+    assert triangle.tolist() == [0, 1, 2]

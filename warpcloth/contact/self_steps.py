@@ -1,0 +1,329 @@
+"""Contact of cloth with itself in the steps of a solver: forces of pairs that are near, and the filter that ends each step."""
+
+import numpy as np
+import warp as wp
+
+from ..core.capture import Mirror
+from ..kernels import self_contact as kernels
+from ..kernels.step import count_step
+from ..kernels.terms.contact import FLOOR
+from .proximity import Proximity
+
+# The skin, relative to the longest edge of the rest shape: beyond the contact distance pairs are listed as far as that. An edge
+# that goes through a triangle of that size is nearer than 0.29 to an edge of it; below 0.5, which is a right angle's height on
+# its longest side, a flat grid has no pairs with itself.
+SKIN = 0.35
+# Rounds of the filter: planes that cut more than a share of the vertices are set anew in so many; the way that lists allow is
+# walked in so many.
+SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
+# The way relative to the common motion, over the skin, that a vertex may make in a round: with as much that it may have made
+# since the list, two of them do not come nearer by more than the skin.
+WAY = 0.25
+
+
+class SelfSteps:
+    """Forces between near parts of cloth, and the filter, in the steps of one solver.
+
+    Where a step begins, :meth:`launch_begin` lists the pairs that are near and fixes the areas of their contact. Where it ends,
+    :meth:`launch_end` keeps them apart.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model` of a scene with self-contact.
+        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds its own arrays.
+        h: Step [s].
+        bounded: Whether contact is that of explicit steps, without the logarithm.
+
+    Attributes:
+        proximity: :class:`warpcloth.contact.proximity.Proximity`.
+        x_before: Positions where the step began, (N,) [m].
+        energies: Those of the pairs by their first vertex, (N,) [J].
+    """
+
+    def __init__(self, model, state, h, bounded):
+        declared = model.scene.self_contact
+        self.model, self.h, self.bounded, self.declared = model, h, bounded, declared
+        self.skin = SKIN * float(model.scene.mesh.edge_lengths.max())
+        self.proximity = Proximity(model, declared.distance, self.skin)
+        device = model.device
+        self.x_before, self._target, self._from, self._other = (model.vectors() for _ in range(4))
+        self._slope, self._iterates = model.scalars(), False
+        self.energies = wp.zeros(model.count, dtype=wp.float64, device=device)
+        areas = np.empty(model.per_copy)
+        areas[model.in_model(np.arange(model.per_copy))] = model.scene.mesh.vertex_areas
+        areas = np.tile(areas, model.copies)
+        self._areas = wp.array(areas, dtype=wp.float64, device=device)
+        self._common = wp.zeros(model.copies, dtype=wp.vec3d, device=device)
+        free = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
+        self._cuts = wp.zeros(2, dtype=wp.int32, device=device)
+        self._rounds, self._proceed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self.cut = state.add("vertices kept apart", wp.zeros(model.copies, dtype=wp.int64, device=device))
+        self.steps = state.add("steps of self-contact", model.scalars(wp.int32))
+        self._most = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
+        self._count = model.kernel(count_step)
+        made = kernels.begin_pairs, kernels.set_areas, kernels.add_forces, kernels.sum_energies, kernels.add_diagonal
+        made += kernels.limit_direction, kernels.precondition, kernels.take_descent, kernels.add_positions
+        made += kernels.add_products, kernels.set_planes, kernels.keep_apart, kernels.end_filter, kernels.common_move
+        self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
+        self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
+        self._moves_together = free
+        self._few = int(SHARE * model.count)
+        self._hold()
+        self._refuse_start()
+
+    def _refuse_start(self):
+        """Refuses a start at which cloth crosses cloth, or is nearer than the filter lets it come.
+
+        An edge that crosses a triangle is near an edge of it, and that pair is listed. Computed in float64, without exact
+        predicates.
+
+        Raises:
+            ValueError: Naming the first pair.
+        """
+        x = self.model.positions
+        self.launch_begin(x)
+        while self.overflowed:
+            self.grow()
+            self.launch_begin(x)
+        of_vertices, of_edges = self.proximity.counts.numpy()
+        stencils, points = self.proximity.stencils.numpy()[: of_vertices + of_edges], x.numpy().astype(np.float64)
+        found, least = self.begun.gap.numpy()[: len(stencils)], FLOOR * self.declared.distance
+        ulps = 6.0 * float(np.finfo(np.float32).eps) * np.abs(points).max(initial=0.0)
+        for e in np.flatnonzero(found < least + ulps)[:1]:
+            parts = (stencils[e][:1], stencils[e][1:]) if e < of_vertices else (stencils[e][:2], stencils[e][2:])
+            self._refuse_pair(parts, f"start {found[e]:.3g} m apart; self_contact needs more than {least + ulps:.3g} m")
+        edges = stencils[of_vertices:]
+        for own, other in ((edges[:, :2], edges[:, 2:]), (edges[:, 2:], edges[:, :2])):
+            crossing = crossings(points, own, self._triangles_of(other))
+            for edge, triangle in crossing[:1]:
+                self._refuse_pair((edge, triangle), "cross at the start; self_contact needs a start without crossings")
+
+    def _triangles_of(self, edges):
+        """The triangles of the model that each of some edges (E, 2) is in, two (E, 2, 3), the same twice at a border."""
+        mesh, n = self.model.scene.mesh, self.model.per_copy
+        triangles = np.asarray(self.model.in_model(mesh.triangles), dtype=np.int64)
+        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        keys = sides[:, 0] * n + sides[:, 1]
+        order = np.argsort(keys, kind="stable")
+        local = np.sort(edges % n, axis=1).astype(np.int64)
+        wanted = local[:, 0] * n + local[:, 1]
+        first, last = (np.searchsorted(keys[order], wanted, side) for side in ("left", "right"))
+        ends = np.stack([np.minimum(first, len(keys) - 1), np.maximum(last - 1, 0)], axis=1)
+        return triangles[order[ends] // 3] + (edges[:, :1] // n * n)[:, :, None]
+
+    def _refuse_pair(self, parts, why):
+        model, named = self.model, []
+        for part in parts:
+            vertices = [int(v % model.per_copy if model.order is None else model.order[v % model.per_copy]) for v in part]
+            named.append(f"{('vertex', 'edge', 'triangle')[len(part) - 1]} {'–'.join(map(str, vertices))}")
+        copy = f" of copy {parts[0][0] // model.per_copy}" if model.copies > 1 else ""
+        raise ValueError(f"{named[0]} and {named[1]}{copy} {why}")
+
+    def _hold(self):
+        """Arrays of as many pairs as the list has room for."""
+        found, device = self.proximity, self.model.device
+        capacity = len(found.stencils)
+
+        def room(dtype):
+            return wp.zeros(capacity, dtype=dtype, device=device)
+
+        self.pairs = kernels.near_pairs(self.model.dtype)()
+        for name in ("stencils", "counts", "first", "corners", "distances"):
+            setattr(self.pairs, name, getattr(found, name))
+        self.begun, self.forces, self._planes = kernels.StepPairs(), kernels.PairForces(), kernels.Planes()
+        self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
+        self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
+        self.forces.normal, self.forces.weights = room(wp.vec3d), room(wp.vec4d)
+        self.forces.energy, self.forces.slope, self.forces.bend = (room(wp.float64) for _ in range(3))
+        self._planes.plane, self._planes.margin = room(wp.vec4d), room(wp.float64)
+        self.multipliers = room(wp.float64)
+
+    def grow(self):
+        """Makes room for the pairs that did not fit; what was recorded must be recorded again."""
+        self.grow_to(self._wanted)
+
+    def grow_to(self, pairs):
+        """Makes room for half as many pairs more than these."""
+        self.proximity.grow(pairs)
+        self._most.write(0)
+        self._hold()
+
+    @property
+    def overflowed(self):
+        """Whether a list since this was last asked did not have room for all pairs; the host reads it."""
+        most = int(self._most.read()[0])
+        if most > len(self.pairs.stencils):
+            self._wanted = most
+            return True
+        return False
+
+    @property
+    def share(self):
+        """The share of the moves of free vertices in all steps that were cut short, (B,)."""
+        free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
+        return self.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
+
+    def start_again(self):
+        """Forgets the steps that an integrator made to find its past."""
+        self.cut.zero_()
+        self.steps.zero_()
+
+    def _launch(self, factory, dim, inputs, outputs):
+        self.model.launch(self._kernels[factory], dim, inputs, outputs)
+
+    def launch_begin(self, x):
+        """Lists the pairs at x, (N,), where a step begins."""
+        wp.copy(self.x_before, x)
+        self.launch_list(x)
+        self.launch_areas(x)
+
+    def launch_list(self, x):
+        """Lists the pairs at x, and notes how many there are."""
+        self.proximity.launch(x)
+        self.model.launch(kernels.note_most, 1, [self.proximity.counts], [self._most.array])
+
+    def launch_areas(self, x):
+        """Fixes the side and the area of each listed pair."""
+        count = len(self.pairs.stencils)
+        self._launch(kernels.begin_pairs, count, [self.pairs, x], [self.begun])
+        given = [self.pairs, self._areas, x, self.declared.stiffness]
+        self._launch(kernels.set_areas, count, given, [self.begun])
+
+    def launch_forces(self, x, correction=None):
+        """Finds the forces of the pairs at x, or x + correction, which the methods below add up."""
+        self.model.launch(self._find, len(self.pairs.stencils), [self.pairs, self.begun, x, correction], [self.forces])
+
+    def add_gradient(self, out):
+        """out (N,) += ∂U/∂x."""
+        self._launch(kernels.add_forces, self.model.count, [self.pairs, self.forces], [out])
+
+    def add_energy(self, sums, out):
+        """out (B,) += U."""
+        self._launch(kernels.sum_energies, self.model.count, [self.pairs, self.forces], [self.energies])
+        sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
+
+    def add_diagonal(self, diagonal, values):
+        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
+        given = [self.pairs, self.model.inverse_mass, diagonal, self.forces]
+        self._launch(kernels.add_diagonal, self.model.count, given, [values])
+
+    def add_products(self, p, q, active):
+        """q += A p of its blocks off the diagonal, for the copies that are ``active`` (B,)."""
+        given = [self.pairs, self.model.inverse_mass, self.forces, p, active, self.model.per_copy]
+        self._launch(kernels.add_products, self.model.count, given, [q])
+
+    def launch_sweep(self, x, correction, h, multipliers, backward):
+        """Moves the vertices of each pair in turn, see :func:`warpcloth.kernels.self_contact.sweep_pairs`."""
+        kernel = self.model.kernel(kernels.sweep_pairs, self.model.dtype)
+        given = [self.pairs, self.model.inverse_mass, self.begun, x, h, not multipliers, backward]
+        self.model.launch(kernel, 1, given, [self.multipliers if multipliers else None, self.forces, correction])
+
+    def launch_end(self, x, v, move=None):
+        """Walks from where the step began to x as far as pairs stay apart; v and ``move`` (N,) follow."""
+        model = self.model
+        wp.copy(self._target, x)
+        wp.copy(x, self.x_before)
+        if self._iterates:
+            self.launch_fresh(x, self.launch_list)
+        self._walk(x)
+        given = [model.inverse_mass, self._target, x, model.per_copy, self.h]
+        self._launch(kernels.end_filter, model.count, given, [v, move, self.cut])
+        model.launch(self._count, model.copies, [], [self.steps])
+
+    def launch_fresh(self, x, launch):
+        """Launches ``launch`` of x if a vertex has moved so far since the last list that the next walk might miss a pair."""
+        wp.capture_if(self.proximity.moved(x, WAY), launch, x=x)
+
+    def _walk(self, x):
+        """Moves x to the target as far as pairs stay apart, by lists made anew on the way."""
+        self._rounds.zero_()
+        self._cuts.zero_()
+        self._launch_walk(x)
+        wp.capture_while(self._proceed, self._launch_round, x=x)
+
+    def _launch_round(self, x):
+        self.launch_list(x)
+        if self._iterates:
+            self.launch_areas(x)
+        self._launch_walk(x)
+
+    def _launch_walk(self, x):
+        model = self.model
+        self._launch_planes(x, self._target, None)
+        wp.copy(self._from, x)
+        given = [self.pairs, self._planes, self._from, self._target, self._common, model.per_copy, WAY * self.skin]
+        self._launch(kernels.keep_apart, model.count, given, [x, self._cuts])
+        given = [self._few, NEAR_ROUNDS, FAR_ROUNDS]
+        model.launch(kernels.another_round, 1, given, [self._cuts, self._rounds, self._proceed])
+
+    def _launch_planes(self, x, target, direction):
+        model, wanted = self.model, [x, target, direction]
+        if self._moves_together:
+            self._launch(kernels.common_move, model.copies, [*wanted, model.per_copy], [self._common])
+        given = [self.pairs, *wanted, self._common, model.per_copy, FLOOR * self.declared.distance]
+        self._launch(kernels.set_planes, len(self.pairs.stencils), given, [self._planes])
+
+    # Of methods whose iterates base + d stay apart too.
+
+    def launch_first(self, base, d):
+        """d such that base + d is as far on the way from where the step began to base as pairs stay apart."""
+        wp.copy(self._target, base)
+        self._walk(self.x_before)
+        self._add(self.x_before, base, -1.0, d)
+
+    def iterates(self):
+        """Says that these methods are used."""
+        self._iterates = True
+
+    def launch_relist(self, base, d, launch):
+        """Lists the pairs at base + d, and launches ``launch``, if vertices have moved far since the last list."""
+        self._add(base, d, 1.0, self.x_before)
+
+        def relist(x):
+            self.launch_list(x)
+            self.launch_areas(x)
+            launch()
+
+        self.launch_fresh(self.x_before, relist)
+
+    def launch_limit(self, sums, gradient, preconditioner, right, direction):
+        """Cuts the direction from the positions of :meth:`launch_relist` short, so that pairs stay apart along all of it.
+
+        Of a copy where energy then does not fall along it, it is that of the preconditioner P, P·right, likewise cut short.
+        """
+        model, N = self.model, self.model.count
+        self._launch(kernels.precondition, N, [preconditioner, right], [self._other])
+        for each in (direction, self._other):
+            self._launch_planes(self.x_before, None, each)
+            given = [self.pairs, self._planes, self.x_before, self._common, model.per_copy, WAY * self.skin]
+            self._launch(kernels.limit_direction, N, given, [each])
+        sums.dot(gradient, direction, self._slope)
+        self._launch(kernels.take_descent, N, [self._slope, self._other, model.per_copy], [direction])
+
+    def _add(self, a, b, sign, out):
+        self._launch(kernels.add_positions, self.model.count, [a, b, sign], [out])
+
+
+def crossings(points, edges, triangles):
+    """The edges that go through triangles.
+
+    Args:
+        points: (N, 3) [m].
+        edges: (E, 2).
+        triangles: (E, m, 3): of each edge those that it is compared with.
+
+    Returns:
+        List of (edge (2,), triangle (3,)).
+    """
+    edges = np.repeat(edges, triangles.shape[1], axis=0)
+    triangles = triangles.reshape(-1, 3)
+    apart = ~(edges[:, :, None] == triangles[:, None, :]).any(axis=(1, 2))
+    edges, triangles = edges[apart], triangles[apart]
+    (p, q), (a, b, c) = points[edges].swapaxes(0, 1), points[triangles].swapaxes(0, 1)
+
+    def volume(a, b, c, d):
+        return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)
+
+    through = volume(a, b, c, p) * volume(a, b, c, q) < 0.0
+    sides = np.sign([volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)])
+    through &= (sides >= 0.0).all(axis=0) | (sides <= 0.0).all(axis=0)
+    return list(zip(edges[through], triangles[through], strict=True))
