@@ -146,6 +146,8 @@ def boxes(dtype):
         high = wp.max(wp.max(a, b), c)
         more = half * (surface.distance + surface.skin)
         more += dtype(4.0) * epsilon(more) * wp.max(wp.max(wp.abs(low)), wp.max(wp.abs(high)))
+        # The smaller of a number and NaN is the number, so NaN would be lost here.
+        more += wp.dot(a, vec3()) + wp.dot(b, vec3()) + wp.dot(c, vec3())
         edge = vec3(more, more, more)
         return low - edge, high + edge
 
