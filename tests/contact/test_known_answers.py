@@ -23,9 +23,15 @@ SOLVERS = {
     "admm": wc.ADMM(substeps=1, tolerance=1e-7, iterations=1000),
     "constrained dynamics": wc.ConstrainedDynamics(substeps=1, tolerance=1e-9, iterations=100),
 }
-each_solver = pytest.mark.parametrize("name", SOLVERS)
-sticky = pytest.mark.parametrize("name", [name for name in SOLVERS if name != "constrained dynamics"])
-implicit = pytest.mark.parametrize("name", [name for name in SOLVERS if name != "explicit"])
+HOST = {"admm": pytest.mark.host}  # test_colliders.py and test_forces.py have it on other devices
+
+
+def of_solvers(*left_out):
+    names = [name for name in SOLVERS if name not in left_out]
+    return pytest.mark.parametrize("name", [pytest.param(name, marks=HOST.get(name, ())) for name in names])
+
+
+each_solver, sticky, implicit = of_solvers(), of_solvers("constrained dynamics"), of_solvers("explicit")
 
 
 def of_triangles(plane):
