@@ -93,9 +93,10 @@ def cloths_of(
         found = _of_path(os.fspath(source), mesh, prims, fps)
     elif prims is not None:
         raise ValueError(f"prim is {shown(prim)}; of a source that is no path it must be None")
+    elif isinstance(source, Sequence) and source.stage is not None and source.path is not None:
+        found = _of_stage(os.fspath(source.path), [source.stage.prim], fps)
     elif isinstance(source, Sequence):
-        in_stage = source.stage is not None and source.path is not None
-        found = _of_stage(os.fspath(source.path), [source.stage.prim], fps) if in_stage else _of_sequence(source)
+        found = _of_sequence(source)
     else:
         found = _of_points(source, mesh)
     if isinstance(mesh, Mesh):

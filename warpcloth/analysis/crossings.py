@@ -60,7 +60,8 @@ def have_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     for axis in range(3):
         flat = corners.copy()
         flat[:, :, axis] = 0.0
-        found |= _side(*flat.transpose(1, 0, 2), np.broadcast_to(np.eye(3)[axis], (len(flat), 3))) != 0
+        a, b, c = flat.transpose(1, 0, 2)
+        found |= _side(a, b, c, np.broadcast_to(np.eye(3)[axis], (len(flat), 3))) != 0
     return found
 
 
