@@ -2,8 +2,6 @@
 
 import numpy as np
 import warp as wp
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ..base.limits import refuse_memory
 from ..base.turns import in_turn
@@ -83,6 +81,9 @@ class Proximity:
 
     def _connected(self, edges):
         """The connected piece of each vertex, −1 of one of no element, and rest points about the middle of each piece."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
         n, points = self.model.per_copy, self.model.rest_points
         joined = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(n, n))
         count, piece = connected_components(joined, directed=False)
