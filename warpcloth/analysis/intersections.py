@@ -1,4 +1,4 @@
-"""Exact intersections of an animation, vertices inside colliders, and limits of stretch that are exceeded."""
+"""The intersections of an animation, found exactly, vertices inside colliders, and limits of stretch that are exceeded."""
 
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Several
@@ -95,25 +95,25 @@ def intersections(
     every: int = 1,
     progress: Progress | None = None,
 ) -> Intersections:
-    """Finds the triangles of a cloth, or of several, that intersect, exactly, in each frame.
+    """Finds the triangles that intersect in each frame of one or several cloths, by exact predicates.
 
-    Triangles without a common vertex intersect if they touch or cross, those with a common vertex or edge if they have more
-    than that in common. Vertices of boundaries that are at one position in all frames count as one, as panels that are sewn
-    together. Vertices inside colliders and limits of stretch that are exceeded are found too.
+    Triangles without a common vertex intersect if they touch or cross. Triangles with a common vertex or edge intersect if they
+    have more than that in common. Boundary vertices that are at the same position in all frames count as one vertex, as in
+    panels that are sewn together. Vertices inside colliders and limits of stretch that are exceeded are found too.
 
     Args:
-        frames: Points of one frame (n, 3) or of several (F, n, 3) [m]; an :class:`warpcloth.Animation`, or a
-            :class:`warpcloth.Scene` as it starts, whose colliders and limits count too; a :class:`warpcloth.Mesh`; a
-            :class:`warpcloth.Sequence`; or a path: a mesh file, anything that :func:`warpcloth.open_sequence` opens, or a
-            stage. Of a result of ours the cloth is checked, of other stages all meshes whose points move, or else all, but
-            no colliders.
-        mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape, or triangles (T, 3); where the frames have none.
-        prim: Paths or names of the meshes of a stage to be checked, of these alone; name of the geometry in other files.
-        fps: Frames a second, where the source does not say it or says it wrong.
-        colliders: Colliders in the place of those of the source. Vertices can be inside a half-space, a solid, or a
+        frames: Points of one frame (n, 3) or of several (F, n, 3) [m]; an :class:`warpcloth.Animation`, or the start of a
+            :class:`warpcloth.Scene`, with their colliders and limits; a :class:`warpcloth.Mesh`; a :class:`warpcloth.Sequence`;
+            or a path: a mesh file, anything that :func:`warpcloth.open_sequence` opens, or a stage. In a stage that warpcloth
+            wrote, the cloth is checked. In other stages, all meshes whose points move are checked, or all meshes if none moves,
+            but no colliders.
+        mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape, or triangles (T, 3), if the frames have none.
+        prim: Paths or names of the meshes of a stage; only these are checked. In other files, the name of the geometry.
+        fps: Frames per second, if the source does not say it or says it wrong.
+        colliders: Colliders in place of those of the source. Vertices can be inside a half-space, a solid, or a
             :class:`warpcloth.MeshCollider` that is closed.
-        stretch: Largest l/L of an edge that is allowed, beside the limits that the source declares.
-        every: Every k-th frame alone.
+        stretch: Largest l/L of an edge that is allowed, in addition to the limits that the source declares.
+        every: Check only every k-th frame.
         progress: Function called with (frames checked, frames), or None.
 
     Returns:

@@ -1,1 +1,1 @@
-"""Contact on a device: the motion of colliders, anchors of friction, and the filter that ends each step."""
+"""Contact on a device: the motion of colliders, anchors of friction, contact of cloth with itself, and the filters of steps."""

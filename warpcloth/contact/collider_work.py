@@ -1,4 +1,4 @@
-"""The work of moving colliders and the work against friction, summed over steps."""
+"""The work of moving colliders and the work against friction, both summed over steps."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Contact and friction at the present state of a solver: the energies that they store, and the forces on each collider."""
+"""Contact and friction at the current state of a solver: their energies, and the forces on each collider."""
 
 from dataclasses import replace
 from functools import partial

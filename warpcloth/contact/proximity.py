@@ -1,4 +1,4 @@
-"""Pairs of vertices and triangles, and of edges, that are near one another: found on the device, in a fixed order."""
+"""Finds pairs of a vertex and a triangle, and of two edges, that are near one another, on the device and in a fixed order."""
 
 import numpy as np
 import warp as wp

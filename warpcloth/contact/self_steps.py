@@ -1,4 +1,4 @@
-"""Contact of cloth with itself in the steps of a solver: forces of pairs that are near, and the filter that ends each step."""
+"""Contact of cloth with itself in the steps of a solver: the forces of near pairs, and the filter at the end of each step."""
 
 import numpy as np
 import warp as wp

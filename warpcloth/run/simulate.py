@@ -86,7 +86,8 @@ class Animation:
         cuts: With a record, the fraction of the moves of free vertices in each frame that the filter of contact cut short,
             (frames+1,) or (frames+1, B); see ``cut``.
         cut: The fraction of the moves of free vertices, over all steps, that were cut short because they would have entered or
-            crossed a collider; with B > 1 copies one value per copy, (B,).
+            crossed a collider, plus the fraction cut short because cloth would have crossed cloth; with B > 1 copies one value
+            per copy, (B,).
         inside: A tuple of :class:`Inside`, one for each collider that contained a vertex, with its first such vertex. This is a
             vertex that is not free, if the collider moves over it or it moves into the collider, or a free vertex between two
             colliders that close on one another.

@@ -14,11 +14,11 @@ _SAG = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Contact of cloth with colliders: a pressure of k(r − d) at distances d < r, and of kr²/(4d) at d < r/2.
+    """Contact of cloth with colliders: a pressure of k(r − d) at distances r/2 ≤ d < r, and of kr²/(4d) at d < r/2.
 
-    It derives from the energy U = Σ kA φ(d) of the vertices, A the area of a vertex; see
-    :mod:`warpcloth.kernels.terms.contact`. A pressure p leaves a gap of r − p/k, or of kr²/(4p) if p is above kr/2. Friction
-    also has the stiffness k: a vertex that sticks moves by up to μN/(kA) before it slides.
+    The energy is U = Σ kA φ(d) over the vertices, where A is the area of a vertex; see :mod:`warpcloth.kernels.terms.contact`.
+    A pressure p leaves a gap of r − p/k, or of kr²/(4p) if p is above kr/2. Friction also has the stiffness k: a vertex that
+    sticks moves by up to μN/(kA) before it slides.
 
     Attributes:
         distance: Contact distance r [m].

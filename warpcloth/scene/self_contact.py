@@ -1,4 +1,4 @@
-"""How cloth touches itself."""
+"""Contact of cloth with itself."""
 
 from dataclasses import dataclass
 
@@ -7,20 +7,20 @@ from ..base.checks import number
 
 @dataclass(frozen=True)
 class SelfContact:
-    """How cloth touches itself and other pieces of cloth: as it touches colliders, see :class:`warpcloth.Contact`.
+    """Contact of cloth with itself and with other pieces of cloth, with the φ of :class:`warpcloth.Contact`.
 
-    U = Σ kA φ(d) over pairs of a vertex and a triangle and pairs of edges at the distance d, see
-    :mod:`warpcloth.kernels.self_contact`. In one connected piece the contact distance of a pair is at most half of its distance
-    at rest, so that neighbours do not push one another, and pairs that share a vertex do not touch. At the end of each step a
-    filter cuts short what would cross: no step ends with cloth that went through cloth.
+    The energy is U = Σ kA φ(d), over pairs of a vertex and a triangle and over pairs of two edges; d is the distance of a pair.
+    See :mod:`warpcloth.kernels.self_contact`. Pairs that share a vertex do not collide. Within a connected piece, the contact
+    distance of a pair is at most half its distance at rest, so neighbours do not push one another. At the end of each step a
+    filter cuts short the moves that would cross: no step ends with cloth that went through cloth.
 
     Attributes:
         distance: Contact distance r [m].
-        stiffness: k [Pa/m]. By default 10 w/r with the weight w of the cloth per area, so that the weight of one layer leaves a
-            gap of 0.9 r.
+        stiffness: k [Pa/m]. By default 10 w/r, where w is the weight of the cloth per area, so that one layer rests at a gap of
+            0.9 r.
 
     Raises:
-        ValueError: If a value breaks a rule.
+        ValueError: If a value is not allowed.
     """
 
     distance: float = 1e-3

@@ -22,10 +22,10 @@ Own = TypeVar("Own", bound="PlateBending")
 class PlateBending(Sparse):
     """Plate bending, U = Σ ½AκᵀCκ.
 
-    κᵀCκ is D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂², with κ the second derivatives of the positions along warp and weft, for
-    each triangle. They are exact for surfaces of constant curvature on any mesh, and deflections converge to those of the
-    plate with the square of the edge length. Forces are linear in x. The plate is flat at rest: of a mesh that is curved at
-    rest only the lengths of edges count.
+    κᵀCκ is D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂². κ holds the second derivatives of the positions along warp and weft, for
+    each triangle. It is exact for surfaces of constant curvature on any mesh. The error of deflections falls with the square of
+    the edge length. Forces are linear in x. The plate is flat at rest: of a mesh that is curved at rest only the lengths of
+    edges count.
 
     The stiffness is given by D₁, Poisson's ratio ν = D₁₂/√(D₁D₂), and two ratios: D₂/D₁ and D₆₆/D₁. An isotropic plate has
     D₂ = D₁ = D and D₆₆ = ½(1 − ν)D.
@@ -35,8 +35,8 @@ class PlateBending(Sparse):
         poisson_ratio: ν, above −1 and below 1, one or (T,).
         weft_ratio: D₂/D₁, one or (T,).
         twist_ratio: D₆₆/D₁, one or (T,); ½(1 − ν)√(D₂/D₁) if None.
-        warp: Vector along the warp, (3,) or (T,3), of which each triangle takes the part in its plane. None: where s of the
-            texture coordinates grows and t does not, which an isotropic plate does not need.
+        warp: Vector along the warp, (3,) or (T,3); each triangle takes the part in its plane. By default the direction in which
+            the texture coordinate s grows and t does not. Isotropic plates need neither.
         name: To tell two terms of one kind apart.
 
     Examples:
@@ -61,7 +61,7 @@ class PlateBending(Sparse):
     def from_stiffnesses(
         cls: type[Own], warp: float, weft: float, coupling: float, twist: float, direction: Any = None, **fields: Any
     ) -> Own:
-        """Returns the plate of D₁, D₂, D₁₂ and D₆₆ [N·m], numbers or (T,); ``direction`` is the vector along the warp.
+        """Returns the plate with D₁, D₂, D₁₂ and D₆₆ [N·m], numbers or (T,); ``direction`` is the vector along the warp.
 
         Raises:
             ValueError: If D₁, D₂ or D₆₆ is not above 0, or D₁₂² is not below D₁D₂.
