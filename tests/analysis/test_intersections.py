@@ -359,6 +359,11 @@ def test_the_command_and_bad_input(tmp_path, capfd, monkeypatch):
         (lambda: wc.intersections(frames, mesh, prim="a"), "prim is 'a'"),
         (lambda: wc.intersections(path, wc.Mesh.grid(3, 3)), "mesh has 8 triangles"),
         (lambda: wc.intersections(frames[:, :-1], mesh), "frames has shape"),
+        (lambda: wc.intersections(None, mesh.triangles), "frames is None"),
+        (lambda: wc.intersections(frames, mesh, prim=5), "prim is 5"),
+        (lambda: wc.intersections(path, prim=[]), r"prim is \[\]"),
+        (lambda: wc.intersections(frames, mesh, colliders=wc.Plane()), "colliders is Plane"),
+        (lambda: wc.intersections(frames, mesh, colliders=["a"]), r"colliders\[0\] is 'a'"),
     ):
         with pytest.raises(ValueError, match=message):
             call()

@@ -176,6 +176,15 @@ def test_folded_sheet_closes(name, dtype, device):
 
 
 @each_solver
+@pytest.mark.parametrize("gap", [2.5e-3, 5e-5])
+def test_starts_pressed_together(name, gap, device):
+    """Sheets within the contact distance fly apart with the energy of contact at the start, which is no divergence."""
+    animation = wc.simulate(layers(n=3, gap=gap, duration=0.125), SOLVERS[name], device=device)
+    assert "diverged" not in animation.status.message
+    assert np.ptp(animation.points[-1, :, 1]) > 5e-3
+
+
+@each_solver
 def test_free_fall(name, device):
     """A flat sheet falls as if nothing had been declared: at ½gt(t + h) in steps h, 2.6 m in 0.7 s."""
     scene = replace(layers(1), gravity=np.array([0.0, -9.81, 0.0]))
@@ -274,6 +283,12 @@ def test_what_is_refused(device):
     with pytest.raises(ValueError, match="symplectic Euler is stable below"):
         wc.Explicit(substeps=1).bind(layers(stiffness=1e7).build(device=device))
     assert layers(stiffness=None, gravity=None).self_contact.stiffness == pytest.approx(10.0 * 0.15 * 9.81 / 5e-3)
+
+
+@pytest.mark.filterwarnings("error")
+def test_all_pinned(device):
+    scene = layers(n=2, gap=1e-3, duration=1 / 24, pins="all")
+    assert wc.simulate(scene, SOLVERS["explicit"], device=device).points[-1] == pytest.approx(scene.positions)
 
 
 def test_starts_that_are_refused(device):

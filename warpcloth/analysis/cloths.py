@@ -88,7 +88,9 @@ def cloths_of(
     """
     if fps is not None:
         number("fps", fps, above=0.0)
-    prims = None if prim is None else [prim] if isinstance(prim, str) else list(prim)
+    prims = [prim] if isinstance(prim, str) else prim if prim is None else list(prim) if isinstance(prim, Iterable) else []
+    if prims is not None and not (prims and all(isinstance(each, str) for each in prims)):
+        raise ValueError(f"prim is {shown(prim)}; it must be a path or name, or several, or None")
     if isinstance(source, (str, os.PathLike)):
         found = _of_path(os.fspath(source), mesh, prims, fps)
     elif prims is not None:
@@ -134,6 +136,8 @@ def _of_points(source, mesh):
         points = as_array(points)
     if points.ndim == 2:
         points = points[None]
+    if points.ndim != 3 and points.size:
+        raise ValueError(f"frames is {shown(source)}; it must be points (n, 3) or (F, n, 3), or what has some")
     if not isinstance(mesh, Mesh):
         if not len(points):
             raise ValueError("frames is empty; there must be one at least")

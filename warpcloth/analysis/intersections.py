@@ -13,7 +13,7 @@ from ..base.texts import numbered
 from ..base.types import FilePath, Progress
 from ..mesh.mesh import Mesh
 from ..mesh.sequences import HasPoints, Sequence
-from ..scene.colliders import Collider
+from ..scene.colliders import Collider, checked_colliders
 from .cloths import Cloths, cloths_of
 from .crossings import Crossings, have_area
 from .samples import Exclusion
@@ -162,7 +162,7 @@ class Checker:
             number("stretch", stretch, above=0.0)
         self.cloths, self.indices = cloths, range(0, len(cloths.labels), every)
         self.limits = [*cloths.limits, *([] if stretch is None else [edge_limit(cloths.mesh, stretch)])]
-        colliders = cloths.colliders if colliders is None else colliders
+        colliders = cloths.colliders if colliders is None else checked_colliders(colliders)
         self.colliders = dict(zip(numbered(each.label for each in colliders), colliders, strict=True))
         self._crossings = Crossings(self._index[cloths.mesh.triangles])
 

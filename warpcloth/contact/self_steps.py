@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror
+from ..core.sums import Sums
 from ..kernels import self_contact as kernels
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
@@ -96,6 +97,19 @@ class SelfSteps:
             crossing = crossings(points, own, self._triangles_of(other))
             for edge, triangle in crossing[:1]:
                 self._refuse_pair((edge, triangle), "cross at the start; self_contact needs a start without crossings")
+
+    def at_start(self):
+        """U [J] at the start, and how many pairs touch there times ½Σ(r − d)² [m²], both (B,)."""
+        x, energy = self.model.positions, self.model.scalars()
+        self.launch_begin(x)
+        self.launch_forces(x)
+        self.add_energy(Sums(self.model), energy)
+        copies = self.pairs.stencils.numpy()[: self.pairs.counts.numpy().sum(), 0] // self.model.per_copy
+        given = self.pairs.distances, self.begun.gap, self.begun.stiffness
+        distance, gap, stiffness = (array.numpy()[: len(copies)] for array in given)
+        open_by = np.where(stiffness > 0.0, np.maximum(distance - gap, 0.0), 0.0)
+        touching, squares = (np.bincount(copies, each, self.model.copies) for each in (open_by > 0.0, open_by**2))
+        return energy.numpy(), 0.5 * touching * squares
 
     def _triangles_of(self, edges):
         """The triangles of the model that each of some edges (E, 2) is in, two (E, 2, 3), the same twice at a border."""

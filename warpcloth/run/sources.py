@@ -63,7 +63,7 @@ def source_of(part, balance, stepper):
 
 @source_of.register(Stepper)
 class Start(Source):
-    """Kinetic and elastic energy at the start.
+    """Kinetic and elastic energy at the start, and that of contact.
 
     Hard constraints count with the energy of closing their gaps in one step. N of them in a row move what hangs on them by up
     to Σ gap ≤ √(N Σ gap²), and midpoint or a relaxation of 2 doubles the speed that hₑ gives. Soft constraints count in the
@@ -78,6 +78,10 @@ class Start(Source):
         velocities = model.in_scene_order(model.velocities.numpy()).astype(np.float64)
         self._energy = balance.kinetic(velocities) + elastic.energy(model.positions)
         gaps = sum(elements.per_copy for elements in closed) * elastic.gaps(model.positions, closed)
+        if stepper.pairs is not None:
+            energy, of_pairs = stepper.pairs.at_start()
+            self._energy += energy
+            gaps = gaps + stepper.options.closes * of_pairs
         self._energy += 4.0 * balance.total * gaps / stepper.he**2
 
     def energy(self, frame, speed):

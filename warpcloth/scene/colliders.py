@@ -1,6 +1,6 @@
 """Colliders: what cloth touches, standing or moved as rigid bodies, and how it touches them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -286,6 +286,21 @@ def turned(q, vectors):
 def default_stiffness(weight: float, distance: float) -> float:
     """The stiffness k [Pa/m] that a weight per area [Pa] presses in by a tenth of the contact distance [m]."""
     return weight / (_SAG * distance)
+
+
+def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:
+    """The colliders that are given.
+
+    Raises:
+        ValueError: If they are no list of colliders.
+    """
+    if isinstance(given, Collider) or not isinstance(given, Iterable):
+        raise ValueError(f"colliders is {shown(given)}; it must be a list of colliders, such as [Plane()]")
+    colliders = tuple(given)
+    for i, collider in enumerate(colliders):
+        if not isinstance(collider, Collider):
+            raise ValueError(f"colliders[{i}] is {shown(collider)}; it must be a collider, such as Plane()")
+    return colliders
 
 
 def refuse_inside(colliders: Sequence[Collider], positions: np.ndarray, free: np.ndarray, copy: str = "") -> None:

@@ -17,7 +17,7 @@ from ..model.model import Model
 from ..terms.contact import VertexContact, VertexFriction
 from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
-from .colliders import Collider, Contact, default_stiffness, refuse_inside
+from .colliders import Collider, Contact, checked_colliders, default_stiffness, refuse_inside
 from .mesh_collider import MeshCollider
 from .self_contact import SelfContact
 
@@ -178,7 +178,7 @@ class Scene:
         else:
             keep("masses", array("masses", self.masses, (n,)))
         self._check_masses()
-        keep("colliders", self._checked_colliders())
+        keep("colliders", checked_colliders(self.colliders))
         keep("contact", self._checked_contact())
         keep("self_contact", self._checked_self_contact())
         self.refuse_inside(self.positions)
@@ -195,16 +195,6 @@ class Scene:
                 given = f"the class {term.__name__}" if isinstance(term, type) else shown(term)
                 raise ValueError(f"terms[{i}] is {given}; it must be an energy, such as Spring(stiffness=1e3)")
         return terms
-
-    def _checked_colliders(self):
-        rule = "it must be a list of colliders, such as [Plane()]"
-        if isinstance(self.colliders, Collider) or not isinstance(self.colliders, Iterable):
-            raise ValueError(f"colliders is {shown(self.colliders)}; {rule}")
-        colliders = tuple(self.colliders)
-        for i, collider in enumerate(colliders):
-            if not isinstance(collider, Collider):
-                raise ValueError(f"colliders[{i}] is {shown(collider)}; it must be a collider, such as Plane()")
-        return colliders
 
     def _checked_contact(self):
         if not (self.contact is None or isinstance(self.contact, Contact)):

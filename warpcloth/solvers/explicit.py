@@ -163,7 +163,7 @@ def _with_pairs(model, h):
         return h
     w = model.in_scene_order(model.inverse_mass.numpy()).reshape(model.copies, -1).max(axis=0)
     stiff = 4.0 * declared.stiffness * float((w * model.scene.mesh.vertex_areas).max())
-    return float(1.0 / (0.5 / h + np.sqrt(0.25 / h**2 + 0.25 * stiff)))
+    return float(1.0 / (0.5 / h + np.sqrt(0.25 / h**2 + 0.25 * stiff))) if stiff else h
 
 
 def _unlike(model):
