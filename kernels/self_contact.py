@@ -877,6 +877,29 @@ def common_move(dtype):
 
 
 @cache
+def walk_from_start(dtype):
+    """Kernel over vertices: sets x to where the step began, in copies whose colliders have cut a move since ``before``."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def walk_each_from_start(
+        # state in
+        x_before: wp.array(dtype=vec3),
+        before: wp.array(dtype=wp.int64),
+        cut: wp.array(dtype=wp.int64),
+        # parameters
+        per_copy: int,
+        # out
+        x: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if cut[i // per_copy] > before[i // per_copy]:
+            x[i] = x_before[i]
+
+    return walk_each_from_start
+
+
+@cache
 def end_filter(dtype):
     """Kernel over vertices: what the filter cut off x is cut off v, over h, and off ``move``, which may be None."""
     vec3, _ = types(dtype)

@@ -70,7 +70,7 @@ def folded(n=13, gap=0.02, **fields):
 def steps_of(scene, device, bounded=False, h=1.0 / 24.0):
     """The :class:`SelfSteps` of a scene in float64, in no solver, and its model."""
     model = scene.build(device=device, dtype="float64")
-    return SelfSteps(model, wc.Explicit(substeps=1000, above_limit="allow").bind(model).state, h, bounded), model
+    return SelfSteps(model, wc.Explicit(substeps=1000, above_limit="allow").bind(model).state, h, bounded, None), model
 
 
 def crossed(points, triangles):
@@ -173,6 +173,24 @@ def test_folded_sheet_closes(name, dtype, device):
     for _ in range(6):
         stepper.frame()
         assert crossed(stepper.state.x.numpy(), scene.mesh.triangles) == 0
+
+
+@each_solver
+@pytest.mark.parametrize(
+    "collider",
+    [wc.Sphere(radius=0.3, position=(0.0, -0.31, 0.0)), wc.Box(size=(0.3, 0.3, 0.3), position=(0.0, -0.16, 0.0))],
+    ids=["ball", "box"],
+)
+def test_thrown_on_a_collider(name, collider, device):
+    """The filters of colliders and of self-contact together leave no vertex inside, and no crossing."""
+    given = {"colliders": [collider], "contact": wc.Contact(stiffness=1e4)}
+    scene = layers(count=3, n=4, stiffness=500.0, **given)
+    scene = replace(scene, velocities=np.tile([1.0, -10.0, 0.5], (48, 1)))
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
+    for _ in range(6):
+        stepper.frame()
+        x = stepper.state.x.numpy()
+        assert collider.distances(x).min() > 0.0 and crossed(x, scene.mesh.triangles) == 0
 
 
 @each_solver

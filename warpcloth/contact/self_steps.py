@@ -33,6 +33,7 @@ class SelfSteps:
         state: The :class:`warpcloth.core.state.State` of the solver, to which it adds its own arrays.
         h: Step [s].
         bounded: Whether contact is that of explicit steps, without the logarithm.
+        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
         proximity: :class:`warpcloth.contact.proximity.Proximity`.
@@ -40,7 +41,7 @@ class SelfSteps:
         energies: Those of the pairs by their first vertex, (N,) [J].
     """
 
-    def __init__(self, model, state, h, bounded):
+    def __init__(self, model, state, h, bounded, colliders):
         declared = model.scene.self_contact
         self.model, self.h, self.bounded, self.declared = model, h, bounded, declared
         self.skin = SKIN * float(model.scene.mesh.edge_lengths.max())
@@ -48,6 +49,7 @@ class SelfSteps:
         device = model.device
         self.x_before, self._target, self._from, self._other = (model.vectors() for _ in range(4))
         self._slope, self._iterates = model.scalars(), False
+        self._colliders, self._cut_before = colliders, None
         self.energies = wp.zeros(model.count, dtype=wp.float64, device=device)
         areas = np.empty(model.per_copy)
         areas[model.in_model(np.arange(model.per_copy))] = model.scene.mesh.vertex_areas
@@ -187,6 +189,8 @@ class SelfSteps:
     def launch_begin(self, x):
         """Lists the pairs at x, (N,), where a step begins."""
         wp.copy(self.x_before, x)
+        if self._cut_before is not None:
+            wp.copy(self._cut_before, self._colliders.notes.cut)
         self.launch_list(x)
         self.launch_areas(x)
 
@@ -232,8 +236,16 @@ class SelfSteps:
         self.model.launch(kernel, 1, given, [self.multipliers if multipliers else None, self.forces, correction])
 
     def launch_end(self, x, v, move=None):
-        """Walks from where the step began to x as far as pairs stay apart; v and ``move`` (N,) follow."""
+        """Walks from where the step began to x as far as pairs stay apart; v and ``move`` (N,) follow.
+
+        Iterates begin at the last of them. That may be in a collider whose filter has moved x out: then at the start too, from
+        where the way to x is outside.
+        """
         model = self.model
+        if self._cut_before is not None:
+            colliders = self._colliders
+            given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
+            self._launch(kernels.walk_from_start, model.count, given, [self.x_before])
         wp.copy(self._target, x)
         wp.copy(x, self.x_before)
         if self._iterates:
@@ -287,6 +299,9 @@ class SelfSteps:
     def iterates(self):
         """Says that these methods are used."""
         self._iterates = True
+        if self._colliders is not None:
+            self._cut_before, model = wp.zeros_like(self._colliders.notes.cut), self.model
+            self._kernels[kernels.walk_from_start] = model.kernel(kernels.walk_from_start, model.dtype)
 
     def launch_relist(self, base, d, launch):
         """Lists the pairs at base + d, and launches ``launch``, if vertices have moved far since the last list."""

@@ -71,7 +71,7 @@ class Stepper:
             self.model = model = model.with_terms(self.colliders.terms)
         self.pairs, self._kept = None, None
         if model.scene.self_contact is not None:
-            self.pairs = SelfSteps(model, self.state, self.h, integrator is None)
+            self.pairs = SelfSteps(model, self.state, self.h, integrator is None, self.colliders)
         if integrator is not None:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he
