@@ -25,6 +25,7 @@ class ThreadedStepper(Stepper):
 
     def __init__(self, options, stepper, model):
         self.options, self.model, self._reset = options, model, None
+        self.pairs = None  # scenes with self-contact refuse threads
         motion = wp.clone(model.positions), wp.clone(model.velocities)
         self.pool = ThreadPool(min(model.threads, model.copies))
         threads = self.pool.threads
