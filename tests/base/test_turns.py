@@ -112,7 +112,7 @@ def test_steppers_in_several_threads_go_as_they_do_alone(device):
 
 
 def test_a_run_within_the_progress_of_a_run(device, tmp_path):
-    """The same thread may begin another run, and so may a thread that it waits for."""
+    """A thread may begin another run within its own, and so may a thread that it waits for."""
     inner = []
 
     def run(output=None, progress=None):

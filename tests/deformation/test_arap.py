@@ -341,14 +341,14 @@ def test_frames_reuse_factors_and_arrays(device, monkeypatch):
     assert np.array_equal(found[-1].points, fresh.points) and np.array_equal(found[-1].energies, fresh.energies)
 
 
-@pytest.mark.parametrize("place", [0.0, 1000.0])
+@pytest.mark.parametrize("offset", [0.0, 1000.0])
 @pytest.mark.parametrize("energy", ["spokes", "spokes_and_rims"])
-def test_float32_is_near_float64(energy, place, device):
+def test_float32_is_near_float64(energy, offset, device):
     mesh, handles, targets = load("bunny")
-    moved = wc.Mesh(mesh.points + place, mesh.triangles)
+    moved = wc.Mesh(mesh.points + offset, mesh.triangles)
     exact = bend(mesh, handles, energy=energy, device=device).solve(targets, iterations=20, tolerance=0.0)
-    found = bend(moved, handles, energy=energy, device=device, dtype="float32").solve(targets + place, 20, 0.0)
-    assert np.abs(found.points - place - exact.points).max() < 1e-5
+    found = bend(moved, handles, energy=energy, device=device, dtype="float32").solve(targets + offset, 20, 0.0)
+    assert np.abs(found.points - offset - exact.points).max() < 1e-5
     assert found.energies == pytest.approx(exact.energies, rel=1e-4)
 
 

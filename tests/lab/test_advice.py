@@ -1,4 +1,4 @@
-"""What matters in a scene, where it is known beforehand."""
+"""Tests of the advice on what matters in a scene, where that is known beforehand."""
 
 import json
 from dataclasses import replace

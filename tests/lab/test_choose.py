@@ -83,7 +83,7 @@ def test_climbing_picks_the_same_and_measures_no_more_than_it_needs(options):
 
 @pytest.mark.parametrize("reason", ["slow", "diverged"])
 def test_a_ladder_ends_where_finer_steps_are_no_help(reason):
-    """What took too long, or is refused for its method, takes no less with more steps; what diverged may hold."""
+    """A setting that took too long, or is refused for its method, is not tried with more steps; one that diverged is."""
     rungs = [Setup("newton", {"substeps": n}) for n in (1, 2, 4)]
     _, found = climb(
         [rungs], lambda setups: [Measured(setup, None, 100.0, None, reason, final=reason == "slow") for setup in setups], 0.01

@@ -126,7 +126,7 @@ def test_an_interruption_keeps_what_is_finished(address, tmp_path):
 
 
 def test_files_are_sent_along(address, tmp_path, monkeypatch):
-    """To places of the workers' own; of three of one name, of which one worker gets two, each its own."""
+    """Workers keep them in folders of their own; of three of one name, of which one worker gets two, each its own."""
     monkeypatch.chdir(tmp_path)  # where the workers are not
     for folder in ("one", "two", "three"):
         Path(folder).mkdir()
@@ -137,10 +137,10 @@ def test_files_are_sent_along(address, tmp_path, monkeypatch):
     with connect(address) as cluster:
         found = {each.arguments["scene"]["name"]: result for each, result in sweep(tasks, cluster)}
     for name in names:
-        for (place, content), path in zip(found[name], ("exact.npz", find_source(name).path), strict=True):
+        for (kept, content), path in zip(found[name], ("exact.npz", find_source(name).path), strict=True):
             path = Path(path)
-            assert content == sha256(path.read_bytes()).hexdigest() and Path(place).name == path.name
-            assert Path(place) == path or (Path(place).is_absolute() and tmp_path not in Path(place).parents)
+            assert content == sha256(path.read_bytes()).hexdigest() and Path(kept).name == path.name
+            assert Path(kept) == path or (Path(kept).is_absolute() and tmp_path not in Path(kept).parents)
     assert Path(found["hanging"][1][0]).samefile(find_source("hanging").path)  # comes with the package
 
 
@@ -258,7 +258,7 @@ class Workers:
 
     def __init__(self, *facts):
         fit = {"source": source_digest(), "arithmetic": "1", "threads": 1, "processor": "A"}
-        self.facts = {f"tcp://w{place}": one if isinstance(one, Exception) else fit | one for place, one in enumerate(facts)}
+        self.facts = {f"tcp://w{i}": one if isinstance(one, Exception) else fit | one for i, one in enumerate(facts)}
 
     def wait_for_workers(self, count, timeout):
         if not self.facts:

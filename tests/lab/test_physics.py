@@ -368,7 +368,7 @@ def test_a_chain_is_exact(device):
 @pytest.mark.parametrize(
     ("case", "resolution", "dtype", "most"),
     [
-        # ε of the places, of size 1, over an extension of 0.2·9.81/2k·(1 + 1/N), k = 50 N/m: 1.1e-14, and at most twice that.
+        # ε of the positions, of size 1, over an extension of 0.2·9.81/2k·(1 + 1/N) (k = 50 N/m): 1.1e-14, twice that at most.
         ("chain", 40, "float64", 2.3e-14),
         ("chain", 40, "float32", 1.3e-5),
         ("catenary", 8, "float64", 1e-10),
@@ -377,7 +377,7 @@ def test_a_chain_is_exact(device):
     ],
 )
 def test_how_well_rest_shapes_are_known(case, resolution, dtype, most, device):
-    """What is exact is wrong by no more than the floor; a looser tolerance of the rest shape shows in it."""
+    """An exact answer is wrong by no more than the floor; a looser tolerance of the rest shape shows in it."""
     found = measured(case, resolution, dtype=dtype, device=device)
     epsilon = np.finfo(dtype).eps
     assert epsilon / 8.0 < found["floor"] < most, found

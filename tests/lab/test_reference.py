@@ -177,7 +177,7 @@ def test_the_error_is_a_bound(explicit, least, most, folder, monkeypatch):
 
 
 def test_the_error_bounds_chaos_too(folder):
-    """What swings through: the order is lost at first, the bound is not."""
+    """Cloth that swings through loses the order at first, but not the bound."""
     scene = SceneRef("hanging", {"n": 6})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

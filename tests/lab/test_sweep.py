@@ -131,7 +131,7 @@ def die(after):
 
 
 def test_a_process_that_is_killed_is_said(tmp_path):
-    """What is finished is kept."""
+    """Finished tasks are kept."""
     store, pipe = tmp_path / "store.jsonl", tmp_path / "pipe"
     os.mkfifo(pipe)
     tasks = [*squares(2), task(die, after=str(pipe))]

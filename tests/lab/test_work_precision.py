@@ -53,7 +53,7 @@ def cache_of_its_own(tmp_path, monkeypatch):
 
 
 def test_gap_is_that_of_the_objective_of_implicit_euler(device):
-    """By φ of springs written out, at places between x̃ and the minimiser, where ∇φ vanishes."""
+    """By φ of springs written out, at positions between x̃ and the minimiser, where ∇φ vanishes."""
     scene = replace(SMALL.load(), terms=SMALL.load().terms[:1])
     step = OneStep(scene, FRAME, SUBSTEPS, device)
     assert step.gap(np.zeros_like(step.best)) == 1.0 and abs(step.gap(step.best)) <= step.floor
@@ -110,7 +110,7 @@ def test_the_gap_closes_in_contact(solver, which, device):
 
 
 def test_float32_ends_where_its_rounding_is(device):
-    """The same first iterations, and an end that more of them do not change."""
+    """Both precisions have the same first iterations, and an end that more of them do not change."""
     single, double = (measure(STEPS[0], device, dtype=dtype) for dtype in ("float32", "float64"))
     gaps = [[point["gap"] for point in found["points"]] for found in (single, double)]
     assert gaps[0][0] == pytest.approx(gaps[1][0], rel=0.05)  # conjugate gradients end where they may
@@ -161,10 +161,10 @@ def test_errors_of_projective_dynamics_end_at_the_floor(device):
     found = spectrum.measure(asdict(SMALL), scene_digest(SMALL.load()), FRAME, 16, device)
     step = OneStep(SMALL.load(), FRAME, 16, device)
     _mu, V, A = spectrum.relative_spectrum(step)
-    places, stepper = np.repeat(step.free, 3), spectrum._bound(step, 256, device)
+    rows, stepper = np.repeat(step.free, 3), spectrum._bound(step, 256, device)
     step.set_state(stepper)
     stepper.step()
-    left, first = ((d.ravel()[places] @ A @ V) for d in (step.correction(stepper) - step.best, step.best))
+    left, first = ((d.ravel()[rows] @ A @ V) for d in (step.correction(stepper) - step.best, step.best))
     assert 0.01 * found["floor"] < np.linalg.norm(left) / np.linalg.norm(first) < found["floor"] < spectrum.RESOLVED
 
 
@@ -172,7 +172,7 @@ def test_errors_of_projective_dynamics_end_at_the_floor(device):
     ("scene", "substeps"), [(SMALL, 4), (SMALL, 16), pytest.param(TOUCHING, 4, id="touching-4")], ids=lambda value: str(value)
 )
 def test_projective_dynamics_converges_as_its_spectrum_says(scene, substeps, device):
-    """What is neglected is of second order in the error: from 1e-2 on the prediction is off by less than 1e-2 of itself, and
+    """Terms of second order in the error are neglected: from 1e-2 on the prediction is off by less than 1e-2 of itself, and
     the last factor of an iteration, at errors of 1e-4 or less, by less than 1e-4 of 1 less it."""
     found = spectrum.measure(asdict(scene), scene_digest(scene.load()), FRAME, substeps, device, limit=np.inf)
     mu = np.array(found["eigenvalues"])
@@ -275,7 +275,7 @@ def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
 
 
 def test_below_the_error_of_the_reference_nothing_is_better():
-    """What is known to no more than 3 ranks by time alone below that, and is within 1 % only if that is added."""
+    """Errors below that of the reference do not rank settings: such settings are ranked by time alone."""
     rows = [
         {"status": "ok", "ms_per_second": ms, "error": error, "solver": f"s{ms}"}
         for ms, error in ((1, 9), (2, 3), (3, 1), (4, 2))

@@ -21,17 +21,17 @@ from warpcloth.usd import FrameSequence
 
 
 def shuffled(scene, seed=0):
-    """A scene of springs and bending with its vertices at random places, and which vertex each is in the other."""
+    """A scene of springs and bending with its vertices in random order, and which vertex each is in the other."""
     mesh = scene.mesh
     order = np.random.default_rng(seed).permutation(len(mesh.points))
-    places = np.argsort(order)
+    ranks = np.argsort(order)
     springs, bending = scene.terms
     changed = wc.Scene(
-        wc.Mesh(mesh.points[order], places[mesh.triangles]),
+        wc.Mesh(mesh.points[order], ranks[mesh.triangles]),
         density=0.1,
         positions=scene.positions[order],
-        terms=[replace(springs, pairs=places[springs.stencil(mesh)]), bending],
-        pins=wc.Pins(places[scene.pins.vertices], scene.pins.keyframes),
+        terms=[replace(springs, pairs=ranks[springs.stencil(mesh)]), bending],
+        pins=wc.Pins(ranks[scene.pins.vertices], scene.pins.keyframes),
         duration=scene.duration,
     )
     return changed, order
@@ -48,12 +48,12 @@ def test_neighbours_of_a_shuffled_grid_come_near(pattern):
     """Edges stay within a level of Cuthill and McKee's or lead to the next; from a corner a level is less than 2n vertices."""
     n = 24
     grid = wc.Mesh.grid(n, n, pattern=pattern)
-    places = np.random.default_rng(2).permutation(n * n)
-    mesh = wc.Mesh(grid.points[np.argsort(places)], places[grid.triangles])
+    ranks = np.random.default_rng(2).permutation(n * n)
+    mesh = wc.Mesh(grid.points[np.argsort(ranks)], ranks[grid.triangles])
     order = near_order(mesh)
     assert np.array_equal(np.sort(order), np.arange(n * n))
     assert np.abs(np.diff(np.argsort(order)[mesh.edges], axis=1)).max() < 4 * n
-    # Of two places at random |i − j| is n²/3 in the mean; two levels of 2n at most leave less.
+    # Of two ranks at random |i − j| is n²/3 in the mean; two levels of 2n at most leave less.
     assert spread(mesh, order) < 2 * n < 0.9 * n * n / 3 < spread(mesh)
 
 
@@ -249,9 +249,9 @@ import warpcloth as wc
 
 def scene():
     grid = wc.Mesh.grid(9, 9)
-    places = np.random.default_rng(4).permutation(81)
-    mesh = wc.Mesh(grid.points[np.argsort(places)], places[grid.triangles])
-    return wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=50.0)], pins=[int(places[0])], duration=0.1)
+    ranks = np.random.default_rng(4).permutation(81)
+    mesh = wc.Mesh(grid.points[np.argsort(ranks)], ranks[grid.triangles])
+    return wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=50.0)], pins=[int(ranks[0])], duration=0.1)
 """
 
 

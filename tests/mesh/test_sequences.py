@@ -33,7 +33,7 @@ def frames(mesh=MESH, count=FRAMES):
 
 
 def cache(path, codes=(101, 102, 103, 104), rest=True, moving=True):
-    """What another program may write: two quads in cm, z up, left-handed, under a group that turns and moves.
+    """Writes what another program may write: two quads in cm, z up, left-handed, under a group that turns and moves.
 
     Returns:
         Stage, prim, and the points of each frame in world space [m], (F, 6, 3).
@@ -58,13 +58,13 @@ def cache(path, codes=(101, 102, 103, 104), rest=True, moving=True):
         now = points + np.float32([0, 0, 10 * frame])
         sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(now), code)
         angle = 30.0 + 20.0 * frame if moving else 30.0
-        place = (7.0 * frame, -3.0, 0.5) if moving else (7.0, -3.0, 0.5)
+        offset = (7.0 * frame, -3.0, 0.5) if moving else (7.0, -3.0, 0.5)
         if moving or frame == 0:
-            move.Set(Gf.Vec3d(place), code)
+            move.Set(Gf.Vec3d(offset), code)
             turn.Set(angle, code)
         c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
         turned = (now.astype(np.float64) * [2, 3, 4]) @ np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)])
-        placed.append(0.01 * (turned + place))
+        placed.append(0.01 * (turned + offset))
     stage.Save()
     return stage, sheet.GetPrim(), np.array(placed)
 

@@ -32,7 +32,7 @@ each_inner = pytest.mark.parametrize("name", INNER)
 
 
 def crumpled(name, n=5, seed=0, **scene):
-    """A net of n² whose vertices are off their rest places by a fifth of an edge, with one term."""
+    """A net of n² whose vertices are off their rest positions by a fifth of an edge, with one term."""
     mesh = wc.Mesh.grid(n, n, pattern="alternating")
     positions = mesh.points + 0.05 * np.random.default_rng(seed).normal(size=mesh.points.shape)
     return wc.Scene(mesh, density=1.0, positions=positions, terms=[DAMPED[name]], gravity=(0.0, 0.0, 0.0), **scene)
@@ -386,7 +386,7 @@ def test_a_rest_shape_knows_no_damping(device):
     [wc.Newton, wc.PBD, wc.HierarchicalPBD, wc.XPBD, wc.ProjectiveDynamics, wc.ADMM, wc.ConstrainedDynamics, wc.Explicit],
 )
 def test_it_calms_a_cloth(solver, device):
-    """The same motion with and without: springs end with lower rates of length, by far, and the centre does not move."""
+    """Damping lowers the rates of length of springs by far, and does not move the centre."""
     ends = []
     for damping in (None, 0.5):
         mesh = wc.Mesh.grid(6, 6)

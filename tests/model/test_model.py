@@ -1,4 +1,4 @@
-"""What is declared and what is built from it: scenes that are refused, copies that differ, and nothing undeclared."""
+"""Tests of scenes and the models built from them: refusals, copies that differ, and nothing that is not declared."""
 
 import json
 import os
@@ -33,8 +33,8 @@ def scene(**fields):
     return wc.Scene(**given)
 
 
-def frames_at(places):
-    return np.asarray(places, dtype=float).reshape(1, -1, 3)
+def frames_at(positions):
+    return np.asarray(positions, dtype=float).reshape(1, -1, 3)
 
 
 def without(values, index, bad):
@@ -391,7 +391,7 @@ def test_a_pinned_vertex_needs_no_mass():
 @pytest.mark.parametrize("copies", [None, 2])
 @pytest.mark.parametrize("pins", [[3, 9], MOVED], ids=["fixed", "moved"])
 def test_a_pinned_vertex_starts_at_rest(pins, copies, device):
-    """What the scene says of its velocity would otherwise be in every frame, of a vertex that never moves."""
+    """A pinned vertex has velocity 0, whatever the scene says: otherwise every frame would show it for a vertex at rest."""
     velocities = np.ones((VERTICES, 3))
     vary = {"velocities": np.tile(velocities, (copies, 1, 1))} if copies else None
     made = scene(pins=pins, velocities=velocities)

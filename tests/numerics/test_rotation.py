@@ -293,7 +293,7 @@ def test_kabsch_where_the_rotation_is_not_unique(device):
 
 
 def test_kabsch_does_without_points_of_weight_0_and_without_a_scale(precision, device):
-    """What has no weight may be anywhere, first of all; squares of what is small or large are not taken."""
+    """Points without weight, the first among them, may be anywhere; small or large values are not squared."""
     rng = np.random.default_rng(15)
     turn = matrices.rotations(rng, 1)
     P = points(rng, 6).astype(precision)

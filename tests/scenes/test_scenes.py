@@ -294,7 +294,7 @@ def test_every_solver_runs_every_scene(name, solver, device, tmp_path):
     written = wc.simulate(declared, QUICK[solver], output=str(tmp_path / "out.usdc"), device=device, frames=2)
     assert kept.status.ok and written.status.ok, (kept.status, written.status)
     assert kept.points.shape == written.points.shape == (3, len(declared.mesh.points), 3)
-    # A stage has its own units and place, so a point goes there and back through float32.
+    # A stage has units and an origin of its own, so a point goes there and back through float32.
     scale = np.abs(kept.points).max()
     assert np.abs(kept.points - np.asarray(written.points)).max() <= 4 * np.finfo(np.float32).eps * scale
     assert np.abs(kept.velocities - np.asarray(written.velocities)).max() <= 1e-5 * (1 + np.abs(kept.velocities).max())

@@ -227,7 +227,7 @@ def test_a_hard_pendulum_is_of_first_order(device):
 
 
 def tetrahedron(pairs=None, lengths=None, stiffness=np.inf, moved=0.05, **fields):
-    """Four vertices, all six edges and more, moved off their places."""
+    """Four vertices, all six edges and more, moved off their positions."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     edges = list(combinations(range(4), 2))
     spring = wc.Spring(pairs=edges if pairs is None else pairs, rest_lengths=lengths, stiffness=stiffness)
@@ -291,10 +291,10 @@ def test_contradicting_constraints_are_reported(linear, device):
 
 @each_linear
 def test_rows_of_every_kind_contradict(linear, device):
-    """A hard body between pins that are too far apart, and a vertex hung hard from two places: nothing else is hard."""
+    """A hard body between pins that are too far apart, and a vertex hung hard from two positions: nothing else is hard."""
     chain = wc.Mesh([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]], edges=[[0, 1], [1, 2]])
     given = {"masses": np.ones(3), "fps": 60.0}
-    hung = [wc.Attachment(vertices=[0], targets=[[place, 0.0, 0.0]], stiffness=np.inf, name=str(place)) for place in (0.0, 0.5)]
+    hung = [wc.Attachment(vertices=[0], targets=[[x, 0.0, 0.0]], stiffness=np.inf, name=str(x)) for x in (0.0, 0.5)]
     for declared in (
         wc.Scene(chain, positions=1.3 * chain.points, terms=[wc.RigidCluster(vertices=[0, 1, 2])], pins=[0, 2], **given),
         wc.Scene(chain, terms=hung, **given),
@@ -307,7 +307,7 @@ def test_rows_of_every_kind_contradict(linear, device):
 def test_rounding_is_no_contradiction(linear, device):
     """A turned body with three pins, and a turned net with four: in float32 their shapes contradict the pins by some ε.
 
-    In steps of 1/6000 s what gravity moves is 3e-7 m, near the rounding of places of 1 m.
+    In steps of 1/6000 s what gravity moves is 3e-7 m, near the rounding of positions of 1 m.
     """
     mesh = wc.Mesh.grid(5, 5)
     c, s = np.cos(0.7), np.sin(0.7)

@@ -730,7 +730,7 @@ def check_fall(name, seconds, device):
 @pytest.mark.host
 @pytest.mark.parametrize("name", STEPPING)
 def test_08_rounding_of_a_fall(name, device):
-    """float32: what solves for x − x̃ and damps keeps strain at the rounding of a place, 1.3 ε|x|/edge = 1e-5.
+    """float32: what solves for x − x̃ and damps keeps strain at the rounding of a position, 1.3 ε|x|/edge = 1e-5.
 
     What keeps energy lets it walk, by less than 2ε(|x|/edge)√steps.
     """
@@ -758,11 +758,11 @@ def jittered(n, seed=0):
     """Delaunay's triangles of n² vertices of a unit square, those inside moved by up to half a cell."""
     grid = wc.Mesh.grid(n, n).points[:, [0, 2]]
     inside = ((grid > 1e-9) & (grid < 1.0 - 1e-9)).astype(float)
-    places = grid + 0.5 / (n - 1) * inside * np.random.default_rng(seed).uniform(-1.0, 1.0, size=grid.shape)
-    triangles = Delaunay(places).simplices
-    edges = places[triangles[:, 1:]] - places[triangles[:, :1]]
+    positions = grid + 0.5 / (n - 1) * inside * np.random.default_rng(seed).uniform(-1.0, 1.0, size=grid.shape)
+    triangles = Delaunay(positions).simplices
+    edges = positions[triangles[:, 1:]] - positions[triangles[:, :1]]
     area = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
-    return wc.Mesh(np.insert(places, 1, 0.0, axis=1), triangles[area > 1e-3 / n**2])
+    return wc.Mesh(np.insert(positions, 1, 0.0, axis=1), triangles[area > 1e-3 / n**2])
 
 
 @pytest.mark.parametrize("edge", [0.02, 0.05, 0.1])

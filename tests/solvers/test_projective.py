@@ -448,7 +448,7 @@ def test_a_hinge_without_curvature_at_rest_counts(device):
 @pytest.mark.host
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_admm_takes_a_crushed_membrane(dtype, device):
-    """From all vertices but the pins on a line, and in one place: no NaN, and the cloth comes back to its size."""
+    """From all vertices but the pins on a line, and all at one position: no NaN, and the cloth comes back to its size."""
     mesh = wc.Mesh.grid(5, 5, pattern="alternating")
     for scale in ([1.0, 0.0, 0.0], [0.0, 0.0, 0.0]):
         noise = 1e-3 * np.random.default_rng(0).normal(size=mesh.points.shape)

@@ -459,12 +459,12 @@ def test_copies_start_where_one_says(name, kind, device):
 def test_putting_copies_back_allocates_nothing(device):
     """After the first time, with arrays of the host and of the device."""
     stepper = led(SOLVERS["xpbd"], device=device)
-    places, mask = np.zeros((3, 36, 3)), np.array([True, False, True])
-    arrays = [wp.array(mask, dtype=wp.bool, device=device), *(wp.array(places, dtype=wp.float64, device=device),) * 2]
-    stepper.reset(mask, places, places)
+    positions, mask = np.zeros((3, 36, 3)), np.array([True, False, True])
+    arrays = [wp.array(mask, dtype=wp.bool, device=device), *(wp.array(positions, dtype=wp.float64, device=device),) * 2]
+    stepper.reset(mask, positions, positions)
     with wp.ScopedMemoryTracker("resets", print=False) as tracker:
         assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1, "the tracker sees an allocation"
-        assert allocations(tracker, lambda: [stepper.reset(), stepper.reset(mask, places, places)]) == 0
+        assert allocations(tracker, lambda: [stepper.reset(), stepper.reset(mask, positions, positions)]) == 0
         assert allocations(tracker, lambda: stepper.reset(*arrays)) == 0
 
 
@@ -507,7 +507,7 @@ def from_dlpack(module):
     ],
 )
 def test_the_state_is_shared_without_copies(shared, device):
-    """What steps move is seen by who took it over before, as (B, n, 3) numbers; NumPy sees the memory of the CPU alone."""
+    """Arrays taken over before the steps show what they move, as (B, n, 3) numbers; NumPy sees memory of the CPU alone."""
     over = shared()
     if over in (np.asarray, np.from_dlpack) and not wp.get_device(device).is_cpu:
         pytest.skip("NumPy has arrays of the host alone")

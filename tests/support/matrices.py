@@ -54,7 +54,7 @@ CLASSES = {
 
 
 def _turned_round(rng, n):
-    """What turns the first axis round, and parts far below rounding, down to where squares underflow, in either precision."""
+    """Matrices that turn the first axis round with parts far below rounding; squares underflow in either precision."""
     A = rng.normal(size=(n, 3, 3)) * 10.0 ** rng.uniform(-45, -6, size=(n, 3, 3))
     A[::2] = np.sign(A[::2]) * np.abs(A[::2]) ** 3.5
     A[:, 0, 0] = -1.0

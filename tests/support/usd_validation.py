@@ -45,7 +45,7 @@ def findings(path):
 
 
 def validate(path, source=None):
-    """What is wrong with a file that this package wrote.
+    """Lists what is wrong with a file that this package wrote.
 
     Args:
         path: The file.

@@ -232,7 +232,7 @@ def test_directions_stand_in_the_world(result):
             around = np.array([local.min(axis=0) - half_width, local.max(axis=0) + half_width])
             np.testing.assert_allclose(extent, around, rtol=0, atol=2 * EPS * np.abs(around).max())
             low, high = ends[np.repeat(placed, 2)].min(axis=0), ends[np.repeat(placed, 2)].max(axis=0)
-            assert (ends[8] >= low).all() and (ends[8] <= high).all(), "an element without a place is amid the others"
+            assert (ends[8] >= low).all() and (ends[8] <= high).all(), "an element without a position is amid the others"
 
 
 def test_no_place_at_all_is_the_middle_of_the_rest_shape(tmp_path):
@@ -282,12 +282,12 @@ def test_a_face_has_the_mean_of_what_is_known(tmp_path, ending):
     # Without any value the colours that say so, here different ones, are all that there is to show.
     np.testing.assert_allclose(shown, [[0.3, 0.7], [0.35, 0.7], [0.3, 0.7], [0.3, 0.7]], rtol=4 * EPS)
     assert len(stage.GetPrimAtPath("/Sheet_axis").GetAttribute("points").Get(0)) == 8
-    # There is no other place for curves: below a mesh they would be wrong, and a root has only roots beside it.
+    # Curves can be nowhere else: below a mesh they would be wrong, and a root has only roots beside it.
     assert [rule for rule, _ in validate(writer.path, source.path)] == ["DefaultPrimChecker"]
 
 
 def add_materials(stage, cloth):
-    """What hides displayColor: materials of a prim for all purposes and for one, and of some of its faces."""
+    """Binds materials that hide displayColor: materials of a prim for all purposes and for one, and of some of its faces."""
     materials = [UsdShade.Material.Define(stage, f"/Looks/{name}") for name in ("All", "Full", "Part", "Above")]
     api = UsdShade.MaterialBindingAPI.Apply(cloth.GetPrim())
     api.Bind(materials[0])
