@@ -229,6 +229,25 @@ class SelfSteps:
         given = [self.pairs, self.model.inverse_mass, self.forces, p, active, self.model.per_copy]
         self._launch(kernels.add_products, self.model.count, given, [q])
 
+    def rows(self):
+        """Of the pairs that press at the last :meth:`launch_forces`: J, whose rows are wᵢn, and kAφ″; the host reads them.
+
+        Returns:
+            J, scipy (pairs, 3N) without columns of what does not move, and D, scipy diagonal (pairs, pairs) [N/m]; ∂²U/∂x² is
+            JᵀDJ.
+        """
+        from scipy.sparse import csr_matrix, diags
+
+        model, count = self.model, min(int(self.pairs.counts.numpy().sum()), len(self.pairs.stencils))
+        bend = self.forces.bend.numpy()[:count]
+        press = np.flatnonzero(bend)
+        w, n = (array.numpy()[press] for array in (self.forces.weights, self.forces.normal))
+        columns = 3 * self.pairs.stencils.numpy()[press].astype(np.int64)[:, :, None] + np.arange(3)
+        values = w[:, :, None] * n[:, None, :] * (model.coordinate_mobility() > 0.0)[columns]
+        starts = 12 * np.arange(len(press) + 1)
+        J = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(press), 3 * model.count))
+        return J, diags(bend[press])
+
     def launch_sweep(self, x, correction, h, multipliers, backward):
         """Moves the vertices of each pair in turn, see :func:`warpcloth.kernels.self_contact.sweep_pairs`."""
         kernel = self.model.kernel(kernels.sweep_pairs, self.model.dtype)

@@ -176,6 +176,16 @@ class Hessian:
             found.append(bsr_matrix(parts, shape=(3 * n, 3 * n)))
         return found
 
+    def coupling(self):
+        """The blocks of pairs off the diagonal at the last :meth:`assemble`, scipy (3N, 3N); None without pairs."""
+        if self.pairs is None:
+            return None
+        J, D = self.pairs.rows()
+        whole = (J.T @ D @ J).tocoo()
+        off = whole.row // 3 != whole.col // 3
+        whole.data[~off] = 0.0
+        return whole.tocsc()
+
     def matrix(self):
         """All copies in one scipy matrix (3N, 3N)."""
         from scipy.sparse import block_diag

@@ -94,3 +94,6 @@ class AcceleratedStep:
         stepper.inertia.add(d, self.unused)
         stepper.sums.sum(stepper.inertia.work, model.per_copy, out)
         self.energy_of.add(stepper.state.x, out, d)
+        if stepper.pairs is not None:
+            stepper.pairs.launch_forces(stepper.state.x, d)
+            stepper.pairs.add_energy(stepper.sums, out)

@@ -1,4 +1,4 @@
-"""Steps of projective dynamics with contact: a constant matrix corrected by the Hessian of contact and friction."""
+"""Steps of projective dynamics and ADMM with contact: a constant matrix corrected by the Hessian of contact and friction."""
 
 import numpy as np
 import warp as wp
@@ -6,7 +6,7 @@ import warp as wp
 from ..core.capture import Mirror, Segment
 from ..core.hessian import Hessian
 from ..kernels.term import HessianPolicy
-from .search import Search
+from .search import HALVINGS, Search
 
 # Of ‖b‖ in the norm of A⁻¹, to which systems are solved closely.
 TOLERANCE = 1e-3
@@ -16,15 +16,70 @@ SHARE, LAST = 0.7, 0.1
 # Of the largest ‖∇φ‖ of a step in the norm of A⁻¹, below which systems are solved closely, as Anderson acceleration needs.
 NEAR = 1e-6
 ITERATIONS = 200
+# A change of ψ, relative to its parts, that is taken for rounding.
+NOISE = 1e-10
 
 
-class ContactSystem:
+class CorrectedSystem:
+    """Solves (A + D) w = b, D semi-definite and of contact, with A⁻¹ as preconditioner of conjugate gradients.
+
+    A p follows from the residuals: an iteration is a solve with A and a product with D.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        linear: Solves with A, ``solve(b, x)``.
+    """
+
+    def __init__(self, model, linear):
+        self.model, self._linear = model, linear
+        right, self._result = model.vectors(), model.vectors()
+        self._right, self._found = Mirror(right), Mirror(self._result)
+
+    def _spread(self, values):
+        return np.repeat(values, self.model.per_copy)[:, None]
+
+    def _dot(self, one, other):
+        B = self.model.copies
+        return np.einsum("bi,bi->b", one.reshape(B, -1), other.reshape(B, -1))
+
+    def _solve(self, add_product, b, z, going, closely):
+        """w = (A + D)⁻¹ b of the copies that are ``going``, from z = A⁻¹ b, and A w; ``add_product(p, q)``: q += D p."""
+        B = self.model.copies
+
+        def over(one, other):
+            return np.divide(one, other, out=np.zeros(B), where=going & (other > 0.0))
+
+        w, Aw, r, p, Ap, fall = np.zeros_like(b), np.zeros_like(b), b.copy(), z, b.copy(), np.zeros(B)
+        rz = first = self._dot(r, z)
+        for iteration in range(ITERATIONS):
+            q = Ap.copy()
+            add_product(p, q)
+            step = over(rz, self._dot(p, q))
+            Aw += self._spread(step) * Ap
+            w, r = w + self._spread(step) * p, r - self._spread(step) * q
+            fall += step * rz
+            enough = (fall >= SHARE * first) | ((step * rz <= LAST * fall) & (iteration > 0))
+            going = going & (closely | ~enough)
+            if not going.any():
+                break
+            self._right.write(r)
+            self._linear.solve(self._right.array, self._result)
+            z = self._found.read().astype(np.float64)
+            before, rz = rz, self._dot(r, z)
+            going = going & (rz > TOLERANCE**2 * first)
+            if not going.any():
+                break
+            ratio = self._spread(over(rz, before))
+            p, Ap = z + ratio * p, r + ratio * Ap
+        return w, Aw
+
+
+class ContactSystem(CorrectedSystem):
     """Solves (A + D) w = ∇φ, D the semi-definite Hessian of contact: closely where φ rose or is nearly least, else roughly.
 
-    The curvature of contact has no bound, so that no constant matrix is above it. A⁻¹ preconditions conjugate gradients, in
-    which A p follows from the residuals: an iteration is a solve with A and a product with D, whose blocks belong to vertices.
-    Copies whose φ rose are ``careful`` in the next 4 iterations, after the second time in 16, and so on: w is then also
-    shortened until φ falls. Without :meth:`start` all always are.
+    The curvature of contact has no bound, so that no constant matrix is above it. D is the sum of the blocks of vertices near
+    colliders and of the matrix of the pairs of self-contact. Copies whose φ rose are ``careful`` in the next 4 iterations,
+    after the second time in 16, and so on: w is then also shortened until φ falls. Without :meth:`start` all always are.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -32,28 +87,39 @@ class ContactSystem:
         linear: Solves with A, ``solve(b, x)``.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia [1/s²].
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None.
 
     Attributes:
         careful: Which copies are, (B,) truth values.
     """
 
-    def __init__(self, model, x, linear, sums, s):
-        self.model, self.x, self._linear = model, x, linear
+    def __init__(self, model, x, linear, sums, s, pairs=None):
+        super().__init__(model, linear)
+        self.x, self._pairs = x, pairs
         touching = [elements for elements in model.terms if elements.collider is not None]
         self._hessian = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=touching)
-        self._search = Search(model, x, sums, s)
+        self._search = Search(model, x, sums, s, pairs)
         self._diagonal = self._hessian.diagonal.numpy()
         self._free = model.inverse_mass.numpy() > 0.0
-        right, self._result = model.vectors(), model.vectors()
-        self._blocks, self._right, self._found = Mirror(self._hessian.values), Mirror(right), Mirror(self._result)
+        self._blocks = Mirror(self._hessian.values)
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
-        self._assemble = Segment(model.device, lambda: self._hessian.assemble(x, 0.0, self._search.correction))
-        self._begin = Segment(model.device, self._search.launch_again)
         self._active = Mirror(model.scalars(wp.int32))
-        self._shorten = Segment(model.device, lambda: self._search.launch(self._active.array))
+        self.record()
         self.careful = np.ones(model.copies, dtype=bool)
         self._left, self._more = (np.zeros(model.copies, dtype=int) for _ in range(2))
         self._start = np.zeros(model.copies)
+
+    def record(self):
+        """Records what an iteration launches."""
+        device, search = self.model.device, self._search
+        self._assemble = Segment(device, self._launch_assemble)
+        self._begin = Segment(device, search.launch_again)
+        self._shorten = Segment(device, lambda: search.launch(self._active.array))
+
+    def _launch_assemble(self):
+        self._hessian.assemble(self.x, 0.0, self._search.correction)
+        if self._pairs is not None:
+            self._pairs.launch_forces(self.x, self._search.correction)
 
     def start(self):
         """Before the first iteration of a step whose iterates stay where they are if φ would rise: no copy is careful."""
@@ -71,12 +137,23 @@ class ContactSystem:
         self._assemble()
         blocks = self._blocks.read()[self._diagonal] * self._free[:, None, None]
         touching = np.flatnonzero(blocks.any(axis=(1, 2)))
-        if not (len(touching) or self.careful.any()):
+        J, D = (None, None) if self._pairs is None else self._pairs.rows()
+        pressing = len(touching) or (J is not None and J.shape[0])
+        if not (pressing or self.careful.any()):
             return
         found = w.numpy().astype(np.float64)
-        if len(touching):
+        if pressing:
             blocks = blocks[touching].astype(np.float64)
-            found = self._solve(touching, blocks, gradient.numpy().astype(np.float64), found, active)
+
+            def add_product(p, q):
+                q[touching] += np.einsum("nij,nj->ni", blocks, p[touching])
+                if J is not None:
+                    q += (J.T @ (D @ (J @ p.ravel()))).reshape(-1, 3)
+
+            b = gradient.numpy().astype(np.float64)
+            first = self._dot(b, found)
+            self._start = np.maximum(self._start, first)
+            found, _ = self._solve(add_product, b, found, active, self.careful | (first <= NEAR**2 * self._start))
         if self.careful.any():
             self._begin()
             self._direction.write(-found)
@@ -86,40 +163,67 @@ class ContactSystem:
         self._found.write(found)
         wp.copy(w, self._result)
 
-    def _spread(self, values):
-        return np.repeat(values, self.model.per_copy)[:, None]
 
-    def _solve(self, touching, blocks, b, z, going):
-        """(A + D)⁻¹ b of the copies that are ``going``, from z = A⁻¹ b; D has ``blocks`` at the vertices ``touching``."""
-        B = self.model.copies
+class PairSystem(CorrectedSystem):
+    """Lowers ψ(d) = ½(d − c)ᵀA(d − c) + U(d), U the energy of self-contact, by Newton's method with a line search.
 
-        def dot(one, other):
-            return np.einsum("bi,bi->b", one.reshape(B, -1), other.reshape(B, -1))
+    Args:
+        model, linear: See :class:`CorrectedSystem`.
+        x: x̃ (N,) [m].
+        sums: :class:`warpcloth.core.sums.Sums`.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`.
+    """
 
-        def over(one, other):
-            return np.divide(one, other, out=np.zeros(B), where=going & (other > 0.0))
+    def __init__(self, model, x, linear, sums, pairs):
+        super().__init__(model, linear)
+        self._x, self._sums, self._pairs = x, sums, pairs
+        trial, pull = model.vectors(), model.vectors()
+        self._trial, self._pull, self._energy = Mirror(trial), Mirror(pull), Mirror(model.scalars())
+        self.record()
 
-        w, r, p, Ap, fall = np.zeros_like(b), b.copy(), z, b.copy(), np.zeros(B)
-        rz = first = dot(r, z)
-        self._start = np.maximum(self._start, first)
-        closely = self.careful | (first <= NEAR**2 * self._start)
-        for iteration in range(ITERATIONS):
-            q = Ap.copy()
-            q[touching] += np.einsum("nij,nj->ni", blocks, p[touching])
-            step = over(rz, dot(p, q))
-            w, r = w + self._spread(step) * p, r - self._spread(step) * q
-            fall += step * rz
-            enough = (fall >= SHARE * first) | ((step * rz <= LAST * fall) & (iteration > 0))
-            going = going & (closely | ~enough)
-            if not going.any():
+    def record(self):
+        """Records what an iteration launches."""
+        self._press = Segment(self.model.device, self._launch_press)
+
+    def _launch_press(self):
+        """U and ∂U/∂x at the trial."""
+        pairs = self._pairs
+        pairs.launch_forces(self._x, self._trial.array)
+        self._energy.array.zero_()
+        pairs.add_energy(self._sums, self._energy.array)
+        self._pull.array.zero_()
+        pairs.add_gradient(self._pull.array)
+        self.model.lock(self._pull.array)
+
+    def _pressed(self, d):
+        self._trial.write(d)
+        self._press()
+        return self._energy.read().copy(), self._pull.read().astype(np.float64)
+
+    def correct(self, d, gradient, w, active):
+        """w = t (A + JᵀDJ)⁻¹ ∇ψ at d, 0 < t ≤ 1, from the A⁻¹ ∇ψ that it is."""
+        d, b, found = (array.numpy().astype(np.float64) for array in (d, gradient, w))
+        energy, pull = self._pressed(d)
+        J, D = self._pairs.rows()
+        Aw = b
+        if J.shape[0]:
+
+            def add_product(p, q):
+                q += (J.T @ (D @ (J @ p.ravel()))).reshape(-1, 3)
+
+            found, Aw = self._solve(add_product, b, found, active, True)
+        slope, linear, square = (self._dot(one, found) for one in (b, b - pull, Aw))
+        step, wanted = np.ones(self.model.copies), active & (slope > 0.0)
+        for _ in range(HALVINGS):
+            after, now = self._pressed(d - self._spread(step) * found)
+            change = after - energy - step * linear + 0.5 * step**2 * square
+            with np.errstate(invalid="ignore"):
+                level = np.abs(change) <= NOISE * (np.abs(energy) + step * np.abs(linear))
+                rises = step * square - linear - self._dot(now, found)
+                lower = (change <= -1e-4 * step * slope) | (level & (rises <= 0.8 * slope))
+            wanted = wanted & ~lower
+            if not wanted.any():
                 break
-            self._right.write(r)
-            self._linear.solve(self._right.array, self._result)
-            z = self._found.read().astype(np.float64)
-            before, rz = rz, dot(r, z)
-            going = going & (rz > TOLERANCE**2 * first)
-            if not going.any():
-                break
-            ratio = self._spread(over(rz, before))
-            p, Ap = z + ratio * p, r + ratio * Ap
-        return w
+            step = np.where(wanted, 0.5 * step, step)
+        self._found.write(self._spread(step) * found)
+        wp.copy(w, self._result)

@@ -92,7 +92,8 @@ class Factorised:
     capturable = False
 
     def __init__(self, hessian):
-        model = self.model = hessian.model
+        self.hessian, self.model = hessian, hessian.model
+        model = self.model
         self.matrices = hessian.matrices()
         self.starts = np.cumsum([0, *(len(matrix.data) for matrix in self.matrices)])
         self.values = Mirror(hessian.values)
@@ -104,9 +105,9 @@ class Factorised:
         right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
         sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
         solution, negative = np.zeros_like(sides), np.zeros(self.model.copies, dtype=bool)
-        values = self.values.read()
+        values, coupling = self.values.read(), self.hessian.coupling()
         for copy in np.flatnonzero(wanted.read()):
-            factor = self._factor(copy, values)
+            factor = self._factor(copy, values, coupling)
             found = None if factor is None else factor.solve(sides[copy])
             if found is not None and np.isfinite(found).all():
                 solution[copy], negative[copy] = found, (factor.U.diagonal() < 0.0).any()
@@ -116,17 +117,24 @@ class Factorised:
     def curves_down(self, unresolved=0.0):
         """Whether some copy has an eigenvalue below −1000 ε times its largest diagonal entry − ``unresolved`` [N/m]."""
         shift = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
-        values = self.values.read()
-        factors = (self._factor(copy, values, shift, unresolved) for copy in range(self.model.copies))
+        given = self.values.read(), self.hessian.coupling(), shift, unresolved
+        factors = (self._factor(copy, *given) for copy in range(self.model.copies))
         return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
     def lowest_eigenvalue(self, copy=0):
         """Finds the lowest eigenvalue of a copy's matrix over coordinates that move [N/m], see :func:`lowest_eigenvalue`."""
-        matrix = self.matrices[copy]
-        matrix.data[:] = self.values.read()[self.starts[copy] : self.starts[copy + 1]]
-        n = 3 * self.model.per_copy
+        columns, n = self._columns(copy, self.values.read(), self.hessian.coupling()), 3 * self.model.per_copy
         free = np.flatnonzero(self.model.coordinate_mobility()[copy * n : (copy + 1) * n])
-        return lowest_eigenvalue(matrix.tocsr()[free][:, free])
+        return lowest_eigenvalue(columns[free][:, free])
+
+    def _columns(self, copy, values, coupling):
+        """A copy's matrix in compressed columns."""
+        matrix = self.matrices[copy]
+        matrix.data[:] = values[self.starts[copy] : self.starts[copy + 1]]
+        if coupling is None:
+            return matrix.tocsc()
+        own = slice(copy * matrix.shape[0], (copy + 1) * matrix.shape[0])
+        return matrix.tocsc() + coupling[own, own]
 
     def _mirror(self, array):
         """The mirror of an array, built when the array is first seen."""
@@ -134,15 +142,13 @@ class Factorised:
             self._mirrors[array.ptr] = Mirror(array)
         return self._mirrors[array.ptr]
 
-    def _factor(self, copy, values, shift=0.0, unresolved=0.0):
+    def _factor(self, copy, values, coupling, shift=0.0, unresolved=0.0):
         """The factors of a copy's matrix, or None; with ``shift`` times its largest entry + ``unresolved`` on the diagonal."""
         from scipy.sparse import identity
 
-        matrix = self.matrices[copy]
-        matrix.data[:] = values[self.starts[copy] : self.starts[copy + 1]]
-        if not np.isfinite(matrix.data).all():
+        columns = self._columns(copy, values, coupling)
+        if not np.isfinite(columns.data).all():
             return None
-        columns = matrix.tocsc()
         if shift:
             added = shift * np.abs(columns.diagonal()).max() + unresolved
             columns = columns + added * identity(columns.shape[0], format="csc")

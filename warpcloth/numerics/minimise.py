@@ -58,6 +58,9 @@ class Minimiser:
             self.linear = ConjugateGradients(self.hessian, self.sums, linear_iterations)
         else:
             self.linear = Factorised(self.hessian)
+        if pairs is not None:
+            self.hessian.prepare()
+            self.preconditioner = wp.zeros(model.count, dtype=model.mat33, device=model.device)
         self.right = model.vectors()
         self.work, self.lost = (wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2))
 
@@ -201,7 +204,8 @@ class Minimiser:
 
     def _launch_search(self):
         if self.pairs is not None:
-            given = self.search.gradient, self.linear.preconditioner, self.right, self.search.direction
+            self.hessian.invert_diagonal(self.preconditioner)
+            given = self.search.gradient, self.preconditioner, self.right, self.search.direction
             self.pairs.launch_limit(self.sums, *given)
         self.search.launch(self.active)
         self._launch_norms()

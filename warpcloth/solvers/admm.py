@@ -16,6 +16,7 @@ from ..core.transpose import Transpose
 from ..kernels import admm as kernels
 from ..kernels.accelerate import plain_step
 from ..model.model import Model
+from ..numerics.contact_system import PairSystem
 from ..numerics.inertia import Inertia
 from ..numerics.iterate import GravityScale
 from ..numerics.linear import factorise_copies
@@ -41,7 +42,8 @@ class ADMM(ImplicitStep):
     - (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once.
 
     Quadratic energies whose elements differ in their number of vertices, such as :class:`warpcloth.PlateBending`, are not
-    split: their matrix is part of that of the last step. The fixed point is that of
+    split: their matrix is part of that of the last step. Nor is the energy of self-contact, for which the last step is one of
+    Newton's method. The fixed point is that of
     :class:`warpcloth.ProjectiveDynamics` and the x(t+h) of :class:`warpcloth.Newton`. Only the product WD matters:
     if D is scaled and W inversely, the iterates stay the same.
 
@@ -99,6 +101,7 @@ class ADMM(ImplicitStep):
 
     name = "admm"
     needs, locks = (ELEMENTS, FINITE), True
+    touches_itself = True
     residual = Residual("largest primal or dual residual of a vertex (as an acceleration)", "m/s²")
     facts = Facts(
         method="implicit steps by the alternating direction method of multipliers",
@@ -172,10 +175,23 @@ class ADMMStepper(ImplicitStepper):
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._scale = GravityScale(model).or_else(1.0)
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
-        self._start = Segment(model.device, self._launch_start)
-        self._local = Segment(model.device, self._launch_local)
-        self._move = Segment(model.device, self._launch_move)
+        self._whole_in_balance = bool(self._whole) or self.pairs is not None
+        self._pressed = None
+        if self.pairs is not None:
+            self._pressed = PairSystem(model, self.state.x, self._factors, self._sums, self.pairs)
+        self._record()
         self.ready()
+
+    def _record(self):
+        device = self.model.device
+        self._start = Segment(device, self._launch_start)
+        self._local = Segment(device, self._launch_local)
+        self._move = Segment(device, self._launch_move)
+
+    def record_again(self):
+        self._record()
+        self._pressed.record()
+        self._record_end()
 
     def start(self):
         self._start()
@@ -185,7 +201,7 @@ class ADMMStepper(ImplicitStepper):
         self._local()
         self.primal = np.where(self._iterating, self._primal.read() / self._scale, self.primal)
         dual = self._dual.read()
-        if self._gradient is not None:
+        if self._whole_in_balance:
             dual = np.maximum(dual, self._unbalanced.read())
         self.dual = np.where(self._iterating, dual / self._scale, self.dual)
         return np.maximum(self.primal, self.dual), {}  # keeps NaN
@@ -194,6 +210,8 @@ class ADMMStepper(ImplicitStepper):
         self._iterating = active.copy()
         self._active.write(active)
         self._factors.solve(self._force, self._w)
+        if self._pressed is not None:
+            self._pressed.correct(self.correction, self._force, self._w, active)
         self._move()
 
     def _ratios_of(self, elements, scale):
@@ -233,8 +251,11 @@ class ADMMStepper(ImplicitStepper):
             transpose.add(of, *sums)
         if self._gradient is not None:
             self._gradient.add(self.state.x, self._force, self.correction)
+        if self.pairs is not None:
+            self.pairs.launch_forces(self.state.x, self.correction)
+            self.pairs.add_gradient(self._force)
         self._inertia.add(self.correction, self._force)
-        if self._gradient is not None:
+        if self._whole_in_balance:
             self._sums.largest(model.inverse_mass, self._force, self._unbalanced.array)
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
             model.lock(forces)

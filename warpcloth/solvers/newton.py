@@ -83,8 +83,6 @@ class Newton(ImplicitStep):
             ValueError: If a term has infinite stiffness.
         """
         self.refuse(model)
-        if self.linear == "factorised" and model.scene.self_contact is not None:
-            raise ValueError('Newton with linear="factorised" cannot take self_contact; linear="cg" can')
         return self._on(NewtonStepper, model)
 
 

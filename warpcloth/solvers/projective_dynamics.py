@@ -68,6 +68,7 @@ class ProjectiveDynamics(ImplicitStep):
 
     name = "projective-dynamics"
     needs, locks = (FINITE, MERGED_DAMPING, PROJECTION_OR_CONTACT), True
+    touches_itself = True
     residual = Residual(UNBALANCED, "times its value at the start of the step")
     facts = Facts(
         method="implicit steps by local projections and global solves with a constant matrix, optionally accelerated",
@@ -130,8 +131,9 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         )
         self.factorise_seconds = self._linear.seconds
         self._contact = None
-        if model.colliders is not None:
-            self._contact = ContactSystem(model, self.state.x, self._linear, self.sums, self.inertia.s)
+        if model.colliders is not None or self.pairs is not None:
+            given = model, self.state.x, self._linear, self.sums, self.inertia.s, self.pairs
+            self._contact = ContactSystem(*given)
         self._gradient_of = plan(model).gradient(corrected=True)
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
         self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
@@ -139,9 +141,17 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._gravity_scale = GravityScale(model)
         method = accelerated(options.acceleration, model, options.window, self.slowest)
         self._accelerated = method and AcceleratedStep(self, method, falls=self._contact is not None)
-        self._start = Segment(model.device, self._launch_start)
-        self._move = Segment(model.device, self._launch_move)
+        self._record()
         self.ready()
+
+    def _record(self):
+        self._start = Segment(self.model.device, self._launch_start)
+        self._move = Segment(self.model.device, self._launch_move)
+
+    def record_again(self):
+        self._record()
+        self._contact.record()
+        self._record_end()
 
     def start(self):
         self._start()
@@ -200,5 +210,8 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         """∇φ at d, and the largest unbalanced acceleration."""
         self.gradient.zero_()
         self._gradient_of.add(self.state.x, self.gradient, self.correction)
+        if self.pairs is not None:
+            self.pairs.launch_forces(self.state.x, self.correction)
+            self.pairs.add_gradient(self.gradient)
         self.inertia.add(self.correction, self.gradient)
         self.sums.largest(self.model.inverse_mass, self.gradient, self._acceleration.array)
