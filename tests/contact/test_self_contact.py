@@ -339,3 +339,64 @@ def test_crossings():
     ((edge, triangle),) = crossings(points, edges, triangles)
     assert edge.tolist() == [3, 4]
     assert triangle.tolist() == [0, 1, 2]
+
+
+def tangled(start):
+    """Sheets that cross at the start: the corner of one in another, all of one in another, and two that coincide."""
+    sheets = layers(turn=17.0 * (start != "coincide"), gap=0.0 if start == "coincide" else 0.02)
+    positions = sheets.positions.copy()
+    if start == "corner":
+        positions[36:] -= [0.15, 0.0, 0.15]
+        positions[71, 1] -= 0.023
+    if start == "tilted":
+        positions[36:, 1] -= np.linspace(0.0, 0.04, 36)
+    velocities = np.zeros_like(positions)
+    velocities[36:, 1] = 0.3
+    return replace(
+        sheets, positions=positions, velocities=velocities, self_contact=replace(sheets.self_contact, crossing_start="run")
+    )
+
+
+def crossing_pairs(points, triangles):
+    """The pairs of triangles that intersect in points as stored, by the exact predicates of libigl, and touching ones too."""
+    predicates = pytest.importorskip("igl.predicates")
+    stored = np.asarray(points, dtype=np.float32).astype(np.float64)
+    return {tuple(sorted(pair)) for pair in predicates.find_self_intersections(stored, triangles.astype(np.int64))[1].tolist()}
+
+
+@each_solver
+@pytest.mark.parametrize("start", ["corner", pytest.param("tilted", marks=SLOW), pytest.param("coincide", marks=SLOW)])
+def test_starts_that_cross(name, start, device):
+    """In no frame do triangles cross that did not at the start, or that have been free, and what is left is counted."""
+    scene = tangled(start)
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
+    tangles, triangles = stepper.pairs.tangles, scene.mesh.triangles
+    known = {tuple(sorted(pair)) for pair in tangles.pairs.tolist()}
+    assert known >= crossing_pairs(scene.positions, triangles) and len(known) == tangles.left()[0] > 0
+    for _ in range(24):
+        stepper.frame()
+        left = {tuple(sorted(pair)) for pair in tangles.pairs[tangles.free == 0].tolist()}
+        assert left <= known and crossing_pairs(stepper.state.x.numpy(), triangles) <= left
+        known = left
+    assert len(known) == tangles.left()[0]
+    if start == "corner":
+        assert not known
+
+
+def test_pairs_of_a_start_that_crosses(device):
+    """A triangle with an edge through another: all pairs of their vertices and edges are left out, and of no other triangle."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [0.2, -0.5, 0.2], [0.3, 0.5, 0.2], [0.2, 0.5, 0.4], [0.4, 0.8, 0.4]])
+    mesh = wc.Mesh(points, [[0, 1, 2], [3, 4, 5], [4, 5, 6]])
+    run = wc.SelfContact(distance=5e-3, stiffness=1e4, crossing_start="run")
+    scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)], self_contact=run)
+    pairs, _model = steps_of(scene, device)
+    assert pairs.tangles.pairs.tolist() == [[0, 1]] and pairs.tangles.left().tolist() == [1]
+    with pytest.raises(ValueError, match=r"cross at the start.*; 1 pairs of triangles cross or are too near, crossing_start="):
+        steps_of(replace(scene, self_contact=replace(run, crossing_start="refuse")), device)
+    with pytest.raises(ValueError, match=r"self_contact\.crossing_start is 'go'"):
+        wc.SelfContact(crossing_start="go")
+    copies = scene.build(device=device, dtype="float64", copies=2)
+    found = wc.XPBD(substeps=2).bind(copies)
+    assert found.pairs.tangles.left().tolist() == [1, 1]
+    animation = wc.simulate(scene, wc.XPBD(substeps=2), device=device, frames=1)
+    assert animation.crossings == 1

@@ -22,6 +22,7 @@ def scene_digest(scene):
     if mesh.parts:
         facts += [(name, *part) for name, part in mesh.parts.items()]
     facts += [scene.colliders, scene.contact] if scene.colliders else []
+    facts += [] if scene.self_contact is None else [scene.self_contact]
     return digest_of((*facts, scene.terms, scene.pins, scene.free_axes, scene.gravity, float(scene.fps), *scene.loads))
 
 

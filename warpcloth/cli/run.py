@@ -52,6 +52,7 @@ def run(arguments):
                 draw_film([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
             except Interrupted as interrupted:
                 raise Interrupted(f"{interrupted}; frames 0 to {status.frame} are in {arguments.output}") from None
+        crosses = scene.self_contact is not None and scene.self_contact.crossing_start == "run"
         facts = {
             "scene": scene.name,
             "source": str(source.path),
@@ -64,6 +65,7 @@ def run(arguments):
             "compile_seconds": setup.seconds + animation.timings["compile"],
             "worst_strain": animation.worst_strain,
             **({"cut": animation.cut, "inside": [each._asdict() for each in animation.inside]} if scene.colliders else {}),
+            **({"crossings": animation.crossings} if crosses else {}),
             "residual": status.residual,
             "residual_measure": status.measure,
             "residual_unit": status.unit,
@@ -99,6 +101,8 @@ def _summary(facts, inside):
     threads, measured = facts["threads"], facts["residual_measure"] is not None
     residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none, the method does not compute one"
     cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by colliders"] if "cut" in facts else []
+    left = facts.get("crossings")
+    crossings = [] if left is None else [f"  crossings     {left} pairs of triangles of the start are left"]
     return "\n".join(
         [
             f"{facts['scene']}: {facts['message']}",
@@ -107,6 +111,7 @@ def _summary(facts, inside):
             f"  worst strain  {100.0 * facts['worst_strain']:.3g} %",
             *cut,
             *(f"  inside        {each}" for each in inside),
+            *crossings,
             f"  residual      {residual}",
             f"  solver        {solver_line(facts)}",
             f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),

@@ -9,6 +9,7 @@ from ..kernels import self_contact as kernels
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from .proximity import Proximity
+from .tangles import Tangles
 
 # The skin, relative to the longest edge of the rest shape: beyond the contact distance pairs are listed as far as that. An edge
 # that goes through a triangle of that size is nearer than 0.29 to an edge of it; below 0.5, which is a right angle's height on
@@ -39,6 +40,7 @@ class SelfSteps:
         proximity: :class:`warpcloth.contact.proximity.Proximity`.
         x_before: Positions where the step began, (N,) [m].
         energies: Those of the pairs by their first vertex, (N,) [J].
+        tangles: :class:`warpcloth.contact.tangles.Tangles` of a start at which cloth crosses or touches cloth, else None.
     """
 
     def __init__(self, model, state, h, bounded, colliders):
@@ -70,11 +72,12 @@ class SelfSteps:
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
         self._moves_together = free
         self._few = int(SHARE * model.count)
+        self.tangles = None
         self._hold()
-        self._refuse_start()
+        self._check_start(state)
 
-    def _refuse_start(self):
-        """Refuses a start at which cloth crosses cloth, or is nearer than the filter lets it come.
+    def _check_start(self, state):
+        """Refuses a start at which cloth crosses cloth, or is nearer than the filter lets it come; or finds its tangles.
 
         An edge that crosses a triangle is near an edge of it, and that pair is listed. Computed in float64, without exact
         predicates.
@@ -91,14 +94,28 @@ class SelfSteps:
         stencils, points = self.proximity.stencils.numpy()[: of_vertices + of_edges], x.numpy().astype(np.float64)
         found, least = self.begun.gap.numpy()[: len(stencils)], FLOOR * self.declared.distance
         ulps = 6.0 * float(np.finfo(np.float32).eps) * np.abs(points).max(initial=0.0)
-        for e in np.flatnonzero(found < least + ulps)[:1]:
-            parts = (stencils[e][:1], stencils[e][1:]) if e < of_vertices else (stencils[e][:2], stencils[e][2:])
-            self._refuse_pair(parts, f"start {found[e]:.3g} m apart; self_contact needs more than {least + ulps:.3g} m")
+        least += ulps
+        near = stencils[found < least]
+        split = int(np.count_nonzero(found[:of_vertices] < least))
         edges = stencils[of_vertices:]
-        for own, other in ((edges[:, :2], edges[:, 2:]), (edges[:, 2:], edges[:, :2])):
-            crossing = crossings(points, own, self._triangles_of(other))
-            for edge, triangle in crossing[:1]:
-                self._refuse_pair((edge, triangle), "cross at the start; self_contact needs a start without crossings")
+        through = [
+            each
+            for own, other in ((edges[:, :2], edges[:, 2:]), (edges[:, 2:], edges[:, :2]))
+            for each in crossings(points, own, self._triangles_of(other))
+        ]
+        if not len(near) and not through:
+            return
+        crossing = [np.array([each[k] for each in through], dtype=np.int64).reshape(-1, 2 + k) for k in (0, 1)]
+        tangles = Tangles(self.model, state, *crossing, (near[:split], near[split:]), least)
+        if self.declared.crossing_start == "run":
+            self.tangles = tangles
+            return
+        rule = f'; {len(tangles)} pairs of triangles cross or are too near, crossing_start="run" takes these'
+        for stencil in near[:1]:
+            parts = (stencil[:1], stencil[1:]) if split else (stencil[:2], stencil[2:])
+            gap = found[np.argmax(found < least)]
+            self._refuse_pair(parts, f"start {gap:.3g} m apart; self_contact needs more than {least:.3g} m{rule}")
+        self._refuse_pair(through[0], f"cross at the start; self_contact needs a start without crossings{rule}")
 
     def at_start(self):
         """U [J] at the start, and how many pairs touch there times ½Σ(r − d)² [m²], both (B,)."""
@@ -182,6 +199,8 @@ class SelfSteps:
         """Forgets the steps that an integrator made to find its past."""
         self.cut.zero_()
         self.steps.zero_()
+        if self.tangles is not None:
+            self.tangles.start_again()
 
     def _launch(self, factory, dim, inputs, outputs):
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
@@ -203,6 +222,8 @@ class SelfSteps:
         """Fixes the side and the area of each listed pair."""
         count = len(self.pairs.stencils)
         self._launch(kernels.begin_pairs, count, [self.pairs, x], [self.begun])
+        if self.tangles is not None:
+            self.tangles.launch_leave_out(self.pairs.stencils, self.pairs.counts, self.begun.gap)
         given = [self.pairs, self._areas, x, self.declared.stiffness]
         self._launch(kernels.set_areas, count, given, [self.begun])
 
@@ -273,6 +294,8 @@ class SelfSteps:
         given = [model.inverse_mass, self._target, x, model.per_copy, self.h]
         self._launch(kernels.end_filter, model.count, given, [v, move, self.cut])
         model.launch(self._count, model.copies, [], [self.steps])
+        if self.tangles is not None:
+            self.tangles.launch_free(x)
 
     def launch_fresh(self, x, launch):
         """Launches ``launch`` of x if a vertex has moved so far since the last list that the next walk might miss a pair."""
@@ -306,6 +329,8 @@ class SelfSteps:
             self._launch(kernels.common_move, model.copies, [*wanted, model.per_copy], [self._common])
         given = [self.pairs, *wanted, self._common, model.per_copy, FLOOR * self.declared.distance]
         self._launch(kernels.set_planes, len(self.pairs.stencils), given, [self._planes])
+        if self.tangles is not None:
+            self.tangles.launch_open(self.pairs.stencils, self.pairs.counts, self._planes.plane)
 
     # Of methods whose iterates base + d stay apart too.
 

@@ -91,6 +91,8 @@ class Animation:
         inside: A tuple of :class:`Inside`, one for each collider that contained a vertex, with its first such vertex. This is a
             vertex that is not free, if the collider moves over it or it moves into the collider, or a free vertex between two
             colliders that close on one another.
+        crossings: How many pairs of triangles that crossed or touched at the start have not come free by the end, see
+            ``SelfContact(crossing_start="run")``; with B > 1 copies one value per copy, (B,).
     """
 
     points: np.ndarray | FrameSequence
@@ -108,6 +110,20 @@ class Animation:
     friction_forces: dict[str, np.ndarray] | None = None
     cuts: np.ndarray | None = None
     inside: tuple[Inside, ...] = ()
+    crossings: int | np.ndarray = 0
+
+    def cloth(self, name: str) -> np.ndarray:
+        """Positions of one cloth of the scene, or of one part of its mesh, (frames+1, n, 3) or (frames+1, B, n, 3) [m].
+
+        Raises:
+            ValueError: There is no such part.
+        """
+        parts = (self.scene.mesh.parts or {}) if self.scene else {}
+        if name not in parts:
+            known = f"its cloths are {', '.join(parts)}" if parts else "Scene.join makes one of several"
+            raise ValueError(f"the scene has no cloth {name!r}; {known}")
+        first, count, _ = parts[name]
+        return np.asarray(self.points)[..., first : first + count, :]
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
@@ -229,9 +245,18 @@ def simulate(
         "scene": scene,
         "cut": of_copies(stepper.cut),
         "inside": _inside(stepper),
+        "crossings": _crossings(stepper),
         **(history.by_name() if history else {}),
     }
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)
+
+
+@in_turn
+def _crossings(stepper):
+    """How many pairs of triangles that crossed at the start have not come free, one number or (B,)."""
+    tangles = None if stepper.pairs is None else stepper.pairs.tangles
+    left = np.zeros(stepper.model.copies, dtype=np.int64) if tangles is None else tangles.left()
+    return left if len(left) > 1 else int(left[0])
 
 
 @in_turn

@@ -18,6 +18,7 @@ from ..terms.contact import VertexContact, VertexFriction
 from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
 from .colliders import Collider, Contact, checked_colliders, default_stiffness, refuse_inside
+from .joining import fields_of_cloths, pins_of_cloths
 from .mesh_collider import MeshCollider
 from .self_contact import SelfContact
 
@@ -112,6 +113,8 @@ class Scene:
             has no effect without colliders.
         self_contact: The :class:`warpcloth.SelfContact` of the cloth with itself; its stiffness is then computed. None if cloth
             passes through cloth.
+        cloths: Names of the cloths of a scene that :meth:`join` made, the parts of the mesh; else empty. In files each is a
+            prim of its own.
 
     Raises:
         ValueError: If a value is not allowed; the message names it.
@@ -141,6 +144,34 @@ class Scene:
     colliders: Converted[Iterable[Collider], tuple[Collider, ...]] = default(())
     contact: Contact | None = None
     self_contact: SelfContact | None = None
+    cloths: tuple[str, ...] = ()
+
+    @classmethod
+    def join(cls, cloths: Mapping[str, "Scene"], **whole: Any) -> "Scene":
+        """One scene of several cloths, such as layers or the pieces of a garment, each of its own mesh and material.
+
+        The mesh is that of :meth:`warpcloth.Mesh.join`. Each cloth keeps its masses, terms, pins, loads, positions and
+        velocities; a term is called by its cloth, as skirt_Spring is. ``Animation.cloth(name)`` has the motion of one cloth,
+        and files have a prim for each.
+
+        Args:
+            cloths: A scene for each name, which must be an identifier. Cloths have no colliders and no contact of their own.
+            **whole: Fields of the whole scene: gravity, duration and fps, which may be left out if cloths agree on them;
+                colliders, contact, self_contact and name; and further terms, such as seams, on the vertices of all cloths.
+
+        Raises:
+            ValueError: There is no cloth, a name is no identifier, meshes cannot be joined, cloths differ in a field of the
+                whole, or a field is not one of the whole.
+
+        Examples:
+            >>> import warpcloth as wc
+            >>> felt = wc.Scene(wc.Mesh.grid(3, 3), density=0.4, terms=[wc.Spring(stiffness=1e3)], pins="corners")
+            >>> silk = wc.Scene(wc.Mesh.grid(5, 5), density=0.05, terms=[wc.Spring(stiffness=50)])
+            >>> wc.Scene.join({"felt": felt, "silk": silk}).terms[1].name
+            'silk_Spring'
+        """
+        found = fields_of_cloths(cloths, whole)
+        return cls(**found, pins=Pins(*pins_of_cloths(list(cloths.values()))))
 
     @property
     def declared(self) -> tuple[object, ...]:
@@ -167,6 +198,9 @@ class Scene:
         keep("gravity", array("gravity", gravity, (3,)))
         keep("positions", self.mesh.points if self.positions is None else array("positions", self.positions, (n, 3)))
         keep("velocities", np.zeros((n, 3)) if self.velocities is None else array("velocities", self.velocities, (n, 3)))
+        keep("cloths", tuple(self.cloths))
+        if self.cloths and self.cloths != tuple(self.mesh.parts or ()):
+            raise ValueError(f"cloths is {self.cloths}; it must be the names of the parts of the mesh, in their order")
         keep("pins", checked_pins(self.pins, self.mesh))
         keep("loads", checked_loads(self.loads, self.mesh))
         keep("free_axes", _checked_axes(self.free_axes, n))
@@ -369,6 +403,9 @@ class Scene:
             + ("" if pins.held.all() else f", {len(pins.vertices) - len(pins.clamped)} of them along some axes")
             + ("" if pins.keyframes is None else f", moved by {len(pins.keyframes)} keyframes"),
         ]
+        for name in self.cloths:
+            first, count, _ = (mesh.parts or {})[name]
+            lines.append(f"  cloth {name}: {count} vertices, mass {self.vertex_masses[first : first + count].sum():.4g} kg")
         if self.locked is not None:
             counts = ", ".join(f"{count} {axis}" for axis, count in zip("xyz", self.locked.sum(axis=0), strict=True))
             lines.append(f"  locked coordinates: {counts}")

@@ -379,9 +379,9 @@ def _free_axes(values):
 
 
 def _of_fields(kind, name, values):
-    """The record of distance and stiffness that values have under a name, or None."""
-    given = {field: values.get(f"{name}.{field}") for field in ("distance", "stiffness")}
-    given = {field: float(value) for field, value in given.items() if value is not None}
+    """The record of a kind that values have under a name, or None."""
+    given = {field.name: values.get(f"{name}.{field.name}") for field in fields(kind)}
+    given = {field: value if isinstance(value, str) else float(value) for field, value in given.items() if value is not None}
     return kind(**given) if given else None
 
 
@@ -478,6 +478,8 @@ def _scene_values(scene):
             given[f"{name}.distance"] = contact.distance
         if contact is not None and contact.stiffness is not None:
             given[f"{name}.stiffness"] = contact.stiffness
+    if scene.self_contact is not None and scene.self_contact.crossing_start != SelfContact.crossing_start:
+        given["self_contact.crossing_start"] = scene.self_contact.crossing_start
     if not np.array_equal(scene.positions, mesh.points):
         given["positions"] = scene.positions
     if scene.velocities.any():
