@@ -900,6 +900,77 @@ def walk_from_start(dtype):
 
 
 @cache
+def find_held(dtype):
+    """Kernel over vertices: whether any must move to be ``outside`` of colliders, and 1/m, 0 of those that must.
+
+    After so many ``turns`` as ``most`` it is said that none must.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_each_held(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        outside: wp.array(dtype=vec3),
+        turns: wp.array(dtype=wp.int32),
+        # parameters
+        most: int,
+        # out
+        mobile: wp.array(dtype=dtype),
+        within: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        w = inverse_mass[i]
+        if wp.length_sq(outside[i] - x[i]) > dtype(0.0):
+            w = dtype(0.0)
+            if turns[0] < most:
+                within[0] = 1
+        mobile[i] = w
+
+    return find_each_held
+
+
+@cache
+def push_pairs(dtype):
+    """Kernel of one thread: each pair in turn moves its targets apart along n, to its gap at x or ``left`` if that is less."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def push_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        mobile: wp.array(dtype=dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        # parameters
+        left: wp.float64,
+        # in and out
+        target: wp.array(dtype=vec3),
+    ):
+        count = wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0])
+        for e in range(count):
+            s = pairs.stencils[e]
+            n = step.normal[e]
+            w = step.weights[e]
+            gap = step.gap[e]
+            W = ZERO
+            for i in range(4):
+                W += w[i] * w[i] * wp.float64(mobile[s[i]])
+                gap += w[i] * wp.dot(n, exact(target[s[i]]) - exact(x[s[i]]))
+            short = wp.min(step.gap[e], left) - gap
+            if short > ZERO and W > ZERO:
+                for i in range(4):
+                    move = w[i] * wp.float64(mobile[s[i]]) * short / W * n
+                    target[s[i]] = target[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+
+    return push_each_pair
+
+
+@cache
 def end_filter(dtype):
     """Kernel over vertices: what the filter cut off x is cut off v, over h, and off ``move``, which may be None."""
     vec3, _ = types(dtype)

@@ -208,6 +208,71 @@ def test_thrown_on_a_collider(name, collider, device):
         assert collider.distances(x).min() > 0.0 and crossed(x, scene.mesh.triangles) == 0
 
 
+# The corners of a cube, whose index has the bits of x, y and z, and its triangles, counter-clockwise from outside.
+CORNERS = 0.3 * (np.array([[i >> 2, i >> 1 & 1, i & 1] for i in range(8)]) - 0.5)
+SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+FACES = SIDES[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+UP = np.arange(7)[:, None] / 6.0 * [0.1, 0.4, 0.0]
+MOVING = {
+    "ball": wc.Sphere(radius=0.3, position=UP - [0.0, 0.31, 0.0]),
+    "box": wc.Box(size=(0.3, 0.3, 0.3), position=UP - [0.0, 0.16, 0.0]),
+    "plane": wc.Plane(position=0.5 * UP - [0.0, 0.01, 0.0]),
+    "mesh": wc.MeshCollider(CORNERS, FACES, position=[0.0, -0.16, 0.0]),
+    "moving mesh": wc.MeshCollider(CORNERS, FACES, position=UP - [0.0, 0.16, 0.0]),
+    "swelling mesh": wc.MeshCollider(CORNERS * (1.0 + UP[:, 1:2, None]), FACES, position=[0.0, -0.2, 0.0]),
+}
+
+
+@pytest.mark.parametrize("kind", MOVING)
+@pytest.mark.parametrize("name", [name if name in ("xpbd", "pbd") else pytest.param(name, marks=SLOW) for name in SOLVERS])
+def test_thrown_on_a_collider_that_comes_towards_it(name, kind, device):
+    """At 3 m/s on one that is a mesh or moves, by up to 1.6 m/s: no vertex ends a frame inside, and no cloth crosses cloth."""
+    collider, given = MOVING[kind], {"contact": wc.Contact(stiffness=1e4)}
+    scene = layers(count=3, n=4, stiffness=500.0, turn=17.0, colliders=[collider], **given)
+    scene = replace(scene, velocities=np.tile([0.5, -3.0, 0.2], (48, 1)))
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float32"))
+    for frame in range(1, 5):
+        stepper.frame()
+        x = stepper.state.x.numpy()
+        assert collider.distances(x, frame=frame).min() > 0.0
+        assert crossed(x, scene.mesh.triangles) == 0
+    assert stepper.inside == []
+
+
+@pytest.mark.parametrize("name", list(SOLVERS)[:4])
+def test_contact_in_a_frame_that_moves(name, device):
+    """Two sheets that fall on a plane at rest, and at rest on a plane that rises as fast, move the same relative to it."""
+    ends = []
+    for moves in (False, True):
+        rise = np.arange(4)[:, None] / 24.0 * [0.0, 0.3, 0.0] * moves
+        plane, given = wc.Plane(position=rise - [0.0, 0.01, 0.0]), {"contact": wc.Contact(distance=5e-3, stiffness=1e5)}
+        scene = layers(gap=8e-3, n=4, turn=17.0, colliders=[plane], duration=0.125, **given)
+        scene = replace(scene, velocities=np.tile([0.0, -0.3 * (not moves), 0.0], (32, 1)))
+        solver = wc.Newton(substeps=10, tolerance=1e-12) if name == "newton" else SOLVERS[name]
+        stepper = solver.bind(scene.build(device=device, dtype="float64"))
+        for _ in range(3):
+            stepper.frame()
+        ends.append(stepper.state.x.numpy() - rise[-1])
+    assert np.ptp(ends[0][:, 1]) > 1e-3
+    assert ends[1] == pytest.approx(ends[0], abs=1e-9)
+
+
+@each_solver
+def test_what_colliders_close_on(name, device):
+    """A box that presses two layers onto a pinned one: the run names a vertex that had no way out, and no layer crosses."""
+    rise = np.arange(6)[:, None] * [0.0, 0.01, 0.0]
+    box, given = wc.Box(size=(0.6, 0.1, 0.6), position=rise - [0.0, 0.06, 0.0]), {"contact": wc.Contact(stiffness=1e4)}
+    scene = layers(count=3, n=4, gap=0.01, colliders=[box], pins=np.arange(32, 48), **given)
+    animation = wc.simulate(scene, SOLVERS[name], frames=3, device=device)
+    (found,) = animation.inside
+    assert found.other == "other cloth"
+    assert found.frame == 3
+    assert found.vertex < 32
+    assert f"vertex {found.vertex} is caught between Box and other cloth in frame" in str(found)
+    for points in animation.points:
+        assert crossed(points, scene.mesh.triangles) == 0
+
+
 @each_solver
 @pytest.mark.parametrize("gap", [2.5e-3, 5e-5])
 def test_starts_pressed_together(name, gap, device):

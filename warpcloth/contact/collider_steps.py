@@ -18,6 +18,8 @@ from .mesh_steps import MeshSteps
 # Where a vertex stops that would end in a collider, relative to the contact distance: where it comes to rest, a deep gap would
 # be a strong force, and in float32 a noisy one.
 LANDING = 0.1
+# What held a vertex back in a collider where no other collider did.
+CLOTH = "other cloth"
 
 
 class ColliderSteps:
@@ -67,7 +69,7 @@ class ColliderSteps:
         self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
         self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
-        self._spare, self._reads = None, False
+        self._spare, self._reads, self._again = None, False, False
         self.least = FLOOR * declared.distance
         # Of midpoint forces are those half-way, of others at the end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
@@ -171,20 +173,43 @@ class ColliderSteps:
     def launch_end(self, x, v, move=None):
         """Keeps vertices that would end in a collider or cross one out of it, in x, v and ``move`` (N,)."""
         model = self.model
-        if self.meshes is None:
-            given = [model.inverse_mass, self.shapes, self.x_before, self.poses]
-            given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
-        else:
-            given = [model.inverse_mass, self.shapes, self.meshes.geometry, self.x_before]
-            given += [self.meshes.motion, self.meshes.lists, model.per_copy]
-        out = [x, v, move, self.notes]
         if model.mobility is not None:
             for wanted, array in zip(self._wanted, (x, v), strict=True):
                 wp.copy(wanted, array)
-        model.launch(self._filter, model.count, given, out)
+        self._launch_filter(model.inverse_mass, x, v, move, self.notes)
         if model.mobility is not None:  # those who then end inside are noted like pins
-            model.launch(self._hold, model.count, [model.mobility, *self._wanted], out[:-1])
-            model.launch(self._filter, model.count, [self._fixed, *given[1:]], out)
+            model.launch(self._hold, model.count, [model.mobility, *self._wanted], [x, v, move])
+            self._launch_filter(self._fixed, x, v, move, self.notes)
+        if not self._again:
+            self.launch_count()
+
+    def _launch_filter(self, inverse_mass, x, v, move, notes):
+        model = self.model
+        if self.meshes is None:
+            given = [inverse_mass, self.shapes, self.x_before, self.poses]
+            given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
+        else:
+            given = [inverse_mass, self.shapes, self.meshes.geometry, self.x_before]
+            given += [self.meshes.motion, self.meshes.lists, model.per_copy]
+        model.launch(self._filter, model.count, given, [x, v, move, notes])
+
+    # Of cloth that touches itself, which may hold vertices back in a collider that comes over them.
+
+    def end_again(self):
+        """Says that these methods are used, the last of which then counts the step."""
+        device, model = self.model.device, self.model
+        self._again, self._unread = True, kernels.FilterNotes()
+        self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
+        self._unread.steps, self._unread.cut = self.steps, wp.zeros(model.copies, dtype=wp.int64, device=device)
+        self._unread.inside = wp.zeros(self._dim, dtype=wp.int64, device=device)
+
+    def launch_out(self, x, v):
+        """Moves vertices in x and v as :meth:`launch_end`, and notes nothing."""
+        self._launch_filter(self.model.inverse_mass, x, v, None, self._unread)
+
+    def launch_inside(self, x, v):
+        """Notes vertices that colliders have come over in the step, and changes nothing; the step is over."""
+        self._launch_filter(self._fixed, x, v, None, self.notes)
         self.launch_count()
 
     @property
@@ -195,13 +220,15 @@ class ColliderSteps:
 
     def inside(self):
         """The first vertex that ended a step inside each collider: tuples of its copy, collider, step, index, and the collider
-        that held it back, or None for a vertex that is not free."""
-        colliders, found = self._dim[1], []
+        that held it back, None for a vertex that is not free, or CLOTH for one that other cloth held back."""
+        colliders, found, n = self._dim[1], [], self.model.per_copy
+        free = self.model.inverse_mass.numpy() > 0.0 if self._again else np.zeros(self.model.count, dtype=bool)
         for (copy, c), value in np.ndenumerate(self.notes.inside.numpy()):
             if value:
                 rest, other = divmod(int(kernels.FIRST) - int(value), colliders + 1)
-                step, vertex = divmod(rest, self.model.per_copy)
-                found.append((copy, c, step, vertex, other if other < colliders else None))
+                step, vertex = divmod(rest, n)
+                held = CLOTH if free[copy * n + vertex] else None
+                found.append((copy, c, step, vertex, other if other < colliders else held))
         return found
 
     def start_again(self):

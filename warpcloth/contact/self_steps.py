@@ -21,6 +21,9 @@ SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
 # The way relative to the common motion, over the skin, that a vertex may make in a round: with as much that it may have made
 # since the list, two of them do not come nearer by more than the skin.
 WAY = 0.25
+# Rounds in which vertices that cloth holds back in a collider are let out, sweeps of each, and the least gap that these leave
+# between cloth, over the contact distance.
+OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
 
 
 class SelfSteps:
@@ -73,6 +76,14 @@ class SelfSteps:
         self._moves_together = free
         self._few = int(SHARE * model.count)
         self.tangles = None
+        declared = model.colliders
+        self._lets_out = declared is not None and (declared.meshes is not None or any(declared.moves))
+        if self._lets_out:
+            colliders.end_again()
+            self._mobile = wp.zeros(model.count, dtype=model.dtype, device=device)
+            self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+            for factory in (kernels.find_held, kernels.push_pairs):
+                self._kernels[factory] = model.kernel(factory, model.dtype)
         self._hold()
         self._check_start(state)
 
@@ -291,6 +302,11 @@ class SelfSteps:
         if self._iterates:
             self.launch_fresh(x, self.launch_list)
         self._walk(x)
+        if self._lets_out:
+            self._turns.zero_()
+            self._launch_held(x)
+            wp.capture_while(self._within, self._launch_let_out, x=x)
+            self._colliders.launch_inside(x, self._from)
         given = [model.inverse_mass, self._target, x, model.per_copy, self.h]
         self._launch(kernels.end_filter, model.count, given, [v, move, self.cut])
         model.launch(self._count, model.copies, [], [self.steps])
@@ -323,6 +339,30 @@ class SelfSteps:
         given = [self._few, NEAR_ROUNDS, FAR_ROUNDS]
         model.launch(kernels.another_round, 1, given, [self._cuts, self._rounds, self._proceed])
 
+    def _launch_held(self, x):
+        """Finds the vertices that cloth holds back in a collider that has come over them, and where they would be outside."""
+        model, out = self.model, self._other
+        wp.copy(out, x)
+        self._colliders.launch_out(out, self._from)
+        self._within.zero_()
+        given = [model.inverse_mass, x, out, self._turns, OUT_ROUNDS]
+        self._launch(kernels.find_held, model.count, given, [self._mobile, self._within])
+
+    def _launch_let_out(self, x):
+        """Walks on to where the vertices that are held back are outside, and other cloth makes way for them."""
+        model, out = self.model, self._other
+        self.launch_list(x)
+        self._launch(kernels.begin_pairs, len(self.pairs.stencils), [self.pairs, x], [self.begun])
+        for _ in range(SWEEPS):
+            given = [self.pairs, self._mobile, self.begun, x, LEFT * self.declared.distance]
+            self._launch(kernels.push_pairs, 1, given, [out])
+        self._launch_planes(x, out, None)
+        wp.copy(self._from, x)
+        given = [self.pairs, self._planes, self._from, out, self._common, model.per_copy, WAY * self.skin]
+        self._launch(kernels.keep_apart, model.count, given, [x, self._cuts])
+        model.launch(self._count, 1, [], [self._turns])
+        self._launch_held(x)
+
     def _launch_planes(self, x, target, direction):
         model, wanted = self.model, [x, target, direction]
         if self._moves_together:
@@ -343,7 +383,7 @@ class SelfSteps:
     def iterates(self):
         """Says that these methods are used."""
         self._iterates = True
-        if self._colliders is not None:
+        if self._colliders is not None and not self._lets_out:
             self._cut_before, model = wp.zeros_like(self._colliders.notes.cut), self.model
             self._kernels[kernels.walk_from_start] = model.kernel(kernels.walk_from_start, model.dtype)
 

@@ -40,8 +40,8 @@ class Inside(NamedTuple):
         vertex: Its index in the mesh.
         frame: The frame in which, or before which, it came in.
         collider: Name of the collider.
-        other: Name of the collider that held it back from there, of a free vertex between the two; None for a vertex that is
-            not free, because pins or locked axes hold it.
+        other: What held it back from there, of a free vertex between the two: the name of a collider, or ``"other cloth"`` with
+            self-contact. None for a vertex that is not free, because pins or locked axes hold it.
         copy: Index of its copy.
     """
 
@@ -267,7 +267,7 @@ def _inside(stepper):
         names = collider_names(model.scene)
         vertex = int(vertex if model.order is None else model.order[vertex])
         frame = int(step) // stepper.steps_per_frame + 1
-        found.append(Inside(vertex, frame, names[collider], None if other is None else names[other], copy))
+        found.append(Inside(vertex, frame, names[collider], names[other] if isinstance(other, int) else other, copy))
     return tuple(sorted(found, key=lambda each: each.frame))
 
 

@@ -256,11 +256,6 @@ class Scene:
             raise ValueError(f"self_contact is {shown(declared)}; it must be a SelfContact or None")
         if not len(self.mesh.triangles):
             raise ValueError("self_contact is given for a mesh without triangles; it must be None")
-        for collider in self.colliders:
-            if collider.moves or isinstance(collider, MeshCollider):
-                raise ValueError(
-                    f"self_contact is given with the collider {collider.label}; colliders must then stand still and be no mesh"
-                )
         if declared.stiffness is not None:
             return declared
         weight = self._areal_mass * float(np.linalg.norm(self.gravity))
