@@ -37,6 +37,7 @@ def info(arguments):
             "fps": scene.fps,
             "frames": scene.frames,
             "pins": len(scene.pins.vertices),
+            "cloths": list(scene.cloths),
         },
         "solver": None,
     }

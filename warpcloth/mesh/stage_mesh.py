@@ -27,6 +27,7 @@ class StageMesh:
         point_vertices: Curves: the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
         corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), where vertices on seams have several
             and the mesh has none; else None.
+        cloths: Of several cloths, whose meshes ``mesh`` joins, the `StageMesh` of each; else none.
         rest: Whether the stage says a rest shape, the default points; else the mesh is that of one time code.
     """
 
@@ -43,3 +44,4 @@ class StageMesh:
     point_vertices: np.ndarray | None = None
     corner_coordinates: np.ndarray | None = None
     rest: bool = True
+    cloths: tuple["StageMesh", ...] = ()

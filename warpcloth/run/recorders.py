@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from ..scene.lines import lines_of
-from ..usd import AnimationWriter, FrameSequence
+from ..usd import AnimationWriter, FrameSequence, JoinedFrames
 from .checkpoint import NAME, Checkpoint
 from .history import collider_names, energy_names
 
@@ -81,6 +81,7 @@ class File:
         self._forces = [list(primvar_names(names, kind).values()) for kind in ("collider_forces", "friction_forces")]
         history = dict.fromkeys(self._energies.values(), "double") | ({REACTION: "float3[]"} if "reactions" in record else {})
         history |= dict.fromkeys((*self._forces[0], *(self._forces[1][c] for c in self._rubbing if names)), "double3")
+        self._prims = [each.prim for each in stage.cloths] if stage else [f"/World/{name}" for name in scene.cloths]
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
@@ -93,9 +94,12 @@ class File:
                 lines=lines,
                 history=history,
                 colliders=scene.colliders,
+                cloths={name: name for name in scene.cloths},
             )
         else:
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, source=stage.path, prim=stage.prim, history=history)
+            cloths = {name: each.prim for name, each in zip(scene.cloths, stage.cloths, strict=True)}
+            given = {"source": stage.path, "prim": stage.prim, "history": history, "cloths": cloths}
+            self.writer = AnimationWriter(output, scene.mesh, scene.fps, **given)
         self.saved = self.writer.saved
         if resume:
             try:
@@ -170,4 +174,6 @@ class File:
 
     def read(self):
         path = self.writer.path
+        if self._prims:
+            return JoinedFrames(path, self._prims), JoinedFrames(path, self._prims, "velocities")
         return FrameSequence(path), FrameSequence(path, attribute="velocities")

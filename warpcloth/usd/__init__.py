@@ -6,7 +6,7 @@ Nothing else here imports pxr, and that is loaded when a stage is first touched.
 from ..base.outputs import STAGE_ENDINGS
 from ..mesh.mesh import READERS
 from ..mesh.sequences import OPENERS
-from .frames import FrameSequence, open_sequence
+from .frames import FrameSequence, JoinedFrames, open_sequence
 from .measures import MeasureWriter
 from .scene import read_scene, write_scene
 from .stage import StageMesh, flattened, read_mesh, read_stage_mesh
@@ -18,6 +18,7 @@ OPENERS.update(dict.fromkeys(STAGE_ENDINGS, open_sequence))
 __all__ = [
     "AnimationWriter",
     "FrameSequence",
+    "JoinedFrames",
     "MeasureWriter",
     "StageMesh",
     "flattened",

@@ -108,7 +108,9 @@ class ChunkWriter:
             raise ValueError(f"output is {self._output}, a file of the source's stage; it must be another file")
         self._rest, self._targets = rest, targets
         self._source = None if source is None else Path(os.path.abspath(source))
-        facts = {METADATA_KEY: {**_facts(metadata or {}), "prim": targets[0].prim}}
+        cloths = [target.prim for target in targets if target.vertices is not None]
+        named = {"prims": " ".join(cloths)} if cloths else {"prim": targets[0].prim}
+        facts = {METADATA_KEY: {**_facts(metadata or {}), **named}}
         self._root_metadata = {**root_metadata, "customLayerData": facts}
         self._files, self._refit = {file: identity(file) for file in files}, refit
         self._lock = Lock(self._output)

@@ -13,6 +13,7 @@ from .modules import Usd, UsdGeom, UsdPhysics
 from .solids import SOLIDS
 from .stage import (
     METADATA_KEY,
+    animated_prims,
     curve_edges,
     face_corners,
     find_prim,
@@ -94,14 +95,13 @@ def read_drawn(path, prim=None):
         stage = posed(open_stage(path), -np.inf, np.inf)
         own = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY)
         named = prim is not None or (isinstance(own, dict) and "prim" in own)
-        chosen = find_prim(stage, path, prim) if named else None
-        found = [each for each in _shown(stage) if chosen is None or each != chosen]
-        found = ([chosen] if chosen else []) + found
+        chosen = [find_prim(stage, path, prim)] if named else animated_prims(stage)
+        found = chosen + [each for each in _shown(stage) if each not in chosen]
         codes = {each: _codes(each) for each in found}
         moving = [each for each in found if len(codes[each]) > 1]
         moving = [each for each in moving if each.IsA(UsdGeom.PointBased)]
         moving = [each for each in moving if len(time_codes_of(UsdGeom.PointBased(each).GetPointsAttr())) > 1] or moving
-        cloths = [chosen] if chosen else moving or [each for each in found if each.IsA(UsdGeom.PointBased)] or found
+        cloths = chosen or moving or [each for each in found if each.IsA(UsdGeom.PointBased)] or found
         prims = [_drawn(each, path, each in cloths, codes[each]) for each in found]
         prims = [each for each in prims if each is not None]
         if not prims:

@@ -1,18 +1,19 @@
 """The frames of an animation, read from its file one at a time."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from ..base.types import FilePath
-from ..mesh.mesh import Surface
+from ..mesh.mesh import Mesh, Surface
 from ..mesh.sequences import Sequence
 from .layers import files_of_stage
 from .modules import Sdf, UsdGeom
 from .stage import (
+    animated_prims,
     carried,
     curve_vertices,
     find_prim,
@@ -33,7 +34,10 @@ _VECTORS = ("points", "velocities")
 
 
 def open_sequence(path, prim, fps):
-    """Opens the frames of a stage for :func:`warpcloth.open_sequence`."""
+    """Opens the frames of a stage for :func:`warpcloth.open_sequence`; of several cloths that a run animated, those of all."""
+    prims = [] if prim is not None else [str(each.GetPath()) for each in animated_prims(open_stage(path))]
+    if len(prims) > 1:
+        return _sequence_of_cloths(path, prims, fps)
     frames = FrameSequence(path, prim)
     codes = frames.time_codes
     stage = read_stage_mesh(path, prim, Surface, codes[0])
@@ -45,6 +49,19 @@ def open_sequence(path, prim, fps):
     labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
     times = frames.times if fps is None else (codes - codes[0]) / fps
     return Sequence(stage.mesh, labels, times, frames.exact, path, stage, stage.rest, np.float32, frames.files, stage.up_axis)
+
+
+def _sequence_of_cloths(path, prims, fps):
+    """The frames of several cloths, as one mesh whose parts are the cloths."""
+    frames = JoinedFrames(path, prims)
+    each = [read_stage_mesh(path, prim, Surface, frames.time_codes[0]) for prim in prims]
+    joined = Mesh.join({prim.rsplit("/", 1)[1]: stage.mesh for prim, stage in zip(prims, each, strict=True)})
+    mesh = Surface(joined.points, joined.triangles, up_axis=joined.up_axis, parts=joined.parts)
+    codes = frames.time_codes
+    labels = codes.astype(np.int64) if np.array_equal(codes, np.rint(codes)) else codes
+    times = frames.times if fps is None else (codes - codes[0]) / fps
+    rest = all(stage.rest for stage in each)
+    return Sequence(mesh, labels, times, frames.exact, path, None, rest, np.float32, frames.files, each[0].up_axis)
 
 
 class FrameSequence:
@@ -226,3 +243,35 @@ class FrameSequence:
             yield
         except ValueError as error:
             raise ValueError(f"{self._where}: {error}") from None
+
+
+class JoinedFrames(FrameSequence):
+    """Points or velocities of several prims of one file, the vertices of the first and then those of the next.
+
+    Args:
+        path: The file.
+        prims: Their paths.
+        attribute: "points" or "velocities".
+    """
+
+    def __init__(self, path: FilePath, prims: Iterable[str], attribute: str = "points") -> None:
+        self._each = [FrameSequence(path, prim, attribute) for prim in prims]
+        first = self._each[0]
+        for other in self._each[1:]:
+            if not np.array_equal(other.time_codes, first.time_codes):
+                raise ValueError(f"{path}: {other} has other time codes than {first}, must have the same")
+        self.time_codes, self.times = first.time_codes, first.times
+        self.shape = (len(first), sum(each.shape[1] for each in self._each), 3)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        return self._each[0].files
+
+    def __repr__(self) -> str:
+        return f"JoinedFrames(shape={self.shape}, {len(self._each)} cloths)"
+
+    def exact(self, frame: int) -> np.ndarray:
+        return np.concatenate([each.exact(frame) for each in self._each])
+
+    def _read(self, frame):
+        return np.concatenate([each[frame] for each in self._each])

@@ -48,8 +48,6 @@ def scene_layer(mesh, pins, up_axis, name):
     Raises:
         ValueError: The name, or that of a pin, is none.
     """
-    if not Sdf.Path.IsValidIdentifier(name):
-        raise ValueError(f"prim is {name!r}; it must be a name of letters, digits and _ where there is no source")
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -58,7 +56,14 @@ def scene_layer(mesh, pins, up_axis, name):
     world = UsdGeom.Xform.Define(stage, "/World").GetPrim()
     Usd.ModelAPI(world).SetKind(Kind.Tokens.component)
     stage.SetDefaultPrim(world)
-    path = f"/World/{name}"
+    return layer, define_cloth(layer, mesh, pins, name), root_metadata(stage)
+
+
+def define_cloth(layer, mesh, pins, name):
+    """Defines a cloth at rest in a layer of `scene_layer`, which says what the parameters are, and returns its `Target`."""
+    if not Sdf.Path.IsValidIdentifier(name):
+        raise ValueError(f"prim is {name!r}; it must be a name of letters, digits and _ where there is no source")
+    stage, path = Usd.Stage.Open(layer), f"/World/{name}"
     if len(mesh.triangles):
         geometry, target = UsdGeom.Mesh.Define(stage, path), Target(path, mesh.triangles)
         geometry.CreateFaceVertexCountsAttr(np.full(len(mesh.triangles), 3, np.int32))
@@ -80,7 +85,7 @@ def scene_layer(mesh, pins, up_axis, name):
     _add_pins(geometry, target, pins or {}, len(mesh.points))
     UsdGeom.Scope.Define(stage, "/World/Looks")
     bind_material(geometry.GetPrim(), define_material(stage, "/World/Looks/Cloth"))
-    return layer, target, root_metadata(stage)
+    return target
 
 
 def define_lines(layer, mesh, lines):
@@ -206,7 +211,7 @@ def bind_material(prim, material):
     UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
 
-def over_layer(source, prim, mesh, primvars, history):
+def over_layer(source, prim, mesh, primvars, history, layer=None):
     """A layer of opinions on the artist's prim, to be animated: it says how to read normals, and has no points.
 
     The artist's default points stay the rest shape; only where there are none (samples alone) ours are given.
@@ -217,6 +222,7 @@ def over_layer(source, prim, mesh, primvars, history):
         mesh: The `Mesh` that is simulated.
         primvars: Interpolation of those that will be sampled, by name; the artist's of the same name are blocked.
         history: Types of the primvars of the history of a run, likewise.
+        layer: A layer of other prims of the same source, to which this one is added, or None.
 
     Returns:
         The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, real paths of all files of the
@@ -231,7 +237,7 @@ def over_layer(source, prim, mesh, primvars, history):
     identity = np.array_equal(surroundings.transform, np.eye(4))
     target = artist_target(artist, surroundings, primvars, transform=None if identity else surroundings.transform)
     target = replace(target, history=history)
-    layer = Sdf.Layer.CreateAnonymous(".usdc")
+    layer = layer or Sdf.Layer.CreateAnonymous(".usdc")
     over = Sdf.CreatePrimInLayer(layer, surroundings.prim)
     rest = target.samples({"points": surroundings.mesh.points})
     defaults = ["extent"]

@@ -49,7 +49,8 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the cloth's prim; may be left out where there is one mesh, or one with cloth attributes.
+        prim: Path or name of the cloth's prim. Else all prims with cloth attributes are the cloths of the scene, or the only
+            mesh is.
 
     Returns:
         Scene: With `stage` set. A result of `write_scene` gives the scene that was written, up to: the order of pins, which
@@ -62,29 +63,60 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
     """
     with sentences(path):
         stage = open_stage(path)
-        cloth = _cloth_prim(stage, path, prim)
-        surroundings = read_stage_mesh(path, str(cloth.GetPath()))
-        where = f"{path}, prim {cloth.GetPath()}"
+        found = _cloth_prims(stage, path, prim)
+        each = [read_stage_mesh(path, str(cloth.GetPath())) for cloth in found]
+        surroundings = each[0]
+        where = f"{path}, prim {surroundings.prim}" if len(each) == 1 else f"{path}"
         with errors_at(where):
             fps = surroundings.fps or surroundings.time_codes_per_second
-            duration = _duration(stage, Values(stage, cloth), fps)
+            duration = _duration(stage, _teller("duration", [Values(stage, cloth) for cloth in found]), fps)
             first = surroundings.start or 0.0
             # One frame more, because there is a keyframe of colliders after all steps.
             stage = posed(stage, first, first + (duration + 1.0 / fps) * surroundings.time_codes_per_second)
-            cloth = stage.GetPrimAtPath(surroundings.prim)
-            scene = _scene(stage, cloth, surroundings, fps, duration)
+        cloths = [stage.GetPrimAtPath(one.prim) for one in each]
+        values = [Values(stage, cloth) for cloth in cloths]
+        scenes = []
+        for cloth, of_cloth, one in zip(cloths, values, each, strict=True):
+            with errors_at(f"{path}, prim {one.prim}"):
+                scenes.append(_scene(stage, cloth, of_cloth, one, fps, duration, values))
 
         def codes(samples):  # one frame more than the scene has, so that all steps within it have a keyframe after them
-            return frame_codes(samples, scene.stage, scene.frames + 1, fps)
+            return frame_codes(samples, surroundings, scenes[0].frames + 1, fps)
 
-        colliders = read_colliders(stage, [cloth], scene.stage, codes)
+        whole = {"colliders": read_colliders(stage, cloths, surroundings, codes)}
         with errors_at(where):
-            return replace(scene, colliders=colliders) if colliders else scene
+            for name, kind in (("contact", Contact), ("self_contact", SelfContact)):
+                whole[name] = _of_fields(kind, name, values)
+            if len(each) == 1:
+                return replace(scenes[0], **whole) if any(whole.values()) else scenes[0]
+            name = _teller("name", values).get("name") or Path(path).stem
+            scene = Scene.join(dict(zip(_names_of(each), scenes, strict=True)), name=name, **whole)
+            mesh, own = scene.mesh, tuple(one.stage for one in scenes)
+            return replace(scene, stage=replace(own[0], mesh=mesh, cloths=own))
 
 
-def _scene(stage, cloth, surroundings, fps, duration):
-    """The scene without its colliders."""
-    values = Values(stage, cloth)
+def _teller(field, values):
+    """Of the values of several cloths those of the first that says a field of the whole scene, else of the first.
+
+    Raises:
+        ValueError: Two say other things.
+    """
+    telling = [(each, each.get(field)) for each in values if each.get(field) is not None]
+    for _, value in telling[1:]:
+        if not np.array_equal(value, telling[0][1]):
+            raise ValueError(f"cloths have {field} {telling[0][1]} and {value}, must have the same, or one of them alone")
+    return telling[0][0] if telling else values[0]
+
+
+def _names_of(each):
+    """A name for each cloth: that of its prim, or where two have the same all of the path."""
+    paths = [one.prim.strip("/") for one in each]
+    names = [path.rsplit("/", 1)[-1] for path in paths]
+    return names if len(set(names)) == len(names) else [path.replace("/", "_") for path in paths]
+
+
+def _scene(stage, cloth, values, surroundings, fps, duration, of_all):
+    """The scene of one cloth without its colliders and contact; gravity may be said by any of all cloths."""
     rest = surroundings.mesh.points
     surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
     mesh = surroundings.mesh
@@ -105,9 +137,7 @@ def _scene(stage, cloth, surroundings, fps, duration):
         pins=Pins(vertices, keyframes, values.get("pins.axes") or "xyz"),
         free_axes=_free_axes(values),
         loads=[_load(values, key, surroundings, round(duration * fps), fps) for key in values.loads],
-        contact=_of_fields(Contact, "contact", values),
-        self_contact=_of_fields(SelfContact, "self_contact", values),
-        gravity=_gravity(stage, values, surroundings.up_axis),
+        gravity=_gravity(stage, _teller("gravity", of_all), surroundings.up_axis),
         duration=duration,
         fps=fps,
         name=cloth.GetName() if name is None else name,
@@ -154,8 +184,8 @@ def _refuse_missing(mass, term):
         raise ValueError(f"has no {' and no '.join(missing)}, must have a mass and a term to be a cloth")
 
 
-def _cloth_prim(stage, path, prim):
-    """The prim that is named, or the only one with cloth attributes, or what `find_prim` takes."""
+def _cloth_prims(stage, path, prim):
+    """The prim that is named, or all with cloth attributes, or what `find_prim` takes."""
     if prim is None:
         of_colliders = {row.name for row in attributes() if row.location == "collider"}
         cloths = [
@@ -164,8 +194,9 @@ def _cloth_prim(stage, path, prim):
             if found.IsA(UsdGeom.PointBased)
             and (set(own_names(found)) - of_colliders or has_api(found, "PhysicsSurfaceDeformableSimAPI"))
         ]
-        prim = cloths[0].GetPath() if len(cloths) == 1 else None
-    return find_prim(stage, path, prim)
+        if cloths:
+            return cloths
+    return [find_prim(stage, path, prim)]
 
 
 def _exact_mesh(values, cloth, surroundings):
@@ -380,7 +411,7 @@ def _free_axes(values):
 
 def _of_fields(kind, name, values):
     """The record of a kind that values have under a name, or None."""
-    given = {field.name: values.get(f"{name}.{field.name}") for field in fields(kind)}
+    given = {field.name: _teller(f"{name}.{field.name}", values).get(f"{name}.{field.name}") for field in fields(kind)}
     given = {field: value if isinstance(value, str) else float(value) for field, value in given.items() if value is not None}
     return kind(**given) if given else None
 

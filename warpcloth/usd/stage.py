@@ -213,6 +213,13 @@ def find_prim(stage, path, prim=None):
     raise ValueError(f"{path}, prim {prim}: there is no such prim, only {_listed(meshes + curves) or 'others, no Mesh'}")
 
 
+def animated_prims(stage):
+    """The prims of several cloths that an earlier run animated, as the root layer names them; none if it was one cloth."""
+    own = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY)
+    named = str(own.get("prims", "")).split() if isinstance(own, dict) else []
+    return [prim for prim in map(stage.GetPrimAtPath, named) if prim]
+
+
 def _called(prim, name):
     return str(name) in (str(prim.GetPath()), prim.GetName())
 

@@ -31,6 +31,7 @@ class Target:
         primvars: Interpolation of each sampled primvar, "vertex" or "uniform", by name.
         history: Type of each further primvar that is sampled, by name: "float3[]" of vertices, or "double" or "double3" of the
             whole cloth, in SI and in world space whatever the prim is in.
+        vertices: The vertices of the whole that it has, a slice, or None of all.
         coloured: Name of the primvar that a sampled displayColor shows, or None: no colours are sampled.
     """
 
@@ -44,6 +45,7 @@ class Target:
     primvars: dict = field(default_factory=dict)
     coloured: str | None = None
     history: dict = field(default_factory=dict)
+    vertices: slice | None = None
 
     @property
     def attributes(self):
@@ -78,15 +80,17 @@ class Target:
         Returns:
             dict: An array of pxr for each of `attributes`.
         """
-        own = self._vectors(vectors)
+        own = self._vectors({name: self._own(values) for name, values in vectors.items()})
         for name, values in (primvars or {}).items():
             own[f"primvars:{name}"] = Vt.FloatArray.FromNumpy(self._shown(values, name, np.isfinite(values)))
-        for name, value in (history or {}).items():
+        for name in self.history if history else ():
+            value = history[name]
             if self.history[name] == "double":
                 own[f"primvars:{name}"] = float(value)
             elif self.history[name] == "double3":
                 own[f"primvars:{name}"] = Gf.Vec3d(*map(float, value))
             else:
+                value = self._own(value)
                 value = value if self.point_vertices is None else value[self.point_vertices]
                 own[f"primvars:{name}"] = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(value, dtype=np.float32))
         if colours is not None:
@@ -98,6 +102,10 @@ class Target:
             shown = self._shown(colours, self.coloured, known)
             own[DISPLAY_COLOUR] = Vt.Vec3fArray.FromNumpy(np.nan_to_num(shown, copy=False))  # nobody sees the colour of a hole
         return own
+
+    def _own(self, values):
+        """The rows of its own vertices."""
+        return values if self.vertices is None else values[self.vertices]
 
     def _shown(self, values, primvar, known):
         """Values for the prim's own points or faces, in float32."""

@@ -11,7 +11,7 @@ from ..mesh.mesh import Mesh
 from ..scene.colliders import Collider
 from .chunks import ChunkWriter, check_scene
 from .gprims import define_colliders
-from .layers import artist_prim, define_lines, over_layer, scene_layer
+from .layers import artist_prim, define_cloth, define_lines, over_layer, scene_layer
 from .stage import carried, read_stage_mesh
 from .targets import Interpolation, check_primvars
 
@@ -51,6 +51,7 @@ class AnimationWriter(ChunkWriter):
         lines: Mapping[str, tuple[np.ndarray, float]] | None = None,
         colliders: Sequence[Collider] = (),
         history: Mapping[str, str] | None = None,
+        cloths: Mapping[str, str] | None = None,
     ) -> None:
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
@@ -71,7 +72,9 @@ class AnimationWriter(ChunkWriter):
                 `lines.lines_of` finds those of a scene. Not allowed with a source.
             colliders: Drawn as gprims under /World/Colliders, with their motion; a layer over a source has none.
             history: Type of each primvar of the history of a run, by name: "float3[]", a vector for each vertex, or "double3"
-                or "double", a vector or a number of the whole cloth.
+                or "double", a vector or a number of the whole cloth; of several cloths the first has those of the whole.
+            cloths: For a mesh whose parts have a prim each, the prims by part: names under /World, or with a source paths.
+                Primvars are not allowed then.
 
         Raises:
             FileNotFoundError: The output's folder or the source does not exist.
@@ -82,13 +85,21 @@ class AnimationWriter(ChunkWriter):
         check_scene(fps, up_axis)
         primvars, history = dict(primvars or {}), dict(history or {})
         check_primvars(primvars | dict.fromkeys(history, "vertex"), mesh)
-        self._start, self._moving_space, files, refit = 0.0, None, (), None
+        if cloths and primvars:
+            raise ValueError("primvars are given for several cloths, which have none; write each cloth by itself")
+        each = [_of_part(mesh, *named) for named in cloths.items()] if cloths else [(None, mesh, prim)]
+        self._start, self._moving_spaces, files, refit = 0.0, {}, (), None
         if source is None:
-            rest, target, root_metadata = scene_layer(mesh, pins, up_axis, prim or "Cloth")
-            target = replace(target, primvars=primvars, history=history)
+            (vertices, own, name), *others = each
+            rest, target, root_metadata = scene_layer(own, _pins_of(pins, vertices), up_axis, name or "Cloth")
+            targets = [replace(target, primvars=primvars, history=history, vertices=vertices)]
+            for vertices, own, name in others:
+                target = define_cloth(rest, own, _pins_of(pins, vertices), name)
+                targets.append(replace(target, history=_of_vertices(history), vertices=vertices))
             # Clips have samples alone; a name, type and interpolation have to stand on the stage itself.
-            target.declare(rest, [f"primvars:{name}" for name in (*primvars, *history)])
-            targets = [target, *define_lines(rest, mesh, lines or {})]
+            for target in targets:
+                target.declare(rest, [f"primvars:{name}" for name in (*target.primvars, *target.history)])
+            targets += define_lines(rest, mesh, lines or {})
             define_colliders(rest, colliders, mesh)
             if colliders:  # whose keyframes are in this layer, and would be read at 24 a second otherwise
                 rest.timeCodesPerSecond = float(fps)
@@ -96,15 +107,21 @@ class AnimationWriter(ChunkWriter):
             for name, given in (("pins", pins), ("lines", lines)):
                 if given:
                     raise ValueError(f"{name}: a source has its own, and a layer over it writes none; leave them out")
-            rest, target, root_metadata, stage, files, transform_at = over_layer(source, prim, mesh, primvars, history)
-            targets = [target]
+            rest, targets, stages = None, [], []
+            for vertices, own, name in each:
+                of_cloth = _of_vertices(history) if targets else history
+                found = over_layer(source, name, own, primvars, of_cloth, rest)
+                rest, target, root_metadata, stage, files, transform_at = found
+                if transform_at:
+                    self._moving_spaces[len(targets)] = _MovingSpace(transform_at, stage, fps)
+                targets.append(replace(target, vertices=vertices))
+                stages.append(stage)
             if stage.start is not None:
                 self._start = stage.start * fps / stage.time_codes_per_second
-            if transform_at:
-                self._moving_space = _MovingSpace(transform_at, stage, fps)
 
             def refit():
-                artist_prim(read_stage_mesh(source, stage.prim, time=0.0), mesh)
+                for stage, (_vertices, own, _name) in zip(stages, each, strict=True):
+                    artist_prim(read_stage_mesh(source, stage.prim, time=0.0), own)
 
         root_metadata |= {"timeCodesPerSecond": float(fps), "framesPerSecond": float(fps)}
         self._put_on(rest, targets, root_metadata, metadata, source, files, refit)
@@ -130,17 +147,39 @@ class AnimationWriter(ChunkWriter):
         """
         self._check_open()
         vectors = {"points": self._checked("points", points), "velocities": self._checked("velocities", velocities)}
-        values = [(self._checked_primvars(primvars), None, history), *[({},)] * (len(self._targets) - 1)]
-        targets = self._targets
-        if self._moving_space:
-            transform, vectors["velocities"] = self._moving_space.at(self.frames, **vectors)
-            targets = [replace(targets[0], transform=transform)]
-        samples = {
-            f"{target.prim}.{name}": value
-            for target, own in zip(targets, values, strict=True)
-            for name, value in target.samples(vectors, *own).items()
-        }
+        primvars, samples = self._checked_primvars(primvars), {}
+        for k, target in enumerate(self._targets):
+            own = vectors
+            if k in self._moving_spaces:
+                of_cloth = slice(None) if target.vertices is None else target.vertices
+                own = vectors | {"velocities": np.array(vectors["velocities"], dtype=np.float64)}
+                found = self._moving_spaces[k].at(self.frames, own["points"][of_cloth], own["velocities"][of_cloth])
+                transform, own["velocities"][of_cloth] = found
+                target = replace(target, transform=transform)
+            found = target.samples(own, {} if k else primvars, None, history)
+            samples |= {f"{target.prim}.{name}": value for name, value in found.items()}
         self._append(self._start + self.frames, samples)
+
+
+def _of_part(mesh, name, prim):
+    """The vertices of a part, its mesh and the prim."""
+    own = mesh.part(name)
+    first = (mesh.parts or {})[name].first
+    return slice(first, first + len(own.points)), own, prim
+
+
+def _pins_of(pins, vertices):
+    """Pins by name, those among the vertices of a part, counted from its first."""
+    if vertices is None or not pins:
+        return pins
+    found = {name: np.asarray(given) for name, given in pins.items()}
+    found = {name: given[(given >= vertices.start) & (given < vertices.stop)] - vertices.start for name, given in found.items()}
+    return {name: given for name, given in found.items() if len(given)}
+
+
+def _of_vertices(history):
+    """The types of the primvars of a history that have a value for each vertex."""
+    return {name: kind for name, kind in history.items() if kind == "float3[]"}
 
 
 class _MovingSpace:
