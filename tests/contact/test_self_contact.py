@@ -349,6 +349,27 @@ def test_copies(name, device):
 
 
 @each_solver
+def test_resets_that_are_refused(name, device):
+    """A copy is not reset to sheets that coincide or cross; the others, and where it was, stay as they were."""
+    scene = layers(n=3, turn=17.0)
+    stepper = SOLVERS[name].bind(scene.build(device=device, copies=2))
+    stepper.frame()
+    before, starts = stepper.state.copy(), np.stack([scene.positions, scene.positions])
+    starts[1, 9:] = starts[1, :9]
+    with pytest.raises(ValueError, match=r"vertex 0 and triangle .* of copy 1 start 0 m apart; self_contact needs more than"):
+        stepper.reset([False, True], positions=starts)
+    starts[1, 9:] = scene.positions[9:]
+    starts[1, 9:, 1] = 0.3 * (starts[1, 9:, 0] - 0.013) + 0.1 * starts[1, 9:, 2]
+    with pytest.raises(ValueError, match=r"of copy 1 cross at the start"):
+        stepper.reset(positions=starts)
+    assert stepper.state == before
+    stepper.reset([True, False], positions=starts)
+    assert (stepper.state.x.numpy()[:18] == starts[0].astype(np.float32)).all()
+    stepper.frame()
+    assert np.isfinite(stepper.state.x.numpy()).all()
+
+
+@each_solver
 def test_nothing_is_there_without(name, device):
     stepper = SOLVERS[name].bind(replace(layers(), self_contact=None).build(device=device))
     assert stepper.pairs is None

@@ -96,7 +96,45 @@ class SelfSteps:
         Raises:
             ValueError: Naming the first pair.
         """
-        x = self.model.positions
+        near, split, gap, through, least = self._too_near(self.model.positions)
+        if not len(near) and not through:
+            return
+        crossing = [np.array([each[k] for each in through], dtype=np.int64).reshape(-1, 2 + k) for k in (0, 1)]
+        tangles = Tangles(self.model, state, *crossing, (near[:split], near[split:]), least)
+        if self.declared.crossing_start == "run":
+            self.tangles = tangles
+            return
+        rule = f'; {len(tangles)} pairs of triangles cross or are too near, crossing_start="run" takes these'
+        self._refuse_pairs(near, split, gap, through, least, rule)
+
+    def refuse_reset(self, mask, x):
+        """Refuses a reset of copies in ``mask`` (B,) to positions x (B·n, 3) at which cloth crosses or nearly touches cloth.
+
+        Returns:
+            Whether lists have got more room, so that what was recorded must be recorded again.
+        """
+        model, before = self.model, len(self.pairs.stencils)
+        x = np.where(np.repeat(mask, model.per_copy)[:, None], x, np.nan)  # which has no pairs
+        tangles, self.tangles = self.tangles, None
+        found = self._too_near(wp.array(x, dtype=model.vec3, device=model.device))
+        self.tangles = tangles
+        if len(found[0]) or found[3]:
+            self._refuse_pairs(*found, "")
+        return len(self.pairs.stencils) > before
+
+    def _refuse_pairs(self, near, split, gap, through, least, rule):
+        for stencil in near[:1]:
+            parts = (stencil[:1], stencil[1:]) if split else (stencil[:2], stencil[2:])
+            self._refuse_pair(parts, f"start {gap:.3g} m apart; self_contact needs more than {least:.3g} m{rule}")
+        self._refuse_pair(through[0], f"cross at the start; self_contact needs a start without crossings{rule}")
+
+    def _too_near(self, x):
+        """Lists the pairs at x and finds those that are too near.
+
+        Returns:
+            Pairs nearer than the least distance, how many of them are of a vertex, the gap of the first [m], edges that go
+            through triangles, and the least distance [m].
+        """
         self.launch_begin(x)
         while self.overflowed:
             self.grow()
@@ -104,7 +142,7 @@ class SelfSteps:
         of_vertices, of_edges = self.proximity.counts.numpy()
         stencils, points = self.proximity.stencils.numpy()[: of_vertices + of_edges], x.numpy().astype(np.float64)
         found, least = self.begun.gap.numpy()[: len(stencils)], FLOOR * self.declared.distance
-        ulps = 6.0 * float(np.finfo(np.float32).eps) * np.abs(points).max(initial=0.0)
+        ulps = 6.0 * float(np.finfo(np.float32).eps) * np.abs(points).max(initial=0.0, where=np.isfinite(points))
         least += ulps
         near = stencils[found < least]
         split = int(np.count_nonzero(found[:of_vertices] < least))
@@ -114,19 +152,8 @@ class SelfSteps:
             for own, other in ((edges[:, :2], edges[:, 2:]), (edges[:, 2:], edges[:, :2]))
             for each in crossings(points, own, self._triangles_of(other))
         ]
-        if not len(near) and not through:
-            return
-        crossing = [np.array([each[k] for each in through], dtype=np.int64).reshape(-1, 2 + k) for k in (0, 1)]
-        tangles = Tangles(self.model, state, *crossing, (near[:split], near[split:]), least)
-        if self.declared.crossing_start == "run":
-            self.tangles = tangles
-            return
-        rule = f'; {len(tangles)} pairs of triangles cross or are too near, crossing_start="run" takes these'
-        for stencil in near[:1]:
-            parts = (stencil[:1], stencil[1:]) if split else (stencil[:2], stencil[2:])
-            gap = found[np.argmax(found < least)]
-            self._refuse_pair(parts, f"start {gap:.3g} m apart; self_contact needs more than {least:.3g} m{rule}")
-        self._refuse_pair(through[0], f"cross at the start; self_contact needs a start without crossings{rule}")
+        gap = found[np.argmax(found < least)] if len(near) else np.inf
+        return near, split, gap, through, least
 
     def at_start(self):
         """U [J] at the start, and how many pairs touch there times ½Σ(r − d)² [m²], both (B,)."""

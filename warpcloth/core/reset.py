@@ -46,6 +46,8 @@ class Reset:
             )
         mask, x, v = self.on_device(mask, positions, velocities)
         x, v = model.positions if x is None else x, model.velocities if v is None else v
+        if stepper.pairs is not None and x is not model.positions and stepper.pairs.refuse_reset(mask.numpy(), x.numpy()):
+            stepper.record_again()
         if self._kernel is None:
             self._prepare()
         starts, words, carried = self._given
