@@ -481,6 +481,27 @@ def test_hard_contact_keeps_its_distance(solver):
     np.testing.assert_allclose(last[:, 1], R, rtol=1e-9)
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_resets_into_colliders_are_refused(threads, device):
+    """By vertex, copy and collider; of copies that are reset only, and pins may start anywhere."""
+    scene = falling([wc.Plane(name="floor"), wc.Sphere(radius=0.1, position=(0.0, 1.0, 0.0), name="ball")], pins=[2])
+    model = scene.build(copies=3, device=device, threads=threads if device == "cpu" else 1)
+    stepper = wc.Newton(substeps=2).bind(model)
+    start = np.tile(scene.positions, (3, 1, 1))
+    start[:, 2, 1] = -0.5
+    start[1, 4], start[2, 5, 1] = [0.0, 1.0, 0.0], -0.25
+    before = stepper.state.x.numpy()
+    for given in (start, wp.array(start.reshape(-1, 3), dtype=model.vec3, device=device)):
+        with pytest.raises(ValueError, match="^vertex 4 starts 0.1 m inside the collider ball in copy 1; it must be outside$"):
+            stepper.reset(positions=given)
+        with pytest.raises(ValueError, match="^vertex 5 starts 0.25 m inside the collider floor in copy 2; it must be outside$"):
+            stepper.reset([True, False, True], given)
+        assert (stepper.state.x.numpy() == before).all()
+    stepper.reset([True, False, False], start)
+    stepper.frame()
+    assert not stepper.inside and np.isfinite(stepper.state.x.numpy()).all()
+
+
 def test_an_equilibrium_rests_on_a_plane():
     scene = falling([wc.Plane()], n=3, height=0.9e-3)
     rest = wc.equilibrium(scene)

@@ -70,7 +70,16 @@ class Reset:
         mask = self._mask(mask)
         x = None if positions is None else self._vectors("positions", "m", positions)
         v = None if velocities is None else self._vectors("velocities", "m/s", velocities)
+        if x is not None and self.model.scene.colliders:
+            self._refuse_inside(mask.numpy(), x.numpy())
         return mask, x, v
+
+    def _refuse_inside(self, mask, x):
+        """Refuses positions (B·n, 3) at which a free vertex of a copy in ``mask`` (B,) is inside a collider, as at a start."""
+        model = self.model
+        points = model.in_scene_order(x.astype(np.float64)).reshape(model.copies, -1, 3)
+        for copy in np.flatnonzero(mask):
+            model.scene.refuse_inside(points[copy], f" in copy {copy}" if model.copies > 1 else "")
 
     def _mask(self, mask):
         """The mask on the device, (B,)."""

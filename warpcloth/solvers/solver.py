@@ -250,7 +250,7 @@ class Stepper:
 
         Keyframes, ``results`` and ``residual`` of these copies start again as well. The other copies are not affected. After
         the first call it allocates nothing. If all arguments are on the device and the solver has no residual, the host does
-        not wait.
+        not wait, unless positions are given with colliders, for which it checks them.
 
         Args:
             mask: Which copies to reset, (B,) truth values; None for all.
@@ -262,7 +262,8 @@ class Stepper:
         the model, and is read in place.
 
         Raises:
-            ValueError: If an argument is not allowed, or positions or velocities are given with ``integrator="bdf2"``.
+            ValueError: If an argument is not allowed, a free vertex of one of these copies would start inside a collider, or
+                positions or velocities are given with ``integrator="bdf2"``.
         """
         if self._reset is None:
             self._reset = Reset(self)
