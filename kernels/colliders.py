@@ -5,6 +5,7 @@ where its forces are taken, see :func:`move_colliders`.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -305,14 +306,28 @@ class FilterNotes:
 
     Where something is inside, ``inside`` is FIRST − ((step·n + vertex)(C + 1) + other), of n vertices and C colliders: other is
     the collider that held it back last, or C for a vertex that is not free. 0 where nothing is.
+
+    ``pushed`` and ``kicked``, (N,) or None, have what a cut changed in the position and the velocity of a vertex; others are
+    left as they are.
     """
 
     steps: wp.array(dtype=wp.int32)
     cut: wp.array(dtype=wp.int64)
     inside: wp.array2d(dtype=wp.int64)
+    pushed: wp.array(dtype=wp.vec3d)
+    kicked: wp.array(dtype=wp.vec3d)
 
 
 FIRST = wp.constant(wp.int64(2**62))
+
+
+@wp.func
+def note_cut(notes: FilterNotes, copy: int, i: int, pushed: Any, kicked: Any):
+    """Notes that vertex i of a copy was cut short, which changed its position and velocity by this."""
+    wp.atomic_add(notes.cut, copy, wp.int64(1))
+    if notes.pushed.shape[0] > 0:
+        notes.pushed[i] = wp.vec3d(wp.float64(pushed[0]), wp.float64(pushed[1]), wp.float64(pushed[2]))
+        notes.kicked[i] = wp.vec3d(wp.float64(kicked[0]), wp.float64(kicked[1]), wp.float64(kicked[2]))
 
 
 @wp.func
@@ -457,8 +472,9 @@ def outside(dtype):
                     cuts = rounds
                     last = c
         if cuts > 0:
-            v = velocity(v, move, change, push, h)
-            wp.atomic_add(notes.cut, copy, wp.int64(1))
+            after = velocity(v, move, change, push, h)
+            note_cut(notes, copy, i, end - x - move, after - v)
+            v = after
         if cuts == ROUNDS:
             for c in range(shape.radius.shape[0]):
                 d, _n = local_gap_of(to_local(poses.after[copy, c], end), shape.core[c], shape.radius[c])
@@ -560,10 +576,14 @@ def hold_locked(dtype):
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
+        notes: FilterNotes,
     ):
         i = wp.tid()
         for axis in range(3):
             if mobility[i][axis] == dtype(0.0):
+                if notes.pushed.shape[0] > 0:
+                    notes.pushed[i][axis] = wp.float64(0.0)
+                    notes.kicked[i][axis] = wp.float64(0.0)
                 if move:
                     move[i][axis] = move[i][axis] + x_before[i][axis] - x[i][axis]
                 x[i][axis] = x_before[i][axis]

@@ -23,6 +23,7 @@ from .colliders import (
     half_space,
     kept_part,
     local_gap_of,
+    note_cut,
     note_inside,
     of_pose,
     pose_types,
@@ -952,11 +953,12 @@ def filter_meshes(dtype):
                     cuts = rounds
                     last = c
         if cuts > 0:
-            v[i] = velocity(v[i], x[i] - x0, change, push, motion.h)
+            after = velocity(v[i], x[i] - x0, change, push, motion.h)
+            note_cut(notes, copy, i, end - x[i], after - v[i])
+            v[i] = after
             if move:
                 move[i] = move[i] + (end - x[i])
             x[i] = end
-            wp.atomic_add(notes.cut, copy, wp.int64(1))
         if cuts == ROUNDS:
             for c in range(count):
                 p = to_local(motion.before[copy, c], x0)

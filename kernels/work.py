@@ -11,6 +11,8 @@ from .term import Term
 from .transpose import LocalSource, gather, scatter
 from .vectors import types
 
+UNCUT, NOW = wp.constant(0), wp.constant(2)  # whether the filter cut the move of a vertex in this step; 1 is in the one before
+
 
 @cache
 def multiplier_pull(term: Term, dtype, scalar: bool):
@@ -231,6 +233,9 @@ def add_collider_work(dtype):
 
     Contact acts within the ``distance``. A step in which the two come nearer or part by more has them in contact for a part of
     it only, in which they share a move: the work of contact is then that of the part of Δx which δ has too.
+
+    Where the filter cut, Δx is the move without that, to ``uncut``, and forces are those of ``now`` alone, in this step and the
+    next. Δx then does not change the energy of contact by ∇U·(Δx − δ), which the filter has done: of_filter −= that.
     """
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
@@ -253,7 +258,8 @@ def add_collider_work(dtype):
     def add(
         # state in
         x_before: wp.array(dtype=vec3),
-        x: wp.array(dtype=vec3),
+        uncut: wp.array(dtype=vec3),
+        cuts: wp.array(dtype=wp.int32),
         now: collider_pulls(dtype),
         # parameters
         distance: dtype,
@@ -261,20 +267,118 @@ def add_collider_work(dtype):
         before: collider_pulls(dtype),
         of_collider: wp.array(dtype=wp.float64),
         against_friction: wp.array(dtype=wp.float64),
+        of_filter: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
-        moved = x[i] - x_before[i]
+        moved = uncut[i] - x_before[i]
         work = work_on(now, i, moved, distance)
         rubbed = wp.float64(0.0)
         if now.friction.shape[0] > 0:
             rubbed = product(now.friction[i], moved - now.move[i])
+        if cuts[i] == NOW:
+            of_filter[i] = of_filter[i] + work + rubbed - product(now.all[i], moved)
         if before.all.shape[0] > 0:
-            work = wp.float64(0.5) * (work + work_on(before, i, moved, distance))
+            if cuts[i] == UNCUT:
+                work = wp.float64(0.5) * (work + work_on(before, i, moved, distance))
+                if now.friction.shape[0] > 0:
+                    rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], moved - before.move[i]))
             before.all[i] = now.all[i]
             if now.friction.shape[0] > 0:
-                rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], moved - before.move[i]))
                 before.friction[i] = now.friction[i]
         of_collider[i] = of_collider[i] - work
         against_friction[i] = against_friction[i] + rubbed
 
     return add
+
+
+@cache
+def add_filter_work(dtype):
+    """Kernel over vertices, after a step: work of the filter += ½m(v² − v₋²) − (m g + f)·(x − x₋), x₋ and v₋ without it.
+
+    It sets ``uncut`` to x₋ and ``cuts``, and what the filter notes back to 0.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
+    def add(
+        # elements
+        mass: wp.array(dtype=dtype),
+        gravity: wp.array(dtype=vec3),
+        per_copy: int,
+        # state in
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        force: wp.array(dtype=vec3),
+        # in and out
+        pushed: wp.array(dtype=wp.vec3d),
+        kicked: wp.array(dtype=wp.vec3d),
+        uncut: wp.array(dtype=vec3),
+        cuts: wp.array(dtype=wp.int32),
+        of_filter: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        push = pushed[i]
+        kick = kicked[i]
+        uncut[i] = x[i]
+        cuts[i] = cuts[i] // 2
+        if wp.dot(push, push) + wp.dot(kick, kick) > wp.float64(0.0):
+            uncut[i] = x[i] - vec3(dtype(push[0]), dtype(push[1]), dtype(push[2]))
+            cuts[i] = NOW
+            m = wp.float64(mass[i])
+            g = gravity[i // per_copy]
+            pull = m * wp.vec3d(wp.float64(g[0]), wp.float64(g[1]), wp.float64(g[2]))
+            if force.shape[0] > 0:
+                pull += wp.vec3d(wp.float64(force[i][0]), wp.float64(force[i][1]), wp.float64(force[i][2]))
+            mean = wp.vec3d(wp.float64(v[i][0]), wp.float64(v[i][1]), wp.float64(v[i][2])) - wp.float64(0.5) * kick
+            of_filter[i] = of_filter[i] + m * wp.dot(mean, kick) - wp.dot(pull, push)
+            pushed[i] = wp.vec3d()
+            kicked[i] = wp.vec3d()
+
+    return add
+
+
+@wp.kernel(module="warpcloth.work.colliders", enable_backward=False)
+def add_stored(
+    # elements
+    stencil: wp.array2d(dtype=wp.int32),
+    # state in
+    energies: wp.array(dtype=wp.float64),
+    cuts: wp.array(dtype=wp.int32),
+    # in and out
+    before: wp.array(dtype=wp.float64),
+    of_filter: wp.array(dtype=wp.float64),
+):
+    """Kernel over elements of contact: work of the filter += the change of their energies in a step that it cut."""
+    e = wp.tid()
+    i = stencil[e, 0]
+    if cuts[i] == NOW:
+        of_filter[i] = of_filter[i] + energies[e] - before[e]
+    before[e] = energies[e]
+
+
+@cache
+def limit_pulls(dtype):
+    """Kernel over vertices: scales ∇U of a collider by ‖f‖/‖∇U‖, ∇U of all, where that is below ½.
+
+    f is the force that a step gave the vertex by contact. It is −∇U where the step converged; else ∇U may be of a vertex that
+    is far inside, and millions of times as much.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
+    def limit(
+        # state in
+        given: wp.array(dtype=vec3),
+        taken: wp.array(dtype=vec3),
+        # in and out
+        pulls: collider_pulls(dtype),
+    ):
+        i = wp.tid()
+        most = wp.length(given[i])
+        size = wp.length(taken[i])
+        if size > dtype(2.0) * most:
+            pulls.all[i] = (most / size) * pulls.all[i]
+            if pulls.friction.shape[0] > 0:
+                pulls.friction[i] = (most / size) * pulls.friction[i]
+
+    return limit

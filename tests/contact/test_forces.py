@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 import warpcloth as wc
 from warpcloth.cli import main
@@ -152,6 +153,81 @@ def test_a_collider_that_jumps_does_the_work_that_the_cloth_gets(name, device):
     assert energies["kinetic"][2] == pytest.approx(1.5 * (0.1 * scene.fps) ** 2, rel=2.0 * R / 0.1)
 
 
+def test_the_filter_takes_the_energy_of_what_it_stops(device):
+    """Of beads at a floor ½mv², of those that it leaves r/10 above it all; of one that slides on, what is normal to a slope."""
+    tilt = np.array([np.sin(0.5), np.cos(0.5), 0.0])
+    start = np.array([[0.0, 1.0, 0.0], [1.0, 2.0, 0.0], [2.0, 1.5, 0.0]])
+    v = np.array([[0.0, -50.0, 0.0], [3.0, -80.0, 1.0], [4.0, -60.0, 0.0]])
+    masses = np.array([1.0, 2.0, 3.0])
+    before = (masses * (v**2).sum(axis=1)).sum() / 2.0
+    for normal in (np.array([0.0, 1.0, 0.0]), tilt):
+        scene = wc.Scene(
+            wc.Mesh.chain(3),
+            masses=masses,
+            positions=start,
+            velocities=v,
+            gravity=(0.0, 0.0, 0.0),
+            colliders=[wc.Plane(normal=normal, position=-2.0 * normal)],
+            contact=wc.Contact(distance=R, stiffness=1e-9),
+        )
+        for solver in (wc.Explicit(substeps=1), wc.Newton(substeps=1, integrator="midpoint"), wc.PBD(substeps=1)):
+            given = {"device": device, "dtype": "float64", "frames": 12, "record": "energies"}
+            run = wc.simulate(scene, solver, **given)
+            normal_part = (masses * (v @ normal) ** 2).sum() / 2.0
+            assert run.energies["kinetic"][-1] == pytest.approx(before - normal_part, rel=1e-6)
+            assert run.energies["work of the filter"][-1] == pytest.approx(-normal_part, rel=1e-6)
+            sums = total(run.energies)
+            np.testing.assert_allclose(sums, sums[0], rtol=1e-8)  # of the tolerance of Newton's method
+
+
+def jumping(shape, friction=0.0):
+    """A hanging sheet, and a collider that jumps by centimetres in each frame."""
+    jumps = np.random.default_rng(1).normal(scale=0.03, size=(12, 3))
+    jumps[0] = 0.0
+    position = np.array([0.25, -0.106, 0.23]) + np.cumsum(jumps, axis=0)
+    if shape == "mesh":
+        box = trimesh.creation.box((0.2, 0.2, 0.2))
+        collider = wc.MeshCollider(box.vertices, box.faces, position=position, friction=friction)
+    else:
+        collider = wc.Sphere(radius=0.1, position=position, friction=friction)
+    return wc.Scene(
+        wc.Mesh.grid(8, 8, size=0.5),
+        density=DENSITY,
+        terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)],
+        colliders=[collider],
+        contact=wc.Contact(distance=R),
+        pins="corners",
+    )
+
+
+JUMPS = [("sphere", 0.0, "float64"), ("sphere", 0.3, "float32")]
+JUMPS += [pytest.param("mesh", 0.3, "float64", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize(("shape", "friction", "dtype"), JUMPS)
+def test_works_balance_with_cuts_too_to_the_order_of_the_scheme(shape, friction, dtype, device):
+    """Nearly all that explicit steps get is of the filter; a box, whose edges cut often, needs shorter steps."""
+    gaps = []
+    for substeps in (64, 128):
+        solver = wc.Explicit(substeps=substeps)
+        run = wc.simulate(jumping(shape, friction), solver, device=device, dtype=dtype, frames=11, record="energies")
+        sums = total(run.energies)
+        gaps.append(np.abs(sums - sums[0]).max())
+    of_filter = np.abs(run.energies["work of the filter"]).max()
+    assert run.cut > 1e-3 and of_filter > 0.01
+    assert gaps[1] < 0.7 * gaps[0] and gaps[1] < 0.1 * of_filter
+
+
+def test_steps_that_do_not_converge_have_works_of_the_same_size(device):
+    """ADMM leaves vertices so deep inside that ∇U there, times the way of the ball, is 10 000 times the work of Newton's method."""
+    found = []
+    for solver in (wc.Newton(substeps=4), wc.ADMM(substeps=4, iterations=10)):
+        run = wc.simulate(jumping("sphere"), solver, device=device, dtype="float64", frames=11, record="energies")
+        found.append(run.energies["work of colliders"][-1] + run.energies["work of the filter"][-1])
+    assert "used up" in run.status.message
+    assert found[1] == pytest.approx(found[0], rel=0.5)
+
+
 def test_forces_of_an_implicit_step_balance_its_momentum(device):
     """Of pins and a ball together, where the ball takes no friction, which is of another N than that of the step."""
     scene = pushed(0.0)
@@ -208,7 +284,7 @@ def test_copies_have_forces_of_their_own(device):
         assert batch.cuts.shape == (5, 2)
     assert list(alone.energies) == [
         *("Spring", "QuadraticBending", "contact with ball", "friction on ball", "contact with ball 2"),
-        *("kinetic", "gravity", "work of colliders", "heat of friction"),
+        *("kinetic", "gravity", "work of colliders", "work of the filter", "heat of friction"),
     ]
 
 

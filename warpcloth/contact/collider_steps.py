@@ -48,6 +48,9 @@ class ColliderSteps:
         steps_per_frame: As given.
         notes: :class:`warpcloth.kernels.colliders.FilterNotes`.
         steps: Steps that the colliders have made, (B,) int32.
+        correction: x − x̃ of the steps with contact (N,) [m], or None for explicit steps; of the effective step ``he`` [s].
+        pushed, kicked: What the filter changed in positions [m] and velocities [m/s] since these were 0, (N,) double precision,
+            after :meth:`note_pushes`.
     """
 
     def __init__(self, model, state, h, steps_per_frame, part):
@@ -67,6 +70,7 @@ class ColliderSteps:
         self.notes.steps = self.steps
         self.notes.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
         self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
+        self.correction, self.he = None, h
         self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
         self._spare, self._reads, self._again = None, False, False
@@ -170,6 +174,11 @@ class ColliderSteps:
         """By how much the bounds of a collider move on in a step, at most [m]."""
         return max(collider.centred().most_move for collider in self.model.scene.colliders) / self.steps_per_frame
 
+    def note_pushes(self):
+        """Allocates ``pushed`` and ``kicked``, which the filter then keeps; steps that were recorded are recorded again."""
+        self.pushed, self.kicked = (wp.zeros(self.model.count, dtype=wp.vec3d, device=self.model.device) for _ in range(2))
+        self.notes.pushed, self.notes.kicked = self.pushed, self.kicked
+
     def launch_end(self, x, v, move=None):
         """Keeps vertices that would end in a collider or cross one out of it, in x, v and ``move`` (N,)."""
         model = self.model
@@ -178,7 +187,7 @@ class ColliderSteps:
                 wp.copy(wanted, array)
         self._launch_filter(model.inverse_mass, x, v, move, self.notes)
         if model.mobility is not None:  # those who then end inside are noted like pins
-            model.launch(self._hold, model.count, [model.mobility, *self._wanted], [x, v, move])
+            model.launch(self._hold, model.count, [model.mobility, *self._wanted], [x, v, move, self.notes])
             self._launch_filter(self._fixed, x, v, move, self.notes)
         if not self._again:
             self.launch_count()

@@ -59,6 +59,7 @@ class ContactGuard:
     def follow(self):
         """Makes steps refresh the terms of contact as well."""
         self.followed = True
+        self.data.notes = self.colliders.notes
         self.colliders.follow()
 
     def launch_start(self, x):

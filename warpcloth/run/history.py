@@ -10,7 +10,7 @@ import warp as wp
 from ..base.checks import shown
 from ..base.texts import numbered
 from ..base.turns import in_turn
-from ..contact.collider_work import ColliderWork
+from ..contact.collider_work import ColliderWork, FilterWork
 from ..contact.present import ColliderPulls, PresentContact
 from ..core.capture import Segment
 from ..core.energy import Energy
@@ -55,7 +55,8 @@ def _term_names(scene):
 def _other_names(scene):
     moved = any(collider.moves for collider in scene.colliders)
     others = ["kinetic", "gravity", *["work of pins"] * scene.pins.moves, *["work of loads"] * bool(scene.loads)]
-    return others + ["work of colliders"] * moved + ["heat of friction"] * bool(scene.rubbing)
+    others += ["work of colliders"] * moved + ["work of the filter"] * bool(scene.colliders)
+    return others + ["heat of friction"] * bool(scene.rubbing)
 
 
 def collider_names(scene: Scene) -> list[str]:
@@ -191,8 +192,9 @@ def _kept(name):
 class History:
     """Wraps a stepper and records energies and reactions after each frame, without changing its state.
 
-    Work that depends on the path, that of moving pins and colliders, of loads that change or follow the cloth, and against
-    friction, is summed in every step, and steps are then launched one by one; frames stay equal to the bit.
+    Work that depends on the path, that of moving pins and colliders, of loads that change or follow the cloth, against
+    friction and of the filter of colliders, is summed in every step, and steps are then launched one by one; frames stay equal
+    to the bit.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
@@ -205,8 +207,8 @@ class History:
         reactions: Of each frame that was kept, (F, B, p, 3) [N].
         forces: On the colliders, and of these the part of friction, of each frame that was kept, (F, B, C, 2, 3) [N].
         cuts: The share of the moves in each frame that was kept which colliders cut short, (F, B).
-        totals: Work of pins, without their kinetic energy, of loads, of colliders and against friction in the last frame that
-            was kept, (4, B) [J].
+        totals: Work of pins, without their kinetic energy, of loads, of colliders, against friction and of the filter in the
+            last frame that was kept, (5, B) [J].
 
     Raises:
         ValueError: If a term is hard and the solver has no multipliers.
@@ -224,6 +226,7 @@ class History:
         self._moving, self._driven, self._rubbed, self._touched = (
             asked and each for each in (scene.pins.moves, changing, rubbed, touched)
         )
+        self._filtered = asked and bool(scene.colliders)
         forces = "reactions" in record or self._moving or self._touched
         self._evaluation = Evaluation(model, stepper.h, stepper, forces)
         self._found, self._frame = deque(), 0
@@ -231,9 +234,9 @@ class History:
         self._rows = {name: [] for name in (*record, *of_colliders)}
         self.carried = (*self._rows, "totals")  # from frame to frame
         self.names = self._evaluation.names
-        self._total, self._each_step, self._cut = np.zeros((4, model.copies)), None, np.zeros(model.copies)
+        self._total, self._each_step, self._cut = np.zeros((5, model.copies)), None, np.zeros(model.copies)
         x, v = stepper.state
-        if self._moving or self._driven or self._touched:
+        if self._moving or self._driven or self._filtered:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
         self._note()
@@ -243,22 +246,25 @@ class History:
         model, evaluation = self.model, self._evaluation
         self._before = before = kernels.past(model.dtype)()
         before.x, before.gradient, before.force = (model.vectors() for _ in range(3))
-        self._works = [wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(4)]
+        self._works = [wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(5)]
         held, gradient = (evaluation.mask(), evaluation.gradient) if self._moving else (None, None)
         force, kernel = None if model.loads is None else model.loads.force, model.kernel(kernels.add_work, model.dtype)
         share = 0.5 if self._stepper.loads_at_end else 0.0
         self._touches = []
-        for stepper, first, end in self._stepper.shares if self._touched else ():
+        for stepper, first, end in self._stepper.shares if self._filtered else ():
             vertices = slice(first * model.per_copy, end * model.per_copy)
             sums = [work[vertices] for work in self._works[2:]]
             stepper.follow_contact()
-            given = stepper.model.terms, stepper.state.x, *sums, stepper.constraint_forces
-            touches = ColliderWork(stepper.colliders, *given)
-            self._touches.append((touches, vertices))
+            cuts, touches, terms = FilterWork(stepper, sums[-1]), None, stepper.model.terms
+            if self._touched or not any(elements.hard and elements.collider is not None for elements in terms):
+                touches = ColliderWork(stepper.colliders, terms, cuts, *sums, stepper.constraint_forces)
+            self._touches.append((cuts, touches, vertices))
 
         def launch():
-            for touches, _vertices in self._touches:
-                touches.launch()
+            for cuts, touches, _vertices in self._touches:
+                cuts.launch()
+                if touches:
+                    touches.launch()
             if self._moving or self._driven:
                 if self._moving:
                     evaluation.launch(x, v)
@@ -277,8 +283,10 @@ class History:
         if self._moving or self._touched:
             self._evaluation.launch(x, v)
             wp.copy(before.gradient, self._evaluation.gradient)
-        for touches, vertices in self._touches:
-            touches.begin(self._evaluation.pulls.found, vertices)
+        for cuts, touches, vertices in self._touches:
+            cuts.begin()
+            if self._touched:
+                touches.begin(self._evaluation.pulls.found, vertices)
 
     def __getattr__(self, name):
         return getattr(self._stepper, name)
@@ -295,6 +303,8 @@ class History:
             for total, work in zip(self._total, self._works, strict=True):
                 total += work.numpy().reshape(self.model.copies, -1).sum(axis=1)
                 work.zero_()
+            if self._touches:
+                self._total[4] += np.concatenate([cuts.elastic() for cuts, _touches, _vertices in self._touches])
         self._frame += 1
         self._note()
 
@@ -307,7 +317,7 @@ class History:
                 energies["work of pins"] = self._total[0] + evaluation.kinetic_of_pins(v) - self._kinetic
             if self._driven:
                 energies["work of loads"] = self._total[1].copy()
-            energies["work of colliders"] = self._total[2].copy()
+            energies["work of colliders"], energies["work of the filter"] = self._total[2].copy(), self._total[4].copy()
             if self._rubbed:
                 stored = sum(energies[name] for name in evaluation.names_of_friction)
                 energies["heat of friction"] = self._total[3] - stored

@@ -269,9 +269,10 @@ class ExplicitStepper(LaunchedStepper):
         self.record((lambda: self.launch_steps(1), 1))
 
     def follow_contact(self):
+        self.colliders.note_pushes()
         if self.plan.guard is not None:
             self.plan.guard.follow()
-            super().follow_contact()
+        self._record_step()
 
     def launch_steps(self, steps):
         self._steps.launch(steps, self.launch_end_of if self.plan.guard is None else self.launch_pins_of)

@@ -31,6 +31,7 @@ class ImplicitStepper(Stepper):
 
     def follow_contact(self):
         super().follow_contact()
+        self._record_end()
         if self.clear_steps is not None:
             self.clear_steps.record()
 

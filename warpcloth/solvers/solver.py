@@ -129,10 +129,11 @@ class Stepper:
         return [] if self.colliders is None else self.colliders.inside()
 
     def follow_contact(self):
-        """Makes steps keep the positions where they began and refresh contact whatever is near, to the same motion.
+        """Makes steps keep the positions where they began and what the filter changed, and refresh contact whatever is near.
 
-        Who reads these of :attr:`colliders` after a step calls it first, and takes steps one by one.
+        The motion stays the same. Who reads these of :attr:`colliders` after a step calls it first, and takes steps one by one.
         """
+        self.colliders.note_pushes()
         if self.clear_steps is not None:
             self.clear_steps.follow()
 
@@ -200,6 +201,7 @@ class Stepper:
         """x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser."""
         self.integrator.launch_finish(correction)
         if self.colliders is not None:
+            self.colliders.correction, self.colliders.he = correction, self.he
             self.colliders.launch_end(*self.state, self.state.arrays.get("move before"))
         if self.pairs is not None:
             self.pairs.launch_end(*self.state, self.state.arrays.get("move before"))
