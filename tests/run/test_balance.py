@@ -74,6 +74,8 @@ def test_what_gains_energy_is_named(name, device):
     assert not animation.status.ok and said in animation.status.message
     assert len(animation.points) == animation.status.frame + 1 > 1 and np.isfinite(animation.points).all()
     assert animation.worst_strain < balance.STRETCHED
+    gains, midpoint = "gained energy" in animation.status.message, getattr(solver, "integrator", None) == "midpoint"
+    assert ("take a shorter one, or bdf2" in animation.status.message) == (gains and midpoint)
 
 
 def test_the_command_line_says_so_and_keeps_the_good_frames(tmp_path, capsys, monkeypatch, device):

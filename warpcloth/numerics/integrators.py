@@ -27,6 +27,7 @@ class Euler:
         part: hₑ/h.
         pin_parts: In which the pins make the way of a step.
         hard: Whether it takes constraints of infinite stiffness.
+        damps: Whether it damps what its steps do not resolve.
         to_and_fro: Whether Gauss–Seidel sweeps must change their direction, because it does not damp what one order adds.
         least_weight: Number of iterations times the least automatic weight of ADMM. A small weight needs many iterations, and
             what a step leaves unfinished becomes a velocity in the next one, which midpoint keeps and Euler damps.
@@ -36,6 +37,7 @@ class Euler:
     part: ClassVar[float] = 1.0
     pin_parts: ClassVar[int] = 1
     hard: ClassVar[bool] = True
+    damps: ClassVar[bool] = True
     to_and_fro: ClassVar[bool] = False
     least_weight: ClassVar[float] = 2.0
     least_factor: ClassVar[float] = -1.0 / 3.0
@@ -77,7 +79,7 @@ class Euler:
 class Midpoint(Euler):
     """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Second order. At xₘ pins are where they are at t + h/2."""
 
-    part, pin_parts, hard, to_and_fro, least_weight, least_factor = 0.5, 2, False, True, 20.0, 0.0
+    part, pin_parts, hard, damps, to_and_fro, least_weight, least_factor = 0.5, 2, False, False, True, 20.0, 0.0
 
     @staticmethod
     def growth(q):

@@ -115,7 +115,7 @@ class Balance:
     def __init__(self, model, stepper):
         self.model = model
         self._h = stepper.h
-        self._staggered = stepper.options.staggered
+        self._staggered, self._damps = stepper.options.staggered, stepper.options.damps
         arrays = (model.positions, model.mass, model.inverse_mass)
         points, mass, inverse = (model.in_scene_order(array.numpy()).astype(np.float64) for array in arrays)
         self.mass = np.where(inverse > 0.0, mass, 0.0).reshape(model.copies, -1)
@@ -189,6 +189,10 @@ class Balance:
         return (
             f"it has gained energy, {self.has[copy]:.3g} J of motion and height, of which {names} can have put in no more "
             f"than {self.given[copy]:.3g} J"
+        ) + (
+            ""
+            if self._damps
+            else "; midpoint adds energy where springs turn or stretch by much in a step: take a shorter one, or bdf2"
         )
 
     def suffices(self, copy, points, stretch):

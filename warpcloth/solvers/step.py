@@ -91,6 +91,11 @@ class Step:
         return self.residual
 
     @property
+    def damps(self) -> bool:
+        """Whether its steps damp what they do not resolve, or have a limit above which they are refused."""
+        return True
+
+    @property
     def divides(self) -> bool:
         """Whether several threads can share the steps of one cloth."""
         return False
@@ -226,6 +231,11 @@ class ImplicitStep(Step):
     """
 
     integrator: Literal["euler", "midpoint", "bdf2"] = "euler"
+
+    @property
+    def damps(self) -> bool:
+        """See :class:`Step`; midpoint does not."""
+        return INTEGRATORS[self.integrator].damps
 
     def refuse_hard(self, model):
         """Refuses infinite stiffness with an integrator that cannot take it."""
