@@ -219,7 +219,7 @@ def test_works_balance_with_cuts_too_to_the_order_of_the_scheme(shape, friction,
 
 
 def test_steps_that_do_not_converge_have_works_of_the_same_size(device):
-    """ADMM leaves vertices so deep inside that ∇U there, times the way of the ball, is 10 000 times the work of Newton's method."""
+    """ADMM leaves vertices so deep inside that ∇U there, times the way of the ball, is 10 000 times the work of the ball."""
     found = []
     for solver in (wc.Newton(substeps=4), wc.ADMM(substeps=4, iterations=10)):
         run = wc.simulate(jumping("sphere"), solver, device=device, dtype="float64", frames=11, record="energies")
