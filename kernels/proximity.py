@@ -583,7 +583,7 @@ def extend_boxes(dtype):
 @cache
 def find_motion(dtype):
     """Kernel over vertices: moved = 1 if one has moved on from ``found``, relative to the middle of its piece, by more than
-    ``most``."""
+    ``most``; stale = 1 if ``found`` is not where the pairs were listed."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -591,14 +591,18 @@ def find_motion(dtype):
         # state in
         x: wp.array(dtype=vec3),
         found: wp.array(dtype=vec3),
+        listed: wp.array(dtype=vec3),
         # parameters
         most: dtype,
         # in and out
         pieces: pieces(dtype),
         # out
         moved: wp.array(dtype=wp.int32),
+        stale: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
+        if not (wp.length_sq(found[i] - listed[i]) <= dtype(0.0)):
+            stale[0] = 1
         p = pieces.piece[i]
         if p >= 0:
             c = pieces.centre[p]

@@ -332,6 +332,39 @@ def test_more_pairs_than_there_is_room_for(name, device):
 
 
 @each_solver
+def test_list_of_a_state(name, device):
+    """Steps after a state was taken are the same, to the bit, whatever the stepper that takes them has listed before."""
+    scene = layers(turn=17.0, speed=1.0)
+    one, other = (SOLVERS[name].bind(scene.build(device=device)) for _ in range(2))
+    for _ in range(2):
+        one.frame()
+    other.frame()
+    other.state.assign(one.state)
+    for stepper in (one, other):
+        stepper.frame()
+    assert one.state == other.state
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_lists_are_kept(count, device):
+    """Sheets that fall together are listed once; a list that was made elsewhere is made anew, where the state says."""
+    pairs, model = steps_of(layers(count), device)
+    pairs.launch_begin(model.positions)
+    first, listed = model.positions.numpy(), pairs.proximity.stencils.numpy()
+    fallen = model.array(first - np.array([0.0, 1.0, 0.0]), model.vec3)
+    pairs.launch_begin(fallen)
+    assert (pairs.proximity.found.numpy() == first).all()
+    rolled = model.array(first * [1.0, 1.0, 0.5], model.vec3)
+    pairs.launch_begin(rolled)
+    assert (pairs.proximity.found.numpy() == rolled.numpy()).all()
+    wp.copy(pairs.proximity.found, model.positions)
+    pairs.launch_begin(fallen)
+    assert (pairs.proximity.found.numpy() == first).all()
+    number = pairs.proximity.counts.numpy().sum()
+    assert (pairs.proximity.stencils.numpy()[:number] == listed[:number]).all()
+
+
+@each_solver
 def test_copies(name, device):
     """Each of two copies moves as one alone, to the bit, and again after it was put back."""
     scene = layers(turn=17.0, speed=1.0)

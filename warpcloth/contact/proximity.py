@@ -32,6 +32,7 @@ class Proximity:
         counts: (2,) int32: how many pairs of either kind were found, which may be more than the capacity.
         first, corners: The corners of pairs at each vertex i, sorted: 4·pair + corner in ``corners`` from first[i] to
             first[i+1].
+        found: Positions of the last list, (N,) [m]. Whoever sets them calls :meth:`launch_kept` before the list is used.
         flag: (1,) int32, see :meth:`moved`.
     """
 
@@ -52,8 +53,9 @@ class Proximity:
             setattr(self._surface, name, value)
         self._allocate_grid()
         self._set_pieces(piece, points)
-        self._found = wp.clone(model.positions)
-        self.flag = wp.zeros(1, dtype=wp.int32, device=device)
+        self.found = model.vectors()  # no surface, from which all have moved
+        self._listed = model.vectors()  # those of the pairs in the arrays
+        self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self._rows = Scan(model, model.count + self._edges)
         self._vertices = Scan(model, model.count)
         self._pairs_of = {each: model.kernel(kernels.find_pairs, model.dtype, each) for each in (False, True)}
@@ -135,6 +137,7 @@ class Proximity:
             return wp.zeros(count, dtype=dtype, device=model.device)
 
         self.capacity = capacity
+        self._listed.fill_(np.nan)
         self.stencils, self.distances = zeros(capacity, wp.vec4i), zeros(capacity, model.dtype)
         self.first, self.corners = zeros(model.count + 1), zeros(4 * capacity)
         self._arrays = {
@@ -155,10 +158,11 @@ class Proximity:
         """Launches the detection at positions x (N,)."""
         surface, grid, pairs, N = self._surface, self._grid, self._pairs, self.model.count
         items, own = self._triangles + self._edges, self._arrays
-        wp.copy(self._found, x)
+        if x is not self.found:
+            wp.copy(self.found, x)
+        wp.copy(self._listed, x)
         if self._pieces.per_copy > 1:
-            self._launch(kernels.begin_boxes, len(self._pieces.centre), [x], [self._pieces])
-            self._launch(kernels.extend_boxes, N, [x], [self._pieces])
+            self._launch_boxes(x)
         self.counts.zero_()
         self._grid_arrays["levels"].zero_()
         self._launch(kernels.count_items, items, [surface, x], [grid])
@@ -174,6 +178,18 @@ class Proximity:
         self._launch(kernels.fill_corners, self.capacity, [self.first], [pairs, self.corners])
         self._launch(kernels.sort_corners, N, [self.first], [self.corners])
 
+    def _launch_boxes(self, x):
+        self._launch(kernels.begin_boxes, len(self._pieces.centre), [x], [self._pieces])
+        self._launch(kernels.extend_boxes, self.model.count, [x], [self._pieces])
+
+    def launch_kept(self, x, part, launch):
+        """Launches ``launch`` of x where :meth:`moved` says so, else of ``found`` if the list is not that of ``found``.
+
+        So the list is a function of x and ``found`` alone, whatever was listed since ``found`` was set.
+        """
+        flag = self.moved(x, part)
+        wp.capture_if(flag, launch, lambda x: wp.capture_if(self._stale, lambda: launch(self.found)), x=x)
+
     def moved(self, x, part=0.5):
         """Launches flag = 1 where pairs may be missing at x (N,), else 0, and returns it; for :func:`warp.capture_if`.
 
@@ -187,12 +203,15 @@ class Proximity:
                 by a ½ − ``part`` of the skin each, relative to one another, before one is.
         """
         self.flag.zero_()
+        self._stale.zero_()
         several = self._pieces.per_copy > 1
         if several:
             self._pieces.motion.zero_()
-        self._launch(kernels.find_motion, self.model.count, [x, self._found, part * self.skin], [self._pieces, self.flag])
+        given = [x, self.found, self._listed, part * self.skin]
+        self._launch(kernels.find_motion, self.model.count, given, [self._pieces, self.flag, self._stale])
         if several:
-            given = [x, self._found, self._pieces, self.distance + self.skin, 2.0 * part * self.skin]
+            wp.capture_if(self._stale, lambda: self._launch_boxes(self.found))
+            given = [x, self.found, self._pieces, self.distance + self.skin, 2.0 * part * self.skin]
             self._launch(kernels.compare_motions, len(self._pieces.centre), given, [self.flag])
         return self.flag
 

@@ -85,7 +85,9 @@ class SelfSteps:
             for factory in (kernels.find_held, kernels.push_pairs):
                 self._kernels[factory] = model.kernel(factory, model.dtype)
         self._hold()
+        state.add("positions of the list", self.proximity.found)
         self._check_start(state)
+        self.start_again()
 
     def _check_start(self, state):
         """Refuses a start at which cloth crosses cloth, or is nearer than the filter lets it come; or finds its tangles.
@@ -158,7 +160,9 @@ class SelfSteps:
     def at_start(self):
         """U [J] at the start, and how many pairs touch there times ½Σ(r − d)² [m²], both (B,)."""
         x, energy = self.model.positions, self.model.scalars()
+        found = wp.clone(self.proximity.found)
         self.launch_begin(x)
+        wp.copy(self.proximity.found, found)
         self.launch_forces(x)
         self.add_energy(Sums(self.model), energy)
         copies = self.pairs.stencils.numpy()[: self.pairs.counts.numpy().sum(), 0] // self.model.per_copy
@@ -234,7 +238,8 @@ class SelfSteps:
         return self.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
 
     def start_again(self):
-        """Forgets the steps that an integrator made to find its past."""
+        """Forgets the steps that an integrator made to find its past, and the list, as a reset does."""
+        self.proximity.found.zero_()
         self.cut.zero_()
         self.steps.zero_()
         if self.tangles is not None:
@@ -244,11 +249,14 @@ class SelfSteps:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self, x):
-        """Lists the pairs at x, (N,), where a step begins."""
+        """Lists the pairs near x, (N,), where a step begins.
+
+        The list of a step before is kept where the walk at the end of this step cannot miss a pair by it.
+        """
         wp.copy(self.x_before, x)
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
-        self.launch_list(x)
+        self.proximity.launch_kept(x, WAY, self.launch_list)
         self.launch_areas(x)
 
     def launch_list(self, x):
