@@ -12,7 +12,7 @@ from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..vectors import types
 from .block_forces import add_block_forces
-from .contact_guard import guard_struct, in_ball, touching_step
+from .contact_guard import guard_type, in_ball, touching_step
 from .term_facts import TermFacts, chain_of
 
 
@@ -44,7 +44,7 @@ def block_step(
         vertices: wp.array(dtype=wp.int32),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        guard: guard_struct(dtype),
+        guard: guard_type(dtype, guarded),
         # parameters
         h: dtype,
         # in and out, the first two scratch

@@ -43,6 +43,18 @@ def guard_struct(dtype):
     return Guard
 
 
+@wp.struct
+class NoGuard:
+    """The struct of steps without colliders, which have fewer parameters to pass."""
+
+    per_copy: int
+
+
+def guard_type(dtype, guarded: bool):
+    """:func:`guard_struct` of steps that are ``guarded``, :class:`NoGuard` of others."""
+    return guard_struct(dtype) if guarded else NoGuard
+
+
 @cache
 def in_ball(dtype, moving: bool):
     """The device function (guard, i, step, before, after) → 1 if a step begins and ends in the ball of vertex i, else 0."""

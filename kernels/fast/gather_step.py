@@ -7,7 +7,7 @@ import warp as wp
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..vectors import types
-from .contact_guard import guard_struct, in_ball, touching_step
+from .contact_guard import guard_type, in_ball, touching_step
 from .gather_forces import move_of, sum_at_vertices
 from .packed_residual import pack_residual
 from .term_facts import TermFacts, chain_of
@@ -35,7 +35,7 @@ def gather_vertex(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         g: vec3,
-        guard: guard_struct(dtype),
+        guard: guard_type(dtype, guarded),
         h: dtype,
         unit: dtype,
         x: wp.array(dtype=vec3),
@@ -116,7 +116,7 @@ def gather_step(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        guard: guard_struct(dtype),
+        guard: guard_type(dtype, guarded),
         # state in
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -165,7 +165,7 @@ def gather_steps_of_copies(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        guard: guard_struct(dtype),
+        guard: guard_type(dtype, guarded),
         # parameters
         h: dtype,
         steps: int,

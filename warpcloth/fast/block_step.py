@@ -8,7 +8,7 @@ import warp as wp
 from ..core.explicit_step import StepRecord
 from ..core.gradient import Gradient
 from ..kernels.fast import block_step as kernels
-from ..kernels.fast.contact_guard import guard_struct
+from ..kernels.fast.contact_guard import NoGuard
 from ..kernels.fast.term_facts import TermFacts
 from ..terms.refresh import STEP, Moment
 from .block_layout import block_layout
@@ -75,7 +75,7 @@ class BlockStep:
         ]
         chain = chained(parts, arrays, model.dtype)
         self._given = [chain, int32_array(vertices, model.device), window.inverse_mass, model.gravity]
-        self._given += [guard.data if guard else guard_struct(model.dtype)(), h, *scratch]
+        self._given += [guard.data if guard else NoGuard(), h, *scratch]
 
     def launch(self, steps, move_pins):
         """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""

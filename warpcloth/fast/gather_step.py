@@ -4,7 +4,7 @@ import warp as wp
 
 from ..core.explicit_step import StepRecord
 from ..kernels.fast import gather_step as kernels
-from ..kernels.fast.contact_guard import guard_struct
+from ..kernels.fast.contact_guard import NoGuard
 from ..terms.refresh import EVALUATION, STEP, Moment
 from .compensation import packed_unit
 from .gather_layout import gathered, lanes_of
@@ -67,7 +67,7 @@ class GatherStep:
             wp.zeros(model.count, dtype=residual_type, device=model.device) if compensated else None for _ in range(2)
         )
         self._states = [(x, v, self.residual), (model.vectors(), model.vectors() if damped else v, other)]
-        data = guard.data if guard else guard_struct(model.dtype)()
+        data = guard.data if guard else NoGuard()
         data.per_copy = model.per_copy
         self._given, self._h = [chain, model.inverse_mass, model.gravity, data], h
         self._unit = unit or 1.0
