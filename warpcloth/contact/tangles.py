@@ -174,7 +174,7 @@ def _table(members, count):
     order = np.argsort(members.ravel(), kind="stable")
     numbers = members.ravel()[order]
     sizes = np.bincount(numbers, minlength=count)
-    place = np.arange(len(numbers)) - (np.cumsum(sizes) - sizes)[numbers]
+    rank = np.arange(len(numbers)) - (np.cumsum(sizes) - sizes)[numbers]
     found = np.full((count, max(sizes.max(initial=0), 1)), -1, dtype=np.int64)
-    found[numbers, place] = order // 3
+    found[numbers, rank] = order // 3
     return found
