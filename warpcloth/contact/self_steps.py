@@ -53,7 +53,7 @@ class SelfSteps:
         self.proximity = Proximity(model, declared.distance, self.skin)
         device = model.device
         self.x_before, self._target, self._from, self._other = (model.vectors() for _ in range(4))
-        self._slope, self._iterates = model.scalars(), False
+        self._slope, self._iterates, self._touching = model.scalars(), False, None
         self._colliders, self._cut_before = colliders, None
         self.energies = wp.zeros(model.count, dtype=wp.float64, device=device)
         areas = np.empty(model.per_copy)
@@ -211,6 +211,10 @@ class SelfSteps:
         self.forces.energy, self.forces.slope, self.forces.bend = (room(wp.float64) for _ in range(3))
         self._planes.plane, self._planes.margin = room(wp.vec4d), room(wp.float64)
         self.multipliers = room(wp.float64)
+        if self._touching is not None:
+            self._swept = kernels.SweptPairs()
+            self._swept.touches, self._swept.normal, self._swept.weights = room(wp.int32), room(wp.vec3d), room(wp.vec4d)
+            self._swept.gap, self._swept.multiplier = room(wp.float64), room(wp.float64)
 
     def grow(self):
         """Makes room for the pairs that did not fit; what was recorded must be recorded again."""
@@ -295,6 +299,7 @@ class SelfSteps:
         """q += A p of its blocks off the diagonal, for the copies that are ``active`` (B,)."""
         given = [self.pairs, self.model.inverse_mass, self.forces, p, active, self.model.per_copy]
         self._launch(kernels.add_products, self.model.count, given, [q])
+        self.model.lock(q)
 
     def rows(self):
         """Of the pairs that press at the last :meth:`launch_forces`: J, whose rows are wᵢn, and kAφ″; the host reads them.
@@ -315,11 +320,41 @@ class SelfSteps:
         J = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(press), 3 * model.count))
         return J, diags(bend[press])
 
-    def launch_sweep(self, x, correction, h, multipliers, backward):
-        """Moves the vertices of each pair in turn, see :func:`warpcloth.kernels.self_contact.sweep_pairs`."""
-        kernel = self.model.kernel(kernels.sweep_pairs, self.model.dtype)
-        given = [self.pairs, self.model.inverse_mass, self.begun, x, h, not multipliers, backward]
-        self.model.launch(kernel, 1, given, [self.multipliers if multipliers else None, self.forces, correction])
+    def sweeps(self, in_turn):
+        """Says that sweeps will move pairs in turn, or all at once, as devices with many threads must."""
+        model, key = self.model, (self.model.dtype, self.model.mobility is not None)
+        if in_turn and model.device.is_cpu:
+            self._sweep = model.kernel(kernels.sweep_pairs, *key)
+            return
+        self._touching = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self._press, self._move = (model.kernel(factory, *key) for factory in (kernels.press_pairs, kernels.move_by_pairs))
+        for factory in (kernels.touch_pairs, kernels.count_touching, kernels.keep_pairs):
+            self._kernels[factory] = model.kernel(factory, model.dtype)
+        self._hold()
+
+    def launch_sweep(self, x, correction, h, adds, backward=False):
+        """Moves the vertices of all pairs, see :func:`warpcloth.kernels.self_contact.sweep_pairs` and its neighbours.
+
+        Args:
+            x: x̃ (N,) [m].
+            correction: d (N,) [m].
+            h: Step [s].
+            adds: Whether multipliers add up over sweeps; else pairs are hard.
+            backward: Whether pairs move from the last to the first, where they move in turn.
+        """
+        model, mobility, multipliers = self.model, self.model.local_mobility, self.multipliers if adds else None
+        if self._touching is None:
+            given = [self.pairs, mobility, self.begun, x, h, not adds, backward]
+            model.launch(self._sweep, 1, given, [multipliers, self.forces, correction])
+            return
+        count, N, swept = len(self.pairs.stencils), model.count, self._swept
+        self._launch(kernels.touch_pairs, count, [self.pairs, self.begun, multipliers, x, correction], [swept])
+        self._launch(kernels.count_touching, N, [self.pairs, swept], [self._touching])
+        given = [self.pairs, mobility, self.begun, self._touching, multipliers, h, not adds]
+        model.launch(self._press, count, given, [swept])
+        model.launch(self._move, N, [self.pairs, mobility, swept, multipliers, self.forces], [correction])
+        if adds:
+            self._launch(kernels.keep_pairs, count, [self.pairs, swept], [multipliers, self.forces])
 
     def launch_end(self, x, v, move=None):
         """Walks from where the step began to x as far as pairs stay apart; v and ``move`` (N,) follow.

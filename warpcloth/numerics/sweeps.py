@@ -95,9 +95,23 @@ class JacobiSweep(_Sweep):
         alpha: α of the average by vertex.
         spread: The number of sweeps that finite stiffness is spread over, or None.
         backend: See :func:`warpcloth.fast.plan.plan`.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs all move after the elements; or None.
     """
 
-    def __init__(self, model, x, h, kind, relaxation, alpha=0.0, scalar=False, multipliers=False, spread=None, backend="auto"):
+    def __init__(
+        self,
+        model,
+        x,
+        h,
+        kind,
+        relaxation,
+        alpha=0.0,
+        scalar=False,
+        multipliers=False,
+        spread=None,
+        backend="auto",
+        pairs=None,
+    ):
         super().__init__(model, x, h, relaxation, scalar, multipliers, None)
         for elements in model.terms:
             if elements.term.cell:
@@ -108,6 +122,21 @@ class JacobiSweep(_Sweep):
         given = x, h, self.correction, self.multipliers, self._keys, *self._weights(kind, alpha), spread
         sweeps = plan(model, backend).jacobi_sweeps(*given)
         self.launch_start, self.launch, self.parts = sweeps.launch_start, sweeps.launch, sweeps.parts
+        if pairs is not None:
+            self._elements, self.pairs, self._adds = sweeps, pairs, multipliers
+            pairs.sweeps(in_turn=False)
+            self.launch_start, self.launch, self.parts = self._launch_start, self._launch, self._parts
+
+    def _launch_start(self):
+        self.pairs.multipliers.zero_()
+        self._elements.launch_start()
+
+    def _launch(self):
+        self._elements.launch(1)
+        self.pairs.launch_sweep(self.x, self.correction, self.h, self._adds)
+
+    def _parts(self, sweeps):
+        return [(self._launch, sweeps)]
 
     def _weights(self, kind, alpha):
         """Factors of elements and of vertices."""
@@ -167,6 +196,8 @@ class GaussSeidelSweep(_Sweep):
         self.pairs = pairs
         super().__init__(model, x, h, relaxation, scalar, multipliers, correction)
         self.multipliers_add = multipliers
+        if pairs is not None:
+            pairs.sweeps(in_turn=True)
         self.pool, self.spread, self.ordered = pool or ThreadPool(1), spread or 1, kind == "sequential"
         self.ranges = [[(0, (elements.cells or elements).count)] for elements in model.terms]
         if kind == "coloured" and model.terms:

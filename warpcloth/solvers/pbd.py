@@ -105,7 +105,6 @@ class PBD(Step):
             ValueError: If a term has no projection, scalar constraint or ``prox``.
         """
         self.refuse(model)
-        self.refuse_unordered(model)
         return self._on(PBDStepper, model)
 
 
@@ -126,7 +125,7 @@ class PBDStepper(LaunchedStepper):
         if options.ordered:
             self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool, pairs=self.pairs)
         else:
-            self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread)
+            self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread, pairs=self.pairs)
         self.model = model.with_terms(self.sweep.elements)
         self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
 

@@ -137,21 +137,16 @@ class Step:
         else:
             refuse_unmet(model.terms, f"{cls.__name__} with {options}", needs, {instead: ()})
 
-    def refuse_unordered(self, model):
-        """Refuses self-contact with sweeps other than Gauss–Seidel."""
-        if model.scene.self_contact is not None and not self.ordered:
-            raise ValueError(
-                f"{type(self).__name__} with sweep={self.sweep!r} cannot take self_contact; "
-                "sweep='coloured' or 'sequential' can"
-            )
-
     @classmethod
     def _refuse_self_contact(cls, model):
         if not cls.touches_itself:
             able = [record.__name__ for record in SOLVERS.values() if record.touches_itself]
             raise ValueError(f"{cls.__name__} cannot take self_contact; {listed(able)} can")
-        if model.mobility is not None:
-            raise ValueError("self_contact is given with vertices that are locked along some axes, which it cannot take")
+        if model.mobility is not None and any(collider.moves or collider.facets for collider in model.scene.colliders):
+            raise ValueError(
+                "self_contact is given with vertices that are locked along some axes and a collider that moves or is a mesh, "
+                "which it cannot take together"
+            )
         if model.threads > 1:
             raise ValueError(f"threads is {model.threads} with self_contact, which takes 1")
 

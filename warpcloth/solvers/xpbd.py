@@ -129,7 +129,6 @@ class XPBD(ImplicitStep):
         """
         self.refuse(model)
         self.refuse_hard(model)
-        self.refuse_unordered(model)
         return self._on(XPBDStepper, model)
 
 
@@ -149,7 +148,7 @@ class XPBDStepper(LaunchedStepper):
         if options.ordered:
             self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool, pairs=self.pairs)
         else:
-            self.sweep = JacobiSweep(*given, **more)
+            self.sweep = JacobiSweep(*given, **more, pairs=self.pairs)
         self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
