@@ -16,6 +16,7 @@ from ..kernels.elementwise import scale
 from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 from .cluster_rows import ClusterRows
+from .pair_rows import PairRows
 
 
 class TermRows:
@@ -91,27 +92,32 @@ class Constraints:
         model: The :class:`warpcloth.model.model.Model`.
         h: Step [s].
         curved: Whether tension stiffens.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None.
 
     Attributes:
-        parts: :class:`TermRows` of each term.
+        parts: :class:`TermRows` of each term, and then of pairs.
         count, per_copy: Rows of all copies and of one.
         multipliers: λ (count,) [kg m over the unit of the constraint].
         gap: C + α̃λ (count,).
         residual, rounding, carried: (count,) [m], see :func:`warpcloth.kernels.constraint_rows.linearise`.
     """
 
-    def __init__(self, model, h, curved):
+    def __init__(self, model, h, curved, pairs=None):
         self.model, self.h = model, h
         self.parts = [
             ClusterRows(model, elements) if elements.cells else TermRows(model, elements, curved) for elements in model.terms
         ]
+        sizes = [elements.per_copy for elements in model.terms]
+        if pairs is not None:
+            self.parts.append(PairRows(model, pairs, curved))
+            sizes.append(self.parts[-1].per_copy)
         self._fresh = [elements for elements in model.terms if not elements.cells]  # whose rows fit themselves
         self.per_copy = sum(part.count for part in self.parts)
         self.count = self.per_copy * model.copies
         first = 0
-        for part in self.parts:
+        for part, size in zip(self.parts, sizes, strict=True):
             layout = kernels.RowLayout()
-            layout.per_copy, layout.first, layout.rows_per_copy = part.elements.per_copy, first, self.per_copy
+            layout.per_copy, layout.first, layout.rows_per_copy = size, first, self.per_copy
             part.set_layout(layout)
             first += part.count
 

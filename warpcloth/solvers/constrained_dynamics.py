@@ -71,6 +71,7 @@ class ConstrainedDynamics(ImplicitStep):
 
     name = "constrained-dynamics"
     needs, locks = (MERGED_DAMPING, ROWS, STEADY_ROWS), True
+    touches_itself = True
     facts = Facts(
         method="implicit steps with hard or compliant constraints, solved for positions and Lagrange multipliers",
         suits="constraints of any stiffness, met at the point nearest to x̃; bodies that hang from one another",
@@ -126,12 +127,17 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
 
     def __init__(self, options, model):
         super().__init__(options, model)
-        model, device = self.model, self.model.device
-        self.constraints = Constraints(model, self.he, options.stabilisation == "geometric-stiffness")
+        self._build()
+        self.ready()
+
+    def _build(self):
+        """Allocates and records everything, as much as there are rows."""
+        options, model, device = self.options, self.model, self.model.device
+        self.constraints = Constraints(model, self.he, options.stabilisation == "geometric-stiffness", self.pairs)
         self._sums, self._row_sums = Sums(model), RowSums(model, self.constraints.per_copy)
         self._search = None
         if options.stabilisation == "line-search":
-            self._search = Search(model, self.state.x, self._sums, 1.0 / self.he**2)
+            self._search = Search(model, self.state.x, self._sums, 1.0 / self.he**2, self.pairs)
             self.correction, self._direction, self._step = self._search.correction, self._search.direction, self._search.step
         else:
             self.correction, self._direction = model.vectors(), model.vectors()
@@ -152,7 +158,10 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._start = Segment(device, self._launch_start)
         self._solve = Segment(device, self._launch_solve) if self._linear.capturable else self._launch_solve
         self._move = Segment(device, self._launch_move)
-        self.ready()
+
+    def record_again(self):
+        self._build()
+        self._record_end()
 
     def start(self):
         self._start()
@@ -177,7 +186,8 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
     def multiplier_forces(self, collider=None):
         """Of M(x − x̃) = Jᵀλ: −Jᵀλ/hₑ²."""
         model, constraints = self.model, self.constraints
-        hard = [part for part in constraints.parts if part.elements.hard and collider in (None, part.elements.collider)]
+        of_terms = [part for part in constraints.parts if part.elements is not None]
+        hard = [part for part in of_terms if part.elements.hard and collider in (None, part.elements.collider)]
         add, pulls = model.kernel(add_scaled, model.dtype), model.vectors()
 
         def launch(out):
@@ -204,9 +214,9 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
 
     def _launch_start(self):
         self.launch_prediction()
-        if self._search:
-            self._search.launch_start()
         self.correction.zero_()
+        if self._search:
+            self._search.launch_again()
         self.constraints.multipliers.zero_()
         self._launch_linearise()
 

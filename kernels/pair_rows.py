@@ -1,0 +1,194 @@
+"""Factories of the constraint rows of pairs of self-contact: C = −√(2φ(d)), as those of contact with colliders.
+
+Each copy has rows for all pairs of the list. Those of pairs of other copies, or farther apart than the contact distance, bind
+nothing, see :mod:`.constraint_rows`: λ ≥ 0 is that of pairs that touch. With ``curved`` each has a second row, which stiffens
+it along n by −λC″.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .constraint_rows import ROUNDINGS, RowLayout, row_values
+from .rotation import epsilon
+from .self_contact import StepPairs, near_pairs, nearest, signed_gap, vertex_of
+from .terms import contact
+from .vectors import types
+
+constraint_slope, constraint_bend, potential = contact.constraint_slope, contact.constraint_bend, contact.potential
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+
+
+@wp.struct
+class PairSlopes:
+    """Of pairs: n, w, C′ and the slope of the row that stiffens; 0 of those that bind nothing."""
+
+    normal: wp.array(dtype=wp.vec3d)
+    weights: wp.array(dtype=wp.vec4d)
+    slope: wp.array(dtype=wp.float64)
+    stiffening: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def row_of_pair(copy: int, e: int, layout: RowLayout, rows: int):
+    return copy * layout.rows_per_copy + layout.first + e * rows
+
+
+@cache
+def linearise_pair_rows(dtype, curved: bool):
+    """Kernel over copies and pairs at x̃ + d: the rows as :func:`.constraint_rows.linearise` makes them."""
+    vec3, _ = types(dtype)
+    at, exact = vertex_of(dtype)
+    Q = wp.constant(2 if curved else 1)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def linearise_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # parameters
+        h: wp.float64,
+        least: wp.float64,
+        per_copy: int,
+        layout: RowLayout,
+        # out, and the multipliers in and out
+        slopes: PairSlopes,
+        rows: row_values(dtype),
+    ):
+        copy, e = wp.tid()
+        count = pairs.counts[0] + pairs.counts[1]
+        own = False
+        if e < count:
+            own = pairs.stencils[e][0] // per_copy == copy
+        row = row_of_pair(copy, e, layout, Q)
+        held = wp.max(wp.float64(rows.multipliers[row]), ZERO)
+        for j in range(Q):
+            rows.multipliers[row + j] = dtype(0.0)
+            rows.gap[row + j] = dtype(0.0)
+            rows.compliance[row + j] = dtype(1.0)
+            rows.inverse[row + j] = dtype(1.0)
+            rows.residual[row + j] = ZERO
+            rows.rounding[row + j] = ZERO
+            rows.carried[row + j] = ZERO
+        if not own:
+            return
+        slopes.slope[e] = ZERO
+        slopes.stiffening[e] = ZERO
+        k = step.stiffness[e]
+        if k == ZERO:
+            return
+        s = pairs.stencils[e]
+        r = wp.float64(pairs.distances[e])
+        w, y, inside = nearest(e < pairs.counts[0], at(x, d, s[0]), at(x, d, s[1]), at(x, d, s[2]), at(x, d, s[3]))
+        gap, n = signed_gap(y, step.normal[e], inside)
+        steep = constraint_slope(gap, r)
+        if steep == ZERO:
+            return
+        C = -wp.sqrt(wp.float64(2.0) * potential(gap, r))
+        moved = ZERO
+        most = ZERO
+        size = ZERO
+        for i in range(4):
+            free = wp.float64(inverse_mass[s[i]])
+            moved += free * w[i] * w[i]
+            most = wp.max(most, free * wp.abs(w[i]))
+            size += wp.abs(w[i]) * (wp.length(at(x, d, s[i]) - at(x, d, s[0])) + wp.length(exact(d[s[i]])))
+        if moved == ZERO:
+            return
+        alpha = ONE / (k * h * h)
+        total = steep * steep * moved
+        excess = wp.max(least * total - alpha, ZERO)
+        alpha += excess
+        slopes.normal[e] = n
+        slopes.weights[e] = w
+        slopes.slope[e] = steep
+        rows.multipliers[row] = dtype(held)
+        rows.gap[row] = dtype(C + alpha * held)
+        rows.compliance[row] = dtype(alpha)
+        inverse = ONE / (total + alpha)
+        rows.inverse[row] = dtype(inverse)
+        if wp.static(curved):
+            stiffening = wp.sqrt(wp.max(-held * constraint_bend(gap, r), ZERO))
+            slopes.stiffening[e] = stiffening
+            rows.inverse[row + 1] = dtype(ONE / (stiffening * stiffening * moved + ONE))
+        rows.carried[row] = most * steep * excess * held * inverse
+        rows.residual[row] = most * steep * wp.abs(C + alpha * held) * inverse
+        lost = most * steep * (steep * size * inverse + held)
+        rows.rounding[row] = wp.float64(dtype(ROUNDINGS) * epsilon(dtype(lost)) * dtype(lost))
+
+    return linearise_each_pair
+
+
+@cache
+def apply_pair_rows(dtype, curved: bool):
+    """Kernel over pairs: rows += J v."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+    Q = wp.constant(2 if curved else 1)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def apply_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        slopes: PairSlopes,
+        v: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        layout: RowLayout,
+        # in and out
+        rows: wp.array(dtype=dtype),
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        if slopes.slope[e] == ZERO:
+            return
+        s = pairs.stencils[e]
+        row = row_of_pair(s[0] // per_copy, e, layout, Q)
+        along = ZERO
+        for i in range(4):
+            along += slopes.weights[e][i] * wp.dot(slopes.normal[e], exact(v[s[i]]))
+        rows[row] = rows[row] + dtype(slopes.slope[e] * along)
+        if wp.static(curved):
+            rows[row + 1] = rows[row + 1] + dtype(slopes.stiffening[e] * along)
+
+    return apply_each_pair
+
+
+@cache
+def gather_pair_rows(dtype, curved: bool):
+    """Kernel over vertices: out += Jᵀ rows."""
+    vec3, _ = types(dtype)
+    Q = wp.constant(2 if curved else 1)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        slopes: PairSlopes,
+        rows: wp.array(dtype=dtype),
+        # parameters
+        per_copy: int,
+        layout: RowLayout,
+        # in and out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        total = wp.vec3d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if slopes.slope[e] != ZERO:
+                row = row_of_pair(i // per_copy, e, layout, Q)
+                pull = slopes.slope[e] * wp.float64(rows[row])
+                if wp.static(curved):
+                    pull += slopes.stiffening[e] * wp.float64(rows[row + 1])
+                total += (slopes.weights[e][pairs.corners[k] - 4 * e] * pull) * slopes.normal[e]
+        out[i] = out[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+
+    return gather_of_pairs

@@ -1,0 +1,73 @@
+"""The constraint rows of pairs of self-contact in :class:`warpcloth.numerics.constraints.Constraints`."""
+
+import numpy as np
+import warp as wp
+
+from ..kernels import pair_rows as kernels
+
+
+class PairRows:
+    """The rows of pairs, see :mod:`warpcloth.kernels.pair_rows`; methods are those of the rows of a term.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`.
+        curved: Whether tension stiffens.
+
+    Attributes:
+        elements: None, for they are of no term.
+        per_copy: Pairs that have rows in each copy: all there is room for.
+        count: Rows of one copy.
+    """
+
+    elements = None
+
+    def __init__(self, model, pairs, curved):
+        self.model, self._pairs, self._curved = model, pairs, curved
+        self.per_copy = capacity = len(pairs.pairs.stencils)
+        self._rows = 2 if curved else 1
+        self.count = self._rows * capacity
+        self._slopes = kernels.PairSlopes()
+        for name, kind in (("normal", wp.vec3d), ("weights", wp.vec4d), ("slope", wp.float64), ("stiffening", wp.float64)):
+            setattr(self._slopes, name, wp.zeros(capacity, dtype=kind, device=model.device))
+        key = model.dtype, curved
+        self._linearise, self._apply = (
+            model.kernel(kernels.linearise_pair_rows, *key),
+            model.kernel(kernels.apply_pair_rows, *key),
+        )
+        self._gather = model.kernel(kernels.gather_pair_rows, *key)
+
+    def set_layout(self, layout):
+        """Sets the layout of its rows, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
+        self._layout = layout
+
+    def launch_linearise(self, x, d, h, least, values):
+        """As of the rows of a term."""
+        model, of = self.model, self._pairs
+        given = [of.pairs, model.inverse_mass, of.begun, x, d, h, least, model.per_copy, self._layout]
+        model.launch(self._linearise, (model.copies, self.per_copy), given, [self._slopes, values])
+
+    def launch_apply(self, v, out, active=None):
+        """out += J v, of all copies."""
+        given = [self._pairs.pairs, self._slopes, v, self.model.per_copy, self._layout]
+        self.model.launch(self._apply, self.per_copy, given, [out])
+
+    def launch_transpose(self, rows, out, active=None):
+        """out += Jᵀ rows, of all copies."""
+        given = [self._pairs.pairs, self._slopes, rows, self.model.per_copy, self._layout]
+        self.model.launch(self._gather, self.model.count, given, [out])
+
+    def entries(self):
+        """J on the host: values, rows and columns."""
+        count = min(int(self._pairs.pairs.counts.numpy().sum()), self.per_copy)
+        binds = np.flatnonzero(self._slopes.slope.numpy()[:count])
+        names = ("slope", "stiffening")[: self._rows]
+        slopes = np.stack([getattr(self._slopes, name).numpy()[binds] for name in names], axis=1)
+        w, n = (array.numpy()[binds] for array in (self._slopes.weights, self._slopes.normal))
+        stencils = self._pairs.pairs.stencils.numpy()[binds].astype(np.int64)
+        layout, copy = self._layout, stencils[:, 0] // self.model.per_copy
+        first = copy * layout.rows_per_copy + layout.first + self._rows * binds
+        values = slopes[:, :, None, None] * w[:, None, :, None] * n[:, None, None, :]
+        rows = np.broadcast_to((first[:, None] + np.arange(self._rows))[:, :, None, None], values.shape)
+        columns = np.broadcast_to((3 * stencils[:, :, None] + np.arange(3))[:, None], values.shape)
+        return values.ravel(), rows.ravel(), columns.ravel()
