@@ -20,7 +20,7 @@ SOLVERS = {
     "projective_dynamics": wc.ProjectiveDynamics(substeps=2),
     "admm": wc.ADMM(substeps=2),
     "newton_factorised": wc.Newton(substeps=2, iterations=30, linear="factorised"),
-    "constrained_dynamics": wc.ConstrainedDynamics(substeps=2),
+    "constrained_dynamics": wc.ConstrainedDynamics(substeps=2, iterations=3),
     "xpbd_jacobi": wc.XPBD(substeps=4, iterations=10, sweep="constraint-averaged"),
     "pbd_jacobi": wc.PBD(substeps=4, iterations=10, sweep="vertex-averaged"),
 }
@@ -44,7 +44,9 @@ PRESSED = {
     "deep": {"gap": 1e-4, "shrink": 0.6, "stiffness": 1e3, "speed": 0.3},
 }
 FAST = [pytest.param(*given, marks=SLOW) for given in ((10.0, "float32"), (10.0, "float64"), (100.0, "float64"))]
-each_solver = pytest.mark.parametrize("name", SOLVERS)
+each_solver = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=SLOW) if name == "constrained_dynamics" else name for name in SOLVERS]
+)
 
 
 def layers(count=2, n=6, gap=0.02, speed=0.0, turn=0.0, distance=5e-3, stiffness=1e5, size=0.5, shrink=1.0, **fields):
@@ -328,6 +330,28 @@ def test_free_fall(name, device):
     assert moved == pytest.approx(np.tile([0.0, -0.5 * 9.81 * t * (t + stepper.h), 0.0], (36, 1)), abs=1e-11)
 
 
+@pytest.mark.parametrize("substeps", [100, 200])
+def test_energy_is_conserved(substeps, device):
+    """Sheets that part at a gap of r/2, without cuts: what explicit steps lose of the energy at the start is of order h²."""
+    scene = layers(n=3, gap=2.5e-3, duration=1 / 24)
+    energies = wc.simulate(scene, wc.Explicit(substeps=substeps), device=device, dtype="float64", record="energies").energies
+    total = sum(energies.values())
+    print(substeps, total, energies)
+    assert energies["self-contact"][0] == pytest.approx(0.5 * 1e5 * 0.25 * 2.5e-3**2)
+    assert energies["self-contact"][-1] < energies["self-contact"][0]
+    assert total[-1] == pytest.approx(total[0], rel=0.05 * (100 / substeps) ** 2)
+
+
+def test_pins_bear_what_lies_on_them(device):
+    """Reactions of a pinned sheet are its weight and that of the sheet that rests on it, at a gap of r − ρg/k."""
+    scene = layers(gap=5e-3 - 0.15 * 9.81 / 1e4, stiffness=1e4, gravity=(0.0, -9.81, 0.0), pins=np.arange(36), duration=1 / 12)
+    given = {"device": device, "dtype": "float64", "record": ("energies", "reactions")}
+    animation = wc.simulate(scene, wc.Newton(substeps=2, tolerance=1e-9), **given)
+    weight = 0.15 * 0.25 * 9.81
+    assert animation.reactions[:, :, 1].sum(axis=1) == pytest.approx(2.0 * weight, rel=1e-6)
+    assert animation.energies["self-contact"] == pytest.approx(0.5 * weight**2 / (1e4 * 0.25), rel=1e-6)
+
+
 @pytest.mark.parametrize("steps", [20, pytest.param(400, marks=SLOW)])
 def test_violent_steps(steps, device):
     """Of random moves of up to a third of the sheet, from wherever the last ended, nothing crosses."""
@@ -453,8 +477,6 @@ def test_solvers_that_refuse(device):
 def test_what_is_refused(device):
     with pytest.raises(ValueError, match="equilibrium cannot take self_contact"):
         wc.equilibrium(layers(), device=device)
-    with pytest.raises(ValueError, match="record is energies with self_contact"):
-        wc.simulate(layers(), wc.Newton(substeps=1), device=device, record="energies")
     with pytest.raises(ValueError, match=r"self_contact\.stiffness has no default without gravity"):
         layers(stiffness=None)
     with pytest.raises(ValueError, match="mesh without triangles"):

@@ -54,7 +54,8 @@ def _term_names(scene):
 
 def _other_names(scene):
     moved = any(collider.moves for collider in scene.colliders)
-    others = ["kinetic", "gravity", *["work of pins"] * scene.pins.moves, *["work of loads"] * bool(scene.loads)]
+    others = ["self-contact"] * (scene.self_contact is not None) + ["kinetic", "gravity"]
+    others += ["work of pins"] * scene.pins.moves + ["work of loads"] * bool(scene.loads)
     others += ["work of colliders"] * moved + ["work of the filter"] * bool(scene.colliders)
     return others + ["heat of friction"] * bool(scene.rubbing)
 
@@ -87,6 +88,7 @@ class Evaluation:
 
     def __init__(self, model, h=None, stepper=None, forces=True):
         self.model, self._h, self._pull, self.pulls = model, h, None, None
+        self._pairs = None if stepper is None else stepper.pairs
         shares = [] if stepper is None or model.colliders is None else stepper.shares
         self._present = PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
         self._terms = self._present.terms
@@ -131,6 +133,10 @@ class Evaluation:
             model.launch(self._back, model.count, [x, v, self._h], [self._before, self._move])
             model.refresh(STEP, Moment(self._before), self._damped)
             self._dissipative.add(self._before, self.gradient, self._move)
+        if self._pairs is not None:
+            self._pairs.launch_begin(x)
+            self._pairs.launch_forces(x)
+            self._pairs.add_gradient(self.gradient)
         if self._pull:
             self._pull(self.gradient)
 
@@ -153,6 +159,12 @@ class Evaluation:
             if energy is not None:  # a hard term stores none
                 energy.add(x, total)
             found[name] = found.get(name, 0.0) + total.numpy()
+        if self._pairs is not None:
+            total = model.scalars()
+            self._pairs.launch_begin(x)
+            self._pairs.launch_forces(x)
+            self._pairs.add_energy(Sums(model), total)
+            found["self-contact"] = total.numpy()
         moved = self._host(x) - self._start
         if v is not None:
             with np.errstate(over="ignore"):  # of a copy that diverges
@@ -299,6 +311,7 @@ class History:
             self._begin()
             for _ in range(self._stepper.steps_per_frame):
                 self._stepper.step()
+                self._make_room()
                 self._each_step()
             for total, work in zip(self._total, self._works, strict=True):
                 total += work.numpy().reshape(self.model.copies, -1).sum(axis=1)
@@ -308,8 +321,22 @@ class History:
         self._frame += 1
         self._note()
 
+    def _make_room(self):
+        """Makes room for all pairs of self-contact at the present state, and records what launches them again."""
+        pairs = self._stepper.pairs
+        if pairs is None:
+            return
+        pairs.launch_begin(self._stepper.state.x)
+        while pairs.overflowed:
+            pairs.grow()
+            self._stepper.record_again()
+            if self._each_step is not None:
+                self._each_step = Segment(self.model.device, self._each_step.record)
+            pairs.launch_begin(self._stepper.state.x)
+
     def _note(self):
         """Finds what is recorded of the present state."""
+        self._make_room()
         evaluation, loads, (x, v), found = self._evaluation, self.model.loads, self._stepper.state, {}
         if "energies" in self._record:
             energies = evaluation.energies(x, v)

@@ -197,10 +197,6 @@ def simulate(
     whole("copies", copies, 1)
     choice("dtype", dtype, tuple(DTYPES))
     record = checked_record(record)
-    if record and scene.self_contact is not None:
-        raise ValueError(
-            f"record is {', '.join(record)} with self_contact, whose energy and forces are not recorded; leave it out"
-        )
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
     if resume and output is None:
