@@ -26,7 +26,7 @@ KEPT = wp.constant(wp.float64(0.9))
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 CLAMPED = wp.constant(wp.float64(0.05))  # the least share of the gap between two sides that either has
 SIDE = wp.constant(wp.float64(0.5))
-PLANAR = wp.constant(wp.float64(1e-12))
+PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges below which they have no normal
 
 
 @cache
@@ -144,15 +144,14 @@ def edge_edge(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     ab = b - a
     cd = d - c
     ca = a - c
-    e = wp.dot(ab, ab)
-    f = wp.dot(cd, cd)
-    g = wp.dot(ab, cd)
-    determinant = e * f - g * g
+    # sin² by the cross product, for |ab|²|cd|² − (ab·cd)² of nearly parallel edges has few digits.
+    normal = wp.cross(ab, cd)
+    determinant = wp.dot(normal, normal)
     w = wp.vec4d(ONE, ZERO, -ONE, ZERO)
     inside = wp.int32(0)
-    if determinant > PLANAR * e * f:
-        s = (g * wp.dot(cd, ca) - f * wp.dot(ab, ca)) / determinant
-        t = (e * wp.dot(cd, ca) - g * wp.dot(ab, ca)) / determinant
+    if determinant > PLANAR * wp.dot(ab, ab) * wp.dot(cd, cd):
+        s = wp.dot(wp.cross(cd, ca), normal) / determinant
+        t = wp.dot(wp.cross(ab, ca), normal) / determinant
         if s > ZERO and s < ONE and t > ZERO and t < ONE:
             w = wp.vec4d(ONE - s, s, t - ONE, -t)
             inside = 1
@@ -192,6 +191,9 @@ def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
     else:
         w, inside = edge_edge(zero, b - a, c - a, d - a)
     y = w[1] * (b - a) + w[2] * (c - a) + w[3] * (d - a)
+    if inside == 1 and not of_vertex:  # the weights of nearly parallel edges have too few digits
+        normal = wp.cross(b - a, d - c)
+        y = wp.dot(normal, a - c) / wp.dot(normal, normal) * normal
     return w, y, inside
 
 

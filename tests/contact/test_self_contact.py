@@ -9,6 +9,7 @@ import warp as wp
 import warpcloth as wc
 from warpcloth.contact.self_steps import SelfSteps, crossings
 from warpcloth.core.sums import Sums
+from warpcloth.kernels.self_contact import nearest
 
 SLOW = pytest.mark.slow
 SOLVERS = {
@@ -436,6 +437,36 @@ def test_copies(name, device):
         first, second = both.state.x.numpy().reshape(2, -1, 3)
         assert (first == alone.state.x.numpy()).all()
         assert (second == first).all() != again
+
+
+@pytest.mark.parametrize("length", [0.1, 1.0, 14.0])
+def test_planes_between_edges_that_are_nearly_parallel(length, device):
+    """Edges at 1e-8 to 1e-2 rad with a gap of 5 µm: y separates all vertices by nine tenths of it."""
+    rng, gap, count = np.random.default_rng(3), 5e-6, 600
+    q = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    angle = 10.0 ** rng.uniform(-8.0, -2.0, (count, 1))
+    first, second = q[:, 0], np.cos(angle) * q[:, 0] + np.sin(angle) * q[:, 1]
+    ends = length * rng.uniform(0.1, 1.0, (4, count, 1))
+    points = np.stack([-ends[0] * first, ends[1] * first, -ends[2] * second - gap * q[:, 2], ends[3] * second - gap * q[:, 2]])
+    out = wp.zeros(count, dtype=wp.vec3d, device=device)
+    wp.launch(nearest_of_edges, count, [wp.array(each, dtype=wp.vec3d, device=device) for each in points], [out], device=device)
+    y = out.numpy()
+    n = y / np.linalg.norm(y, axis=1)[:, None]
+    a, b, c, d = (np.einsum("ij,ij->i", n, each - points[0]) for each in points)
+    assert (np.minimum(a, b) - np.maximum(c, d) > 0.9 * gap).all()
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def nearest_of_edges(
+    a: wp.array(dtype=wp.vec3d),
+    b: wp.array(dtype=wp.vec3d),
+    c: wp.array(dtype=wp.vec3d),
+    d: wp.array(dtype=wp.vec3d),
+    out: wp.array(dtype=wp.vec3d),
+):
+    i = wp.tid()
+    _w, y, _inside = nearest(False, a[i], b[i], c[i], d[i])
+    out[i] = y
 
 
 @each_solver
