@@ -118,7 +118,9 @@ class SelfSteps:
         model, before = self.model, len(self.pairs.stencils)
         x = np.where(np.repeat(mask, model.per_copy)[:, None], x, np.nan)  # which has no pairs
         tangles, self.tangles = self.tangles, None
+        listed = wp.clone(self.proximity.found)  # part of the state, which stays as it is
         found = self._too_near(wp.array(x, dtype=model.vec3, device=model.device))
+        wp.copy(self.proximity.found, listed)
         self.tangles = tangles
         if len(found[0]) or found[3]:
             self._refuse_pairs(*found, "")
