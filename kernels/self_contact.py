@@ -927,8 +927,8 @@ def kept_share(dtype):
 def keep_apart(dtype):
     """Kernel over vertices: x ← x + u + t(δ − u), u the ``common`` move, t such that no plane of a pair comes too near.
 
-    ``most`` bounds t‖δ − u‖, by which no pair that is not listed can cross. ``cuts`` counts the vertices that planes cut short,
-    and those that only this bound did.
+    ``most`` bounds t‖δ − u‖, by which no pair that is not listed can cross. ``cuts`` (B, 2) counts the vertices that planes cut
+    short, and those that only this bound did. Copies that do not ``walk`` stay.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -943,21 +943,25 @@ def keep_apart(dtype):
         x_ref: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
         common: wp.array(dtype=wp.vec3d),
+        walk: wp.array(dtype=wp.int32),
         # parameters
         per_copy: int,
         most: wp.float64,
         # out
         x: wp.array(dtype=vec3),
-        cuts: wp.array(dtype=wp.int32),
+        cuts: wp.array2d(dtype=wp.int32),
     ):
         i = wp.tid()
-        u = common[i // per_copy]
+        copy = i // per_copy
+        if walk[copy] == 0:
+            return
+        u = common[copy]
         move = exact(target[i]) - exact(x_ref[i]) - u
         far, t = kept(pairs, planes, x_ref, i, move, most)
         if t < ONE:
             end = exact(x_ref[i]) + u + t * move
             x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
-            wp.atomic_add(cuts, wp.where(t < far, 0, 1), 1)
+            wp.atomic_add(cuts, copy, wp.where(t < far, 0, 1), 1)
         else:
             x[i] = target[i]
 
@@ -1216,18 +1220,24 @@ def another_round(
     near_rounds: int,
     far_rounds: int,
     # in and out
-    cuts: wp.array(dtype=wp.int32),
+    cuts: wp.array2d(dtype=wp.int32),
     rounds: wp.array(dtype=wp.int32),
     # out
+    walk: wp.array(dtype=wp.int32),
     proceed: wp.array(dtype=wp.int32),
 ):
-    """Whether the filter goes on from a new list: planes cut many in one of the first rounds, or its bound does."""
-    rounds[0] = rounds[0] + 1
-    proceed[0] = 0
-    if (cuts[0] > few and rounds[0] < near_rounds) or (cuts[1] > 0 and rounds[0] < far_rounds):
+    """Kernel over copies: whether one walks on, by a new list: planes cut many in one of the first rounds, or the bound does.
+
+    ``proceed`` is 1 if any does.
+    """
+    c = wp.tid()
+    rounds[c] = rounds[c] + 1
+    walk[c] = 0
+    if (cuts[c, 0] > few and rounds[c] < near_rounds) or (cuts[c, 1] > 0 and rounds[c] < far_rounds):
+        walk[c] = 1
         proceed[0] = 1
-    cuts[0] = 0
-    cuts[1] = 0
+    cuts[c, 0] = 0
+    cuts[c, 1] = 0
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)

@@ -62,8 +62,9 @@ class SelfSteps:
         self._areas = wp.array(areas, dtype=wp.float64, device=device)
         self._common = wp.zeros(model.copies, dtype=wp.vec3d, device=device)
         free = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
-        self._cuts = wp.zeros(2, dtype=wp.int32, device=device)
-        self._rounds, self._proceed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self._cuts = wp.zeros((model.copies, 2), dtype=wp.int32, device=device)
+        self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(2))
+        self._proceed = wp.zeros(1, dtype=wp.int32, device=device)
         self.cut = state.add("vertices kept apart", wp.zeros(model.copies, dtype=wp.int64, device=device))
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32))
         self._most = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
@@ -74,7 +75,7 @@ class SelfSteps:
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
         self._moves_together = free
-        self._few = int(SHARE * model.count)
+        self._few = int(SHARE * model.per_copy)
         self.tangles = None
         declared = model.colliders
         self._lets_out = declared is not None and (declared.meshes is not None or any(declared.moves))
@@ -376,6 +377,7 @@ class SelfSteps:
         self._walk(x)
         if self._lets_out:
             self._turns.zero_()
+            self._walking.fill_(1)
             self._launch_held(x)
             wp.capture_while(self._within, self._launch_let_out, x=x)
             self._colliders.launch_inside(x, self._from)
@@ -393,6 +395,7 @@ class SelfSteps:
         """Moves x to the target as far as pairs stay apart, by lists made anew on the way."""
         self._rounds.zero_()
         self._cuts.zero_()
+        self._walking.fill_(1)
         self._launch_walk(x)
         wp.capture_while(self._proceed, self._launch_round, x=x)
 
@@ -405,11 +408,16 @@ class SelfSteps:
     def _launch_walk(self, x):
         model = self.model
         self._launch_planes(x, self._target, None)
-        wp.copy(self._from, x)
-        given = [self.pairs, self._planes, self._from, self._target, self._common, model.per_copy, WAY * self.skin]
-        self._launch(kernels.keep_apart, model.count, given, [x, self._cuts])
+        self._launch_apart(x, self._target)
+        self._proceed.zero_()
         given = [self._few, NEAR_ROUNDS, FAR_ROUNDS]
-        model.launch(kernels.another_round, 1, given, [self._cuts, self._rounds, self._proceed])
+        model.launch(kernels.another_round, model.copies, given, [self._cuts, self._rounds, self._walking, self._proceed])
+
+    def _launch_apart(self, x, target):
+        model = self.model
+        wp.copy(self._from, x)
+        given = [self.pairs, self._planes, self._from, target, self._common, self._walking, model.per_copy, WAY * self.skin]
+        self._launch(kernels.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
         """Finds the vertices that cloth holds back in a collider that has come over them, and where they would be outside."""
@@ -429,9 +437,7 @@ class SelfSteps:
             given = [self.pairs, self._mobile, self.begun, x, LEFT * self.declared.distance]
             self._launch(kernels.push_pairs, 1, given, [out])
         self._launch_planes(x, out, None)
-        wp.copy(self._from, x)
-        given = [self.pairs, self._planes, self._from, out, self._common, model.per_copy, WAY * self.skin]
-        self._launch(kernels.keep_apart, model.count, given, [x, self._cuts])
+        self._launch_apart(x, out)
         model.launch(self._count, 1, [], [self._turns])
         self._launch_held(x)
 
