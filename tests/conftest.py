@@ -3,6 +3,7 @@
 import signal
 
 import pytest
+import warp as wp
 
 
 def pytest_configure():
@@ -18,6 +19,12 @@ def pytest_addoption(parser):
 def device(request):
     """Name of the Warp device to test on."""
     return request.config.getoption("--device")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def default_device(device):
+    """Arrays for which a test names no device are on the tested one, also where a machine has a GPU."""
+    wp.set_device(device)
 
 
 def pytest_collection_modifyitems(config, items):
