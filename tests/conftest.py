@@ -22,9 +22,9 @@ def device(request):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def default_device(device):
+def default_device(request):
     """Arrays for which a test names no device are on the tested one, also where a machine has a GPU."""
-    wp.set_device(device)
+    wp.set_device(request.config.getoption("--device"))
 
 
 def pytest_collection_modifyitems(config, items):
