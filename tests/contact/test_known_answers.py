@@ -302,32 +302,38 @@ def test_an_overhang_slips_or_sticks(solver, device):
         assert moved > 0.02 if slips else abs(moved) < 0.005, more
 
 
+# The stretching of the chain below, 100 N, is what projective dynamics converges with in each step: where a step uses up its
+# iterations, the motion depends on rounding, and so on the processor. L-BFGS takes 0.8 of the time of Anderson acceleration.
 FALLING = {
     "explicit": wc.Explicit(substeps=300),
-    "newton": wc.Newton(substeps=8, tolerance=1e-6),
-    "projective_dynamics": wc.ProjectiveDynamics(substeps=2, tolerance=1e-2, iterations=100),
+    "newton": wc.Newton(substeps=4, integrator="bdf2", tolerance=1e-6),
+    "projective_dynamics": wc.ProjectiveDynamics(
+        substeps=4, integrator="bdf2", tolerance=1e-2, iterations=200, acceleration="l-bfgs"
+    ),
     "xpbd": wc.XPBD(substeps=50, iterations=10),
 }
 
 
-def deeper(solver, duration, device):
+def deeper(solver, duration, device, **fields):
     """How deep the tip of a chain over an edge is in the end, over what it should be."""
-    chain = scene("chain_over_edge", links=60, duration=duration)
-    points = wc.simulate(chain, solver, dtype="float64", device=device).points
+    chain = scene("chain_over_edge", duration=duration, **fields)
+    animation = wc.simulate(chain, solver, dtype="float64", device=device)
+    assert animation.status.ok, animation.status.message
+    points = animation.points
     depths = points[0, :, 1].max() - points[:, -1, 1]
     return depths[-1] / (depths[0] * np.cosh(duration * np.sqrt(G)))
 
 
-@methods("newton", "projective_dynamics", **FALLING)
+@methods("projective_dynamics", **FALLING)
 def test_a_chain_slides_over_an_edge(solver, device):
-    """a₀ cosh(t√(g/L)), to 1 %."""
-    assert deeper(solver, 0.7, device) == pytest.approx(1.0, abs=0.01)
+    """a₀ cosh(t√(g/L)), to 0.5 %."""
+    assert deeper(solver, 0.7, device, links=30, stretching=100.0) == pytest.approx(1.0, abs=0.005)
 
 
 @pytest.mark.slow
 def test_a_chain_slides_over_an_edge_with_first_order(device):
     """Of steps of implicit Euler; links leave the rest."""
-    found = [deeper(replace(FALLING["newton"], substeps=2**k), 0.4, device) for k in (1, 2, 3)]
+    found = [deeper(wc.Newton(substeps=2**k, tolerance=1e-6), 0.4, device, links=60) for k in (1, 2, 3)]
     assert (found[0] - found[1]) / (found[1] - found[2]) == pytest.approx(2.0, abs=0.2)
 
 
