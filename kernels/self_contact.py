@@ -32,12 +32,13 @@ PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges belo
 @cache
 def near_pairs(dtype):
     """The struct of the pairs that are near, see :class:`warpcloth.contact.proximity.Proximity`: how many of a vertex and of
-    edges, the pairs of each vertex, and where their contact begins [m]."""
+    edges, those that each vertex has with triangles, the pairs of each vertex, and where their contact begins [m]."""
 
     @wp.struct
     class Pairs:
         stencils: wp.array(dtype=wp.vec4i)
         counts: wp.array(dtype=wp.int32)
+        rows: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
         corners: wp.array(dtype=wp.int32)
         distances: wp.array(dtype=dtype)
@@ -325,32 +326,28 @@ def set_areas(dtype):
         gap = step.gap[e]
         area = ZERO
         if e < triangles:
-            v = s[0]
+            first = pairs.rows[s[0]]
+            end = pairs.rows[s[0] + 1]
             least = gap
-            for k in range(pairs.first[v], pairs.first[v + 1]):
-                other = pairs.corners[k] // 4
-                if pairs.corners[k] == 4 * other and other < triangles:
-                    if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
-                        least = wp.min(least, step.gap[other])
+            for other in range(first, end):
+                if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                    least = wp.min(least, step.gap[other])
             own = part_of_area(gap, least, r)
             if own > ZERO:
                 total = ZERO
-                for k in range(pairs.first[v], pairs.first[v + 1]):
-                    other = pairs.corners[k] // 4
-                    if pairs.corners[k] == 4 * other and other < triangles:
-                        if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
-                            total += part_of_area(step.gap[other], least, r)
-                area = SIDE * areas[v] * own / total
+                for other in range(first, end):
+                    if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                        total += part_of_area(step.gap[other], least, r)
+                area = SIDE * areas[s[0]] * own / total
         else:
             least = wp.float64(wp.inf)
             for i in range(4):
                 sign = wp.where(i < 2, ONE, -ONE)
-                v = s[i]
-                for k in range(pairs.first[v], pairs.first[v + 1]):
-                    other = pairs.corners[k] // 4
-                    if pairs.corners[k] == 4 * other and other < triangles:
-                        if sign * wp.dot(n, step.normal[other]) > SIDE:
-                            least = wp.min(least, step.gap[other])
+                for other in range(pairs.rows[s[i]], pairs.rows[s[i] + 1]):
+                    if least <= gap:
+                        break  # most end here
+                    if step.gap[other] < least and sign * wp.dot(n, step.normal[other]) > SIDE:
+                        least = step.gap[other]
             nearer = ONE
             if least < wp.float64(wp.inf):
                 nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)

@@ -30,6 +30,7 @@ class Proximity:
             (a, b, c, d) of the pairs of the edges ab and cd.
         distances: (capacity,) r_c of each [m].
         counts: (2,) int32: how many pairs of either kind were found, which may be more than the capacity.
+        rows: Pairs rows[i] to rows[i+1] are those of vertex i and a triangle; those of edges follow, by the first of the two.
         first, corners: The corners of pairs at each vertex i, sorted: 4·pair + corner in ``corners`` from first[i] to
             first[i+1].
         found: Positions of the last list, (N,) [m]. Whoever sets them calls :meth:`launch_kept` before the list is used.
@@ -139,12 +140,12 @@ class Proximity:
         self.capacity = capacity
         self._listed.fill_(np.nan)
         self.stencils, self.distances = zeros(capacity, wp.vec4i), zeros(capacity, model.dtype)
-        self.first, self.corners = zeros(model.count + 1), zeros(4 * capacity)
+        self.first, self.corners, self.rows = zeros(model.count + 1), zeros(4 * capacity), zeros(rows + 1)
         self._arrays = {
             "counts": self.counts,
             "found": zeros(capacity, wp.vec2i),
             "row_counts": zeros(rows),
-            "first": zeros(rows + 1),
+            "first": self.rows,
             "items": zeros(capacity),
             "stencils": self.stencils,
             "distances": self.distances,

@@ -205,7 +205,7 @@ class SelfSteps:
             return wp.zeros(capacity, dtype=dtype, device=device)
 
         self.pairs = kernels.near_pairs(self.model.dtype)()
-        for name in ("stencils", "counts", "first", "corners", "distances"):
+        for name in ("stencils", "counts", "rows", "first", "corners", "distances"):
             setattr(self.pairs, name, getattr(found, name))
         self.begun, self.forces, self._planes = kernels.StepPairs(), kernels.PairForces(), kernels.Planes()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
