@@ -344,7 +344,7 @@ def set_areas(dtype):
             for i in range(4):
                 sign = wp.where(i < 2, ONE, -ONE)
                 for other in range(pairs.rows[s[i]], pairs.rows[s[i] + 1]):
-                    if least <= gap:
+                    if least <= gap and least < wp.float64(wp.inf):
                         break  # most end here
                     if step.gap[other] < least and sign * wp.dot(n, step.normal[other]) > SIDE:
                         least = step.gap[other]
