@@ -998,6 +998,28 @@ def limit_direction(dtype):
 
 
 @cache
+def shorten(dtype):
+    """Kernel over vertices: p ← p most/max‖pⱼ‖ in copies where that shortens it."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def shorten_each_direction(
+        # state in
+        longest: wp.array(dtype=wp.float64),
+        # parameters
+        per_copy: int,
+        most: wp.float64,
+        # in and out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if longest[i // per_copy] > most:
+            p[i] = dtype(most / longest[i // per_copy]) * p[i]
+
+    return shorten_each_direction
+
+
+@cache
 def precondition(dtype):
     """Kernel over vertices: p = P r."""
     vec3, mat33 = types(dtype)

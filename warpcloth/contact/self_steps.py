@@ -460,9 +460,11 @@ class SelfSteps:
 
     def iterates(self):
         """Says that these methods are used."""
-        self._iterates = True
+        self._iterates, model = True, self.model
+        self._kernels[kernels.shorten] = model.kernel(kernels.shorten, model.dtype)
+        self._longest, self._ones = model.scalars(), wp.ones(model.count, dtype=model.dtype, device=model.device)
         if self._colliders is not None and not self._lets_out:
-            self._cut_before, model = wp.zeros_like(self._colliders.notes.cut), self.model
+            self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._kernels[kernels.walk_from_start] = model.kernel(kernels.walk_from_start, model.dtype)
 
     def launch_relist(self, base, d, launch):
@@ -479,11 +481,15 @@ class SelfSteps:
     def launch_limit(self, sums, gradient, preconditioner, right, direction):
         """Cuts the direction from the positions of :meth:`launch_relist` short, so that pairs stay apart along all of it.
 
+        If lists do not allow all of it, it is shortened as a whole: cut at each vertex it would stretch stiff cloth.
+
         Of a copy where energy then does not fall along it, it is that of the preconditioner P, P·right, likewise cut short.
         """
         model, N = self.model, self.model.count
         self._launch(kernels.precondition, N, [preconditioner, right], [self._other])
         for each in (direction, self._other):
+            sums.largest(self._ones, each, self._longest)
+            self._launch(kernels.shorten, N, [self._longest, model.per_copy, WAY * self.skin], [each])
             self._launch_planes(self.x_before, None, each)
             given = [self.pairs, self._planes, self.x_before, self._common, model.per_copy, WAY * self.skin]
             self._launch(kernels.limit_direction, N, given, [each])

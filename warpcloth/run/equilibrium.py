@@ -11,6 +11,8 @@ from ..base.checks import choice, number, whole
 from ..base.limits import MOST_FRAMES
 from ..base.turns import in_turn
 from ..base.types import Precision
+from ..contact.self_steps import SelfSteps
+from ..core.state import State
 from ..core.status import Residual, Result, Status, digits, sentence
 from ..numerics.minimise import Minimiser
 from ..scene.scene import Scene
@@ -37,8 +39,8 @@ class Equilibrium(NamedTuple):
         stable: Whether the descent ended in balance and no eigenvalue is more negative than rounding and the tolerance explain.
             Then no small move lowers the energy to second order. Moves that change no energy, such as those of a body that
             nothing holds, have the eigenvalue 0 and count as stable.
-        energies: With ``record="energies"``, a dictionary [J]: each term, ``"gravity"`` since the start, and the ``"work of
-            loads"`` that are constant.
+        energies: With ``record="energies"``, a dictionary [J]: each term, ``"self-contact"``, ``"gravity"`` since the start,
+            and the ``"work of loads"`` that are constant.
         reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (p, 3) [N].
         collider_forces: With ``record="reactions"``, the force of the cloth on each collider by its name, (3,) [N].
     """
@@ -73,6 +75,11 @@ def equilibrium(
     among them, so colliders with friction are refused: run such a scene with damping until it rests. Colliders that are meshes
     are refused too.
 
+    With self-contact all iterates stay apart, pins included: pins with keyframes move as far as cloth lets them, and if they do
+    not arrive, the iterations are used up. The areas of contact are held constant while the cloth settles, then computed again,
+    until forces balance. ``stable`` and ``lowest_eigenvalue`` leave out that pairs rotate. Layers without friction, which may
+    slide off one another, often have no equilibrium.
+
     The method is Newton's without inertia, with a line search; gravity is applied in equal load steps. If the Hessian is
     singular, because, for example, a flat cloth without bending stiffness cannot carry its weight, the step is taken with
     inertia, s/2‖x − x_now‖²_M, and s is lowered from there. This is a proximal point method, in which the energy never rises.
@@ -97,8 +104,8 @@ def equilibrium(
         :class:`Equilibrium`.
 
     Raises:
-        ValueError: If an argument is not allowed, a stiffness is infinite, a collider is a mesh or has friction, or a free
-            vertex starts inside a collider at its last keyframe.
+        ValueError: If an argument is not allowed, a stiffness is infinite, a collider is a mesh or has friction, a free vertex
+            starts inside a collider at its last keyframe, or cloth crosses cloth at the start.
 
     Examples:
         >>> import warpcloth as wc
@@ -118,17 +125,20 @@ def equilibrium(
     model = scene.build(device=device, dtype=dtype)
     refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
     base = wp.clone(model.positions)
-    minimiser = Minimiser(model, base, "adaptive", linear, s=0.0)
+    pairs = None
+    if scene.self_contact is not None:
+        pairs = SelfSteps(model, State(base, model.vectors(), 1), h=0.0, bounded=False, colliders=None)
+        pairs.iterates()
+    minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
     descent = _Descent(minimiser, base, tolerance, iterations)
     for part in range(1, load_steps + 1):
-        _move_pins(scene.pins, base, part / load_steps)
-        result = _settle_loads(model, base, descent, part / load_steps)
+        result = _settle_all(model, base, descent, part / load_steps)
     # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
     if result in SETTLED and minimiser.curves_down(tolerance):
         base.assign(base.numpy() + _nudge(model))
         # What is left unbalanced compresses the edges of a nearly straight chain by many times itself, and curves the energy.
         descent.tolerance *= 0.01
-        result = descent.run(1.0, _frequency_scale(model))
+        result = descent.run(1.0, _frequency_scale(model)) if pairs is None else _settle_all(model, base, descent, 1.0)
         if result in SETTLED and minimiser.curves_down(tolerance):
             result = Result.SADDLE
     residual, began = descent.residual, result.value
@@ -148,7 +158,7 @@ def equilibrium(
     status = Status(result, residual=residual, message=message, measure=RESIDUAL.measure, unit=unit)
     energies = reactions = forces = None
     if record:
-        evaluation = Evaluation(model, forces="reactions" in record)
+        evaluation = Evaluation(model, forces="reactions" in record, pairs=pairs)
         if "energies" in record:
             energies = {name: float(value[0]) for name, value in evaluation.energies(base).items()}
         if "reactions" in record:
@@ -161,9 +171,7 @@ def equilibrium(
 
 
 def _with_colliders_at_rest(scene):
-    """The scene with moving colliders where their last keyframe has them; refuses friction and self-contact."""
-    if scene.self_contact is not None:
-        raise ValueError("equilibrium cannot take self_contact; run the scene with damping until it rests")
+    """The scene with moving colliders where their last keyframe has them; refuses friction."""
     for collider in scene.colliders:
         if collider.facets:
             raise ValueError(f"the collider {collider.label} is a mesh, which only steps take; run the scene until it rests")
@@ -185,7 +193,8 @@ class _Descent:
 
     def __init__(self, minimiser, base, tolerance, iterations):
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
-        self.used, self.moved = 0, 0.0
+        self.used, self.moved, self.pairs = 0, 0.0, minimiser.pairs
+        self._apart = wp.clone(base)  # the last positions of a descent, which base may have left without regard to pairs
         self.scale = None  # from the first descent: without gravity a later one would be scaled by its own rounding
         model = minimiser.model
         self.load = float(
@@ -210,12 +219,18 @@ class _Descent:
             s /= 16.0
             self.used += 1  # so that a round which finds no direction at all ends too
 
-    def balanced(self):
-        """Whether the loads as they are now leave no more unbalanced than the tolerance, or than rounding did before."""
-        before = self.unbalanced
+    def balanced(self, update):
+        """Whether new areas, and loads by ``update``, leave no more unbalanced than the tolerance, or than rounding does."""
         self.minimiser.clear()
-        self.unbalanced = float(self.minimiser.unbalanced()[0])
-        return self.unbalanced <= max(self.tolerance * self.load, 2.0 * before)
+        rounded = float(self.minimiser.unbalanced()[0])
+        update()
+        self._begin()
+        self.minimiser.clear()
+        found = float(self.minimiser.unbalanced()[0])
+        if found > max(self.tolerance * self.load, 2.0 * rounded):
+            return False
+        self.unbalanced = max(self.unbalanced, min(found, self.tolerance * self.load))
+        return True
 
     @property
     def residual(self):
@@ -224,30 +239,63 @@ class _Descent:
 
     def _settle(self, s, load, most):
         self.minimiser.set_objective(s, load)
+        self._begin()
         if self.load == 0.0:
             self.minimiser.clear()
             self.load = float(self.minimiser.unbalanced()[0]) or 1.0
-        (result,) = self.minimiser.minimise(self.tolerance, min(most, max(self.iterations - self.used, 0)), self.scale)
+        most = min(most, max(self.iterations - self.used, 0))
+        (result,) = self.minimiser.minimise(self.tolerance, most, self.scale)
+        while self.pairs is not None and self.pairs.overflowed:
+            self._grow()
+            self._begin()
+            (result,) = self.minimiser.minimise(self.tolerance, most, self.scale)
         self.scale = self.minimiser.scale
         self.unbalanced = float(self.minimiser.unbalanced()[0])
         self.used += self.minimiser.iterations
         correction = self.minimiser.correction.numpy()
         self.moved = np.abs(correction).max(initial=0.0) / self.size
         self.base.assign(self.base.numpy() + correction)
+        wp.copy(self._apart, self.base)
         return result
 
+    def _begin(self):
+        """Lists the pairs of self-contact, and fixes their areas."""
+        if self.pairs is None:
+            return
+        self.pairs.launch_begin(self._apart)
+        while self.pairs.overflowed:
+            self._grow()
+            self.pairs.launch_begin(self._apart)
 
-def _settle_loads(model, base, descent, part):
-    """Descends under the fraction ``part`` of all loads, again where these follow the cloth until they no longer change it."""
-    while True:
-        if model.loads is not None:
+    def _grow(self):
+        self.pairs.grow()
+        self.minimiser.record()
+
+
+def _settle_all(model, base, descent, part):
+    """Descends under the fraction ``part`` of loads and keyframes until what follows the cloth no longer changes it.
+
+    Loads may follow it, and the areas of pairs of self-contact do. Pins that cloth held back go on from there.
+    """
+    pins, loads = model.scene.pins, model.loads
+    follows = descent.pairs is not None or (loads is not None and loads.follows)
+
+    def set_loads():
+        if loads is not None:
             # Of keyframes the last, whatever their number.
-            model.loads.set(model, Moment(base, ahead=MOST_FRAMES))
+            loads.set(model, Moment(base, ahead=MOST_FRAMES))
+
+    while True:
+        base.assign(_with_pins(pins, base.numpy(), part))
+        set_loads()
         result = descent.run(part, _frequency_scale(model))
-        if model.loads is None or not model.loads.follows or result not in SETTLED or descent.used >= descent.iterations:
+        if not follows or result not in SETTLED:
             return result
-        model.loads.set(model, Moment(base, ahead=MOST_FRAMES))
-        if descent.balanced():
+        points = base.numpy()
+        arrived = (points == _with_pins(pins, points, part)).all()
+        if descent.used >= descent.iterations:
+            return result if arrived else Result.ITERATIONS_USED_UP
+        if arrived and descent.balanced(set_loads):
             return result
         descent.used += 1
 
@@ -257,16 +305,16 @@ def _halved(found, least):
     return any(one <= 0.5 * before for one, before in zip(found, least, strict=True))
 
 
-def _move_pins(pins, base, part):
-    """Moves pins with keyframes, in place, to their positions after the fraction ``part`` of the keyframes."""
+def _with_pins(pins, points, part):
+    """The points (n, 3) [m] with pins that have keyframes after the fraction ``part`` of these."""
     if pins.keyframes is None:
-        return
+        return points
     at = part * (len(pins.keyframes) - 1)
     before = min(int(at), len(pins.keyframes) - 1)
     one, two = pins.keyframes[before], pins.keyframes[min(before + 1, len(pins.keyframes) - 1)]
-    points = base.numpy()
-    points[pins.vertices] = np.where(pins.held, one + (at - before) * (two - one), points[pins.vertices])
-    base.assign(points)
+    moved = np.array(points)
+    moved[pins.vertices] = np.where(pins.held, one + (at - before) * (two - one), points[pins.vertices])
+    return moved
 
 
 def _nudge(model):

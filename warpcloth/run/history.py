@@ -74,6 +74,7 @@ class Evaluation:
         stepper: The :class:`warpcloth.solvers.solver.Stepper` whose colliders and multipliers it takes; None for colliders
             where they start, and no hard terms.
         forces: Whether it finds forces.
+        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact where there is no stepper.
 
     Attributes:
         names: Names of the energies.
@@ -86,9 +87,9 @@ class Evaluation:
         ValueError: If a term is hard and the solver has no multipliers.
     """
 
-    def __init__(self, model, h=None, stepper=None, forces=True):
+    def __init__(self, model, h=None, stepper=None, forces=True, pairs=None):
         self.model, self._h, self._pull, self.pulls = model, h, None, None
-        self._pairs = None if stepper is None else stepper.pairs
+        self._pairs = pairs if stepper is None else stepper.pairs
         shares = [] if stepper is None or model.colliders is None else stepper.shares
         self._present = PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
         self._terms = self._present.terms
