@@ -25,6 +25,8 @@ PARALLEL = wp.constant(wp.float64(1e-3))
 KEPT = wp.constant(wp.float64(0.9))
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 CLAMPED = wp.constant(wp.float64(0.05))  # the least share of the gap between two sides that either has
+# Of a gap, what two approaches may add up to without a plane: below 0.9², by KEPT and as y separates nine tenths of the gap.
+WIDE = wp.constant(wp.float64(0.75))
 SIDE = wp.constant(wp.float64(0.5))
 PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges below which they have no normal
 
@@ -76,14 +78,6 @@ class SweptPairs:
     weights: wp.array(dtype=wp.vec4d)
     gap: wp.array(dtype=wp.float64)
     multiplier: wp.array(dtype=wp.float64)
-
-
-@wp.struct
-class Planes:
-    """Of pairs a plane between their sides: n with its offset, and how near to it each side may come [m]."""
-
-    plane: wp.array(dtype=wp.vec4d)
-    margin: wp.array(dtype=wp.float64)
 
 
 @wp.func
@@ -826,35 +820,105 @@ def wanted_move(dtype):
 
 
 @cache
-def set_planes(dtype):
-    """Kernel over pairs: planes normal to y between their sides at x, at the share of the gap that their approaches ask for.
+def find_ways(dtype):
+    """Kernel over vertices: by how much their moves bring a pair nearer at most, their farthest coordinates, and shares of 1.
 
-    The ``common`` move of all vertices of a copy does not count as an approach.
+    The first is the move that is wanted from the ``common`` move, and WIDE times what there was since ``begun``, where the gaps
+    were found, from that of the first vertex of the copy [m].
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
     wanted = wanted_move(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def set_each_plane(
-        # elements
-        pairs: near_pairs(dtype),
+    def find_each_way(
         # state in
         x: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
         direction: wp.array(dtype=vec3),
         common: wp.array(dtype=wp.vec3d),
+        begun: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        # out
+        ways: wp.array(dtype=wp.vec2d),
+        share: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        start = exact(x[i])
+        move = wanted(x, target, direction, i)
+        far = wp.max(wp.max(wp.abs(start)), wp.max(wp.abs(start + move)))
+        one = i - i % per_copy
+        since = start - exact(begun[i]) - (exact(x[one]) - exact(begun[one]))
+        ways[i] = wp.vec2d(wp.length(move - common[i // per_copy]) + WIDE * wp.length(since), far)
+        share[i] = ONE
+
+    return find_each_way
+
+
+@wp.func
+def margin_of(least: wp.float64, far: wp.float64):
+    """How near to a plane either side may come, with coordinates as ``far`` as that.
+
+    Between float32 numbers, which frames are stored as, 4 units in the last place remain.
+    """
+    ulp = wp.float64(1.1920929e-07) * far
+    return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
+
+
+@cache
+def cut_by_planes(dtype):
+    """Kernel over pairs: the ``share`` of its move from x that each vertex can make, at most that of before.
+
+    A plane normal to y lies between the two sides, at the share of the gap that their approaches ask for. The ``common`` move
+    of all vertices of a copy does not count as an approach. No plane is needed by pairs that are ``open``, and by those whose
+    ``gap`` is so wide that none cuts a move of :func:`find_ways`: each side has at least CLAMPED of it.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+    wanted = wanted_move(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def cut_by_each_plane(
+        # elements
+        pairs: near_pairs(dtype),
+        gap: wp.array(dtype=wp.float64),
+        open: wp.array(dtype=wp.int32),
+        # state in
+        x: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        common: wp.array(dtype=wp.vec3d),
+        ways: wp.array(dtype=wp.vec2d),
         # parameters
         per_copy: int,
         least: wp.float64,
-        # out
-        planes: Planes,
+        # in and out
+        share: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
         s = pairs.stencils[e]
         of_vertex = e < pairs.counts[0]
+        sides = wp.where(of_vertex, 1, 2)
+        way = wp.vec2d()
+        far = ZERO
+        for i in range(4):
+            each = ways[s[i]]
+            far = wp.max(far, each[1])
+            if i < sides:
+                way[0] = wp.max(way[0], each[0])
+            else:
+                way[1] = wp.max(way[1], each[0])
+        margin = margin_of(least, far)
+        if gap:
+            # Approaches that add up to KEPT·gap − KEPT/CLAMPED·margin or less are not cut, however the gap is shared.
+            if way[0] + way[1] <= WIDE * gap[e] - KEPT / CLAMPED * margin:
+                return
+        if open:
+            if open[e] != 0:
+                return
         origin = exact(x[s[0]])
         _w, y, _inside = nearest(of_vertex, origin, exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
         n = y / wp.max(wp.length(y), wp.float64(1e-300))
@@ -862,81 +926,59 @@ def set_planes(dtype):
         highest = -wp.float64(wp.inf)
         first = ZERO
         second = ZERO
-        far = ZERO
-        sides = wp.where(of_vertex, 1, 2)
+        position = wp.vec4d()
+        approaches = wp.vec4d()
         for i in range(4):
-            point = exact(x[s[i]])
             move = wanted(x, target, direction, s[i])
             approach = wp.dot(n, move - common[s[i] // per_copy])
-            along = wp.dot(n, point - origin)
-            far = wp.max(far, wp.max(wp.max(wp.abs(point)), wp.max(wp.abs(point + move))))
+            along = wp.dot(n, exact(x[s[i]]) - origin)
+            position[i] = along
             if i < sides:
+                approaches[i] = -approach
                 lowest = wp.min(lowest, along)
                 first = wp.max(first, -approach)
             else:
+                approaches[i] = approach
                 highest = wp.max(highest, along)
                 second = wp.max(second, approach)
-        share = SIDE
+        part = SIDE
         if first + second > ZERO:
-            share = wp.clamp(second / (first + second), CLAMPED, ONE - CLAMPED)
-        offset = highest + share * (lowest - highest)
-        planes.plane[e] = wp.vec4d(n[0], n[1], n[2], offset)
-        # Between float32 numbers, which frames are stored as, 4 units in the last place remain.
-        ulp = wp.float64(1.1920929e-07) * far
-        planes.margin[e] = SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
+            part = wp.clamp(second / (first + second), CLAMPED, ONE - CLAMPED)
+        offset = highest + part * (lowest - highest)
+        for i in range(4):
+            if approaches[i] > ZERO:
+                room = wp.where(i < sides, ONE, -ONE) * (position[i] - offset) - margin
+                t = KEPT * wp.max(room, ZERO) / approaches[i]
+                if t < share[s[i]]:
+                    wp.atomic_min(share, s[i], t)
 
-    return set_each_plane
+    return cut_by_each_plane
 
 
-@cache
-def kept_share(dtype):
-    """The device function (…, x, i, move) → the shares of a move from xᵢ that its bound, and planes too, allow."""
-    vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
-
-    @wp.func
-    def kept(pairs: near_pairs(dtype), planes: Planes, x: wp.array(dtype=vec3), i: int, move: wp.vec3d, most: wp.float64):
-        size = wp.length(move)
-        far = ONE
-        if size > most:
-            far = most / size
-        t = far
-        start = exact(x[i])
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            corner = pairs.corners[k] - 4 * e
-            plane = planes.plane[e]
-            n = wp.vec3d(plane[0], plane[1], plane[2])
-            sign = -ONE
-            if corner == 0 or (corner == 1 and e >= pairs.counts[0]):
-                sign = ONE
-            approach = -sign * wp.dot(n, move)
-            if approach > ZERO:
-                origin = exact(x[pairs.stencils[e][0]])
-                room = sign * (wp.dot(n, start - origin) - plane[3]) - planes.margin[e]
-                t = wp.min(t, KEPT * wp.max(room, ZERO) / approach)
-        return far, t
-
-    return kept
+@wp.func
+def bounded_share(move: wp.vec3d, most: wp.float64):
+    """The share of a move that is at most so long."""
+    size = wp.length(move)
+    far = ONE
+    if size > most:
+        far = most / size
+    return far
 
 
 @cache
 def keep_apart(dtype):
-    """Kernel over vertices: x ← x + u + t(δ − u), u the ``common`` move, t such that no plane of a pair comes too near.
+    """Kernel over vertices: x ← x + u + t(δ − u), u the ``common`` move, t at most the ``share`` that planes leave.
 
     ``most`` bounds t‖δ − u‖, by which no pair that is not listed can cross. ``cuts`` (B, 2) counts the vertices that planes cut
     short, and those that only this bound did. Copies that do not ``walk`` stay.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    kept = kept_share(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def keep_each_apart(
-        # elements
-        pairs: near_pairs(dtype),
         # state in
-        planes: Planes,
+        share: wp.array(dtype=wp.float64),
         x_ref: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
         common: wp.array(dtype=wp.vec3d),
@@ -954,7 +996,8 @@ def keep_apart(dtype):
             return
         u = common[copy]
         move = exact(target[i]) - exact(x_ref[i]) - u
-        far, t = kept(pairs, planes, x_ref, i, move, most)
+        far = bounded_share(move, most)
+        t = wp.min(far, share[i])
         if t < ONE:
             end = exact(x_ref[i]) + u + t * move
             x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
@@ -970,15 +1013,11 @@ def limit_direction(dtype):
     """Kernel over vertices: p ← u + t(p − u), as :func:`keep_apart`."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    kept = kept_share(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def limit_each_direction(
-        # elements
-        pairs: near_pairs(dtype),
         # state in
-        planes: Planes,
-        x: wp.array(dtype=vec3),
+        share: wp.array(dtype=wp.float64),
         common: wp.array(dtype=wp.vec3d),
         # parameters
         per_copy: int,
@@ -989,7 +1028,7 @@ def limit_direction(dtype):
         i = wp.tid()
         u = common[i // per_copy]
         move = exact(direction[i]) - u
-        _far, t = kept(pairs, planes, x, i, move, most)
+        t = wp.min(bounded_share(move, most), share[i])
         if t < ONE:
             end = u + t * move
             direction[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))

@@ -102,21 +102,22 @@ def leave_out(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def open_planes(
+def find_open(
     # elements
     stencils: wp.array(dtype=wp.vec4i),
     counts: wp.array(dtype=wp.int32),
     left: LeftOut,
     # out
-    plane: wp.array(dtype=wp.vec4d),
+    open: wp.array(dtype=wp.int32),
 ):
-    """Over pairs: those that are whole and have no free tangle get a plane without a normal, which nothing approaches."""
+    """Over pairs: those that are whole and have no free tangle are open, which no plane divides."""
     e = wp.tid()
     if e < counts[0] + counts[1]:
+        open[e] = 0
         row = row_of(stencils[e], e < counts[0], left)
         if row >= 0:
             if left.whole[row] != 0 and free_of(row, left) == 0:
-                plane[e] = wp.vec4d()
+                open[e] = 1
 
 
 @wp.func

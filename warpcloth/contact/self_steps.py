@@ -52,7 +52,8 @@ class SelfSteps:
         self.skin = SKIN * float(model.scene.mesh.edge_lengths.max())
         self.proximity = Proximity(model, declared.distance, self.skin)
         device = model.device
-        self.x_before, self._target, self._from, self._other = (model.vectors() for _ in range(4))
+        self.x_before, self._target, self._from, self._other, self._begun_at = (model.vectors() for _ in range(5))
+        self._ways, self._share = (wp.zeros(model.count, dtype=kind, device=device) for kind in (wp.vec2d, wp.float64))
         self._slope, self._iterates, self._touching = model.scalars(), False, None
         self._colliders, self._cut_before = colliders, None
         self.energies = wp.zeros(model.count, dtype=wp.float64, device=device)
@@ -71,7 +72,14 @@ class SelfSteps:
         self._count = model.kernel(count_step)
         made = kernels.begin_pairs, kernels.set_areas, kernels.add_forces, kernels.sum_energies, kernels.add_diagonal
         made += kernels.limit_direction, kernels.precondition, kernels.take_descent, kernels.add_positions
-        made += kernels.add_products, kernels.set_planes, kernels.keep_apart, kernels.end_filter, kernels.common_move
+        made += (
+            kernels.add_products,
+            kernels.find_ways,
+            kernels.cut_by_planes,
+            kernels.keep_apart,
+            kernels.end_filter,
+            kernels.common_move,
+        )
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
         self._moves_together = free
@@ -207,12 +215,12 @@ class SelfSteps:
         self.pairs = kernels.near_pairs(self.model.dtype)()
         for name in ("stencils", "counts", "rows", "first", "corners", "distances"):
             setattr(self.pairs, name, getattr(found, name))
-        self.begun, self.forces, self._planes = kernels.StepPairs(), kernels.PairForces(), kernels.Planes()
+        self.begun, self.forces = kernels.StepPairs(), kernels.PairForces()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
         self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
         self.forces.normal, self.forces.weights = room(wp.vec3d), room(wp.vec4d)
         self.forces.energy, self.forces.slope, self.forces.bend = (room(wp.float64) for _ in range(3))
-        self._planes.plane, self._planes.margin = room(wp.vec4d), room(wp.float64)
+        self._open = room(wp.int32) if self.declared.crossing_start == "run" else None
         self.multipliers = room(wp.float64)
         if self._touching is not None:
             self._swept = kernels.SweptPairs()
@@ -274,11 +282,20 @@ class SelfSteps:
     def launch_areas(self, x):
         """Fixes the side and the area of each listed pair."""
         count = len(self.pairs.stencils)
-        self._launch(kernels.begin_pairs, count, [self.pairs, x], [self.begun])
+        self._launch_sides(x)
         if self.tangles is not None:
             self.tangles.launch_leave_out(self.pairs.stencils, self.pairs.counts, self.begun.gap)
         given = [self.pairs, self._areas, x, self.declared.stiffness]
         self._launch(kernels.set_areas, count, given, [self.begun])
+
+    def _launch_sides(self, x):
+        """Fixes the side of each listed pair, and its gap."""
+        wp.copy(self._begun_at, x)
+        self._launch(kernels.begin_pairs, len(self.pairs.stencils), [self.pairs, x], [self.begun])
+
+    def _relist(self, x):
+        self.launch_list(x)
+        self._launch_sides(x)
 
     def launch_forces(self, x, correction=None):
         """Finds the forces of the pairs at x, or x + correction, which the methods below add up."""
@@ -373,7 +390,7 @@ class SelfSteps:
         wp.copy(self._target, x)
         wp.copy(x, self.x_before)
         if self._iterates:
-            self.launch_fresh(x, self.launch_list)
+            self.launch_fresh(x, self._relist)
         self._walk(x)
         if self._lets_out:
             self._turns.zero_()
@@ -392,7 +409,7 @@ class SelfSteps:
         wp.capture_if(self.proximity.moved(x, WAY), launch, x=x)
 
     def _walk(self, x):
-        """Moves x to the target as far as pairs stay apart, by lists made anew on the way."""
+        """Moves x to the target as far as pairs stay apart, by lists made anew on the way where it has come far."""
         self._rounds.zero_()
         self._cuts.zero_()
         self._walking.fill_(1)
@@ -400,7 +417,7 @@ class SelfSteps:
         wp.capture_while(self._proceed, self._launch_round, x=x)
 
     def _launch_round(self, x):
-        self.launch_list(x)
+        self.launch_fresh(x, self._relist)
         if self._iterates:
             self.launch_areas(x)
         self._launch_walk(x)
@@ -416,7 +433,7 @@ class SelfSteps:
     def _launch_apart(self, x, target):
         model = self.model
         wp.copy(self._from, x)
-        given = [self.pairs, self._planes, self._from, target, self._common, self._walking, model.per_copy, WAY * self.skin]
+        given = [self._share, self._from, target, self._common, self._walking, model.per_copy, WAY * self.skin]
         self._launch(kernels.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
@@ -431,8 +448,7 @@ class SelfSteps:
     def _launch_let_out(self, x):
         """Walks on to where the vertices that are held back are outside, and other cloth makes way for them."""
         model, out = self.model, self._other
-        self.launch_list(x)
-        self._launch(kernels.begin_pairs, len(self.pairs.stencils), [self.pairs, x], [self.begun])
+        self._relist(x)
         for _ in range(SWEEPS):
             given = [self.pairs, self._mobile, self.begun, x, LEFT * self.declared.distance]
             self._launch(kernels.push_pairs, 1, given, [out])
@@ -442,13 +458,19 @@ class SelfSteps:
         self._launch_held(x)
 
     def _launch_planes(self, x, target, direction):
+        """Finds the share of each wanted move that planes leave."""
         model, wanted = self.model, [x, target, direction]
         if self._moves_together:
             self._launch(kernels.common_move, model.copies, [*wanted, model.per_copy], [self._common])
-        given = [self.pairs, *wanted, self._common, model.per_copy, FLOOR * self.declared.distance]
-        self._launch(kernels.set_planes, len(self.pairs.stencils), given, [self._planes])
+        given = [*wanted, self._common, self._begun_at, model.per_copy]
+        self._launch(kernels.find_ways, model.count, given, [self._ways, self._share])
+        gap, open = self.begun.gap, None
         if self.tangles is not None:
-            self.tangles.launch_open(self.pairs.stencils, self.pairs.counts, self._planes.plane)
+            gap, open = None, self._open  # gaps are infinite where a pair is left out of contact
+            self.tangles.launch_open(self.pairs.stencils, self.pairs.counts, open)
+        given = [self.pairs, gap, open, *wanted, self._common, self._ways]
+        given += [model.per_copy, FLOOR * self.declared.distance]
+        self._launch(kernels.cut_by_planes, len(self.pairs.stencils), given, [self._share])
 
     # Of methods whose iterates base + d stay apart too.
 
@@ -491,7 +513,7 @@ class SelfSteps:
             sums.largest(self._ones, each, self._longest)
             self._launch(kernels.shorten, N, [self._longest, model.per_copy, WAY * self.skin], [each])
             self._launch_planes(self.x_before, None, each)
-            given = [self.pairs, self._planes, self.x_before, self._common, model.per_copy, WAY * self.skin]
+            given = [self._share, self._common, model.per_copy, WAY * self.skin]
             self._launch(kernels.limit_direction, N, given, [each])
         sums.dot(gradient, direction, self._slope)
         self._launch(kernels.take_descent, N, [self._slope, self._other, model.per_copy], [direction])

@@ -72,9 +72,9 @@ class Tangles:
         """Sets the gap [m] of pairs that are left out to infinity, at which there is no contact."""
         self.model.launch(kernels.leave_out, len(stencils), [stencils, counts, self._left], [gap])
 
-    def launch_open(self, stencils, counts, plane):
-        """Takes away the planes of pairs that are left out."""
-        self.model.launch(kernels.open_planes, len(stencils), [stencils, counts, self._left], [plane])
+    def launch_open(self, stencils, counts, open):
+        """Finds the pairs that no plane divides."""
+        self.model.launch(kernels.find_open, len(stencils), [stencils, counts, self._left], [open])
 
     def launch_free(self, x):
         """Notes which triangles are free at x (N,)."""
