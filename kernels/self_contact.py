@@ -28,6 +28,7 @@ CLAMPED = wp.constant(wp.float64(0.05))  # the least share of the gap between tw
 # Of a gap, what two approaches may add up to without a plane: below 0.9², by KEPT and as y separates nine tenths of the gap.
 WIDE = wp.constant(wp.float64(0.75))
 SIDE = wp.constant(wp.float64(0.5))
+ULP = wp.constant(wp.float64(1.1920929e-07))  # of float32, over the number, at most
 PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges below which they have no normal
 
 
@@ -862,7 +863,7 @@ def margin_of(least: wp.float64, far: wp.float64):
 
     Between float32 numbers, which frames are stored as, 4 units in the last place remain.
     """
-    ulp = wp.float64(1.1920929e-07) * far
+    ulp = ULP * far
     return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
 
 
@@ -1299,11 +1300,16 @@ def another_round(
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def note_most(
+def note_list(
     # state in
     counts: wp.array(dtype=wp.int32),
+    # parameters
+    made: int,
     # in and out
     most: wp.array(dtype=wp.int32),
+    lists: wp.array(dtype=wp.int32),
 ):
-    """The largest number of pairs in any list."""
-    most[0] = wp.max(most[0], counts[0] + counts[1])
+    """Kernel over copies: the largest number of pairs in any list, and how many lists were ``made``."""
+    c = wp.tid()
+    most[c] = wp.max(most[c], counts[0] + counts[1])
+    lists[c] = lists[c] + made

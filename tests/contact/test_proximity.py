@@ -5,57 +5,9 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.pairs import all_pairs
 from warpcloth.contact.proximity import Proximity
 from warpcloth.model.model import Model
-
-
-def from_segment(p, a, b):
-    """Distances of points to segments (…, 3)."""
-    e = b - a
-    length = (e * e).sum(axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        t = np.where(length > 0.0, ((p - a) * e).sum(axis=-1) / length, 0.0).clip(0.0, 1.0)
-    return np.linalg.norm(p - a - t[..., None] * e, axis=-1)
-
-
-def from_triangle(p, a, b, c):
-    """Distances of points to triangles, by their sides, and by their planes where a point is above the inside."""
-    n = np.cross(b - a, c - a)
-    size = np.linalg.norm(n, axis=-1)
-    found = np.minimum(np.minimum(from_segment(p, a, b), from_segment(p, b, c)), from_segment(p, c, a))
-    inside = size > 0.0
-    for one, other in ((a, b), (b, c), (c, a)):
-        inside &= (np.cross(other - one, p - one) * n).sum(axis=-1) >= 0.0
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(inside, np.abs(((p - a) * n).sum(axis=-1)) / size, found)
-
-
-def between_edges(a, b, c, d):
-    """Distances of segments: from an end of one to the other, or of the lines where both feet are inside."""
-    found = np.minimum(from_segment(a, c, d), from_segment(b, c, d))
-    found = np.minimum(found, np.minimum(from_segment(c, a, b), from_segment(d, a, b)))
-    e, f, r = b - a, d - c, a - c
-    ee, ff, ef, er, fr = ((u * v).sum(axis=-1) for u, v in ((e, e), (f, f), (e, f), (e, r), (f, r)))
-    det = ee * ff - ef * ef
-    with np.errstate(invalid="ignore", divide="ignore"):
-        s, t = (ef * fr - er * ff) / det, (ee * fr - ef * er) / det
-        inside = (det > 1e-12 * ee * ff) & (s >= 0.0) & (s <= 1.0) & (t >= 0.0) & (t <= 1.0)
-        return np.where(inside, np.linalg.norm(r + s[..., None] * e - t[..., None] * f, axis=-1), found)
-
-
-def all_pairs(mesh, x):
-    """All pairs that share no vertex: (VT stencils, distances now, at rest), and those of edges."""
-    points, kinds = mesh.points, []
-    v, t = (each.ravel() for each in np.meshgrid(np.unique(mesh.triangles), np.arange(len(mesh.triangles)), indexing="ij"))
-    e, f = np.triu_indices(len(mesh.edges), 1)
-    for s, measure in (
-        (np.column_stack([v, mesh.triangles[t]]), from_triangle),
-        (np.column_stack([mesh.edges[e], mesh.edges[f]]), between_edges),
-    ):
-        apart = (s[:, :1] != s[:, 1:]).all(axis=1) & (s[:, 1] != s[:, 2]) & (s[:, 1] != s[:, 3])
-        s = s[apart]
-        kinds.append((s, measure(*x[s.T]), measure(*points[s.T])))
-    return kinds
 
 
 def pieces(mesh):

@@ -97,7 +97,7 @@ def folded(n=13, gap=0.02, **fields):
 def steps_of(scene, device, bounded=False, h=1.0 / 24.0):
     """The :class:`SelfSteps` of a scene in float64, in no solver, and its model."""
     model = scene.build(device=device, dtype="float64")
-    return SelfSteps(model, wc.Explicit(substeps=1000, above_limit="allow").bind(model).state, h, bounded, None), model
+    return SelfSteps(model, wc.Explicit(substeps=1000, above_limit="allow").bind(model).state, h, 1, bounded, None), model
 
 
 def crossed(points, triangles):

@@ -355,7 +355,7 @@ def test_books_are_primvars_of_the_animation(source, single, tmp_path, device):
 
 @pytest.mark.host
 def test_wrong_records_and_hidden_forces_are_refused():
-    with pytest.raises(ValueError, match=r"^record is 'forces'; it must be some of 'energies', 'reactions'$"):
+    with pytest.raises(ValueError, match=r"^record is 'forces'; it must be some of 'energies', 'reactions', 'pairs'$"):
         wc.simulate(square(), SOLVERS["newton"], record="forces")
     with pytest.raises(ValueError, match=r"^record is 3; it must be"):
         wc.equilibrium(square(), record=3)

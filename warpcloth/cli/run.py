@@ -1,5 +1,6 @@
 """The command ``run``: runs a scene and writes its animation."""
 
+import math
 import os
 import statistics
 
@@ -25,7 +26,7 @@ def run(arguments):
     arguments.output = _own_output(scene, arguments.resume) if arguments.output is None else arguments.output
     check_writable(arguments.output)
     check_drawing(arguments.film, [arguments.output])
-    record = record_of(arguments)
+    record = record_of(arguments, scene)
     device = find_device(arguments.device)
     if arguments.tolerance is not None or arguments.budget is not None:
         from .choose import take_choice
@@ -66,6 +67,7 @@ def run(arguments):
             "worst_strain": animation.worst_strain,
             **({"cut": animation.cut, "inside": [each._asdict() for each in animation.inside]} if scene.colliders else {}),
             **({"crossings": animation.crossings} if crosses else {}),
+            **({"self_contact": _self_contact(animation.self_contact)} if animation.self_contact else {}),
             "residual": status.residual,
             "residual_measure": status.measure,
             "residual_unit": status.unit,
@@ -95,12 +97,28 @@ def _own_output(scene, resume):
     return output
 
 
+def _self_contact(found):
+    """A :class:`warpcloth.run.simulate.SelfContactSummary` as JSON; a gap of no pair is None."""
+    return found._asdict() | {"least_gap": found.least_gap if math.isfinite(found.least_gap) else None}
+
+
+def _lines_of(found):
+    """Lines of the summary about self-contact."""
+    gap = "no pair was listed" if found["least_gap"] is None else f"least gap {found['least_gap']:.3g} m"
+    counts = f"up to {found['pairs']:,} pairs, {found['lists']:,} lists of them"
+    yield f"  self-contact  {counts}, {100.0 * found['kept']:.4g} % of moves kept, {gap}"
+    if found["too_near"]:
+        yield f"  too near      {found['too_near']}"
+
+
 def _summary(facts, inside):
     from ..core.status import digits
 
     threads, measured = facts["threads"], facts["residual_measure"] is not None
     residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none, the method does not compute one"
-    cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by colliders"] if "cut" in facts else []
+    touching, by = facts.get("self_contact"), "colliders"
+    by += " and other cloth" if touching else ""
+    cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by {by}"] if "cut" in facts else []
     left = facts.get("crossings")
     crossings = [] if left is None else [f"  crossings     {left} pairs of triangles of the start are left"]
     return "\n".join(
@@ -112,6 +130,7 @@ def _summary(facts, inside):
             *cut,
             *(f"  inside        {each}" for each in inside),
             *crossings,
+            *(_lines_of(touching) if touching else ()),
             f"  residual      {residual}",
             f"  solver        {solver_line(facts)}",
             f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),

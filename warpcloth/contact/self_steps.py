@@ -1,10 +1,15 @@
 """Contact of cloth with itself in the steps of a solver: the forces of near pairs, and the filter at the end of each step."""
 
+from contextlib import contextmanager
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror
+from ..core.status import Stopped
 from ..core.sums import Sums
+from ..kernels import gap_notes
 from ..kernels import self_contact as kernels
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
@@ -26,6 +31,20 @@ WAY = 0.25
 OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
 
 
+class TooNear(NamedTuple):
+    """A frame in which cloth comes nearer to itself than float32 can tell apart, as frames are stored.
+
+    Attributes:
+        copy: Index of its copy.
+        frame: The first such frame.
+        vertex: A vertex of the model there, of those in one copy.
+    """
+
+    copy: int
+    frame: int
+    vertex: int
+
+
 class SelfSteps:
     """Forces between near parts of cloth, and the filter, in the steps of one solver.
 
@@ -36,6 +55,7 @@ class SelfSteps:
         model: The :class:`warpcloth.model.model.Model` of a scene with self-contact.
         state: The :class:`warpcloth.core.state.State` of the solver, to which it adds its own arrays.
         h: Step [s].
+        steps_per_frame: Steps a frame.
         bounded: Whether contact is that of explicit steps, without the logarithm.
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
@@ -43,10 +63,11 @@ class SelfSteps:
         proximity: :class:`warpcloth.contact.proximity.Proximity`.
         x_before: Positions where the step began, (N,) [m].
         energies: Those of the pairs by their first vertex, (N,) [J].
+        lists: How many lists of pairs were made, (B,) int32, the same for all copies.
         tangles: :class:`warpcloth.contact.tangles.Tangles` of a start at which cloth crosses or touches cloth, else None.
     """
 
-    def __init__(self, model, state, h, bounded, colliders):
+    def __init__(self, model, state, h, steps_per_frame, bounded, colliders):
         declared = model.scene.self_contact
         self.model, self.h, self.bounded, self.declared = model, h, bounded, declared
         self.skin = SKIN * float(model.scene.mesh.edge_lengths.max())
@@ -68,7 +89,11 @@ class SelfSteps:
         self._proceed = wp.zeros(1, dtype=wp.int32, device=device)
         self.cut = state.add("vertices kept apart", wp.zeros(model.copies, dtype=wp.int64, device=device))
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32))
-        self._most = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
+        self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
+        self.lists = state.add("lists of pairs", model.scalars(wp.int32))
+        self._notes, self._per_frame = gap_notes.GapNotes(), steps_per_frame
+        self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
+        self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
         self._count = model.kernel(count_step)
         made = kernels.begin_pairs, kernels.set_areas, kernels.add_forces, kernels.sum_energies, kernels.add_diagonal
         made += kernels.limit_direction, kernels.precondition, kernels.take_descent, kernels.add_positions
@@ -79,12 +104,13 @@ class SelfSteps:
             kernels.keep_apart,
             kernels.end_filter,
             kernels.common_move,
+            gap_notes.note_gaps,
         )
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
         self._moves_together = free
         self._few = int(SHARE * model.per_copy)
-        self.tangles = None
+        self.tangles, self._counted = None, None
         declared = model.colliders
         self._lets_out = declared is not None and (declared.meshes is not None or any(declared.moves))
         if self._lets_out:
@@ -95,6 +121,7 @@ class SelfSteps:
                 self._kernels[factory] = model.kernel(factory, model.dtype)
         self._hold()
         state.add("positions of the list", self.proximity.found)
+        self._carried = self.proximity.found, self._most.array, self.lists, self._notes.nearest, self._notes.too_near
         self._check_start(state)
         self.start_again()
 
@@ -127,9 +154,8 @@ class SelfSteps:
         model, before = self.model, len(self.pairs.stencils)
         x = np.where(np.repeat(mask, model.per_copy)[:, None], x, np.nan)  # which has no pairs
         tangles, self.tangles = self.tangles, None
-        listed = wp.clone(self.proximity.found)  # part of the state, which stays as it is
-        found = self._too_near(wp.array(x, dtype=model.vec3, device=model.device))
-        wp.copy(self.proximity.found, listed)
+        with self._looking():
+            found = self._too_near(wp.array(x, dtype=model.vec3, device=model.device))
         self.tangles = tangles
         if len(found[0]) or found[3]:
             self._refuse_pairs(*found, "")
@@ -171,9 +197,8 @@ class SelfSteps:
     def at_start(self):
         """U [J] at the start, and how many pairs touch there times ½Σ(r − d)² [m²], both (B,)."""
         x, energy = self.model.positions, self.model.scalars()
-        found = wp.clone(self.proximity.found)
-        self.launch_begin(x)
-        wp.copy(self.proximity.found, found)
+        with self._looking():
+            self.launch_begin(x)
         self.launch_forces(x)
         self.add_energy(Sums(self.model), energy)
         copies = self.pairs.stencils.numpy()[: self.pairs.counts.numpy().sum(), 0] // self.model.per_copy
@@ -182,6 +207,16 @@ class SelfSteps:
         open_by = np.where(stiffness > 0.0, np.maximum(distance - gap, 0.0), 0.0)
         touching, squares = (np.bincount(copies, each, self.model.copies) for each in (open_by > 0.0, open_by**2))
         return energy.numpy(), 0.5 * touching * squares
+
+    @contextmanager
+    def _looking(self):
+        """Leaves the state as it was, whatever is listed meanwhile."""
+        kept = [wp.clone(array) for array in self._carried]
+        try:
+            yield
+        finally:
+            for array, before in zip(self._carried, kept, strict=True):
+                wp.copy(array, before)
 
     def _triangles_of(self, edges):
         """The triangles of the model that each of some edges (E, 2) is in, two (E, 2, 3), the same twice at a border."""
@@ -228,19 +263,25 @@ class SelfSteps:
             self._swept.gap, self._swept.multiplier = room(wp.float64), room(wp.float64)
 
     def grow(self):
-        """Makes room for the pairs that did not fit; what was recorded must be recorded again."""
-        self.grow_to(self._wanted)
+        """Makes room for the pairs that did not fit; what was recorded must be recorded again.
+
+        Raises:
+            Stopped: There is no memory for them.
+        """
+        try:
+            self.grow_to(self._wanted)
+        except ValueError as error:
+            raise Stopped(str(error)) from None
 
     def grow_to(self, pairs):
         """Makes room for half as many pairs more than these."""
         self.proximity.grow(pairs)
-        self._most.write(0)
         self._hold()
 
     @property
     def overflowed(self):
         """Whether a list since this was last asked did not have room for all pairs; the host reads it."""
-        most = int(self._most.read()[0])
+        most = int(self._most.read().max())
         if most > len(self.pairs.stencils):
             self._wanted = most
             return True
@@ -252,11 +293,39 @@ class SelfSteps:
         free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
         return self.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
 
+    @property
+    def most(self):
+        """The largest number of pairs in any list of the steps so far, of all copies."""
+        return int(self._most.read().max())
+
+    @property
+    def least_gap(self):
+        """The least distance of a pair in any frame so far, as stored in float32, (B,) [m]; infinite where none was listed."""
+        return _gaps(self._notes.nearest)
+
+    @property
+    def too_near(self):
+        """A :class:`TooNear` of each copy in which a pair came nearer than 4 units in the last place of float32 coordinates."""
+        found, n = [], self.model.per_copy
+        for copy, value in enumerate(self._notes.too_near.numpy()):
+            if value:
+                found.append(TooNear(copy, *divmod(int(gap_notes.FIRST) - int(value), n)))
+        return found
+
+    def in_frame(self):
+        """Of the last :meth:`launch_begin`, for each copy (B,): pairs listed, pairs in contact, and the least gap [m]."""
+        model = self.model
+        if self._counted is None:
+            self._counted = model.kernel(gap_notes.count_pairs, model.dtype)
+        counts, nearest = wp.zeros((model.copies, 2), dtype=wp.int32, device=model.device), model.scalars(wp.float64)
+        given = [self.pairs, self.begun, self.x_before, model.per_copy]
+        model.launch(self._counted, len(self.pairs.stencils), given, [counts, nearest])
+        return *counts.numpy().T, _gaps(nearest)
+
     def start_again(self):
         """Forgets the steps that an integrator made to find its past, and the list, as a reset does."""
-        self.proximity.found.zero_()
-        self.cut.zero_()
-        self.steps.zero_()
+        for array in (self.cut, self.steps, *self._carried):
+            array.zero_()
         if self.tangles is not None:
             self.tangles.start_again()
 
@@ -273,11 +342,14 @@ class SelfSteps:
             wp.copy(self._cut_before, self._colliders.notes.cut)
         self.proximity.launch_kept(x, WAY, self.launch_list)
         self.launch_areas(x)
+        given = [self.pairs, self.begun, x, self.steps, self._per_frame, self.model.per_copy]
+        self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [self._notes])
 
     def launch_list(self, x):
-        """Lists the pairs at x, and notes how many there are."""
+        """Lists the pairs at x, and notes how many there are; that of ``found`` is one that was made before."""
         self.proximity.launch(x)
-        self.model.launch(kernels.note_most, 1, [self.proximity.counts], [self._most.array])
+        given = [self.proximity.counts, int(x is not self.proximity.found)]
+        self.model.launch(kernels.note_list, self.model.copies, given, [self._most.array, self.lists])
 
     def launch_areas(self, x):
         """Fixes the side and the area of each listed pair."""
@@ -520,6 +592,12 @@ class SelfSteps:
 
     def _add(self, a, b, sign, out):
         self._launch(kernels.add_positions, self.model.count, [a, b, sign], [out])
+
+
+def _gaps(nearest):
+    """Distances [m] by their inverses, an array on the device."""
+    with np.errstate(divide="ignore"):
+        return 1.0 / nearest.numpy()
 
 
 def crossings(points, edges, triangles):

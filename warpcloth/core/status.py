@@ -17,11 +17,16 @@ class Result(Enum):
     SADDLE = "in balance, but not where the energy is least"
     CONTRADICTED = "constraints contradict one another"
     DIVERGED = "diverged"
+    STOPPED = "stopped"
 
     def worse(self, other):
         """The worse of two results."""
         order = list(Result)
         return max(self, other, key=order.index)
+
+
+class Stopped(ValueError):
+    """A step cannot be taken, so the run ends before it; the message says why."""
 
 
 UNBALANCED = "largest unbalanced acceleration of a vertex"
@@ -67,8 +72,8 @@ class Status(NamedTuple):
 
     @property
     def ok(self):
-        """False if a copy diverged."""
-        return self.result is not Result.DIVERGED
+        """False if a copy diverged, or the run could not go on."""
+        return self.result not in (Result.DIVERGED, Result.STOPPED)
 
 
 def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None, use=None):

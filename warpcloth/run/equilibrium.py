@@ -127,7 +127,7 @@ def equilibrium(
     base = wp.clone(model.positions)
     pairs = None
     if scene.self_contact is not None:
-        pairs = SelfSteps(model, State(base, model.vectors(), 1), h=0.0, bounded=False, colliders=None)
+        pairs = SelfSteps(model, State(base, model.vectors(), 1), h=0.0, steps_per_frame=1, bounded=False, colliders=None)
         pairs.iterates()
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
     descent = _Descent(minimiser, base, tolerance, iterations)

@@ -22,20 +22,24 @@ from ..model.damping import dissipations
 from ..scene.scene import Scene
 from ..terms.refresh import STEP, Moment
 
-RECORDS = ("energies", "reactions")
+RECORDS = ("energies", "reactions", "pairs")
+# What "pairs" has of self-contact in each frame.
+PAIRS = ("pairs in contact", "pairs listed", "new lists", "moves kept", "least gap")
 
 
-def checked_record(record: Any) -> tuple[str, ...]:
+def checked_record(record: Any, scene: Scene | None = None) -> tuple[str, ...]:
     """Returns what to record, each word once, in the order of :data:`RECORDS`.
 
     Raises:
-        ValueError: If a word is another.
+        ValueError: If a word is another, or is "pairs" without the scene of a run that has self-contact.
     """
     words = (record,) if isinstance(record, str) else record if isinstance(record, Iterable) else (record,)
     words = tuple(words)
     for word in words:
         if word not in RECORDS:
             raise ValueError(f"record is {shown(word)}; it must be some of {', '.join(map(repr, RECORDS))}")
+        if word == "pairs" and (scene is None or scene.self_contact is None):
+            raise ValueError("record is 'pairs', which only runs of scenes with self_contact have")
     return tuple(word for word in RECORDS if word in words)
 
 
@@ -219,7 +223,8 @@ class History:
         energies: Of each frame that was kept, (F, B, K) [J].
         reactions: Of each frame that was kept, (F, B, p, 3) [N].
         forces: On the colliders, and of these the part of friction, of each frame that was kept, (F, B, C, 2, 3) [N].
-        cuts: The share of the moves in each frame that was kept which colliders cut short, (F, B).
+        pairs: :data:`PAIRS` of each frame that was kept, (F, B, 5).
+        cuts: The share of the moves in each frame that was kept which contact cut short, (F, B).
         totals: Work of pins, without their kinetic energy, of loads, of colliders, against friction and of the filter in the
             last frame that was kept, (5, B) [J].
 
@@ -227,7 +232,7 @@ class History:
         ValueError: If a term is hard and the solver has no multipliers.
     """
 
-    energies, reactions, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
+    energies, reactions, pairs, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
 
     @in_turn
     def __init__(self, stepper, model, record):
@@ -243,11 +248,13 @@ class History:
         forces = "reactions" in record or self._moving or self._touched
         self._evaluation = Evaluation(model, stepper.h, stepper, forces)
         self._found, self._frame = deque(), 0
-        of_colliders = [*["forces"] * ("reactions" in record), "cuts"] if scene.colliders else []
-        self._rows = {name: [] for name in (*record, *of_colliders)}
+        of_contact = ["forces"] * ("reactions" in record and bool(scene.colliders))
+        of_contact += ["cuts"] * (bool(scene.colliders) or scene.self_contact is not None)
+        self._rows = {name: [] for name in (*record, *of_contact)}
         self.carried = (*self._rows, "totals")  # from frame to frame
         self.names = self._evaluation.names
-        self._total, self._each_step, self._cut = np.zeros((5, model.copies)), None, np.zeros(model.copies)
+        self._total, self._each_step = np.zeros((5, model.copies)), None
+        self._seen = self._counted()
         x, v = stepper.state
         if self._moving or self._driven or self._filtered:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
@@ -360,10 +367,20 @@ class History:
             if evaluation.hidden and not self._frame:  # multipliers are those of a step
                 for name in ("reactions", *["forces"] * bool(evaluation.pulls and evaluation.pulls.hard)):
                     found[name][:] = np.nan
-        if self.model.colliders is not None:
-            before, self._cut = self._cut, self._stepper.cut * self._frame  # of as many steps in each frame
-            found["cuts"] = self._cut - before
+        before, self._seen = self._seen, self._counted()
+        if "cuts" in self._rows:
+            found["cuts"] = self._seen[0] - before[0]
+        if "pairs" in self._record:
+            listed, touching, gap = self._stepper.pairs.in_frame()
+            lists, kept = self._seen[1] - before[1], 1.0 - (self._seen[2] - before[2])
+            found["pairs"] = np.stack([touching, listed, lists, kept, gap], axis=-1).astype(np.float64)
         self._found.append((found, self._total.copy()))
+
+    def _counted(self):
+        """The counts of contact so far, (B,) each: cuts, of as many steps in each frame, lists of pairs, and their cuts."""
+        pairs, none = self._stepper.pairs, np.zeros(self.model.copies)
+        of_pairs = (none, none) if pairs is None else (pairs.lists.numpy().copy(), pairs.share * self._frame)
+        return self._stepper.cut * self._frame, *of_pairs
 
     def keep(self, alive):
         """Keeps what was found in the next frame, NaN in copies that are no longer ``alive`` (B,), and returns it by name."""
@@ -377,7 +394,7 @@ class History:
         """Goes on from the frame kept last, to which the stepper was set."""
         self._found.clear()
         self._total, self._frame = np.array(self.totals), max(map(len, self._rows.values())) - 1
-        self._cut = self._stepper.cut * self._frame
+        self._seen = self._counted()
 
     def by_name(self):
         """Returns the fields of the animation that it fills, by name; rows are (F, …), or (F, B, …) of several copies."""
@@ -387,6 +404,8 @@ class History:
             found["energies"] = dict(zip(self.names, np.moveaxis(rows["energies"], -1, 0), strict=True))
         if "reactions" in rows:
             found["reactions"] = rows["reactions"]
+        if "pairs" in rows:
+            found["pairs"] = dict(zip(PAIRS, np.moveaxis(rows["pairs"], -1, 0), strict=True))
         if "forces" in rows:
             names = collider_names(self.model.scene)
             of_all, of_friction = np.moveaxis(rows["forces"], (-3, -2), (1, 0))

@@ -7,7 +7,7 @@ import numpy as np
 from ..scene.lines import lines_of
 from ..usd import AnimationWriter, FrameSequence, JoinedFrames
 from .checkpoint import NAME, Checkpoint
-from .history import collider_names, energy_names
+from .history import PAIRS, collider_names, energy_names
 
 REACTION = "reaction"  # name of the primvar
 
@@ -76,10 +76,12 @@ class File:
         stage, self.single_file, self._output = scene.stage, single_file, output
         self._facts, self._found, self.checkpoint, self._ended = facts, None, None, False
         self._energies = primvar_names(energy_names(scene)) if "energies" in record else {}
+        self._pairs = primvar_names(PAIRS, "self_contact") if "pairs" in record else {}
         self._pins, self._vertices = scene.pins.vertices, len(scene.mesh.points)
         self._rubbing, names = scene.rubbing, collider_names(scene) if "reactions" in record else []
         self._forces = [list(primvar_names(names, kind).values()) for kind in ("collider_forces", "friction_forces")]
-        history = dict.fromkeys(self._energies.values(), "double") | ({REACTION: "float3[]"} if "reactions" in record else {})
+        numbers = *self._energies.values(), *self._pairs.values()
+        history = dict.fromkeys(numbers, "double") | ({REACTION: "float3[]"} if "reactions" in record else {})
         history |= dict.fromkeys((*self._forces[0], *(self._forces[1][c] for c in self._rubbing if names)), "double3")
         self._prims = [each.prim for each in stage.cloths] if stage else [f"/World/{name}" for name in scene.cloths]
         if stage is None:
@@ -150,6 +152,8 @@ class File:
         found = {}
         if "energies" in recorded:
             found |= dict(zip(self._energies.values(), recorded["energies"][0].tolist(), strict=True))
+        if "pairs" in recorded:
+            found |= dict(zip(self._pairs.values(), recorded["pairs"][0].tolist(), strict=True))
         if "reactions" in recorded:
             found[REACTION] = np.zeros((self._vertices, 3))
             found[REACTION][self._pins] = recorded["reactions"][0]

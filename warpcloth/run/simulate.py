@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from ..base.interrupts import recording
 from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
 from ..base.turns import in_turn
 from ..base.types import FilePath, Precision, Progress
-from ..core.status import Status
+from ..core.status import Status, Stopped
 from ..mesh.ordering import order_of_run
 from ..model.precision import DTYPES
 from ..scene.scene import Scene
@@ -58,6 +58,27 @@ class Inside(NamedTuple):
         return f"vertex {self.vertex} is caught between {self.collider} and {self.other} {where}"
 
 
+class SelfContactSummary(NamedTuple):
+    """The contact of cloth with itself in a run.
+
+    Attributes:
+        pairs: The largest number of pairs in a list, those of all copies. A list has the pairs that are nearer than the contact
+            distance plus 0.35 of the longest edge.
+        lists: How many lists were made.
+        kept: The fraction of the moves of free vertices, over all steps, that the filter left whole; with B > 1 copies one
+            value per copy, (B,).
+        least_gap: The least distance of a pair in any frame, as stored in float32 [m], or (B,); infinite if none was listed.
+        too_near: None if all gaps in all frames are at least 4 units in the last place of the farthest float32 coordinate of
+            the pair. Else a sentence that names the first frame, a vertex there, and the least gap.
+    """
+
+    pairs: int
+    lists: int
+    kept: float | np.ndarray
+    least_gap: float | np.ndarray
+    too_near: str | None
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Animation:
     """The result of a run: the start and every good frame after it.
@@ -83,7 +104,11 @@ class Animation:
         collider_forces: With ``record="reactions"``, a dictionary from the name of a collider to the force of the cloth on it,
             friction included, (frames+1, 3) or (frames+1, B, 3) [N].
         friction_forces: In the same form, the part of these forces that is friction, for colliders that have friction.
-        cuts: With a record, the fraction of the moves of free vertices in each frame that the filter of contact cut short,
+        pairs: With ``record="pairs"``, a dictionary of arrays (frames+1,) or (frames+1, B), of the pairs of self-contact at the
+            end of each frame: ``"pairs in contact"``, nearer than the contact distance; ``"pairs listed"``; ``"new lists"``
+            that were made in the frame, for all copies alike; ``"moves kept"``, the fraction of the moves of free vertices that
+            the filter left whole; and ``"least gap"``, the least distance of a pair [m], infinite if none is listed.
+        cuts: With a record, the fraction of the moves of free vertices in each frame that the filters of contact cut short,
             (frames+1,) or (frames+1, B); see ``cut``.
         cut: The fraction of the moves of free vertices, over all steps, that were cut short because they would have entered or
             crossed a collider, plus the fraction cut short because cloth would have crossed cloth; with B > 1 copies one value
@@ -93,6 +118,7 @@ class Animation:
             colliders that close on one another.
         crossings: How many pairs of triangles that crossed or touched at the start have not come free by the end, see
             ``SelfContact(crossing_start="run")``; with B > 1 copies one value per copy, (B,).
+        self_contact: The :class:`SelfContactSummary` of a scene with self-contact, else None.
     """
 
     points: np.ndarray | FrameSequence
@@ -111,6 +137,8 @@ class Animation:
     cuts: np.ndarray | None = None
     inside: tuple[Inside, ...] = ()
     crossings: int | np.ndarray = 0
+    pairs: dict[str, np.ndarray] | None = None
+    self_contact: SelfContactSummary | None = None
 
     def cloth(self, name: str) -> np.ndarray:
         """Positions of one cloth of the scene, or of one part of its mesh, (frames+1, n, 3) or (frames+1, B, n, 3) [m].
@@ -168,13 +196,14 @@ def simulate(
         threads: See :class:`warpcloth.model.model.Model`.
         resume: Whether to continue the interrupted run to ``output`` after its last finished chunk of frames. The result equals
             that of an uninterrupted run bit for bit. All arguments but ``frames`` and ``single_file`` must be the same.
-        record: ``"energies"``, ``"reactions"`` or both. The :class:`Animation` then has them for each frame, and ``output`` has
-            them as primvars. The motion is the same bit for bit. The work of moving pins, moving colliders and changing loads,
-            and the work against friction, are summed in every step, which takes more time.
+        record: Some of ``"energies"``, ``"reactions"`` and, of a scene with self-contact, ``"pairs"``. The :class:`Animation`
+            then has them for each frame, and ``output`` has them as primvars. The motion is the same bit for bit. With
+            ``"energies"``, the work of moving pins, moving colliders and changing loads, and the work against friction, are
+            summed in every step, which takes more time.
 
     Returns:
-        :class:`Animation`. A run that diverges ends with its last good frame, and ``status`` says so. With several copies the
-        others continue, and a copy that diverged is NaN from then on.
+        :class:`Animation`. A run that diverges, or that has no memory for the pairs of self-contact, ends with its last good
+        frame, and ``status`` says so. If one of several copies diverges, the others continue, and it is NaN from then on.
 
     Raises:
         BlockingIOError: If another process, or thread, is writing ``output``.
@@ -196,7 +225,7 @@ def simulate(
     whole("frames", frames, 1, MOST_FRAMES)
     whole("copies", copies, 1)
     choice("dtype", dtype, tuple(DTYPES))
-    record = checked_record(record)
+    record = checked_record(record, scene)
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")
     if resume and output is None:
@@ -242,6 +271,7 @@ def simulate(
         "cut": of_copies(stepper.cut),
         "inside": _inside(stepper),
         "crossings": _crossings(stepper),
+        "self_contact": _self_contact(stepper, status.ok),
         **(history.by_name() if history else {}),
     }
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)
@@ -253,6 +283,30 @@ def _crossings(stepper):
     tangles = None if stepper.pairs is None else stepper.pairs.tangles
     left = np.zeros(stepper.model.copies, dtype=np.int64) if tangles is None else tangles.left()
     return left if len(left) > 1 else int(left[0])
+
+
+@in_turn
+def _self_contact(stepper, ok):
+    """The :class:`SelfContactSummary` of a run that has ended; the gaps of the last frame are noted only now, if it is ok."""
+    pairs, model = stepper.pairs, stepper.model
+    if pairs is None:
+        return None
+    with suppress(Stopped):  # of the last gaps alone
+        while ok:
+            pairs.launch_begin(stepper.state.x)
+            if not pairs.overflowed:
+                break
+            pairs.grow()
+    gaps, said = pairs.least_gap, []
+    for copy, frame, vertex in pairs.too_near:
+        vertex = int(vertex if model.order is None else model.order[vertex])
+        of_copy = f" of copy {copy}" if model.copies > 1 else ""
+        said.append(
+            f"in frame {frame}{of_copy} first, at vertex {vertex}, cloth is nearer to itself than 4 units in the last place of "
+            f"float32 coordinates, in which frames are stored; the least gap is {gaps[copy]:.3g} m"
+        )
+    of_run = of_copies(1.0 - pairs.share), of_copies(gaps), "; ".join(said) or None
+    return SelfContactSummary(pairs.most, int(pairs.lists.numpy().max()), *of_run)
 
 
 @in_turn

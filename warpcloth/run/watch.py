@@ -5,7 +5,7 @@ from contextlib import closing
 import numpy as np
 
 from ..base.turns import in_turn
-from ..core.status import Result, Status, sentence
+from ..core.status import Result, Status, Stopped, sentence
 from .balance import GAIN, STRETCHED, Balance
 from .frames_ahead import Frame, frames_of
 
@@ -26,12 +26,15 @@ def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
     """
     if first == frames:
         return
-    of_number = None if keeps is None else lambda before: keeps(first + 1 + before)
+    of_number, number = None if keeps is None else lambda before: keeps(first + 1 + before), first
     with closing(frames_of(stepper, frames - first, ahead, of_number)) as found:
-        for number, frame in enumerate(found, start=first + 1):
-            if not watch.passes(number, frame):
-                return
-            yield number, frame
+        try:
+            for number, frame in enumerate(found, start=first + 1):
+                if not watch.passes(number, frame):
+                    return
+                yield number, frame
+        except Stopped as stopped:
+            watch.stops(number + 1, stopped)
 
 
 def of_copies(values):
@@ -56,7 +59,8 @@ class Watch:
         good: The last good frame of each copy (B,).
         alive: Whether a copy is still good (B,).
         growth: Largest energy of motion and height in a good frame, divided by what the sources can have put in, (B,).
-        last: The last frame that was watched.
+        last: The last frame that was watched; before the first what the stepper says.
+        stopped: Whether the run could not go on.
         seconds: What computing each frame took, a list.
         history: The :class:`warpcloth.run.history.History` of the run, if it has one.
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
@@ -71,6 +75,7 @@ class Watch:
         self.worst_strain, self.messages, self.seconds = np.zeros(model.copies), {}, []
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.growth, self.balance, self.history = np.zeros(model.copies), Balance(model, stepper), None
+        self.last, self.stopped = Frame(None, None, stepper.results, stepper.residual, 0.0), False
 
     def passes(self, number, frame):
         """Whether any copy is still good; marks those that no longer are, and puts NaN in their place.
@@ -111,6 +116,13 @@ class Watch:
             array.reshape(B, n, 3)[~self.alive] = np.nan
         return bool(self.alive.any())
 
+    def stops(self, number, why):
+        """Notes that frame ``number`` cannot be computed, and why."""
+        self.stopped = True
+        for copy in np.flatnonzero(self.alive):
+            of_copy = f", copy {copy}" if len(self.alive) > 1 else ""
+            self.messages[copy] = f"stopped before the end of frame {number}{of_copy}: {why}"
+
     def _carried(self):
         """Pairs of an object and the names of its attributes that go on from frame to frame."""
         yield self, ("worst_strain", "good", "alive", "growth", "seconds")
@@ -147,7 +159,8 @@ class Watch:
     def status(self, solver):
         """Returns the :class:`Status` of a run with a solver, from its last frame."""
         results, residual = self.last.results, self.last.residual
-        results = [Result.DIVERGED if copy in self.messages else result for copy, result in enumerate(results)]
+        ended = [Result.STOPPED if self.stopped and alive else Result.DIVERGED for alive in self.alive]
+        results = [ended[copy] if copy in self.messages else result for copy, result in enumerate(results)]
         result = max(results, key=list(Result).index)
         kind, measure, unit = solver.residual_on(self.model), None, None
         copy = int(np.argmax(residual))  # the first that is NaN, if any

@@ -71,7 +71,7 @@ class Stepper:
             self.model = model = model.with_terms(self.colliders.terms)
         self.pairs, self._kept = None, None
         if model.scene.self_contact is not None:
-            self.pairs = SelfSteps(model, self.state, self.h, integrator is None, self.colliders)
+            self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
         if integrator is not None:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he
@@ -224,9 +224,9 @@ class Stepper:
         self._kept.assign(self.state)
         steps()
         while self.pairs.overflowed:
+            self.state.assign(self._kept)
             self.pairs.grow()
             self.record_again()
-            self.state.assign(self._kept)
             steps()
 
     def record_again(self):

@@ -1,0 +1,129 @@
+"""Factories of the kernels that note how near cloth comes to itself, at the end of frames.
+
+Frames are stored in float32, which moves vertices by up to half a unit in the last place. So gaps are judged as stored.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from . import self_contact
+from .self_contact import StepPairs, module_of, near_pairs, vertex_of
+from .vectors import types
+
+nearest_points = self_contact.nearest
+ZERO, ONE, ULP = self_contact.ZERO, self_contact.ONE, self_contact.ULP
+FOUR = wp.constant(wp.float64(4.0))
+FIRST = wp.constant(wp.int64(2**62))
+
+
+@wp.struct
+class GapNotes:
+    """The least gaps in the frames so far, (copies,).
+
+    ``nearest`` is 1/d of the least [1/m]. Where a gap is too small for float32, ``too_near`` is FIRST − (frame·n + vertex), of
+    n vertices: the first frame with such a pair, and the first vertex of one in it; else it is 0.
+    """
+
+    nearest: wp.array(dtype=wp.float64)
+    too_near: wp.array(dtype=wp.int64)
+
+
+@cache
+def stored_gap(dtype):
+    """The device function (of_vertex, s, x, d) → the gap of a pair as frames store it, in float32, and four units in the last
+    place of its farthest coordinate; d is that at x."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.func
+    def rounded(v: vec3):
+        return wp.vec3d(wp.float64(wp.float32(v[0])), wp.float64(wp.float32(v[1])), wp.float64(wp.float32(v[2])))
+
+    @wp.func
+    def stored(of_vertex: bool, s: wp.vec4i, x: wp.array(dtype=vec3), d: wp.float64):
+        far = ZERO
+        for i in range(4):
+            far = wp.max(far, wp.max(wp.abs(exact(x[s[i]]))))
+        fine = FOUR * ULP * far
+        found = d
+        if d < FOUR * fine:
+            a = rounded(x[s[0]])
+            _w, y, _inside = nearest_points(of_vertex, a, rounded(x[s[1]]), rounded(x[s[2]]), rounded(x[s[3]]))
+            found = wp.length(y)
+        return found, fine
+
+    return stored
+
+
+@cache
+def note_gaps(dtype):
+    """Kernel over pairs, where a step begins: notes their gaps if a frame ends there."""
+    vec3, _ = types(dtype)
+    stored = stored_gap(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def note_each_gap(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        steps: wp.array(dtype=wp.int32),
+        # parameters
+        per_frame: int,
+        per_copy: int,
+        # out
+        notes: GapNotes,
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        s = pairs.stencils[e]
+        copy = s[0] // per_copy
+        if steps[copy] % per_frame != 0 or not step.gap[e] < wp.float64(wp.inf):
+            return
+        d, fine = stored(e < pairs.counts[0], s, x, step.gap[e])
+        inverse = ONE / d
+        if inverse > notes.nearest[copy]:
+            wp.atomic_max(notes.nearest, copy, inverse)
+        if not d >= fine:
+            frame = wp.int64(steps[copy] // per_frame)
+            key = frame * wp.int64(per_copy) + wp.int64(s[0] - copy * per_copy)
+            wp.atomic_max(notes.too_near, copy, FIRST - key)
+
+    return note_each_gap
+
+
+@cache
+def count_pairs(dtype):
+    """Kernel over pairs, where a step begins: how many a copy has listed, how many are in contact, and 1/d of the nearest."""
+    vec3, _ = types(dtype)
+    stored = stored_gap(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def count_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        # out
+        counts: wp.array2d(dtype=wp.int32),
+        nearest: wp.array(dtype=wp.float64),
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        s = pairs.stencils[e]
+        copy = s[0] // per_copy
+        wp.atomic_add(counts, copy, 0, 1)
+        if step.gap[e] < wp.float64(wp.inf):
+            d, _fine = stored(e < pairs.counts[0], s, x, step.gap[e])
+            wp.atomic_max(nearest, copy, ONE / d)
+            if step.gap[e] < wp.float64(pairs.distances[e]):
+                wp.atomic_add(counts, copy, 1, 1)
+
+    return count_each_pair

@@ -1,0 +1,164 @@
+"""What a run says of contact of cloth with itself: pairs, lists, moves that were kept, gaps, and where it cannot go on."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom
+
+import warpcloth as wc
+from support.pairs import all_pairs
+from support.usd_validation import validate
+from warpcloth.cli import main
+from warpcloth.contact import proximity
+from warpcloth.core.status import Result
+from warpcloth.run.history import PAIRS
+from warpcloth.usd import write_scene
+from warpcloth.usd.stage import find_prim
+
+SOLVER = wc.XPBD(substeps=2, iterations=4)
+DISTANCE = 5e-3
+
+
+def sheets(n=4, gap=0.02, velocity=(0.0, -1.0, 0.0), turn=17.0, **fields):
+    """Two sheets of 0.5 m, one turned above the other, which moves."""
+    grid, (c, s) = wc.Mesh.grid(n, n, size=0.5), (np.cos(np.radians(turn)), np.sin(np.radians(turn)))
+    above = (grid.points - 0.25) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) + [0.25, 0.25 + gap, 0.25]
+    given = {"gravity": np.zeros(3), "fps": 24.0, "duration": 0.25, "self_contact": wc.SelfContact(DISTANCE, 1e5)} | fields
+    return wc.Scene(
+        wc.Mesh(np.concatenate([grid.points, above]), np.concatenate([grid.triangles, grid.triangles + n * n])),
+        density=0.15,
+        terms=[wc.Spring(stiffness=100.0)],
+        velocities=np.repeat([np.zeros(3), velocity], n * n, axis=0),
+        **given,
+    )
+
+
+def gaps(scene, points):
+    """Distances of all pairs of a frame as stored."""
+    return np.concatenate([now for _, now, _ in all_pairs(scene.mesh, points.astype(np.float32).astype(np.float64))])
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_record_of_pairs(dtype, device):
+    """Frame by frame against all pairs in NumPy; without it the run has the same motion and totals."""
+    scene, run = sheets(), {"device": device, "dtype": dtype}
+    found, plain = (wc.simulate(scene, SOLVER, record=record, **run) for record in ("pairs", ()))
+    assert (found.points == plain.points).all() and plain.pairs is None
+    assert tuple(found.pairs) == PAIRS and all(values.shape == (7,) for values in found.pairs.values())
+    distances = [gaps(scene, points) for points in np.asarray(found.points)]
+    apart = np.array([each.min() for each in distances])  # neighbours in a sheet are farther apart than the sheets
+    assert found.pairs["least gap"] == pytest.approx(apart, rel=1e-5)
+    inside = np.array([(each < DISTANCE).sum() for each in distances])
+    assert (found.pairs["pairs in contact"] == inside).all() and inside.max() > 1 and inside[0] == 0
+    assert (found.pairs["pairs listed"] >= inside).all()
+    total = found.self_contact
+    assert total.least_gap == found.pairs["least gap"].min() and total.too_near is None
+    assert total.pairs >= found.pairs["pairs listed"].max() and total.lists == found.pairs["new lists"].sum() >= 2
+    assert 1.0 - total.kept == pytest.approx(found.cut) and found.cuts.mean() == pytest.approx(6 / 7 * found.cut)
+    assert found.pairs["moves kept"] == pytest.approx(1.0 - found.cuts)
+    assert plain.self_contact == total
+
+
+def test_moves_that_the_filter_cuts(device):
+    """Thrown at 100 m/s: each frame says how much was kept, and the total is its mean."""
+    found = wc.simulate(sheets(velocity=(0.0, -100.0, 0.0)), SOLVER, device=device, record="pairs", frames=4)
+    kept = found.pairs["moves kept"]
+    assert kept[0] == 1.0 and kept[1] < 0.9 and kept[1:].mean() == pytest.approx(found.self_contact.kept)
+
+
+def test_totals_of_copies(device):
+    """Each has its own gap and share; lists are those of all."""
+    velocities = np.stack([sheets().velocities, 0.0 * sheets().velocities])
+    run = {"copies": 2, "vary": {"velocities": velocities}, "device": device, "frames": 4}
+    found = wc.simulate(sheets(), SOLVER, record="pairs", **run)
+    assert found.pairs["least gap"].shape == (5, 2) and found.pairs["pairs in contact"][:, 1].max() == 0.0
+    assert found.self_contact.least_gap == pytest.approx([found.pairs["least gap"][:, 0].min(), 0.02], rel=1e-6)
+    assert (found.pairs["new lists"][:, 0] == found.pairs["new lists"][:, 1]).all()
+
+
+def test_none_of_it_without_self_contact(device):
+    scene = sheets(self_contact=None)
+    assert wc.simulate(scene, SOLVER, device=device, frames=1).self_contact is None
+    with pytest.raises(ValueError, match="record is 'pairs', which only runs of scenes with self_contact have"):
+        wc.simulate(scene, SOLVER, device=device, record=("energies", "pairs"))
+    with pytest.raises(ValueError, match="record is 'pairs', which only runs"):
+        wc.equilibrium(sheets(), device=device, record="pairs")
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_frames_too_coarse_for_the_gap_are_named(dtype, device):
+    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 12.6 m this is less than 4 · 2⁻²³ x, from frame 3 on."""
+    soft = wc.SelfContact(DISTANCE, 1e-6)  # which does not push them apart in the meantime
+    scene = sheets(gap=6e-6, turn=0.0, self_contact=soft)
+    scene = replace(scene, velocities=np.tile([100.0, 0.0, 0.0], (32, 1)))
+    near = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=2).self_contact
+    assert near.too_near is None and near.least_gap == pytest.approx(6e-6, rel=1e-3)
+    far = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=4).self_contact
+    assert far.too_near.startswith("in frame 3 first, at vertex ") and "the least gap is 6e-06 m" in far.too_near
+
+
+def test_a_resumed_run_has_the_same_record(tmp_path, device):
+    def stop(frame, _frames):
+        if frame == 12:
+            raise KeyboardInterrupt
+
+    scene, record = sheets(duration=14 / 24), ("energies", "pairs")
+    whole = wc.simulate(scene, SOLVER, device=device, record=record)
+    given = {"device": device, "record": record, "output": tmp_path / "out.usdc"}
+    with pytest.raises(KeyboardInterrupt):
+        wc.simulate(scene, SOLVER, progress=stop, **given)
+    resumed = wc.simulate(scene, SOLVER, resume=True, **given)
+    assert resumed.self_contact == whole.self_contact
+    for name in PAIRS:
+        assert (resumed.pairs[name] == whole.pairs[name]).all()
+    stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    prim = find_prim(stage, "out", None)
+    for name in PAIRS:
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(f"self_contact:{name.replace(' ', '_')}")
+        assert primvar.GetInterpolation() == "constant"
+        assert [primvar.Get(frame) for frame in range(15)] == whole.pairs[name].tolist()
+    assert validate(tmp_path / "out.usdc") == []
+
+
+def test_command(tmp_path, capsys, device):
+    stage = write_scene(sheets(duration=4 / 24), tmp_path / "sheets.usda")
+    files = {name: str(tmp_path / name) for name in ("run.usdc", "run.csv", "run.json")}
+    options = ["--solver", "xpbd", "-s", "substeps=2", "iterations=4", "--device", device]
+    given = ["run", str(stage), *options, "-o", files["run.usdc"]]
+    assert main([*given, "--csv", files["run.csv"], "--report", files["run.json"]]) == 0
+    printed = capsys.readouterr().out
+    assert "  self-contact  up to " in printed and " % of moves kept, least gap 0.00" in printed
+    with open(files["run.csv"], newline="") as file:
+        rows = list(csv.DictReader(file))
+    with open(files["run.json"]) as file:
+        report = json.load(file)
+    for name in PAIRS:
+        assert [float(row[name]) for row in rows] == report["pairs"][name]
+    assert main([*given, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)["self_contact"]
+    assert facts["least_gap"] == min(report["pairs"]["least gap"]) and facts["too_near"] is None
+    assert facts["lists"] == sum(report["pairs"]["new lists"])
+
+
+@pytest.mark.parametrize("solver", [SOLVER, wc.Newton(substeps=2)], ids=["xpbd", "newton"])
+def test_no_memory_for_pairs(solver, tmp_path, monkeypatch, device):
+    """A run that cannot go on says in which frame and why, and its frames are those of one that can."""
+    scene = sheets(n=10, gap=0.2, velocity=(0.0, -3.0, 0.0), duration=4 / 24)
+    whole = wc.simulate(scene, solver, device=device)
+    assert whole.status.ok and whole.self_contact.pairs > 1024
+
+    def no_memory(frame, _frames):
+        monkeypatch.setattr(proximity, "BYTES_OF_A_PAIR", 1 << 62)
+
+    given = {"device": device, "progress": no_memory}
+    for output in (None, tmp_path / "out.usdc"):
+        monkeypatch.undo()
+        found = wc.simulate(scene, solver, output=output, **given)
+        frame = found.status.frame
+        assert 0 < frame < 4 and found.status.result is Result.STOPPED and not found.status.ok
+        assert found.status.message.startswith(f"stopped before the end of frame {frame + 1}: the cloth has ")
+        assert "pairs that are near one another, which takes" in found.status.message
+        assert (np.asarray(found.points) == np.asarray(whole.points)[: frame + 1]).all()
