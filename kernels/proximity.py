@@ -72,8 +72,8 @@ def grids(dtype):
 def pair_lists(dtype):
     """The struct of the pairs: ``counts`` (2,) that were found, and in no order (row, item) of those within the capacity.
 
-    Rows are vertices and then edges; row i has the items from ``first`` [i] on, sorted. ``row_counts`` and ``corner_counts``
-    are scratch, 0 where nothing runs.
+    Rows are vertices and then edges; row i has the items from ``first`` [i] on, sorted. ``row_counts`` is scratch, 0 where
+    nothing runs.
     """
 
     @wp.struct
@@ -85,7 +85,6 @@ def pair_lists(dtype):
         items: wp.array(dtype=wp.int32)
         stencils: wp.array(dtype=wp.vec4i)
         distances: wp.array(dtype=dtype)
-        corner_counts: wp.array(dtype=wp.int32)
 
     return PairList
 
@@ -441,7 +440,7 @@ def fill_rows(dtype):
 
 @cache
 def write_pairs(dtype):
-    """Kernel over rows: their pairs in order, with the contact distance of each, and the number of corners of each vertex."""
+    """Kernel over rows: their pairs in order, with the contact distance of each."""
     vertex_cutoff, edge_cutoff = (cutoffs(dtype, each) for each in (False, True))
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -472,50 +471,8 @@ def write_pairs(dtype):
                 d = edge_cutoff(surface, s, vertex)
             pairs.stencils[k] = s
             pairs.distances[k] = d
-            for corner in range(4):
-                wp.atomic_add(pairs.corner_counts, s[corner], 1)
 
     return write_each_pair
-
-
-@cache
-def fill_corners(dtype):
-    """Kernel over the capacity, in turns that leave ``corner_counts`` 0: 4·pair + corner of the pairs at each vertex."""
-
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
-    def fill_each_corner(
-        # state in
-        first: wp.array(dtype=wp.int32),
-        # in and out
-        pairs: pair_lists(dtype),
-        # out
-        corners: wp.array(dtype=wp.int32),
-    ):
-        capacity = pairs.found.shape[0]
-        k = capacity - 1 - wp.tid()
-        if k < kept(pairs.counts, capacity):
-            for corner in range(4):
-                v = pairs.stencils[k][corner]
-                corners[first[v] + wp.atomic_sub(pairs.corner_counts, v, 1) - 1] = 4 * k + corner
-
-    return fill_each_corner
-
-
-@cache
-def sort_corners():
-    """Kernel over vertices: the corners of each in order."""
-
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def sort_each(
-        # elements
-        first: wp.array(dtype=wp.int32),
-        # in and out
-        corners: wp.array(dtype=wp.int32),
-    ):
-        i = wp.tid()
-        sort(corners, first[i], first[i + 1])
-
-    return sort_each
 
 
 @cache

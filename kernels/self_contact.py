@@ -13,6 +13,7 @@ from functools import cache
 
 import warp as wp
 
+from .proximity import sort
 from .terms import contact
 from .vectors import types
 
@@ -35,13 +36,21 @@ PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges belo
 @cache
 def near_pairs(dtype):
     """The struct of the pairs that are near, see :class:`warpcloth.contact.proximity.Proximity`: how many of a vertex and of
-    edges, those that each vertex has with triangles, the pairs of each vertex, and where their contact begins [m]."""
+    edges, those that each vertex has with triangles, and where their contact begins [m].
+
+    Those that have an area in a step are its ``acting`` pairs, so many as ``number`` says; few are. On the CPU they are in
+    order. ``corners`` has 4·pair + corner of those at vertex i from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is
+    scratch, 0 where nothing runs.
+    """
 
     @wp.struct
     class Pairs:
         stencils: wp.array(dtype=wp.vec4i)
         counts: wp.array(dtype=wp.int32)
         rows: wp.array(dtype=wp.int32)
+        acting: wp.array(dtype=wp.int32)
+        number: wp.array(dtype=wp.int32)
+        corner_counts: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
         corners: wp.array(dtype=wp.int32)
         distances: wp.array(dtype=dtype)
@@ -208,14 +217,14 @@ def signed_gap(y: wp.vec3d, normal: wp.vec3d, inside: int):
 
 
 @wp.func
-def apart(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, r: wp.float64):
-    """Whether the balls about the first vertex of each side, which hold the side, are farther apart than r."""
-    found = wp.bool(False)
-    if of_vertex:
-        size = wp.max(wp.length(c - b), wp.length(d - b))
-        found = wp.length(a - b) > size + r
-    else:
-        found = wp.length(a - c) > wp.length(b - a) + wp.length(d - c) + r
+def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """The gap between both sides of a pair along n, |n| ≤ 1, which its d is never below."""
+    y = wp.dot(n, c - a)
+    z = wp.dot(n, d - a)
+    x = wp.dot(n, b - a)
+    found = -wp.max(wp.max(y, z), x)
+    if not of_vertex:
+        found = wp.min(x, ZERO) - wp.max(y, z)
     return found
 
 
@@ -289,7 +298,7 @@ def part_of_area(gap: wp.float64, least: wp.float64, r: wp.float64):
 
 @cache
 def set_areas(dtype):
-    """Kernel over pairs, where a step begins: kA.
+    """Kernel over pairs, where a step begins: kA, and which are acting.
 
     Half the area of a vertex goes to triangles on each side of it. Triangles that meet share it where the nearest point is
     about as near to several of them. A pair of edges, (A₁ + … + A₄)/12, counts only as far as it is nearer than the pairs of
@@ -354,13 +363,51 @@ def set_areas(dtype):
                 total = areas[s[0]] + areas[s[1]] + areas[s[2]] + areas[s[3]]
                 area = nearer * z * (wp.float64(2.0) - z) * total / wp.float64(12.0)
         step.stiffness[e] = stiffness * area
+        if area > ZERO:
+            pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
+            for i in range(4):
+                wp.atomic_add(pairs.corner_counts, s[i], 1)
 
     return set_each_area
 
 
 @cache
+def fill_corners(dtype):
+    """Kernel over pairs, in turns that leave ``corner_counts`` 0: the corners of acting pairs at each vertex."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def fill_each_corner(
+        # in and out
+        pairs: near_pairs(dtype),
+    ):
+        t = pairs.number[0] - 1 - wp.tid()
+        if t >= 0:
+            e = pairs.acting[t]
+            s = pairs.stencils[e]
+            for i in range(4):
+                pairs.corners[pairs.first[s[i]] + wp.atomic_sub(pairs.corner_counts, s[i], 1) - 1] = 4 * e + i
+
+    return fill_each_corner
+
+
+@cache
+def sort_corners(dtype):
+    """Kernel over vertices: the corners of each in order."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def sort_each(
+        # in and out
+        pairs: near_pairs(dtype),
+    ):
+        i = wp.tid()
+        sort(pairs.corners, pairs.first[i], pairs.first[i + 1])
+
+    return sort_each
+
+
+@cache
 def find_forces(dtype, bounded: bool):
-    """Kernel over pairs: kAφ, kAφ′ and kAφ″ at x, or x + correction, with w and n; of ``bounded`` contact φ = ½(r − d)²."""
+    """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; of ``bounded`` contact φ = ½(r − d)²."""
     vec3, _ = types(dtype)
     at, _exact = vertex_of(dtype)
 
@@ -375,23 +422,22 @@ def find_forces(dtype, bounded: bool):
         # out
         forces: PairForces,
     ):
-        e = wp.tid()
-        if e >= pairs.counts[0] + pairs.counts[1]:
+        t = wp.tid()
+        if t >= pairs.number[0]:
             return
+        e = pairs.acting[t]
         forces.energy[e] = ZERO
         forces.slope[e] = ZERO
         forces.bend[e] = ZERO
         k = step.stiffness[e]
         r = wp.float64(pairs.distances[e])
-        if k == ZERO:
-            return
         s = pairs.stencils[e]
         a = at(x, correction, s[0])
         b = at(x, correction, s[1])
         c = at(x, correction, s[2])
         d = at(x, correction, s[3])
         of_vertex = e < pairs.counts[0]
-        if apart(of_vertex, a, b, c, d, r):
+        if gap_along(of_vertex, step.normal[e], a, b, c, d) >= r:
             return
         w, y, inside = nearest(of_vertex, a, b, c, d)
         gap, n = signed_gap(y, step.normal[e], inside)
@@ -548,7 +594,7 @@ def free_move(dtype, axes: bool):
 
 @cache
 def sweep_pairs(dtype, axes: bool):
-    """Kernel of one thread: each pair in turn takes its force away, and gets that of the prox at the gap that is left.
+    """Kernel of one thread: each acting pair in turn takes its force away, and gets that of the prox at the gap that is left.
 
     With d̂ = n·Σwᵢxᵢ without the force of the pair and W = Σ wᵢ²/mᵢ, λ = (d* − d̂)/W, where d* solves
     (d* − d̂)/W = −kAhₑ²φ′(d*) in closed form, and Δxᵢ = wᵢ λ n/mᵢ. M(x − x̃) = Σ wᵢλn then holds with the n and w that pairs have
@@ -575,57 +621,54 @@ def sweep_pairs(dtype, axes: bool):
         forces: PairForces,
         correction: wp.array(dtype=vec3),
     ):
-        count = wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0])
+        count = pairs.number[0]
         for turn in range(count):
-            e = turn
-            if backward:
-                e = count - 1 - turn
+            e = pairs.acting[wp.where(backward, count - 1 - turn, turn)]
             k = step.stiffness[e]
-            if k > ZERO:
-                r = wp.float64(pairs.distances[e])
-                s = pairs.stencils[e]
-                before = ZERO
-                if multipliers:
-                    before = multipliers[e]
-                a = at(x, correction, s[0])
-                b = at(x, correction, s[1])
-                c = at(x, correction, s[2])
-                d = at(x, correction, s[3])
-                of_vertex = e < pairs.counts[0]
-                if before != ZERO or not apart(of_vertex, a, b, c, d, r):
-                    w, y, inside = nearest(of_vertex, a, b, c, d)
-                    gap, n = signed_gap(y, step.normal[e], inside)
-                    if before != ZERO or gap < r:
-                        W = ZERO
-                        left = gap
-                        for i in range(4):
-                            push = w[i] * moved(inverse_mass, s[i], n)
-                            W += w[i] * wp.dot(n, push)
-                            if before != ZERO:
-                                left -= forces.weights[e][i] * before * wp.dot(push, forces.normal[e])
-                        after = ZERO
-                        if W > ZERO and left < r:
-                            compliance = wp.float64(wp.inf)
-                            if not hard:
-                                compliance = W * k * h * h
-                            after = (gap_after(left, r, compliance) - left) / W
-                        for i in range(4):
-                            move = w[i] * after * n
-                            if before != ZERO:
-                                move -= forces.weights[e][i] * before * forces.normal[e]
-                            move = moved(inverse_mass, s[i], move)
-                            correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
-                        if multipliers:
-                            multipliers[e] = after
-                            forces.weights[e] = w
-                            forces.normal[e] = n
+            r = wp.float64(pairs.distances[e])
+            s = pairs.stencils[e]
+            before = ZERO
+            if multipliers:
+                before = multipliers[e]
+            a = at(x, correction, s[0])
+            b = at(x, correction, s[1])
+            c = at(x, correction, s[2])
+            d = at(x, correction, s[3])
+            of_vertex = e < pairs.counts[0]
+            if before != ZERO or gap_along(of_vertex, step.normal[e], a, b, c, d) < r:
+                w, y, inside = nearest(of_vertex, a, b, c, d)
+                gap, n = signed_gap(y, step.normal[e], inside)
+                if before != ZERO or gap < r:
+                    W = ZERO
+                    left = gap
+                    for i in range(4):
+                        push = w[i] * moved(inverse_mass, s[i], n)
+                        W += w[i] * wp.dot(n, push)
+                        if before != ZERO:
+                            left -= forces.weights[e][i] * before * wp.dot(push, forces.normal[e])
+                    after = ZERO
+                    if W > ZERO and left < r:
+                        compliance = wp.float64(wp.inf)
+                        if not hard:
+                            compliance = W * k * h * h
+                        after = (gap_after(left, r, compliance) - left) / W
+                    for i in range(4):
+                        move = w[i] * after * n
+                        if before != ZERO:
+                            move -= forces.weights[e][i] * before * forces.normal[e]
+                        move = moved(inverse_mass, s[i], move)
+                        correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+                    if multipliers:
+                        multipliers[e] = after
+                        forces.weights[e] = w
+                        forces.normal[e] = n
 
     return sweep_each_pair
 
 
 @cache
 def touch_pairs(dtype):
-    """Kernel over pairs of a Jacobi sweep: n, w and d of those that touch, or have a force; λ comes of :func:`press_pairs`."""
+    """Kernel over acting pairs of a Jacobi sweep: n, w and d where they touch or have a force; λ is of :func:`press_pairs`."""
     vec3, _ = types(dtype)
     at, _exact = vertex_of(dtype)
 
@@ -641,12 +684,11 @@ def touch_pairs(dtype):
         # out
         swept: SweptPairs,
     ):
-        e = wp.tid()
-        if e >= pairs.counts[0] + pairs.counts[1]:
+        t = wp.tid()
+        if t >= pairs.number[0]:
             return
+        e = pairs.acting[t]
         swept.touches[e] = 0
-        if step.stiffness[e] == ZERO:
-            return
         before = ZERO
         if multipliers:
             before = multipliers[e]
@@ -657,7 +699,7 @@ def touch_pairs(dtype):
         c = at(x, correction, s[2])
         d = at(x, correction, s[3])
         of_vertex = e < pairs.counts[0]
-        if before == ZERO and apart(of_vertex, a, b, c, d, r):
+        if before == ZERO and gap_along(of_vertex, step.normal[e], a, b, c, d) >= r:
             return
         w, y, inside = nearest(of_vertex, a, b, c, d)
         gap, n = signed_gap(y, step.normal[e], inside)
@@ -694,7 +736,7 @@ def count_touching(dtype):
 
 @cache
 def press_pairs(dtype, axes: bool):
-    """Kernel over pairs of a Jacobi sweep: the λ of the prox, as if W were D = Σ nᵢwᵢ²/mᵢ, nᵢ the pairs that touch at a vertex.
+    """Kernel over acting pairs of a Jacobi sweep: the λ of the prox, as if W were D = Σ nᵢwᵢ²/mᵢ, nᵢ those that touch at i.
 
     D is at least J W Jᵀ of all of them, so the sum of the moves never overshoots. The fixed point is that of
     :func:`sweep_pairs`.
@@ -717,9 +759,10 @@ def press_pairs(dtype, axes: bool):
         # in and out
         swept: SweptPairs,
     ):
-        e = wp.tid()
-        if e >= pairs.counts[0] + pairs.counts[1]:
+        t = wp.tid()
+        if t >= pairs.number[0]:
             return
+        e = pairs.acting[t]
         if swept.touches[e] == 0:
             return
         s = pairs.stencils[e]
@@ -779,7 +822,7 @@ def move_by_pairs(dtype, axes: bool):
 
 @cache
 def keep_pairs(dtype):
-    """Kernel over pairs of a Jacobi sweep: λ, w and n are those of the next one before."""
+    """Kernel over acting pairs of a Jacobi sweep: λ, w and n are those of the next one before."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def keep_each_pair(
@@ -791,9 +834,10 @@ def keep_pairs(dtype):
         multipliers: wp.array(dtype=wp.float64),
         forces: PairForces,
     ):
-        e = wp.tid()
-        if e >= pairs.counts[0] + pairs.counts[1]:
+        t = wp.tid()
+        if t >= pairs.number[0]:
             return
+        e = pairs.acting[t]
         if swept.touches[e] == 1:
             multipliers[e] = swept.multiplier[e]
             forces.weights[e] = swept.weights[e]

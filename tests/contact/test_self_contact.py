@@ -212,6 +212,22 @@ def test_pins_that_cloth_holds_back(device):
     assert rest.points[:16, 1].max() < 0.02
 
 
+def test_acting_pairs(device):
+    """They are those of the list that have an area, and their corners are in order at each vertex."""
+    pairs, model = steps_of(layers(3, turn=17.0, gap=2e-3), device)
+    for _ in range(2):
+        pairs.launch_begin(model.positions)
+        count = pairs.proximity.counts.numpy().sum()
+        acting = np.flatnonzero(pairs.begun.stiffness.numpy()[:count] > 0.0)
+        assert 0 < len(acting) < count
+        assert (np.sort(pairs.pairs.acting.numpy()[: pairs.pairs.number.numpy()[0]]) == acting).all()
+        first, corners = pairs.pairs.first.numpy(), pairs.pairs.corners.numpy()[: 4 * len(acting)]
+        assert (np.sort(corners) == (4 * acting[:, None] + np.arange(4)).ravel()).all()
+        vertices = pairs.pairs.stencils.numpy().reshape(-1)[corners]
+        assert (vertices == np.repeat(np.arange(model.count), np.diff(first))).all()
+        assert (np.diff(corners)[np.diff(vertices) == 0] > 0).all()
+
+
 @pytest.mark.parametrize("fields", PRESSED.values(), ids=PRESSED)
 @pytest.mark.parametrize("name", MEET)
 def test_minimiser_is_the_same(name, fields, device):

@@ -31,8 +31,6 @@ class Proximity:
         distances: (capacity,) r_c of each [m].
         counts: (2,) int32: how many pairs of either kind were found, which may be more than the capacity.
         rows: Pairs rows[i] to rows[i+1] are those of vertex i and a triangle; those of edges follow, by the first of the two.
-        first, corners: The corners of pairs at each vertex i, sorted: 4·pair + corner in ``corners`` from first[i] to
-            first[i+1].
         found: Positions of the last list, (N,) [m]. Whoever sets them calls :meth:`launch_kept` before the list is used.
         flag: (1,) int32, see :meth:`moved`.
     """
@@ -58,15 +56,13 @@ class Proximity:
         self._listed = model.vectors()  # those of the pairs in the arrays
         self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self._rows = Scan(model, model.count + self._edges)
-        self._vertices = Scan(model, model.count)
         self._pairs_of = {each: model.kernel(kernels.find_pairs, model.dtype, each) for each in (False, True)}
         self._launch = model.launcher(
             (
-                (kernels.count_items, kernels.fill_buckets, kernels.fill_rows, kernels.write_pairs, kernels.fill_corners),
+                (kernels.count_items, kernels.fill_buckets, kernels.fill_rows, kernels.write_pairs),
                 model.dtype,
             ),
             ((kernels.begin_boxes, kernels.extend_boxes, kernels.find_motion, kernels.compare_motions), model.dtype),
-            ((kernels.sort_corners,),),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
@@ -140,7 +136,7 @@ class Proximity:
         self.capacity = capacity
         self._listed.fill_(np.nan)
         self.stencils, self.distances = zeros(capacity, wp.vec4i), zeros(capacity, model.dtype)
-        self.first, self.corners, self.rows = zeros(model.count + 1), zeros(4 * capacity), zeros(rows + 1)
+        self.rows = zeros(rows + 1)
         self._arrays = {
             "counts": self.counts,
             "found": zeros(capacity, wp.vec2i),
@@ -149,7 +145,6 @@ class Proximity:
             "items": zeros(capacity),
             "stencils": self.stencils,
             "distances": self.distances,
-            "corner_counts": zeros(model.count),
         }
         self._pairs = kernels.pair_lists(model.dtype)()
         for name, value in self._arrays.items():
@@ -175,9 +170,6 @@ class Proximity:
         self._rows.launch(own["row_counts"], own["first"])
         self._launch(kernels.fill_rows, self.capacity, [], [pairs])
         self._launch(kernels.write_pairs, N + self._edges, [surface, N, self._triangles], [pairs])
-        self._vertices.launch(own["corner_counts"], self.first)
-        self._launch(kernels.fill_corners, self.capacity, [self.first], [pairs, self.corners])
-        self._launch(kernels.sort_corners, N, [self.first], [self.corners])
 
     def _launch_boxes(self, x):
         self._launch(kernels.begin_boxes, len(self._pieces.centre), [x], [self._pieces])

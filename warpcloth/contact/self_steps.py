@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror
+from ..core.scan import Scan
 from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels import gap_notes
@@ -95,7 +96,15 @@ class SelfSteps:
         self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
         self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
         self._count = model.kernel(count_step)
-        made = kernels.begin_pairs, kernels.set_areas, kernels.add_forces, kernels.sum_energies, kernels.add_diagonal
+        made = (
+            kernels.begin_pairs,
+            kernels.set_areas,
+            kernels.fill_corners,
+            kernels.sort_corners,
+            kernels.add_forces,
+            kernels.sum_energies,
+            kernels.add_diagonal,
+        )
         made += kernels.limit_direction, kernels.precondition, kernels.take_descent, kernels.add_positions
         made += (
             kernels.add_products,
@@ -109,6 +118,7 @@ class SelfSteps:
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
         self._moves_together = free
+        self._vertices = Scan(model, model.count)
         self._few = int(SHARE * model.per_copy)
         self.tangles, self._counted = None, None
         declared = model.colliders
@@ -248,8 +258,10 @@ class SelfSteps:
             return wp.zeros(capacity, dtype=dtype, device=device)
 
         self.pairs = kernels.near_pairs(self.model.dtype)()
-        for name in ("stencils", "counts", "rows", "first", "corners", "distances"):
+        for name in ("stencils", "counts", "rows", "distances"):
             setattr(self.pairs, name, getattr(found, name))
+        for name, size in self._acting_sizes(capacity).items():
+            setattr(self.pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
         self.begun, self.forces = kernels.StepPairs(), kernels.PairForces()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
         self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
@@ -261,6 +273,10 @@ class SelfSteps:
             self._swept = kernels.SweptPairs()
             self._swept.touches, self._swept.normal, self._swept.weights = room(wp.int32), room(wp.vec3d), room(wp.vec4d)
             self._swept.gap, self._swept.multiplier = room(wp.float64), room(wp.float64)
+
+    def _acting_sizes(self, capacity):
+        N = self.model.count
+        return {"acting": capacity, "number": 1, "corner_counts": N, "first": N + 1, "corners": 4 * capacity}
 
     def grow(self):
         """Makes room for the pairs that did not fit; what was recorded must be recorded again.
@@ -352,13 +368,17 @@ class SelfSteps:
         self.model.launch(kernels.note_list, self.model.copies, given, [self._most.array, self.lists])
 
     def launch_areas(self, x):
-        """Fixes the side and the area of each listed pair."""
+        """Fixes the side and the area of each listed pair, and so which are acting."""
         count = len(self.pairs.stencils)
         self._launch_sides(x)
         if self.tangles is not None:
             self.tangles.launch_leave_out(self.pairs.stencils, self.pairs.counts, self.begun.gap)
+        self.pairs.number.zero_()
         given = [self.pairs, self._areas, x, self.declared.stiffness]
         self._launch(kernels.set_areas, count, given, [self.begun])
+        self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
+        self._launch(kernels.fill_corners, count, [], [self.pairs])
+        self._launch(kernels.sort_corners, self.model.count, [], [self.pairs])
 
     def _launch_sides(self, x):
         """Fixes the side of each listed pair, and its gap."""
@@ -402,9 +422,9 @@ class SelfSteps:
         """
         from scipy.sparse import csr_matrix, diags
 
-        model, count = self.model, min(int(self.pairs.counts.numpy().sum()), len(self.pairs.stencils))
-        bend = self.forces.bend.numpy()[:count]
-        press = np.flatnonzero(bend)
+        model, bend = self.model, self.forces.bend.numpy()
+        acting = np.sort(self.pairs.acting.numpy()[: self.pairs.number.numpy()[0]])
+        press = acting[bend[acting] != 0.0]
         w, n = (array.numpy()[press] for array in (self.forces.weights, self.forces.normal))
         columns = 3 * self.pairs.stencils.numpy()[press].astype(np.int64)[:, :, None] + np.arange(3)
         values = w[:, :, None] * n[:, None, :] * (model.coordinate_mobility() > 0.0)[columns]
