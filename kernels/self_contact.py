@@ -1352,8 +1352,12 @@ def note_list(
     # in and out
     most: wp.array(dtype=wp.int32),
     lists: wp.array(dtype=wp.int32),
+    # out
+    listed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: the largest number of pairs in any list, and how many lists were ``made``."""
+    """Kernel over copies: the largest number of pairs in any list, how many lists were ``made``, and whether this has pairs."""
     c = wp.tid()
+    if c == 0:
+        listed[0] = wp.min(counts[0] + counts[1], 1)
     most[c] = wp.max(most[c], counts[0] + counts[1])
     lists[c] = lists[c] + made

@@ -496,6 +496,29 @@ def test_lists_are_kept(count, device):
     assert (pairs.proximity.stencils.numpy()[:number] == listed[:number]).all()
 
 
+@pytest.mark.parametrize("speed", [0.0, 1.0, 20.0])
+def test_quiet_explicit_steps_are_those_with_contact(speed, device):
+    """To the bit, of a sheet that falls, of copies that bend and are listed anew, and where moves are long; so are frames."""
+    scene = layers(1, gravity=np.array([0.0, -9.81, 0.0]))
+    bent = speed * np.sin(9.0 * scene.positions[:, :1]) * [0.3, 1.0, 0.0]
+    ends = []
+    for quiet in (True, False, "step by step"):
+        stepper = SOLVERS["explicit"].bind(replace(scene, velocities=bent).build(device=device, copies=2))
+        assert stepper._steps._quiet
+        stepper._steps._quiet = bool(quiet)
+        stepper.record_again()
+        for _ in range(3):
+            for _ in range(80 if quiet == "step by step" else 0):
+                stepper.step()
+            if quiet != "step by step":
+                stepper.frame()
+        ends.append(stepper.state.copy())
+    assert ends[0] == ends[1]
+    assert ends[0] == ends[2]
+    assert (stepper.pairs.lists.numpy() > (1 if speed else 0)).all()
+    assert stepper.pairs.steps.numpy().tolist() == [240, 240]
+
+
 @each_solver
 def test_copies(name, device):
     """Each of two copies moves as one alone, to the bit, and again after it was put back."""

@@ -33,6 +33,8 @@ class Proximity:
         rows: Pairs rows[i] to rows[i+1] are those of vertex i and a triangle; those of edges follow, by the first of the two.
         found: Positions of the last list, (N,) [m]. Whoever sets them calls :meth:`launch_kept` before the list is used.
         flag: (1,) int32, see :meth:`moved`.
+        listed: Positions of which the list in the arrays is, (N,) [m].
+        centre: The vertex in the middle of each connected piece of all copies.
     """
 
     @in_turn
@@ -53,7 +55,7 @@ class Proximity:
         self._allocate_grid()
         self._set_pieces(piece, points)
         self.found = model.vectors()  # no surface, from which all have moved
-        self._listed = model.vectors()  # those of the pairs in the arrays
+        self.listed = model.vectors()  # those of the pairs in the arrays
         self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self._rows = Scan(model, model.count + self._edges)
         self._pairs_of = {each: model.kernel(kernels.find_pairs, model.dtype, each) for each in (False, True)}
@@ -107,6 +109,7 @@ class Proximity:
         if len(used) > 1:
             for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("motion", model.dtype)):
                 self._piece_arrays[name] = wp.zeros(model.copies * len(used), dtype=kind, device=model.device)
+        self.centre = self._piece_arrays["centre"]
         self._pieces = kernels.pieces(model.dtype)()
         for name, value in ({"per_copy": len(used)} | self._piece_arrays).items():
             setattr(self._pieces, name, value)
@@ -134,7 +137,7 @@ class Proximity:
             return wp.zeros(count, dtype=dtype, device=model.device)
 
         self.capacity = capacity
-        self._listed.fill_(np.nan)
+        self.listed.fill_(np.nan)
         self.stencils, self.distances = zeros(capacity, wp.vec4i), zeros(capacity, model.dtype)
         self.rows = zeros(rows + 1)
         self._arrays = {
@@ -156,7 +159,7 @@ class Proximity:
         items, own = self._triangles + self._edges, self._arrays
         if x is not self.found:
             wp.copy(self.found, x)
-        wp.copy(self._listed, x)
+        wp.copy(self.listed, x)
         if self._pieces.per_copy > 1:
             self._launch_boxes(x)
         self.counts.zero_()
@@ -200,7 +203,7 @@ class Proximity:
         several = self._pieces.per_copy > 1
         if several:
             self._pieces.motion.zero_()
-        given = [x, self.found, self._listed, part * self.skin]
+        given = [x, self.found, self.listed, part * self.skin]
         self._launch(kernels.find_motion, self.model.count, given, [self._pieces, self.flag, self._stale])
         if several:
             wp.capture_if(self._stale, lambda: self._launch_boxes(self.found))

@@ -65,6 +65,8 @@ class SelfSteps:
         x_before: Positions where the step began, (N,) [m].
         energies: Those of the pairs by their first vertex, (N,) [J].
         lists: How many lists of pairs were made, (B,) int32, the same for all copies.
+        listed: Whether the last list has pairs, (1,) int32.
+        moves_together: Whether moves are relative to their mean for the filter, as nothing is pinned.
         tangles: :class:`warpcloth.contact.tangles.Tangles` of a start at which cloth crosses or touches cloth, else None.
     """
 
@@ -92,6 +94,7 @@ class SelfSteps:
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32))
         self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
+        self.listed = wp.zeros(1, dtype=wp.int32, device=device)
         self._notes, self._per_frame = gap_notes.GapNotes(), steps_per_frame
         self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
         self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
@@ -117,7 +120,7 @@ class SelfSteps:
         )
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
-        self._moves_together = free
+        self.moves_together = free
         self._vertices = Scan(model, model.count)
         self._few = int(SHARE * model.per_copy)
         self.tangles, self._counted = None, None
@@ -365,7 +368,7 @@ class SelfSteps:
         """Lists the pairs at x, and notes how many there are; that of ``found`` is one that was made before."""
         self.proximity.launch(x)
         given = [self.proximity.counts, int(x is not self.proximity.found)]
-        self.model.launch(kernels.note_list, self.model.copies, given, [self._most.array, self.lists])
+        self.model.launch(kernels.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
 
     def launch_areas(self, x):
         """Fixes the side and the area of each listed pair, and so which are acting."""
@@ -552,7 +555,7 @@ class SelfSteps:
     def _launch_planes(self, x, target, direction):
         """Finds the share of each wanted move that planes leave."""
         model, wanted = self.model, [x, target, direction]
-        if self._moves_together:
+        if self.moves_together:
             self._launch(kernels.common_move, model.copies, [*wanted, model.per_copy], [self._common])
         given = [*wanted, self._common, self._begun_at, model.per_copy]
         self._launch(kernels.find_ways, model.count, given, [self._ways, self._share])

@@ -43,19 +43,18 @@ class ExplicitStep:
         symplectic: Whether x is updated with v after the step.
         count: Number of steps that moving pins have made (B,) int32, or None.
         compensated: Whether x is updated by compensated summation.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose forces are added, or None.
 
     Attributes:
+        gradient: ∂U/∂x (N,) [N] of what is not of the terms, to which steps add; 0 after each.
         residual: Position residual of compensated summation (N,) [m], or None.
         record: :class:`StepRecord`.
     """
 
-    def __init__(self, model, state, h, symplectic, count, compensated=False, pairs=None):
-        self.pairs = pairs
+    def __init__(self, model, state, h, symplectic, count, compensated=False):
         self.model, self.state, self.record = model, state, StepRecord("core", compensated=compensated)
         self.residual = model.vectors() if compensated else None
         self._pins = model.pins, model.keyframes, count
-        self._gradient, self._elastic = model.vectors(), Gradient(model, corrected=compensated)
+        self.gradient, self._elastic = model.vectors(), Gradient(model, corrected=compensated)
         self._damped = dissipations(model, h)
         self._dissipative = Gradient(model, corrected=True, terms=self._damped)
         self._ahead = model.vectors() if self._damped else None
@@ -70,14 +69,10 @@ class ExplicitStep:
         for _ in range(steps):
             model.refresh(STEP, Moment(x, steps=self._pins[-1], per_frame=self._per_frame))
             model.refresh(STEP, Moment(x), self._damped)
-            self._elastic.add(x, self._gradient, self.residual)
-            if self.pairs is not None:
-                self.pairs.launch_begin(x)
-                self.pairs.launch_forces(x)
-                self.pairs.add_gradient(self._gradient)
+            self._elastic.add(x, self.gradient, self.residual)
             if self._damped:
                 model.launch(self._move_ahead, model.count, [v, self._given[-1]], [self._ahead])
-                self._dissipative.add(x, self._gradient, self._ahead)
-            model.lock(self._gradient)
-            model.launch(self._step, model.count, self._given, [self._gradient, x, v, self.residual])
+                self._dissipative.add(x, self.gradient, self._ahead)
+            model.lock(self.gradient)
+            model.launch(self._step, model.count, self._given, [self.gradient, x, v, self.residual])
             move_pins(*self._pins, x, v)

@@ -48,6 +48,7 @@ class BlockStep:
         window: The :class:`Window` of the vertices of ``state``, if these are not all of the model.
 
     Attributes:
+        gradient: ∂U/∂x (N,) [N] of what is not of the terms, to which steps add; 0 after each.
         residual: Position residual of compensated summation (N,) [m], or None.
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
@@ -59,7 +60,7 @@ class BlockStep:
         terms = [as_pairs(model, elements) for elements in window.terms]
         pairs = tuple(now.label for now, before in zip(terms, window.terms, strict=True) if now is not before)
         refreshed, swept = ([each for each in terms if (each.refresh is not None) == apart] for apart in (True, False))
-        self._refreshed, self._gradient = Gradient(model, terms=refreshed), wp.zeros_like(state[0])
+        self._refreshed, self.gradient = Gradient(model, terms=refreshed), wp.zeros_like(state[0])
         self.record = StepRecord("blocks", pairs=pairs, compensated=compensated)
         vertices, swept, arrays, numbers = block_layout(swept, len(state[0]) // model.copies, model.copies)
         damped = [elements.damping is not None for elements in swept]
@@ -84,8 +85,8 @@ class BlockStep:
             if self._guard:
                 self._guard.launch_start(x)
             model.refresh(STEP, Moment(x), self._refreshed.terms)
-            self._refreshed.add(x, self._gradient)
-            model.launch(self._kernel, model.copies, self._given, [self._gradient, x, v, self.residual])
+            self._refreshed.add(x, self.gradient)
+            model.launch(self._kernel, model.copies, self._given, [self.gradient, x, v, self.residual])
             move_pins(*self._pins, x, v)
             if self._guard:
                 self._guard.launch_end(x)

@@ -19,6 +19,7 @@ from .contact_guard import ContactGuard
 from .gather_corrections import GatherSweeps
 from .gather_gradient import GatherGradient
 from .gather_step import GatherStep
+from .quiet_steps import QuietSteps
 from .scatter_corrections import ScatterSweeps
 from .subdomains import SubdomainSteps
 
@@ -57,14 +58,15 @@ class Plan:
             pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares them.
             colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of a model that has some, for faster classes
                 to take contact themselves, or None to leave it to the terms and to the end of each step, as it is with meshes.
-            pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact, which the plain steps take, or None.
+            pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact, or None.
 
         Raises:
             ValueError: If threads cannot share the steps; it names the term.
         """
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
         if pairs is not None:
-            steps = ExplicitStep(*given[:-1], pairs=pairs)
+            blocks = self.backend == "blocks" and self.model.uniform and colliders is None
+            steps = QuietSteps((BlockStep if blocks else ExplicitStep)(*given[:-1]), pairs, count)
         elif pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
             steps = SubdomainSteps(*given, pool)

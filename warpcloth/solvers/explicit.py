@@ -268,6 +268,11 @@ class ExplicitStepper(LaunchedStepper):
         self.state.add("position residual", self._steps.residual)
         self.record((lambda: self.launch_steps(1), 1))
 
+    def _record_frame(self):
+        if self.pairs is None:
+            return super()._record_frame()
+        return [(self._segments(lambda: self.launch_steps(self.steps_per_frame)), 1)]  # which is a loop of the device
+
     def follow_contact(self):
         self.colliders.note_pushes()
         if self.plan.guard is not None:

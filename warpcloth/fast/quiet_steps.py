@@ -1,0 +1,85 @@
+"""Explicit steps of cloth with self-contact, of which those that nothing can touch are plain steps and one test."""
+
+import warp as wp
+
+from ..contact.self_steps import WAY
+from ..kernels.fast.quiet_step import find_unquiet
+from ..kernels.loop import count_down
+from ..kernels.step import count_step
+
+
+class QuietSteps:
+    """Takes plain steps while no pair is listed, and takes one again with contact and filter if the test says so.
+
+    The test is that of the list, by motion relative to the middle of the cloth: while it says that the list may be kept, no
+    pair can have a force. A vertex also may not move by more than the filter allows in a round. Steps of both kinds are then
+    the same, to the bit. If a copy has several pieces, colliders, moving pins or loads, or starts with crossings, all steps
+    are those with contact.
+
+    Args:
+        steps: The plain steps, with a ``gradient`` to which contact adds before a step.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`.
+        count: Number of steps of keyframes (B,) int32, or None.
+
+    Attributes:
+        residual, record: As of the plain steps.
+    """
+
+    residual = None
+
+    def __init__(self, steps, pairs, count):
+        self._plain, self._pairs, self.record, model = steps, pairs, steps.record, pairs.model
+        one = len(pairs.proximity.centre) == model.copies
+        self._quiet = one and count is None and not model.scene.colliders and pairs.tangles is None
+        self._v_before = model.vectors()
+        self._left, self._again = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        self._test, size = model.kernel(find_unquiet, model.dtype), model.per_copy if model.device.is_cpu else 1
+        self._dim = model.copies, -(-model.per_copy // size)
+        # Both below what the list and the filter allow, by more than rounding; all moves are then so near their mean.
+        way = (1.0 - 1e-4) * WAY * pairs.skin
+        self._given = [model.per_copy, size, way, 0.49 * way if pairs.moves_together else way, pairs.moves_together]
+        self._count, self._count_down = model.kernel(count_step), model.kernel(count_down)
+
+    def launch(self, steps, end):
+        """Launches so many steps, and ``end`` (pins, keyframes, count, x, v) after each that is not a plain one."""
+        step = self._launch_step if self._quiet else self._launch_full
+        if steps == 1:
+            step(end)
+            return
+        self._left.fill_(steps)
+        wp.capture_while(self._left, self._launch_one, step=step, end=end)
+
+    def _launch_one(self, step, end):
+        step(end)
+        self._pairs.model.launch(self._count_down, 1, [], [self._left])
+
+    def _launch_step(self, end):
+        wp.capture_if(self._pairs.listed, self._launch_full, self._launch_plain, end=end)
+
+    def _launch_full(self, end):
+        pairs, (x, _v) = self._pairs, self._plain.state
+        pairs.launch_begin(x)
+        pairs.launch_forces(x)
+        pairs.add_gradient(self._plain.gradient)
+        self._plain.launch(1, end)
+
+    def _launch_plain(self, end):
+        pairs, (x, v), model = self._pairs, self._plain.state, self._pairs.model
+        wp.copy(pairs.x_before, x)
+        wp.copy(self._v_before, v)
+        self._plain.launch(1, lambda *moved: None)
+        self._again.zero_()
+        near = pairs.proximity
+        given = [near.centre, pairs.x_before, x, near.found, near.listed, *self._given]
+        model.launch(self._test, self._dim, given, [self._again])
+        wp.capture_if(self._again, self._launch_again, self._launch_count, end=end)
+
+    def _launch_again(self, end):
+        x, v = self._plain.state
+        wp.copy(x, self._pairs.x_before)
+        wp.copy(v, self._v_before)
+        self._launch_full(end)
+
+    def _launch_count(self, end):
+        model = self._pairs.model
+        model.launch(self._count, model.copies, [], [self._pairs.steps])
