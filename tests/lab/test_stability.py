@@ -302,12 +302,12 @@ def test_implicit_euler_never_diverges(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hanging", "net"])
 def test_implicit_euler_never_diverges_on_full_maps(name, device):
-    """Every second decade with five steps up to 1 s, 40 of each, and the start compressed too."""
+    """Every second decade with steps between and beyond those of the test above, and the start compressed too."""
     scene = SceneRef(name, {"n": 6, **({"stiffness": 1e3} if name == "net" else {})})
     for fixed in ({}, {"compression": 0.3}):
-        steps = tuple(np.geomspace(1e-4, 1.0, 5).tolist())
+        steps = 1e-3, 1e-2, 1.0
         cells = mapped(
-            scene, IMPLICIT + OTHERS, "stiffness", DECADES[::2], "dt", steps, 40, fixed, 1e-4, device=device, reference=False
+            scene, IMPLICIT + OTHERS, "stiffness", DECADES[::2], "dt", steps, 20, fixed, 1e-4, device=device, reference=False
         )
         assert {cell["verdict"] for cell in flat(cells[:3])} <= {"stable", "stalled"}
         assert not unexplained(cells)

@@ -752,6 +752,7 @@ PROBE = """
 import inspect, json, os, sys
 import warp as wp
 
+wp.config.optimization_level = 0  # what is compiled is counted, and hardly runs
 launched, loaded, rows = {}, set(), set()
 launch, load, make = wp.launch, wp.Module.load, wp.array.__init__
 
