@@ -162,3 +162,22 @@ def test_no_memory_for_pairs(solver, tmp_path, monkeypatch, device):
         assert found.status.message.startswith(f"stopped before the end of frame {frame + 1}: the cloth has ")
         assert "pairs that are near one another, which takes" in found.status.message
         assert (np.asarray(found.points) == np.asarray(whole.points)[: frame + 1]).all()
+
+
+@pytest.mark.parametrize("solver", [SOLVER, wc.Newton(substeps=2), wc.PBD(substeps=2)], ids=["xpbd", "newton", "pbd"])
+def test_bits_repeat(solver, device):
+    """Runs are the same that make room for pairs in the middle of a frame, that have it from the start, and in a batch."""
+    scene, ends = sheets(n=10, gap=0.2, velocity=(0.0, -3.0, 0.0)), []
+    for copies, room in ((1, None), (1, None), (1, 10_000), (2, None)):
+        stepper = solver.bind(scene.build(device=device, copies=copies))
+        if room:
+            stepper.pairs.grow_to(room)
+            stepper.record_again()
+        stepper.frame()
+        before = len(stepper.pairs.pairs.stencils)
+        for _ in range(3):
+            stepper.frame()
+        assert (len(stepper.pairs.pairs.stencils) > before) == (room is None)
+        x, v = (array.numpy().reshape(copies, -1, 3) for array in stepper.state)
+        ends += [x[copy].tobytes() + v[copy].tobytes() for copy in range(copies)]
+    assert len(ends) == 5 and len(set(ends)) == 1

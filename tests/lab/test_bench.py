@@ -128,6 +128,19 @@ def test_what_contact_costs(scene, device):
     assert said.startswith(f"{row['ms'] / row['ms_without']:.2f} of the time without") and _contact({"ms": 1.0}) == ""
 
 
+def test_what_self_contact_costs(device):
+    """As above, and what its filter did: sheets in a stack are listed as near to one another, and stay apart."""
+    scene = SceneRef("stack", {"sheets": 2, "n": 4})
+    given = {"frames": 1, "device": device, "dtype": "float32", "started": time.time()}
+    row = measure(asdict(scene), asdict(Setup("xpbd", {"substeps": 4, "iterations": 2})), **given)
+    assert row["contact_ns"] == pytest.approx(
+        1e6 * (row["ms"] - row["ms_without"]) / (row["vertices"] * 4 * 3)
+    )  # floor, ball and cloth
+    assert row["pairs"] > 0 and 0.0 < row["lists"] <= 1.0 and 0.0 < row["kept"] <= 1.0 and row["least_gap"] > 0.0
+    said = _contact(row)
+    assert f"; {row['pairs']} pairs, {row['lists']:.2g} lists a substep, " in said and said.endswith(" m")
+
+
 def test_growth_with_triangles():
     rows = [row(8, 0.1 * count**0.5, triangles=count) for count in (100, 400, 1600)]
     (one,) = growth(rows)

@@ -31,8 +31,9 @@ Columns:
   compile s   additional time when all kernels must be compiled
   factor s    time to factorise constant matrices
   MB          peak memory: of the process on a CPU, of Warp's memory pool on CUDA
-With colliders, the last column compares the time of a frame with that of the same cloth without them, and divides the
-difference by the numbers of vertices, substeps and colliders.
+With colliders or self-contact, the last column compares the time of a frame with that of the same cloth without contact, and
+divides the difference by the numbers of vertices, substeps and colliders, counting self-contact as one. With self-contact it
+also has the largest number of near pairs, how often they were listed, the moves that the filter kept, and the least gap.
 
   warpcloth bench --json > before.json
   warpcloth bench hanging --solver xpbd -s substeps=4 iterations=20 --sizes 32 64 128
@@ -210,10 +211,16 @@ def _cells(row):
 
 
 def _contact(row):
-    """Describes the cost of contact; "" without colliders."""
-    if row.get("ms_without") is None:
-        return ""
-    return f"{row['ms'] / row['ms_without']:.2f} of the time without colliders, {row['contact_ns']:.3g} ns a vertex and substep"
+    """Describes the cost of contact, and what self-contact did; "" without either."""
+    said = []
+    if row.get("ms_without") is not None:
+        ratio = row["ms"] / row["ms_without"]
+        said.append(f"{ratio:.2f} of the time without contact, {row['contact_ns']:.3g} ns a vertex and substep")
+    if row.get("pairs") is not None:
+        gap = "none" if row["least_gap"] is None else f"{row['least_gap']:.2g} m"
+        kept = f"{100.0 * row['kept']:.4g} % of moves kept, least gap {gap}"
+        said.append(f"{row['pairs']:,} pairs, {row['lists']:.2g} lists a substep, {kept}")
+    return "; ".join(said)
 
 
 def _scene_of(row):

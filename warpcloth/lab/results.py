@@ -15,6 +15,7 @@ COLUMNS = (
     *("vertices", "elements", "substeps", "iterations", "frames", "ms", "ms_low", "ms_high", "cloths_per_s", "ns", "bytes"),
     *("bytes_per_s", "share", "launches"),
     *("start_s", "cold_start_s", "bind_s", "factorise_s", "memory", "triangles", "ms_without", "contact_ns"),
+    *("pairs", "lists", "kept", "least_gap"),
 )
 
 

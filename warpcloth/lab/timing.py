@@ -18,6 +18,7 @@ from .measurements import SceneRef, Setup
 
 # Frames before the first that counts, and seconds after which no further one is begun once there are three.
 _WARM_UP, _SECONDS, _FEWEST = 2, 10.0, 3
+OF_SELF_CONTACT = ("pairs", "lists", "kept", "least_gap")
 
 
 def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
@@ -48,8 +49,10 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
         - ``start_s``: From ``started`` to the end of the first frame. ``bind_s``: Building the model and binding the solver
           alone, with compiling what is in no cache, but without ``factorise_s``, that of constant matrices [s].
         - ``triangles``: Of all mesh colliders.
-        - ``ms_without``, ``contact_ns``: Of a scene with colliders the time of a frame of the same cloth without them [ms], and
-          the difference over vertices, substeps and colliders [ns].
+        - ``ms_without``, ``contact_ns``: Of a scene with colliders or self-contact the time of a frame of the same cloth
+          without any contact [ms], and the difference over vertices, substeps and colliders, of which self-contact is one [ns].
+        - ``pairs``, ``lists``, ``kept``, ``least_gap``: With self-contact the most pairs in a list, the number of lists of a
+          step, the fraction of moves that its filter kept, and the least gap in any frame [m], of all copies.
         - ``memory``: The most that was taken, of the process on a CPU and of Warp's memory pool on CUDA [bytes].
     """
     names = (
@@ -67,6 +70,7 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
         "triangles",
         "ms_without",
         "contact_ns",
+        *OF_SELF_CONTACT,
     )
     found = {"status": "ok", "reason": "", "frames": 0, **dict.fromkeys((*names, "start_s", "bind_s", "factorise_s", "memory"))}
     declared, device = SceneRef(**scene).load(), wp.get_device(device)
@@ -96,14 +100,16 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
     if frames:
         found |= _warm(stepper, model, points, frames, found["elements"])
     found["memory"] = _memory(device)
-    if frames and declared.colliders:
-        bare = replace(declared, colliders=(), contact=None)
+    if stepper.pairs is not None:
+        found |= _self_contact(stepper)
+    if frames and (declared.colliders or declared.self_contact):
+        bare = replace(declared, colliders=(), contact=None, self_contact=None)
         with contextlib.suppress(ValueError):  # of a solver that does not take what is left
             without = solver.bind(bare.build(device=device, dtype=dtype, copies=copies, order=order, threads=threads))
             others = Mirror(without.state.x)
             _run_frame(without, others)
             ms = _warm(without, without.model, others, frames, 0)["ms"]
-            each = model.count * stepper.steps_per_frame * len(declared.colliders)
+            each = model.count * stepper.steps_per_frame * (len(declared.colliders) + (declared.self_contact is not None))
             found |= {"ms_without": ms, "contact_ns": 1e6 * (found["ms"] - ms) / each}
     if not np.isfinite(stepper.state.x.numpy()).all() or Result.DIVERGED in stepper.results:
         return found | {"status": "diverged", "reason": f"diverged within {found['frames'] + _WARM_UP} frames"}
@@ -135,6 +141,15 @@ def _warm(stepper, model, points, frames, elements):
         "bytes_per_s": moved * substeps / (1e-3 * median),
         "launches": launches_of(lambda: _run_frame(stepper, points)) / substeps,
     }
+
+
+def _self_contact(stepper):
+    """Counts of self-contact in all steps so far, and the least gap."""
+    pairs = stepper.pairs
+    lists, steps = (int(array.numpy().max()) for array in (pairs.lists, pairs.steps))
+    gap = float(pairs.least_gap.min())
+    values = pairs.most, lists / steps, 1.0 - float(pairs.share.mean()), gap if np.isfinite(gap) else None
+    return dict(zip(OF_SELF_CONTACT, values, strict=True))
 
 
 def _run_frame(stepper, points):
