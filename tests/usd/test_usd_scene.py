@@ -186,8 +186,11 @@ def contact_alone():
     return wc.Scene(mesh(), density=0.1, terms=[SPRING], contact=wc.Contact(stiffness=math.inf))
 
 
+SELF_CONTACT = wc.SelfContact(distance=1 / 300, friction=0.3, crossing_start="run")
+
+
 def self_contact():
-    return wc.Scene(mesh(), density=0.1, terms=[SPRING], self_contact=wc.SelfContact(distance=1 / 300, crossing_start="run"))
+    return wc.Scene(mesh(), density=0.1, terms=[SPRING], self_contact=SELF_CONTACT)
 
 
 SCENES = [

@@ -15,6 +15,7 @@ from ..kernels import self_contact as kernels
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from .proximity import Proximity
+from .self_friction import SelfFriction, Slips, acting_sizes
 from .tangles import Tangles
 
 # The skin, relative to the longest edge of the rest shape: beyond the contact distance pairs are listed as far as that. An edge
@@ -68,6 +69,8 @@ class SelfSteps:
         listed: Whether the last list has pairs, (1,) int32.
         moves_together: Whether moves are relative to their mean for the filter, as nothing is pinned.
         tangles: :class:`warpcloth.contact.tangles.Tangles` of a start at which cloth crosses or touches cloth, else None.
+        friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
+        stale: Whether lists have got more room outside of steps, so that what was recorded must be recorded again.
     """
 
     def __init__(self, model, state, h, steps_per_frame, bounded, colliders):
@@ -132,9 +135,14 @@ class SelfSteps:
             self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
             for factory in (kernels.find_held, kernels.push_pairs):
                 self._kernels[factory] = model.kernel(factory, model.dtype)
+        self.friction, self.stale = None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)
         self._carried = self.proximity.found, self._most.array, self.lists, self._notes.nearest, self._notes.too_near
+        if self.declared.friction:
+            slips = state.add_part("friction", Slips(model, self.proximity.capacity))
+            slips.grow = self._grow_outside
+            self.friction = SelfFriction(model, slips, self.steps, self.declared.friction, bounded)
         self._check_start(state)
         self.start_again()
 
@@ -263,7 +271,7 @@ class SelfSteps:
         self.pairs = kernels.near_pairs(self.model.dtype)()
         for name in ("stencils", "counts", "rows", "distances"):
             setattr(self.pairs, name, getattr(found, name))
-        for name, size in self._acting_sizes(capacity).items():
+        for name, size in acting_sizes(self.model, capacity).items():
             setattr(self.pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
         self.begun, self.forces = kernels.StepPairs(), kernels.PairForces()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
@@ -276,10 +284,6 @@ class SelfSteps:
             self._swept = kernels.SweptPairs()
             self._swept.touches, self._swept.normal, self._swept.weights = room(wp.int32), room(wp.vec3d), room(wp.vec4d)
             self._swept.gap, self._swept.multiplier = room(wp.float64), room(wp.float64)
-
-    def _acting_sizes(self, capacity):
-        N = self.model.count
-        return {"acting": capacity, "number": 1, "corner_counts": N, "first": N + 1, "corners": 4 * capacity}
 
     def grow(self):
         """Makes room for the pairs that did not fit; what was recorded must be recorded again.
@@ -296,6 +300,12 @@ class SelfSteps:
         """Makes room for half as many pairs more than these."""
         self.proximity.grow(pairs)
         self._hold()
+        if self.friction is not None:
+            self.friction.hold(self.proximity.capacity)
+
+    def _grow_outside(self, pairs):
+        self.grow_to(pairs)
+        self.stale = True
 
     @property
     def overflowed(self):
@@ -363,6 +373,8 @@ class SelfSteps:
         self.launch_areas(x)
         given = [self.pairs, self.begun, x, self.steps, self._per_frame, self.model.per_copy]
         self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [self._notes])
+        if self.friction is not None:
+            self.friction.launch_begin(self.pairs, self.begun, x)
 
     def launch_list(self, x):
         """Lists the pairs at x, and notes how many there are; that of ``found`` is one that was made before."""
@@ -395,29 +407,41 @@ class SelfSteps:
     def launch_forces(self, x, correction=None):
         """Finds the forces of the pairs at x, or x + correction, which the methods below add up."""
         self.model.launch(self._find, len(self.pairs.stencils), [self.pairs, self.begun, x, correction], [self.forces])
+        if self.friction is not None:
+            self.friction.launch_forces(x, correction)
 
     def add_gradient(self, out):
         """out (N,) += ∂U/∂x."""
         self._launch(kernels.add_forces, self.model.count, [self.pairs, self.forces], [out])
+        if self.friction is not None:
+            self.friction.add_gradient(out)
 
     def add_energy(self, sums, out):
         """out (B,) += U."""
         self._launch(kernels.sum_energies, self.model.count, [self.pairs, self.forces], [self.energies])
+        if self.friction is not None:
+            self.friction.add_energies(self.energies)
         sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
 
     def add_diagonal(self, diagonal, values):
         """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
         given = [self.pairs, self.model.inverse_mass, diagonal, self.forces]
         self._launch(kernels.add_diagonal, self.model.count, given, [values])
+        if self.friction is not None:
+            self.friction.add_diagonal(diagonal, values)
 
     def add_products(self, p, q, active):
         """q += A p of its blocks off the diagonal, for the copies that are ``active`` (B,)."""
         given = [self.pairs, self.model.inverse_mass, self.forces, p, active, self.model.per_copy]
         self._launch(kernels.add_products, self.model.count, given, [q])
+        if self.friction is not None:
+            self.friction.add_products(p, q, active)
         self.model.lock(q)
 
     def rows(self):
         """Of the pairs that press at the last :meth:`launch_forces`: J, whose rows are wᵢn, and kAφ″; the host reads them.
+
+        Friction has rows of its own, along the plane normal to n.
 
         Returns:
             J, scipy (pairs, 3N) without columns of what does not move, and D, scipy diagonal (pairs, pairs) [N/m]; ∂²U/∂x² is
@@ -428,16 +452,22 @@ class SelfSteps:
         model, bend = self.model, self.forces.bend.numpy()
         acting = np.sort(self.pairs.acting.numpy()[: self.pairs.number.numpy()[0]])
         press = acting[bend[acting] != 0.0]
-        w, n = (array.numpy()[press] for array in (self.forces.weights, self.forces.normal))
-        columns = 3 * self.pairs.stencils.numpy()[press].astype(np.int64)[:, :, None] + np.arange(3)
+        found = [array.numpy()[press] for array in (self.pairs.stencils, self.forces.weights, self.forces.normal)]
+        found.append(bend[press])
+        if self.friction is not None:
+            found = [np.concatenate(each) for each in zip(found, self.friction.rows(), strict=True)]
+        stencils, w, n, bend = found
+        columns = 3 * stencils.astype(np.int64)[:, :, None] + np.arange(3)
         values = w[:, :, None] * n[:, None, :] * (model.coordinate_mobility() > 0.0)[columns]
-        starts = 12 * np.arange(len(press) + 1)
-        J = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(press), 3 * model.count))
-        return J, diags(bend[press])
+        starts = 12 * np.arange(len(bend) + 1)
+        J = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(bend), 3 * model.count))
+        return J, diags(bend)
 
     def sweeps(self, in_turn):
         """Says that sweeps will move pairs in turn, or all at once, as devices with many threads must."""
         model, key = self.model, (self.model.dtype, self.model.mobility is not None)
+        if self.friction is not None:
+            self.friction.sweeps(in_turn)
         if in_turn and model.device.is_cpu:
             self._sweep = model.kernel(kernels.sweep_pairs, *key)
             return
@@ -457,6 +487,19 @@ class SelfSteps:
             adds: Whether multipliers add up over sweeps; else pairs are hard.
             backward: Whether pairs move from the last to the first, where they move in turn.
         """
+        if self.friction is not None and backward:
+            self.friction.launch_sweep(x, correction, h, backward)
+        self._launch_sweep(x, correction, h, adds, backward)
+        if self.friction is not None and not backward:
+            self.friction.launch_sweep(x, correction, h, backward)
+
+    def launch_no_multipliers(self):
+        """Launches λ = 0 of all pairs."""
+        self.multipliers.zero_()
+        if self.friction is not None:
+            self.friction.multipliers.zero_()
+
+    def _launch_sweep(self, x, correction, h, adds, backward):
         model, mobility, multipliers = self.model, self.model.local_mobility, self.multipliers if adds else None
         if self._touching is None:
             given = [self.pairs, mobility, self.begun, x, h, not adds, backward]
@@ -478,6 +521,8 @@ class SelfSteps:
         where the way to x is outside.
         """
         model = self.model
+        if self.friction is not None and self._iterates:  # whose areas may be those of a list that was made on the way
+            self.friction.launch_contact(self.pairs, self.begun)
         if self._cut_before is not None:
             colliders = self._colliders
             given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
@@ -496,6 +541,8 @@ class SelfSteps:
         given = [model.inverse_mass, self._target, x, model.per_copy, self.h]
         self._launch(kernels.end_filter, model.count, given, [v, move, self.cut])
         model.launch(self._count, model.copies, [], [self.steps])
+        if self.friction is not None:
+            self.friction.launch_end(x)
         if self.tangles is not None:
             self.tangles.launch_free(x)
 
@@ -514,8 +561,13 @@ class SelfSteps:
     def _launch_round(self, x):
         self.launch_fresh(x, self._relist)
         if self._iterates:
-            self.launch_areas(x)
+            self._launch_areas_again(x)
         self._launch_walk(x)
+
+    def _launch_areas_again(self, x):
+        self.launch_areas(x)
+        if self.friction is not None:
+            self.friction.launch_relisted()
 
     def _launch_walk(self, x):
         model = self.model
@@ -590,7 +642,7 @@ class SelfSteps:
 
         def relist(x):
             self.launch_list(x)
-            self.launch_areas(x)
+            self._launch_areas_again(x)
             launch()
 
         self.launch_fresh(self.x_before, relist)

@@ -21,6 +21,7 @@ class State:
 
     Attributes:
         arrays: All arrays on the device by name, with N or B rows, ``"x"`` and ``"v"`` among them.
+        parts: Values of other sizes by name, which copy, assign and store themselves; a reset leaves them as they are.
         starts: Values at the start, for those arrays that neither start at 0 nor have their start in the model.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).
@@ -28,7 +29,7 @@ class State:
     """
 
     def __init__(self, x, v, batch_size, shares=()):
-        self.arrays, self.starts, self.shares = {"x": x, "v": v}, {}, tuple(shares)
+        self.arrays, self.starts, self.shares, self.parts = {"x": x, "v": v}, {}, tuple(shares), {}
         self.lent = {}
         self._results, self._residual = [Result.COMPLETED] * batch_size, np.zeros(batch_size)
 
@@ -70,6 +71,11 @@ class State:
             array = self.arrays[name] = self.lent.get(name, array)
         return array
 
+    def add_part(self, name, part):
+        """Registers a value with the methods ``copy``, ``assign``, ``to_host`` and ``from_host``, and returns it."""
+        self.parts[name] = part
+        return part
+
     def start_here(self, *names):
         """Takes the present values of the arrays of these names as those at the start."""
         self.starts |= {name: wp.clone(self.arrays[name]) for name in names}
@@ -78,6 +84,7 @@ class State:
         """Returns an equal state with arrays of its own."""
         other = State(wp.clone(self.x), wp.clone(self.v), len(self.results), [share.copy() for share in self.shares])
         other.arrays |= {name: wp.clone(array) for name, array in self.arrays.items() if name not in other.arrays}
+        other.parts = {name: part.copy() for name, part in self.parts.items()}
         other.starts, other.results, other.residual = self.starts, list(self.results), self.residual.copy()
         return other
 
@@ -87,6 +94,8 @@ class State:
             share.assign(of_other)
         for name, array in self.arrays.items():  # after the shares, whose x and v are parts of these
             wp.copy(array, other.arrays[name])
+        for name, part in self.parts.items():
+            part.assign(other.parts[name])
         self.results, self.residual = list(other.results), other.residual.copy()
 
     def __eq__(self, other):
@@ -105,6 +114,8 @@ class State:
         """Returns everything as copies in NumPy arrays, by name."""
         found = {name: np.array(array.numpy()) for name, array in self.arrays.items()}
         found |= {"results": np.array([result.name for result in self.results]), "residual": np.array(self.residual)}
+        for name, part in self.parts.items():
+            found |= {f"{name} {key}": values for key, values in part.to_host().items()}
         for k, share in enumerate(self.shares):
             found |= {f"share {k} {name}": values for name, values in share.to_host().items() if name not in ("x", "v")}
         return found
@@ -116,10 +127,13 @@ class State:
             ValueError: If they are of another scene or solver.
         """
         now = self.to_host()
-        if now.keys() != values.keys() or any(now[name].shape != values[name].shape for name in now):
+        sized = [name for name in now if not any(name.startswith(f"{part} ") for part in self.parts)]
+        if now.keys() != values.keys() or any(now[name].shape != values[name].shape for name in sized):
             raise ValueError("the state is of another scene or solver")
         for name, array in self.arrays.items():
             array.assign(values[name])
+        for name, part in self.parts.items():
+            part.from_host({key: values[f"{name} {key}"] for key in part.to_host()})
         self.results, self.residual = [Result[name] for name in values["results"]], np.array(values["residual"])
         for k, share in enumerate(self.shares):
             own = {name: values.get(f"share {k} {name}", array) for name, array in share.to_host().items()}

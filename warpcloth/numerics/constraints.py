@@ -16,7 +16,7 @@ from ..kernels.elementwise import scale
 from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 from .cluster_rows import ClusterRows
-from .pair_rows import PairRows
+from .pair_rows import FrictionRows, PairRows
 
 
 class TermRows:
@@ -110,7 +110,9 @@ class Constraints:
         sizes = [elements.per_copy for elements in model.terms]
         if pairs is not None:
             self.parts.append(PairRows(model, pairs, curved))
-            sizes.append(self.parts[-1].per_copy)
+            if pairs.friction is not None:
+                self.parts.append(FrictionRows(model, pairs.friction))
+            sizes += [part.per_copy for part in self.parts[len(sizes) :]]
         self._fresh = [elements for elements in model.terms if not elements.cells]  # whose rows fit themselves
         self.per_copy = sum(part.count for part in self.parts)
         self.count = self.per_copy * model.copies

@@ -23,19 +23,18 @@ class PairRows:
     elements = None
 
     def __init__(self, model, pairs, curved):
-        self.model, self._pairs, self._curved = model, pairs, curved
+        self._hold(model, pairs, 2 if curved else 1)
+        self._linearise = model.kernel(kernels.linearise_pair_rows, model.dtype, curved)
+
+    def _hold(self, model, pairs, rows):
+        self.model, self._pairs, self._rows = model, pairs, rows
         self.per_copy = capacity = len(pairs.pairs.stencils)
-        self._rows = 2 if curved else 1
-        self.count = self._rows * capacity
+        self.count = rows * capacity
         self._slopes = kernels.PairSlopes()
-        for name, kind in (("normal", wp.vec3d), ("weights", wp.vec4d), ("slope", wp.float64), ("stiffening", wp.float64)):
+        for name, kind in (("weights", wp.vec4d), ("first", wp.vec3d), ("second", wp.vec3d)):
             setattr(self._slopes, name, wp.zeros(capacity, dtype=kind, device=model.device))
-        key = model.dtype, curved
-        self._linearise, self._apply = (
-            model.kernel(kernels.linearise_pair_rows, *key),
-            model.kernel(kernels.apply_pair_rows, *key),
-        )
-        self._gather = model.kernel(kernels.gather_pair_rows, *key)
+        factories = kernels.apply_pair_rows, kernels.gather_pair_rows
+        self._apply, self._gather = (model.kernel(factory, model.dtype, rows == 2) for factory in factories)
 
     def set_layout(self, layout):
         """Sets the layout of its rows, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
@@ -60,14 +59,33 @@ class PairRows:
     def entries(self):
         """J on the host: values, rows and columns."""
         count = min(int(self._pairs.pairs.counts.numpy().sum()), self.per_copy)
-        binds = np.flatnonzero(self._slopes.slope.numpy()[:count])
-        names = ("slope", "stiffening")[: self._rows]
+        binds = np.flatnonzero(self._slopes.first.numpy()[:count].any(axis=1))
+        names = ("first", "second")[: self._rows]
         slopes = np.stack([getattr(self._slopes, name).numpy()[binds] for name in names], axis=1)
-        w, n = (array.numpy()[binds] for array in (self._slopes.weights, self._slopes.normal))
+        w = self._slopes.weights.numpy()[binds]
         stencils = self._pairs.pairs.stencils.numpy()[binds].astype(np.int64)
         layout, copy = self._layout, stencils[:, 0] // self.model.per_copy
         first = copy * layout.rows_per_copy + layout.first + self._rows * binds
-        values = slopes[:, :, None, None] * w[:, None, :, None] * n[:, None, None, :]
+        values = slopes[:, :, None, :] * w[:, None, :, None]
         rows = np.broadcast_to((first[:, None] + np.arange(self._rows))[:, :, None, None], values.shape)
         columns = np.broadcast_to((3 * stencils[:, :, None] + np.arange(3))[:, None], values.shape)
         return values.ravel(), rows.ravel(), columns.ravel()
+
+
+class FrictionRows(PairRows):
+    """The rows of friction between pairs, see :func:`warpcloth.kernels.pair_rows.linearise_friction_rows`.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        friction: :class:`warpcloth.contact.self_friction.SelfFriction`.
+    """
+
+    def __init__(self, model, friction):
+        self._hold(model, friction, 2)
+        self._linearise = model.kernel(kernels.linearise_friction_rows, model.dtype)
+
+    def launch_linearise(self, x, d, h, least, values):
+        """As of the rows of a term."""
+        model, of = self.model, self._pairs
+        given = [of.pairs, model.inverse_mass, of.rubbed, of.start, x, d, h, least, model.per_copy, self._layout]
+        model.launch(self._linearise, (model.copies, self.per_copy), given, [self._slopes, values])

@@ -128,7 +128,7 @@ class JacobiSweep(_Sweep):
             self.launch_start, self.launch, self.parts = self._launch_start, self._launch, self._parts
 
     def _launch_start(self):
-        self.pairs.multipliers.zero_()
+        self.pairs.launch_no_multipliers()
         self._elements.launch_start()
 
     def _launch(self):
@@ -224,7 +224,7 @@ class GaussSeidelSweep(_Sweep):
     def launch_start(self):
         """Launches d = 0, λ = 0, once x̃ is there."""
         if self.pairs is not None:
-            self.pairs.multipliers.zero_()
+            self.pairs.launch_no_multipliers()
         for array in (self.correction, *self.multipliers):
             if array is not None:
                 array.zero_()

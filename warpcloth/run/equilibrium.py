@@ -72,8 +72,8 @@ def equilibrium(
     keyframes. Pressure follows the cloth: its forces are held constant while the cloth settles, then computed again, until they
     balance. ``stable`` and ``lowest_eigenvalue`` are for these forces. Colliders stand at their last keyframe, however they
     came there, and free vertices must start outside them. With friction there are many rest shapes, and the motion decides
-    among them, so colliders with friction are refused: run such a scene with damping until it rests. Colliders that are meshes
-    are refused too.
+    among them, so colliders and self-contact with friction are refused: run such a scene with damping until it rests. Colliders
+    that are meshes are refused too.
 
     With self-contact all iterates stay apart, pins included: pins with keyframes move as far as cloth lets them, and if they do
     not arrive, the iterations are used up. The areas of contact are held constant while the cloth settles, then computed again,
@@ -104,8 +104,8 @@ def equilibrium(
         :class:`Equilibrium`.
 
     Raises:
-        ValueError: If an argument is not allowed, a stiffness is infinite, a collider is a mesh or has friction, a free vertex
-            starts inside a collider at its last keyframe, or cloth crosses cloth at the start.
+        ValueError: If an argument is not allowed, a stiffness is infinite, a collider is a mesh, there is friction, a free
+            vertex starts inside a collider at its last keyframe, or cloth crosses cloth at the start.
 
     Examples:
         >>> import warpcloth as wc
@@ -180,6 +180,11 @@ def _with_colliders_at_rest(scene):
                 f"the collider {collider.label} has friction {collider.friction:g}, with which there are many rest shapes and "
                 "the motion decides among them; set it to 0, or run the scene with damping until it rests"
             )
+    if scene.self_contact is not None and scene.self_contact.friction:
+        raise ValueError(
+            f"self_contact.friction is {scene.self_contact.friction:g}, with which there are many rest shapes and the motion "
+            "decides among them; set it to 0, or run the scene with damping until it rests"
+        )
     if not any(collider.moves for collider in scene.colliders):
         return scene
     try:

@@ -21,6 +21,7 @@ class SelfContact:
         distance: Contact distance r [m].
         stiffness: k [Pa/m]. By default 10 w/r, where w is the weight of the cloth per area, so that one layer rests at a gap of
             0.9 r.
+        friction: Coefficient μ of friction.
         crossing_start: What to do if cloth crosses or touches cloth at the start: ``"refuse"`` it, or ``"run"`` all the same.
             Triangles that cross or touch at the start then pass through one another, until they are free; from then on they
             cannot cross again. No other triangles come to cross. ``Animation.crossings`` is the number of pairs that are left.
@@ -31,10 +32,12 @@ class SelfContact:
 
     distance: float = 1e-3
     stiffness: float | None = None
+    friction: float = 0.0
     crossing_start: Literal["refuse", "run"] = "refuse"
 
     def __post_init__(self) -> None:
         number("self_contact.distance", self.distance, above=0.0)
         if self.stiffness is not None:
             number("self_contact.stiffness", self.stiffness, above=0.0)
+        number("self_contact.friction", self.friction, least=0.0)
         choice("self_contact.crossing_start", self.crossing_start, STARTS)

@@ -222,6 +222,9 @@ class Stepper:
         if self._kept is None:
             self._kept = self.state.copy()
         self._kept.assign(self.state)
+        if self.pairs.stale:
+            self.record_again()
+            self.pairs.stale = False
         steps()
         while self.pairs.overflowed:
             self.state.assign(self._kept)

@@ -13,7 +13,7 @@ from ..core.status import Residual
 from ..model.model import Model
 from ..numerics.integrators import INTEGRATORS
 from ..scene.scene import Scene
-from ..terms.needs import FINITE, Need, listed, refuse_unmet
+from ..terms.needs import FINITE, NORMAL_FORCE, Need, listed, refuse_unmet
 from .facts import Facts
 from .solver import Stepper
 from .threaded import ThreadedStepper
@@ -142,6 +142,12 @@ class Step:
         if not cls.touches_itself:
             able = [record.__name__ for record in SOLVERS.values() if record.touches_itself]
             raise ValueError(f"{cls.__name__} cannot take self_contact; {listed(able)} can")
+        if model.scene.self_contact.friction and NORMAL_FORCE in cls.needs:
+            able = [
+                record.__name__ for record in SOLVERS.values() if record.touches_itself and NORMAL_FORCE not in record.needs
+            ]
+            lack = NORMAL_FORCE.lack.format(label="friction of self_contact")
+            raise ValueError(f"{cls.__name__} cannot take {lack}; {listed(able)} can, or {NORMAL_FORCE.remedy}")
         if model.mobility is not None and any(collider.moves or collider.facets for collider in model.scene.colliders):
             raise ValueError(
                 "self_contact is given with vertices that are locked along some axes and a collider that moves or is a mesh, "

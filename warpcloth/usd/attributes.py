@@ -90,6 +90,7 @@ ATTRIBUTES = (
     # How it touches itself.
     Attribute("self_contact.distance", "warpcloth:selfContact:distance", "cloth", ("double",)),
     Attribute("self_contact.stiffness", "warpcloth:selfContact:stiffness", "cloth", ("double",)),
+    Attribute("self_contact.friction", "warpcloth:selfContact:friction", "cloth", ("double",)),
     Attribute("self_contact.crossing_start", "warpcloth:selfContact:crossingStart", "cloth", ("token",)),
     # A selection or indices. The others are pinned too.
     Attribute("pins.vertices", "warpcloth:pins", "cloth", ("string", "int[]")),

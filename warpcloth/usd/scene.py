@@ -509,8 +509,9 @@ def _scene_values(scene):
             given[f"{name}.distance"] = contact.distance
         if contact is not None and contact.stiffness is not None:
             given[f"{name}.stiffness"] = contact.stiffness
-    if scene.self_contact is not None and scene.self_contact.crossing_start != SelfContact.crossing_start:
-        given["self_contact.crossing_start"] = scene.self_contact.crossing_start
+    for name in ("friction", "crossing_start"):
+        if scene.self_contact is not None and (value := getattr(scene.self_contact, name)) != getattr(SelfContact, name):
+            given[f"self_contact.{name}"] = value
     if not np.array_equal(scene.positions, mesh.points):
         given["positions"] = scene.positions
     if scene.velocities.any():

@@ -1,0 +1,182 @@
+"""Factories of the kernels that sweep over pairs of cloth with friction, see :mod:`.self_friction`, one by one or all at once.
+
+u is linear in positions, u = Σ wᵢxᵢ + …, so the local step is that of all vector constraints. With û without the force of the
+pair and W = Σ wᵢ²/mᵢ, λ = −hₑ²∂U/∂u at the u* = û + Wλ that solves it, and Δxᵢ = wᵢλ/mᵢ. Where vertices are locked along some
+axes, W is that of an axis that moves: the fixed point is the same.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .self_contact import ONE, ZERO, free_move, near_pairs
+from .self_friction import RubbedPairs, friction_module, stretch_of
+from .vectors import types
+
+
+@wp.func
+def multiplier_after(u: wp.vec3d, D: wp.float64, k: wp.float64, limit: wp.float64, h: wp.float64):
+    """λ = −h²∂U/∂u at the u* = u + Dλ that solves it: in closed form, that of :func:`.terms.friction.prox`."""
+    found = wp.vec3d()
+    l = wp.length(u)
+    if D > ZERO and l > ZERO:
+        c = D * k * h * h
+        most = wp.min(k * h * h * l / (ONE + c), limit * h * h)
+        found = -most / l * u
+    return found
+
+
+@cache
+def greatest_mobility(dtype, axes: bool):
+    """The device function (inverse masses, i) → 1/m, of an axis that has most."""
+    moved = free_move(dtype, axes)
+    kind, _ = types(dtype)
+
+    @wp.func
+    def greatest(inverse_mass: wp.array(dtype=kind if axes else dtype), i: int):
+        return wp.max(moved(inverse_mass, i, wp.vec3d(ONE, ONE, ONE)))
+
+    return greatest
+
+
+@cache
+def sweep_friction(dtype, axes: bool):
+    """Kernel of one thread: each acting pair in turn takes its force away, and gets that of the prox at the u that is left.
+
+    M(x − x̃) = Σ wᵢλ holds, and a fixed point is the minimiser of the step.
+    """
+    vec3, _ = types(dtype)
+    stretch, moved, greatest = stretch_of(dtype), free_move(dtype, axes), greatest_mobility(dtype, axes)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sweep_friction_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=vec3 if axes else dtype),
+        # state in
+        rubbed: RubbedPairs,
+        start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # parameters
+        h: wp.float64,
+        backward: bool,
+        # in and out
+        multipliers: wp.array(dtype=wp.vec3d),
+        correction: wp.array(dtype=vec3),
+    ):
+        count = pairs.number[0]
+        for turn in range(count):
+            e = pairs.acting[wp.where(backward, count - 1 - turn, turn)]
+            limit = rubbed.limit[e]
+            if limit > ZERO:
+                s = pairs.stencils[e]
+                w = rubbed.weights[e]
+                D = ZERO
+                for i in range(4):
+                    D += w[i] * w[i] * greatest(inverse_mass, s[i])
+                before = multipliers[e]
+                u = stretch(s, w, rubbed.normal[e], rubbed.stretch[e], start, x, correction) - D * before
+                after = multiplier_after(u, D, rubbed.stiffness[e], limit, h)
+                multipliers[e] = after
+                for i in range(4):
+                    move = moved(inverse_mass, s[i], w[i] * (after - before))
+                    correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+
+    return sweep_friction_of_pairs
+
+
+@cache
+def count_rubbing(dtype):
+    """Kernel over vertices: how many pairs of a vertex have friction."""
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def count_rubbing_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        rubbed: RubbedPairs,
+        # out
+        rubbing: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        total = ZERO
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            if rubbed.limit[pairs.corners[k] // 4] > ZERO:
+                total += ONE
+        rubbing[i] = total
+
+    return count_rubbing_pairs
+
+
+@cache
+def rub_pairs(dtype, axes: bool):
+    """Kernel over acting pairs of a Jacobi sweep: λ of the prox, as if W were D = Σ nᵢwᵢ²/mᵢ, nᵢ the ``rubbing`` ones at i."""
+    vec3, _ = types(dtype)
+    stretch, greatest = stretch_of(dtype), greatest_mobility(dtype, axes)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def rub_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=vec3 if axes else dtype),
+        # state in
+        rubbed: RubbedPairs,
+        start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        rubbing: wp.array(dtype=wp.float64),
+        # parameters
+        h: wp.float64,
+        # in and out
+        multipliers: wp.array(dtype=wp.vec3d),
+        # out
+        changes: wp.array(dtype=wp.vec3d),
+    ):
+        turn = wp.tid()
+        if turn >= pairs.number[0]:
+            return
+        e = pairs.acting[turn]
+        limit = rubbed.limit[e]
+        if limit == ZERO:
+            return
+        s = pairs.stencils[e]
+        w = rubbed.weights[e]
+        D = ZERO
+        for i in range(4):
+            D += rubbing[s[i]] * w[i] * w[i] * greatest(inverse_mass, s[i])
+        before = multipliers[e]
+        u = stretch(s, w, rubbed.normal[e], rubbed.stretch[e], start, x, correction) - D * before
+        after = multiplier_after(u, D, rubbed.stiffness[e], limit, h)
+        multipliers[e] = after
+        changes[e] = after - before
+
+    return rub_each_pair
+
+
+@cache
+def move_by_friction(dtype, axes: bool):
+    """Kernel over vertices of a Jacobi sweep: d += W Σ wᵢΔλ."""
+    vec3, _ = types(dtype)
+    moved = free_move(dtype, axes)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def move_each_by_friction(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=vec3 if axes else dtype),
+        # state in
+        rubbed: RubbedPairs,
+        changes: wp.array(dtype=wp.vec3d),
+        # in and out
+        correction: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        total = wp.vec3d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if rubbed.limit[e] > ZERO:
+                total += rubbed.weights[e][pairs.corners[k] - 4 * e] * changes[e]
+        move = moved(inverse_mass, i, total)
+        correction[i] = correction[i] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+
+    return move_each_by_friction

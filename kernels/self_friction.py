@@ -1,0 +1,474 @@
+"""Factories of the kernels of friction of cloth with itself: U = Σ kA H(‖u‖), u = (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)).
+
+H is the Huber function of :mod:`.terms.friction` with ε = μN/(kA): a spring of the stiffness of contact whose force is no more
+than μN. The pairs are those near one another where the step began, at the positions xⁿ, and so are w, n, N and kA of each. ξ is
+the stretch that the spring had there, which steps pass on: ξ ← (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)), cut to ε where the next begins
+and it is longer. So a pair that sticks does not creep, and one that slides drags its spring along.
+
+ξ is kept relative to the edge between the last two vertices of a pair, by which it turns with the cloth. A pair without a ξ of
+its own begins with the mean of those pairs that touched between the same parts: that have a vertex in common on either side.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .self_contact import ONE, SIDE, ZERO, StepPairs, near_pairs, vertex_of
+from .terms import contact
+from .vectors import types
+
+slope = contact.slope
+
+
+@wp.struct
+class RubbedPairs:
+    """Of pairs where the step began: n, w, kA [N/m], μN [N], 0 of those that do not touch, ξ [m], and kA of contact."""
+
+    normal: wp.array(dtype=wp.vec3d)
+    weights: wp.array(dtype=wp.vec4d)
+    stiffness: wp.array(dtype=wp.float64)
+    limit: wp.array(dtype=wp.float64)
+    contact: wp.array(dtype=wp.float64)
+    stretch: wp.array(dtype=wp.vec3d)
+
+
+@wp.struct
+class RubForces:
+    """Of pairs at some positions: kAH [J], ∂U/∂u [N], u/‖u‖, and the second derivatives along u and across it [N/m]."""
+
+    energy: wp.array(dtype=wp.float64)
+    pull: wp.array(dtype=wp.vec3d)
+    direction: wp.array(dtype=wp.vec3d)
+    along: wp.array(dtype=wp.float64)
+    across: wp.array(dtype=wp.float64)
+
+
+@cache
+def friction_module(dtype):
+    return f"warpcloth.self_friction.{dtype.__name__}"
+
+
+@wp.func
+def edge_tangent(edge: wp.vec3d, n: wp.vec3d):
+    """The direction of an edge in the plane normal to n, 0 of an edge along n."""
+    t = edge - wp.dot(n, edge) * n
+    return t / wp.max(wp.length(t), wp.float64(1e-300))
+
+
+@wp.func
+def equal(s: wp.vec4i, q: wp.vec4i):
+    return s[0] == q[0] and s[1] == q[1] and s[2] == q[2] and s[3] == q[3]
+
+
+@wp.func
+def has(s: wp.vec4i, vertex: int, first: int, last: int):
+    found = wp.bool(False)
+    for i in range(first, last):
+        if s[i] == vertex:
+            found = True
+    return found
+
+
+@wp.func
+def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_last: int):
+    """Whether two sides, given by the range of their corners, have a vertex in common."""
+    found = wp.bool(False)
+    for i in range(s_first, s_last):
+        if has(q, s[i], q_first, q_last):
+            found = True
+    return found
+
+
+@cache
+def begin_friction(dtype, bounded: bool):
+    """Kernel over pairs, where a step begins: w, n, kA and μN, and which are acting: those with an area or friction.
+
+    kA is that of the contact of the last step, which ``kept`` it, so that the mean of N is that of the force of contact; of
+    explicit steps, whose contact is evaluated where the step begins, that of this step. So it is in a copy that has made no
+    ``steps``, and of pairs that were not kept, if areas changed within the last step because it was ``relisted``.
+    """
+
+    @wp.kernel(module=f"{friction_module(dtype)}.{bounded}", enable_backward=False)
+    def begin_friction_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        lists: near_pairs(dtype),
+        # state in
+        step: StepPairs,
+        kept: near_pairs(dtype),
+        slips: wp.array(dtype=wp.vec4d),
+        steps: wp.array(dtype=wp.int32),
+        relisted: wp.array(dtype=wp.int32),
+        # parameters
+        per_copy: int,
+        friction: wp.float64,
+        # out
+        rubbed: RubbedPairs,
+    ):
+        e = wp.tid()
+        if e >= lists.counts[0] + lists.counts[1]:
+            return
+        s = lists.stencils[e]
+        r = wp.float64(lists.distances[e])
+        gap = step.gap[e]
+        k = step.stiffness[e]
+        rubbed.contact[e] = k
+        limit = ZERO
+        if gap < r:
+            if wp.static(not bounded):
+                if steps[s[0] // per_copy] > 0:
+                    if relisted[0] == 0:
+                        k = ZERO
+                    for j in range(kept.first[s[0]], kept.first[s[0] + 1]):
+                        q = kept.corners[j] // 4
+                        if (q < kept.counts[0]) == (e < lists.counts[0]) and equal(s, kept.stencils[q]):
+                            k = slips[q][3]
+            if wp.static(bounded):
+                limit = friction * k * (r - gap)
+            else:
+                limit = -friction * k * slope(gap, r)
+            rubbed.normal[e] = step.normal[e]
+            rubbed.weights[e] = step.weights[e]
+            rubbed.stiffness[e] = k
+        rubbed.limit[e] = limit
+        if rubbed.contact[e] > ZERO or limit > ZERO:
+            pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
+            for i in range(4):
+                wp.atomic_add(pairs.corner_counts, s[i], 1)
+
+    return begin_friction_of_pairs
+
+
+@cache
+def set_stretch(dtype):
+    """Kernel over acting pairs, where a step begins: ξ, by what the last step ``kept`` of a copy that has made ``steps``."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def set_stretch_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        kept: near_pairs(dtype),
+        slips: wp.array(dtype=wp.vec4d),
+        steps: wp.array(dtype=wp.int32),
+        # parameters
+        per_copy: int,
+        # in and out
+        rubbed: RubbedPairs,
+    ):
+        turn = wp.tid()
+        if turn >= pairs.number[0]:
+            return
+        e = pairs.acting[turn]
+        limit = rubbed.limit[e]
+        s = pairs.stencils[e]
+        rubbed.stretch[e] = wp.vec3d()
+        if limit == ZERO or steps[s[0] // per_copy] == 0:
+            return
+        n = rubbed.normal[e]
+        sides = wp.where(e < pairs.counts[0], 1, 2)
+        total = wp.vec3d()
+        weight = ZERO
+        own = wp.bool(False)
+        for side in range(sides):
+            for j in range(kept.first[s[side]], kept.first[s[side] + 1]):
+                e_kept = kept.corners[j] // 4
+                slip = slips[e_kept]
+                if slip[2] > ZERO and not own:
+                    q = kept.stencils[e_kept]
+                    kept_sides = wp.where(e_kept < kept.counts[0], 1, 2)
+                    # Of the other pairs some have their sides the other way round.
+                    way = ZERO
+                    if meet(s, 0, sides, q, 0, kept_sides) and meet(s, sides, 4, q, kept_sides, 4):
+                        way = ONE
+                    elif meet(s, 0, sides, q, kept_sides, 4) and meet(s, sides, 4, q, 0, kept_sides):
+                        way = -ONE
+                    if way != ZERO:
+                        m = way * n
+                        t = edge_tangent(exact(x[q[3]]) - exact(x[q[2]]), m)
+                        stretch = way * (slip[0] * t + slip[1] * wp.cross(m, t))
+                        if kept_sides == sides and equal(s, q):
+                            own = True
+                            total = stretch
+                        else:
+                            weight += slip[2]
+                            total += slip[2] * stretch
+        if not own and weight > ZERO:
+            total = total / weight
+        pull = rubbed.stiffness[e] * wp.length(total)
+        if pull > limit:
+            total = limit / pull * total
+        rubbed.stretch[e] = total
+
+    return set_stretch_of_pairs
+
+
+@cache
+def set_contact(dtype):
+    """Kernel over acting pairs: kA of contact, as of another list of pairs, 0 of those that do not act there."""
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def set_contact_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        others: near_pairs(dtype),
+        # state in
+        of_others: StepPairs,
+        # out
+        rubbed: RubbedPairs,
+    ):
+        turn = wp.tid()
+        if turn >= pairs.number[0]:
+            return
+        e = pairs.acting[turn]
+        s = pairs.stencils[e]
+        of_vertex = e < pairs.counts[0]
+        found = ZERO
+        for j in range(others.first[s[0]], others.first[s[0] + 1]):
+            other = others.corners[j] // 4
+            if (other < others.counts[0]) == of_vertex and equal(s, others.stencils[other]):
+                found = of_others.stiffness[other]
+        rubbed.contact[e] = found
+
+    return set_contact_of_pairs
+
+
+@cache
+def stretch_of(dtype):
+    """The device function (stencil, w, n, ξ, start, x, correction) → u."""
+    vec3, _ = types(dtype)
+    at, exact = vertex_of(dtype)
+
+    @wp.func
+    def stretch(
+        s: wp.vec4i,
+        w: wp.vec4d,
+        n: wp.vec3d,
+        before: wp.vec3d,
+        start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+    ):
+        u = before
+        for i in range(4):
+            u += w[i] * (at(x, correction, s[i]) - exact(start[s[i]]))
+        return u - wp.dot(n, u) * n
+
+    return stretch
+
+
+@cache
+def find_friction(dtype):
+    """Kernel over acting pairs: energy, force and second derivatives at x, or x + correction."""
+    vec3, _ = types(dtype)
+    stretch = stretch_of(dtype)
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def find_friction_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        rubbed: RubbedPairs,
+        start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        # out
+        forces: RubForces,
+    ):
+        turn = wp.tid()
+        if turn >= pairs.number[0]:
+            return
+        e = pairs.acting[turn]
+        limit = rubbed.limit[e]
+        if limit == ZERO:
+            return
+        k = rubbed.stiffness[e]
+        u = stretch(pairs.stencils[e], rubbed.weights[e], rubbed.normal[e], rubbed.stretch[e], start, x, correction)
+        l = wp.length(u)
+        least = wp.min(l, limit / k)
+        forces.energy[e] = k * least * (l - SIDE * least)
+        forces.direction[e] = u / wp.max(l, wp.float64(1e-300))
+        if k * l > limit:
+            forces.pull[e] = limit / l * u
+            forces.along[e] = ZERO
+            forces.across[e] = limit / l
+        else:
+            forces.pull[e] = k * u
+            forces.along[e] = k
+            forces.across[e] = k
+
+    return find_friction_of_pairs
+
+
+@cache
+def add_friction(dtype):
+    """Kernel over vertices: out += ∂U/∂x, in the order of the pairs."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def add_friction_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        rubbed: RubbedPairs,
+        forces: RubForces,
+        # in and out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        total = wp.vec3d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if rubbed.limit[e] > ZERO:
+                total += rubbed.weights[e][pairs.corners[k] - 4 * e] * forces.pull[e]
+        out[i] = out[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+
+    return add_friction_of_pairs
+
+
+@cache
+def sum_friction(dtype):
+    """Kernel over vertices: adds the energies of the pairs of which a vertex is the first [J]."""
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def sum_friction_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        rubbed: RubbedPairs,
+        forces: RubForces,
+        # in and out
+        energies: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        total = ZERO
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if pairs.corners[k] == 4 * e and rubbed.limit[e] > ZERO:
+                total += forces.energy[e]
+        energies[i] = energies[i] + total
+
+    return sum_friction_of_pairs
+
+
+@cache
+def add_friction_diagonal(dtype):
+    """Kernel over vertices: adds Σ wᵢ²∂²U/∂u² to the diagonal blocks of a Hessian; nothing to those of pins."""
+    _, mat33 = types(dtype)
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def add_friction_to_diagonal(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        diagonal: wp.array(dtype=wp.int32),
+        # state in
+        rubbed: RubbedPairs,
+        forces: RubForces,
+        # in and out
+        values: wp.array(dtype=mat33),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] == dtype(0.0):
+            return
+        total = wp.mat33d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if rubbed.limit[e] > ZERO:
+                w = rubbed.weights[e][pairs.corners[k] - 4 * e]
+                n = rubbed.normal[e]
+                u = forces.direction[e]
+                flat = wp.identity(n=3, dtype=wp.float64) - wp.outer(n, n)
+                total += w * w * (forces.across[e] * flat + (forces.along[e] - forces.across[e]) * wp.outer(u, u))
+        values[diagonal[i]] = values[diagonal[i]] + mat33(total)
+
+    return add_friction_to_diagonal
+
+
+@cache
+def add_friction_products(dtype):
+    """Kernel over vertices: q += wᵢ ∂²U/∂u² Σⱼ wⱼpⱼ over the other corners j of its pairs, of copies that are active."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def add_products_of_friction(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        rubbed: RubbedPairs,
+        forces: RubForces,
+        p: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # in and out
+        q: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] == dtype(0.0) or active[i // per_copy] == 0:
+            return
+        total = wp.vec3d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if rubbed.limit[e] > ZERO:
+                corner = pairs.corners[k] - 4 * e
+                s = pairs.stencils[e]
+                w = rubbed.weights[e]
+                n = rubbed.normal[e]
+                u = forces.direction[e]
+                move = wp.vec3d()
+                for j in range(4):
+                    if j != corner and inverse_mass[s[j]] > dtype(0.0):
+                        move += w[j] * exact(p[s[j]])
+                change = forces.across[e] * (move - wp.dot(n, move) * n)
+                change += (forces.along[e] - forces.across[e]) * wp.dot(u, move) * u
+                total += w[corner] * change
+        q[i] = q[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+
+    return add_products_of_friction
+
+
+@cache
+def end_friction(dtype):
+    """Kernel over acting pairs, where a step ends at x: what the next one needs.
+
+    Those are the parts of ξ along t, the edge of the pair in the plane normal to n, and along n × t; kA of friction, 0 of pairs
+    without; and kA of contact.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    def end_friction_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        rubbed: RubbedPairs,
+        start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # out
+        slips: wp.array(dtype=wp.vec4d),
+    ):
+        turn = wp.tid()
+        if turn >= pairs.number[0]:
+            return
+        e = pairs.acting[turn]
+        slips[e] = wp.vec4d(ZERO, ZERO, ZERO, rubbed.contact[e])
+        if rubbed.limit[e] == ZERO:
+            return
+        s = pairs.stencils[e]
+        w = rubbed.weights[e]
+        n = rubbed.normal[e]
+        u = rubbed.stretch[e]
+        for i in range(4):
+            u += w[i] * (exact(x[s[i]]) - exact(start[s[i]]))
+        u -= wp.dot(n, u) * n
+        t = edge_tangent(exact(start[s[3]]) - exact(start[s[2]]), n)
+        slips[e] = wp.vec4d(wp.dot(u, t), wp.dot(u, wp.cross(n, t)), rubbed.stiffness[e], rubbed.contact[e])
+
+    return end_friction_of_pairs

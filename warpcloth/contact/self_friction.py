@@ -1,0 +1,238 @@
+"""Friction of cloth with itself in the steps of a solver."""
+
+import numpy as np
+import warp as wp
+
+from ..core.scan import Scan
+from ..kernels import friction_sweeps
+from ..kernels import self_contact as kernels_of_pairs
+from ..kernels import self_friction as kernels
+from ..kernels.self_contact import near_pairs
+
+# Rows of the arrays of a list for each pair that there is room for.
+ROWS = {"stencils": 1, "corners": 4, "slips": 1}
+LISTS = "stencils", "counts", "first", "corners"
+
+
+def acting_sizes(model, room):
+    """Sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.self_contact.near_pairs`, by name."""
+    return {"acting": room, "number": 1, "corner_counts": model.count, "first": model.count + 1, "corners": 4 * room}
+
+
+class Slips:
+    """Pairs of a step, and how far friction is stretched in each where it ends: what a step passes to the next.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        room: Pairs that there is room for.
+
+    Attributes:
+        room: As given.
+        pairs: A :func:`warpcloth.kernels.self_contact.near_pairs`, without distances.
+        slips: (room,), see :func:`warpcloth.kernels.self_friction.end_friction`.
+        relisted: (1,) int32, whether pairs were listed again within the step.
+        grow: A function of a number of pairs that makes room for as many, by default that of this object alone.
+    """
+
+    def __init__(self, model, room):
+        self.model, self.grow, self._arrays = model, self.hold, {}
+        for name, rows in (("counts", 2), ("first", model.count + 1), ("relisted", 1)):
+            self._arrays[name] = wp.zeros(rows, dtype=wp.int32, device=model.device)
+        self.hold(room)
+
+    def hold(self, room):
+        """Allocates room for so many pairs, and keeps those that are there."""
+        before, self.room = dict(self._arrays), room
+        for (name, rows), dtype in zip(ROWS.items(), (wp.vec4i, wp.int32, wp.vec4d), strict=True):
+            self._arrays[name] = wp.zeros(rows * room, dtype=dtype, device=self.model.device)
+            if name in before:
+                wp.copy(self._arrays[name], before[name], count=min(len(before[name]), rows * room))
+        self.slips, self.relisted = self._arrays["slips"], self._arrays["relisted"]
+        self.pairs = near_pairs(self.model.dtype)()
+        for name in LISTS:
+            setattr(self.pairs, name, self._arrays[name])
+
+    def launch_lists(self, pairs, names):
+        """Launches copies of lists of other pairs, with as much room."""
+        for name in names:
+            wp.copy(getattr(self.pairs, name), getattr(pairs, name))
+
+    # As a part of a state.
+
+    def copy(self):
+        """Returns an equal object with arrays of its own."""
+        other = Slips(self.model, self.room)
+        other.assign(self)
+        return other
+
+    def assign(self, other):
+        """Copies the values of another one of the same model."""
+        if other.room > self.room:
+            self.grow(other.room)
+        for name, array in other._arrays.items():
+            wp.copy(self._arrays[name], array, count=len(array))
+
+    def to_host(self):
+        """Returns copies of what the arrays hold, by name; the room does not matter to them."""
+        found = {name: array.numpy() for name, array in self._arrays.items()}
+        count, corners = int(found["counts"].sum()), int(found["first"][-1])
+        sizes = {"stencils": count, "slips": count, "corners": corners}
+        return {name: np.array(values[: sizes.get(name, len(values))]) for name, values in found.items()}
+
+    def from_host(self, values):
+        """Sets everything to what :meth:`to_host` returned."""
+        count = int(values["counts"].sum())
+        if count > self.room:
+            self.grow(count)
+        for name, array in self._arrays.items():
+            whole = array.numpy()
+            whole[: len(values[name])] = values[name]
+            array.assign(whole)
+
+
+class SelfFriction:
+    """Forces of friction between near parts of cloth, and how far they are stretched, in the steps of one solver.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        slips: :class:`Slips`, which belong to the state of the solver.
+        steps: Steps since the start of each copy, (B,) int32.
+        friction: μ.
+        bounded: Whether contact is that of explicit steps.
+
+    Attributes:
+        pairs: Those of the step, a :func:`warpcloth.kernels.self_contact.near_pairs` without distances.
+        rubbed: :class:`warpcloth.kernels.self_friction.RubbedPairs`.
+        start: Positions where the step began, (N,) [m].
+    """
+
+    def __init__(self, model, slips, steps, friction, bounded):
+        self.model, self._kept, self._steps, self._friction = model, slips, steps, friction
+        self.start, self._step, self._rubbing = model.vectors(), Slips(model, slips.room), None
+        self._vertices, self._one = Scan(model, model.count), wp.ones(1, dtype=wp.int32, device=model.device)
+        made = kernels.set_stretch, kernels.find_friction, kernels.add_friction, kernels.sum_friction
+        made += kernels_of_pairs.fill_corners, kernels_of_pairs.sort_corners
+        made += kernels.add_friction_diagonal, kernels.add_friction_products, kernels.end_friction, kernels.set_contact
+        self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
+        self._begin = model.kernel(kernels.begin_friction, model.dtype, bounded)
+        self.hold(slips.room)
+
+    def hold(self, room):
+        """Arrays of so many pairs; what is kept stays as it is."""
+        self._kept.hold(room)
+        self._step.hold(room)
+        self.pairs = self._step.pairs
+        for name in ("acting", "number", "corner_counts"):
+            size = acting_sizes(self.model, room)[name]
+            setattr(self.pairs, name, wp.zeros(size, dtype=wp.int32, device=self.model.device))
+
+        def zeros(dtype):
+            return wp.zeros(room, dtype=dtype, device=self.model.device)
+
+        self.rubbed, self._forces = kernels.RubbedPairs(), kernels.RubForces()
+        self.rubbed.normal, self.rubbed.weights, self.rubbed.stretch = zeros(wp.vec3d), zeros(wp.vec4d), zeros(wp.vec3d)
+        self.rubbed.stiffness, self.rubbed.limit, self.rubbed.contact = (zeros(wp.float64) for _ in range(3))
+        self._forces.energy, self._forces.along, self._forces.across = (zeros(wp.float64) for _ in range(3))
+        self._forces.pull, self._forces.direction = zeros(wp.vec3d), zeros(wp.vec3d)
+        self.multipliers = zeros(wp.vec3d)
+        if self._rubbing is not None:
+            self._changes = zeros(wp.vec3d)
+
+    def _launch(self, factory, dim, inputs, outputs):
+        self.model.launch(self._kernels[factory], dim, inputs, outputs)
+
+    def launch_begin(self, pairs, begun, x):
+        """Where a step begins at x: takes the pairs of the list, with their n, w and kA, and what is kept of the last step."""
+        model, kept = self.model, self._kept
+        wp.copy(self.start, x)
+        self._step.launch_lists(pairs, ("stencils", "counts"))
+        self.pairs.number.zero_()
+        self._step.relisted.zero_()
+        given = [self.pairs, pairs, begun, kept.pairs, kept.slips, self._steps, kept.relisted, model.per_copy, self._friction]
+        model.launch(self._begin, kept.room, given, [self.rubbed])
+        self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
+        self._launch(kernels_of_pairs.fill_corners, kept.room, [], [self.pairs])
+        self._launch(kernels_of_pairs.sort_corners, model.count, [], [self.pairs])
+        given = [self.pairs, x, kept.pairs, kept.slips, self._steps, model.per_copy]
+        self._launch(kernels.set_stretch, kept.room, given, [self.rubbed])
+        if self._rubbing is not None:
+            self._launch(friction_sweeps.count_rubbing, model.count, [self.pairs, self.rubbed], [self._rubbing])
+
+    def launch_relisted(self):
+        """Notes that pairs, and so their areas, are others within the step."""
+        wp.copy(self._step.relisted, self._one)
+
+    def launch_contact(self, pairs, begun):
+        """Takes kA of the contact of the step from another list of pairs, which may have been made within it."""
+        wp.copy(self._kept.relisted, self._step.relisted)
+        self._launch(kernels.set_contact, self._kept.room, [self.pairs, pairs, begun], [self.rubbed])
+
+    def launch_forces(self, x, correction):
+        """Finds the forces at x, or x + correction, which the methods below add up."""
+        given = [self.pairs, self.rubbed, self.start, x, correction]
+        self._launch(kernels.find_friction, self._kept.room, given, [self._forces])
+
+    def launch_end(self, x):
+        """Keeps the pairs of the step, and how far they are stretched at x."""
+        self._kept.slips.zero_()
+        given = [self.pairs, self.rubbed, self.start, x]
+        self._launch(kernels.end_friction, self._kept.room, given, [self._kept.slips])
+        self._kept.launch_lists(self.pairs, LISTS)
+
+    def add_gradient(self, out):
+        """out (N,) += ∂U/∂x."""
+        self._launch(kernels.add_friction, self.model.count, [self.pairs, self.rubbed, self._forces], [out])
+
+    def add_energies(self, out):
+        """Adds the energies of the pairs to those of their first vertices, (N,) [J]."""
+        self._launch(kernels.sum_friction, self.model.count, [self.pairs, self.rubbed, self._forces], [out])
+
+    def add_diagonal(self, diagonal, values):
+        """As of :class:`warpcloth.contact.self_steps.SelfSteps`, like the next two."""
+        given = [self.pairs, self.model.inverse_mass, diagonal, self.rubbed, self._forces]
+        self._launch(kernels.add_friction_diagonal, self.model.count, given, [values])
+
+    def add_products(self, p, q, active):
+        given = [self.pairs, self.model.inverse_mass, self.rubbed, self._forces, p, active, self.model.per_copy]
+        self._launch(kernels.add_friction_products, self.model.count, given, [q])
+
+    def rows(self):
+        """Returns stencils, w, directions and second derivatives of the rows of all pairs that touch, two a pair."""
+        count = min(int(self.pairs.counts.numpy().sum()), self._kept.room)
+        rubs = np.flatnonzero(self.rubbed.limit.numpy()[:count])
+        found = self.pairs.stencils, self.rubbed.weights, self.rubbed.normal, self._forces.direction
+        stencils, w, n, u = (array.numpy()[rubs] for array in found)
+        still = ~u.any(axis=1)  # any direction in the plane is one along which it is stretched
+        axis = np.eye(3)[np.abs(n).argmin(axis=1)]
+        u = np.where(still[:, None], np.cross(n, axis), u)
+        u /= np.linalg.norm(u, axis=1)[:, None]
+        along, across = (array.numpy()[rubs] for array in (self._forces.along, self._forces.across))
+        return (
+            np.concatenate([stencils, stencils]),
+            np.concatenate([w, w]),
+            np.concatenate([u, np.cross(n, u)]),
+            np.concatenate([along, across]),
+        )
+
+    def sweeps(self, in_turn):
+        """As of :class:`warpcloth.contact.self_steps.SelfSteps`, like the next."""
+        model, key = self.model, (self.model.dtype, self.model.mobility is not None)
+        if in_turn and model.device.is_cpu:
+            self._sweep = model.kernel(friction_sweeps.sweep_friction, *key)
+            return
+        self._rubbing = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self._rub, self._move = (
+            model.kernel(factory, *key) for factory in (friction_sweeps.rub_pairs, friction_sweeps.move_by_friction)
+        )
+        self._kernels[friction_sweeps.count_rubbing] = model.kernel(friction_sweeps.count_rubbing, model.dtype)
+        self.hold(self._kept.room)
+
+    def launch_sweep(self, x, correction, h, backward):
+        model, mobility = self.model, self.model.local_mobility
+        if self._rubbing is None:
+            given = [self.pairs, mobility, self.rubbed, self.start, x, h, backward]
+            model.launch(self._sweep, 1, given, [self.multipliers, correction])
+            return
+        given = [self.pairs, mobility, self.rubbed, self.start, x, correction, self._rubbing, h]
+        model.launch(self._rub, self._kept.room, given, [self.multipliers, self._changes])
+        model.launch(self._move, model.count, [self.pairs, mobility, self.rubbed, self._changes], [correction])
