@@ -18,15 +18,16 @@ from .terms import contact
 from .vectors import types
 
 potential, slope, bend, gap_after = contact.potential, contact.slope, contact.bend, contact.gap_after
-# Of a vertex on the edge between triangles, they share its area by how much farther than the nearest they are, over r.
+# Triangles that meet share the area of a vertex. The part of one falls to 0 where it is farther than the nearest by SHARING·r.
 SHARING = wp.constant(wp.float64(0.25))
-# sin² of the angle between edges below which they are taken as parallel, and count less.
+# Two edges count less if sin² of the angle between them is below this, and not at all if they are parallel.
 PARALLEL = wp.constant(wp.float64(1e-3))
-# The share of the way to the plane between two sides that a step may make.
+# The share of its way to a plane that a vertex may go in one round of the filter.
 KEPT = wp.constant(wp.float64(0.9))
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
-CLAMPED = wp.constant(wp.float64(0.05))  # the least share of the gap between two sides that either has
-# Of a gap, what two approaches may add up to without a plane: below 0.9², by KEPT and as y separates nine tenths of the gap.
+CLAMPED = wp.constant(wp.float64(0.05))  # the least share of the gap that lies between either side and the plane
+# A pair needs no plane if its sides approach by less than this share of its gap. It is below 0.9²: y separates nine tenths of
+# the gap at least, and of these KEPT may be closed.
 WIDE = wp.constant(wp.float64(0.75))
 SIDE = wp.constant(wp.float64(0.5))
 ULP = wp.constant(wp.float64(1.1920929e-07))  # of float32, over the number, at most
@@ -35,12 +36,14 @@ PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges belo
 
 @cache
 def near_pairs(dtype):
-    """The struct of the pairs that are near, see :class:`warpcloth.contact.proximity.Proximity`: how many of a vertex and of
-    edges, those that each vertex has with triangles, and where their contact begins [m].
+    """The struct of the pairs that are near, see :class:`warpcloth.contact.proximity.Proximity`.
 
-    Those that have an area in a step are its ``acting`` pairs, so many as ``number`` says; few are. On the CPU they are in
-    order. ``corners`` has 4·pair + corner of those at vertex i from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is
-    scratch, 0 where nothing runs.
+    ``counts`` has the number of pairs of a vertex and a triangle, which come first, and that of pairs of edges. Those of vertex
+    i with triangles are from ``rows`` [i] to rows[i+1]. The contact of a pair begins at its distance in ``distances`` [m].
+
+    ``acting`` lists the pairs that have an area in a step; there are ``number`` of them, which are few. On the CPU they are in
+    order. ``corners`` lists 4·pair + corner of the acting pairs at vertex i from ``first`` [i] to first[i+1], sorted.
+    ``corner_counts`` is scratch that is 0 between launches.
     """
 
     @wp.struct
@@ -60,7 +63,7 @@ def near_pairs(dtype):
 
 @wp.struct
 class StepPairs:
-    """Of pairs at the start of a step: n, d, w and kA [N/m]."""
+    """n, d, w and kA [N/m] of each pair at the start of a step."""
 
     normal: wp.array(dtype=wp.vec3d)
     gap: wp.array(dtype=wp.float64)
@@ -70,7 +73,7 @@ class StepPairs:
 
 @wp.struct
 class PairForces:
-    """Of pairs at some positions: n, w, kAφ [J], kAφ′ [N] and kAφ″ [N/m]."""
+    """n, w, kAφ [J], kAφ′ [N] and kAφ″ [N/m] of each pair at some positions."""
 
     normal: wp.array(dtype=wp.vec3d)
     weights: wp.array(dtype=wp.vec4d)
@@ -81,7 +84,7 @@ class PairForces:
 
 @wp.struct
 class SweptPairs:
-    """Of pairs in a Jacobi sweep: whether they touch, n, w and d there, and the λ that they get."""
+    """Of each pair in a Jacobi sweep: whether it touches, its n, w and d, and the λ that it gets."""
 
     touches: wp.array(dtype=wp.int32)
     normal: wp.array(dtype=wp.vec3d)
@@ -204,7 +207,7 @@ def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
 
 @wp.func
 def signed_gap(y: wp.vec3d, normal: wp.vec3d, inside: int):
-    """d and n of a pair, by its ``normal`` where the step began: d is below 0 where it has gone through."""
+    """d and n of a pair. If y points against its ``normal`` at the start of the step, it has gone through and d is below 0."""
     d = wp.length(y)
     n = normal
     if d > ZERO:
@@ -218,7 +221,7 @@ def signed_gap(y: wp.vec3d, normal: wp.vec3d, inside: int):
 
 @wp.func
 def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """The gap between both sides of a pair along n, |n| ≤ 1, which its d is never below."""
+    """The gap between both sides of a pair along n, |n| ≤ 1: a lower bound of its d."""
     y = wp.dot(n, c - a)
     z = wp.dot(n, d - a)
     x = wp.dot(n, b - a)
@@ -300,10 +303,10 @@ def part_of_area(gap: wp.float64, least: wp.float64, r: wp.float64):
 def set_areas(dtype):
     """Kernel over pairs, where a step begins: kA, and which are acting.
 
-    Half the area of a vertex goes to triangles on each side of it. Triangles that meet share it where the nearest point is
-    about as near to several of them. A pair of edges, (A₁ + … + A₄)/12, counts only as far as it is nearer than the pairs of
-    its vertices on the same side, and less if it is nearly parallel: where two layers lie flat on one another, the areas of all
-    pairs add up to that of a layer, and crossed folds have contact too.
+    Half the area of a vertex goes to triangles on each side of it. Triangles that meet share this half if they are about
+    equally near. The area of a pair of edges is (A₁ + … + A₄)/12. It counts only as far as the pair is nearer than those of its
+    vertices with triangles on the same side, and less if the edges are nearly parallel. So crossed folds have contact too, and
+    where two layers lie flat on one another the areas of all pairs add up to that of one layer.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -373,7 +376,7 @@ def set_areas(dtype):
 
 @cache
 def fill_corners(dtype):
-    """Kernel over pairs, in turns that leave ``corner_counts`` 0: the corners of acting pairs at each vertex."""
+    """Kernel over pairs: lists the corners of acting pairs at each vertex. It counts ``corner_counts`` down to 0."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def fill_each_corner(
@@ -392,7 +395,7 @@ def fill_corners(dtype):
 
 @cache
 def sort_corners(dtype):
-    """Kernel over vertices: the corners of each in order."""
+    """Kernel over vertices: sorts the corners of each."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def sort_each(
@@ -594,7 +597,7 @@ def free_move(dtype, axes: bool):
 
 @cache
 def sweep_pairs(dtype, axes: bool):
-    """Kernel of one thread: each acting pair in turn takes its force away, and gets that of the prox at the gap that is left.
+    """Kernel of one thread: each acting pair in turn takes its force away, then adds that of the prox at the gap without it.
 
     With d̂ = n·Σwᵢxᵢ without the force of the pair and W = Σ wᵢ²/mᵢ, λ = (d* − d̂)/W, where d* solves
     (d* − d̂)/W = −kAhₑ²φ′(d*) in closed form, and Δxᵢ = wᵢ λ n/mᵢ. M(x − x̃) = Σ wᵢλn then holds with the n and w that pairs have
@@ -736,7 +739,7 @@ def count_touching(dtype):
 
 @cache
 def press_pairs(dtype, axes: bool):
-    """Kernel over acting pairs of a Jacobi sweep: the λ of the prox, as if W were D = Σ nᵢwᵢ²/mᵢ, nᵢ those that touch at i.
+    """Kernel over acting pairs of a Jacobi sweep: the λ of the prox, with D = Σ nᵢwᵢ²/mᵢ for W; nᵢ pairs touch at i.
 
     D is at least J W Jᵀ of all of them, so the sum of the moves never overshoots. The fixed point is that of
     :func:`sweep_pairs`.
@@ -788,7 +791,7 @@ def press_pairs(dtype, axes: bool):
 
 @cache
 def move_by_pairs(dtype, axes: bool):
-    """Kernel over vertices of a Jacobi sweep: d += W Σ wᵢ(λn − λ'n'), the last of before, by the pairs that touch."""
+    """Kernel over vertices of a Jacobi sweep: d += W Σ wᵢ(λn − λ'n') over the pairs that touch, λ'n' of the last sweep."""
     vec3, _ = types(dtype)
     moved = free_move(dtype, axes)
 
@@ -822,7 +825,7 @@ def move_by_pairs(dtype, axes: bool):
 
 @cache
 def keep_pairs(dtype):
-    """Kernel over acting pairs of a Jacobi sweep: λ, w and n are those of the next one before."""
+    """Kernel over acting pairs of a Jacobi sweep: keeps λ, w and n for the next sweep."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def keep_each_pair(
@@ -848,7 +851,7 @@ def keep_pairs(dtype):
 
 @cache
 def wanted_move(dtype):
-    """The device function (x, target, direction, i) → the wanted move of a vertex: its direction, or to its target."""
+    """The device function (x, target, direction, i) → the wanted move of vertex i: its direction, or to its target if None."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -866,10 +869,10 @@ def wanted_move(dtype):
 
 @cache
 def find_ways(dtype):
-    """Kernel over vertices: by how much their moves bring a pair nearer at most, their farthest coordinates, and shares of 1.
+    """Kernel over vertices: a bound on how much each brings a pair nearer [m], its largest coordinate [m], and a share of 1.
 
-    The first is the move that is wanted from the ``common`` move, and WIDE times what there was since ``begun``, where the gaps
-    were found, from that of the first vertex of the copy [m].
+    The bound adds up two lengths: that of the wanted move less the ``common`` move, and WIDE times that of the motion since
+    ``begun``, where the gaps were found, less the motion of the first vertex of the copy.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -903,9 +906,9 @@ def find_ways(dtype):
 
 @wp.func
 def margin_of(least: wp.float64, far: wp.float64):
-    """How near to a plane either side may come, with coordinates as ``far`` as that.
+    """The least distance to a plane that either side keeps, where no coordinate is above ``far``.
 
-    Between float32 numbers, which frames are stored as, 4 units in the last place remain.
+    So 4 units in the last place of float32 remain between the sides; frames are stored in float32.
     """
     ulp = ULP * far
     return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
@@ -913,11 +916,11 @@ def margin_of(least: wp.float64, far: wp.float64):
 
 @cache
 def cut_by_planes(dtype):
-    """Kernel over pairs: the ``share`` of its move from x that each vertex can make, at most that of before.
+    """Kernel over pairs: lowers the ``share`` of its wanted move from x that each vertex may make.
 
-    A plane normal to y lies between the two sides, at the share of the gap that their approaches ask for. The ``common`` move
-    of all vertices of a copy does not count as an approach. No plane is needed by pairs that are ``open``, and by those whose
-    ``gap`` is so wide that none cuts a move of :func:`find_ways`: each side has at least CLAMPED of it.
+    A plane normal to y lies between the two sides, and divides their gap in the ratio of their approaches; each side has at
+    least CLAMPED of it. The ``common`` move of all vertices of a copy does not count as an approach. A pair that is ``open``
+    gets no plane, nor does one whose ``gap`` is so wide that no plane would cut the moves that :func:`find_ways` bounds.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -958,7 +961,7 @@ def cut_by_planes(dtype):
                 way[1] = wp.max(way[1], each[0])
         margin = margin_of(least, far)
         if gap:
-            # Approaches that add up to KEPT·gap − KEPT/CLAMPED·margin or less are not cut, however the gap is shared.
+            # Wherever the plane lies, it cuts no approaches that add up to KEPT·gap − KEPT/CLAMPED·margin or less.
             if way[0] + way[1] <= WIDE * gap[e] - KEPT / CLAMPED * margin:
                 return
         if open:
@@ -1002,7 +1005,7 @@ def cut_by_planes(dtype):
 
 @wp.func
 def bounded_share(move: wp.vec3d, most: wp.float64):
-    """The share of a move that is at most so long."""
+    """The largest share of a move, up to 1, that is no longer than ``most``."""
     size = wp.length(move)
     far = ONE
     if size > most:
@@ -1014,8 +1017,8 @@ def bounded_share(move: wp.vec3d, most: wp.float64):
 def keep_apart(dtype):
     """Kernel over vertices: x ← x + u + t(δ − u), u the ``common`` move, t at most the ``share`` that planes leave.
 
-    ``most`` bounds t‖δ − u‖, by which no pair that is not listed can cross. ``cuts`` (B, 2) counts the vertices that planes cut
-    short, and those that only this bound did. Copies that do not ``walk`` stay.
+    ``most`` bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B, 2) counts the vertices that planes
+    cut short, and those that this bound alone cut short. Copies that do not ``walk`` stay.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -1124,7 +1127,7 @@ def precondition(dtype):
 
 @cache
 def take_descent(dtype):
-    """Kernel over vertices: p = the other direction, of copies of which the slope along p is not below 0."""
+    """Kernel over vertices: p = the other direction, in copies where the slope along p is not below 0."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -1216,9 +1219,9 @@ def walk_from_start(dtype):
 
 @cache
 def find_held(dtype):
-    """Kernel over vertices: whether any must move to be ``outside`` of colliders, and 1/m, 0 of those that must.
+    """Kernel over vertices: sets ``within`` if any must move to get ``outside`` of colliders; ``mobile`` is 1/m, 0 of those.
 
-    After so many ``turns`` as ``most`` it is said that none must.
+    After ``most`` turns ``within`` is not set any more.
     """
     vec3, _ = types(dtype)
 
@@ -1249,7 +1252,7 @@ def find_held(dtype):
 
 @cache
 def push_pairs(dtype):
-    """Kernel of one thread: each pair in turn moves its targets apart along n, to its gap at x or ``left`` if that is less."""
+    """Kernel of one thread: each pair in turn moves its targets apart along n, to its gap at x or to ``left`` if less."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -1287,7 +1290,7 @@ def push_pairs(dtype):
 
 @cache
 def end_filter(dtype):
-    """Kernel over vertices: what the filter cut off x is cut off v, over h, and off ``move``, which may be None."""
+    """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and over h to v; counts them."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -1329,9 +1332,10 @@ def another_round(
     walk: wp.array(dtype=wp.int32),
     proceed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: whether one walks on, by a new list: planes cut many in one of the first rounds, or the bound does.
+    """Kernel over copies: whether a copy walks on in another round.
 
-    ``proceed`` is 1 if any does.
+    It does so while planes cut more than ``few`` vertices, for at most ``near_rounds``, and while the bound of the list cuts
+    one, for at most ``far_rounds``. ``proceed`` is 1 if any copy walks on.
     """
     c = wp.tid()
     rounds[c] = rounds[c] + 1
@@ -1355,7 +1359,7 @@ def note_list(
     # out
     listed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: the largest number of pairs in any list, how many lists were ``made``, and whether this has pairs."""
+    """Kernel over copies: the most pairs in any list; how many lists, ``made`` of them new; and whether this has pairs."""
     c = wp.tid()
     if c == 0:
         listed[0] = wp.min(counts[0] + counts[1], 1)

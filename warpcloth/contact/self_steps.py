@@ -18,28 +18,28 @@ from .proximity import Proximity
 from .self_friction import SelfFriction, Slips, acting_sizes
 from .tangles import Tangles
 
-# The skin, relative to the longest edge of the rest shape: beyond the contact distance pairs are listed as far as that. An edge
-# that goes through a triangle of that size is nearer than 0.29 to an edge of it; below 0.5, which is a right angle's height on
-# its longest side, a flat grid has no pairs with itself.
+# The skin, over the longest edge of the rest shape. Pairs are listed that are nearer than the contact distance plus the skin.
+# It is more than 0.29: an edge that goes through a triangle with sides of at most 1 is nearer than that to one of them. And it
+# is less than 0.5, the height of a right-angled triangle on its longest side if that is 1, so that a flat grid has no pairs.
 SKIN = 0.35
-# Rounds of the filter: planes that cut more than a share of the vertices are set anew in so many; the way that lists allow is
-# walked in so many.
+# Rounds of the filter: planes are set anew in at most NEAR_ROUNDS, as long as they cut more than SHARE of the vertices; a way
+# that is longer than one list allows is walked in at most FAR_ROUNDS.
 SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
-# The way relative to the common motion, over the skin, that a vertex may make in a round: with as much that it may have made
-# since the list, two of them do not come nearer by more than the skin.
+# The longest way of a vertex in a round, relative to the common motion, over the skin. It may have gone as far since the list
+# was made, and so may the other vertex: both together come nearer by at most the skin.
 WAY = 0.25
-# Rounds in which vertices that cloth holds back in a collider are let out, sweeps of each, and the least gap that these leave
-# between cloth, over the contact distance.
+# Vertices that cloth holds back in a collider are let out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
+# keeps a gap to other cloth of LEFT times the contact distance, or that of before if it was less.
 OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
 
 
 class TooNear(NamedTuple):
-    """A frame in which cloth comes nearer to itself than float32 can tell apart, as frames are stored.
+    """The first frame in which cloth is nearer to itself than float32 can tell apart; frames are stored in float32.
 
     Attributes:
         copy: Index of its copy.
-        frame: The first such frame.
-        vertex: A vertex of the model there, of those in one copy.
+        frame: Index of the frame.
+        vertex: Index of a vertex there, in the order of the model, within the copy.
     """
 
     copy: int
@@ -364,7 +364,7 @@ class SelfSteps:
     def launch_begin(self, x):
         """Lists the pairs near x, (N,), where a step begins.
 
-        The list of a step before is kept where the walk at the end of this step cannot miss a pair by it.
+        Keeps an earlier list as long as the walk at the end of this step cannot miss a pair with it.
         """
         wp.copy(self.x_before, x)
         if self._cut_before is not None:
@@ -377,7 +377,7 @@ class SelfSteps:
             self.friction.launch_begin(self.pairs, self.begun, x)
 
     def launch_list(self, x):
-        """Lists the pairs at x, and notes how many there are; that of ``found`` is one that was made before."""
+        """Lists the pairs at x and notes their number. A list at ``found`` was made before and does not count again."""
         self.proximity.launch(x)
         given = [self.proximity.counts, int(x is not self.proximity.found)]
         self.model.launch(kernels.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
@@ -517,8 +517,8 @@ class SelfSteps:
     def launch_end(self, x, v, move=None):
         """Walks from where the step began to x as far as pairs stay apart; v and ``move`` (N,) follow.
 
-        Iterates begin at the last of them. That may be in a collider whose filter has moved x out: then at the start too, from
-        where the way to x is outside.
+        After iterates that stay apart, the walk starts at the last of them. But this may be inside a collider, out of which the
+        filter of colliders has moved x: then too the walk starts where the step began, since that way is outside.
         """
         model = self.model
         if self.friction is not None and self._iterates:  # whose areas may be those of a list that was made on the way
@@ -547,11 +547,11 @@ class SelfSteps:
             self.tangles.launch_free(x)
 
     def launch_fresh(self, x, launch):
-        """Launches ``launch`` of x if a vertex has moved so far since the last list that the next walk might miss a pair."""
+        """Calls ``launch`` with x if a vertex has moved so far since the last list that the next walk might miss a pair."""
         wp.capture_if(self.proximity.moved(x, WAY), launch, x=x)
 
     def _walk(self, x):
-        """Moves x to the target as far as pairs stay apart, by lists made anew on the way where it has come far."""
+        """Moves x towards the target as far as pairs stay apart. On a long way lists are made anew."""
         self._rounds.zero_()
         self._cuts.zero_()
         self._walking.fill_(1)
@@ -650,9 +650,8 @@ class SelfSteps:
     def launch_limit(self, sums, gradient, preconditioner, right, direction):
         """Cuts the direction from the positions of :meth:`launch_relist` short, so that pairs stay apart along all of it.
 
-        If lists do not allow all of it, it is shortened as a whole: cut at each vertex it would stretch stiff cloth.
-
-        Of a copy where energy then does not fall along it, it is that of the preconditioner P, P·right, likewise cut short.
+        A direction longer than lists allow is shortened as a whole: cut at each vertex alone it would stretch stiff cloth. Of a
+        copy where energy does not fall along what is left it is P·right, with the preconditioner P, cut short likewise.
         """
         model, N = self.model, self.model.count
         self._launch(kernels.precondition, N, [preconditioner, right], [self._other])
