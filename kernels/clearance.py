@@ -32,7 +32,7 @@ def near_colliders(dtype, ended: bool):
 
     Before a step it is asked for twice the way of its prediction, 2‖h v + h² g‖; of one that has ``ended``, for the way from
     ``x`` to ``end``. The distance from x to the colliders decides, and depends on the state alone; a ball spares finding it
-    where it is large enough for both ways one after another.
+    where it is large enough for both ways one after another. Once one is near, no other need be looked at.
     """
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)
@@ -58,6 +58,8 @@ def near_colliders(dtype, ended: bool):
         near: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
+        if near[0] != 0:
+            return
         copy = i // per_copy
         x0 = x[i]
         way = clear.drift

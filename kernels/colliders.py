@@ -14,7 +14,7 @@ from .terms import contact
 from .terms.contact import local_gap, turned
 from .vectors import types
 
-local_gap_of, turned_by, slope_of, DELTA = local_gap, turned, contact.slope, contact.DELTA
+local_gap_of, turned_by, slope_of, DELTA, beyond_reach = local_gap, turned, contact.slope, contact.DELTA, contact.beyond
 ROUNDS = wp.constant(6)  # in which a vertex that colliders stop is looked at again
 SLIDING = wp.constant(2)  # of these, in which it slides; then its way is only shortened, which ends
 MARCHES = wp.constant(32)  # planes that a vertex meets on its way past a collider, at most
@@ -69,6 +69,19 @@ def of_pose(dtype):
         return turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], X) + vec3(pose[0], pose[1], pose[2])
 
     return to_local, to_space
+
+
+@cache
+def out_of_reach(dtype):
+    """The device function (pose, core, radius, reach, x) → whether a collider is surely farther than ``reach`` from x."""
+    vec3, _ = types(dtype)
+    pose_type, _anchor = pose_types(dtype)
+
+    @wp.func
+    def surely(pose: pose_type, core: vec3, radius: dtype, reach: dtype, x: vec3):
+        return beyond_reach(x, vec3(pose[0], pose[1], pose[2]), vec3(pose[3], pose[4], pose[5]), pose[6], core, radius, reach)
+
+    return surely
 
 
 @cache
@@ -185,6 +198,7 @@ def pose_collider(dtype):
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
     kept, behind, rest_type = kept_part(dtype), half_space(dtype), wp.types.vector(contact.PARAMETERS, dtype)
+    surely_out = out_of_reach(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_pose(
@@ -212,10 +226,17 @@ def pose_collider(dtype):
         core = shape.core[collider]
         radius = shape.radius[collider]
         if wp.isfinite(core[0]) and h > dtype(0.0):
-            X = to_local(poses.before[copy, collider], x[i])
-            ahead = x[i] + h * (v[i] + h * gravity[i // per_gravity])
-            way = to_local(poses.after[copy, collider], ahead) - X
-            t = kept(X, way, core, radius, least)
+            way = h * (v[i] + h * gravity[i // per_gravity])
+            before = poses.before[copy, collider]
+            after = poses.after[copy, collider]
+            t = dtype(1.0)
+            X = x[i]
+            # The move relative to a collider that stands is the way.
+            if not (before == after and surely_out(before, core, radius, wp.length(way) + least, X)):
+                ahead = X + way
+                X = to_local(before, X)
+                way = to_local(after, ahead) - X
+                t = kept(X, way, core, radius, least)
             if t < dtype(1.0):
                 X = X + t * way
                 d, n = local_gap_of(X, core, radius)
@@ -250,7 +271,7 @@ def anchor_vertices(dtype, bounded: bool):
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
-    rest_type = wp.types.vector(8, dtype)
+    rest_type, surely_out = wp.types.vector(8, dtype), out_of_reach(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -273,6 +294,11 @@ def anchor_vertices(dtype, bounded: bool):
         i = stencil[e, 0]
         copy = e // per_copy
         pose = poses.before[copy, collider]
+        if surely_out(pose, shape.core[collider], shape.radius[collider], distance, x[i]):
+            if rest[e][6] != dtype(0.0) or anchors[i][3] != dtype(0.0):
+                rest[e][6] = dtype(0.0)
+                anchors[i] = anchor_type()
+            return
         X = to_local(pose, x[i])
         d, n = local_gap_of(X, shape.core[collider], shape.radius[collider])
         depth = -slope_of(d, distance)
@@ -424,7 +450,7 @@ def outside(dtype):
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
-    stopped = stopped_by_shape(dtype)
+    stopped, surely_out = stopped_by_shape(dtype), out_of_reach(dtype)
     _along, velocity = sliding(dtype)
 
     @wp.func
@@ -454,23 +480,27 @@ def outside(dtype):
             rounds += 1
             for c in range(shape.radius.shape[0]):
                 pose = poses.after[copy, c]
-                X = to_local(poses.before[copy, c], x)
-                X, less, by, hit = stopped(
-                    X,
-                    to_local(pose, end) - X,
-                    shape.core[c],
-                    shape.radius[c],
-                    shape.friction[c],
-                    rounded,
-                    landing,
-                    rounds <= SLIDING,
-                )
-                if hit:
-                    end = to_space(pose, X)
-                    change += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], less)
-                    push += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], by)
-                    cuts = rounds
-                    last = c
+                began = poses.before[copy, c]
+                # The move relative to a collider that stands is the move.
+                reach = wp.length(end - x) + rounded
+                if not (began == pose and surely_out(pose, shape.core[c], shape.radius[c], reach, x)):
+                    X = to_local(began, x)
+                    X, less, by, hit = stopped(
+                        X,
+                        to_local(pose, end) - X,
+                        shape.core[c],
+                        shape.radius[c],
+                        shape.friction[c],
+                        rounded,
+                        landing,
+                        rounds <= SLIDING,
+                    )
+                    if hit:
+                        end = to_space(pose, X)
+                        change += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], less)
+                        push += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], by)
+                        cuts = rounds
+                        last = c
         if cuts > 0:
             after = velocity(v, move, change, push, h)
             note_cut(notes, copy, i, end - x - move, after - v)

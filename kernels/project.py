@@ -263,7 +263,7 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool =
     ):
         y = y_of(stencil, e, r, x, d)
         if wp.static(idle is not None):
-            if idle(y, r) == 1 and multipliers == lambda_type(dtype(0.0)):
+            if idle(y, r, dtype(0.0)) == 1 and multipliers == lambda_type(dtype(0.0)):
                 return lambda_type(dtype(0.0)), y_type()
         w = corners()
         for i in range(K):
@@ -276,7 +276,10 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool =
 
 @cache
 def sweep_turn(dtype):
-    """The struct of one launch of a Gauss–Seidel sweep: elements from ``first`` on, ``each`` of a thread; h, sweeps and ω."""
+    """The struct of one launch of a Gauss–Seidel sweep: elements from ``first`` on, ``each`` of a thread; h, sweeps and ω.
+
+    ``busy`` is the list of :func:`list_busy` of a term that has one.
+    """
 
     @wp.struct
     class SweepTurn:
@@ -285,6 +288,7 @@ def sweep_turn(dtype):
         h: dtype
         sweeps: int
         relaxation: dtype
+        busy: wp.array(dtype=wp.int32)
 
     return SweepTurn
 
@@ -298,13 +302,68 @@ def nth_of_thread(first: int, each: int, thread: int, k: int):
     return e
 
 
+LISTED_EVERY = wp.constant(16)  # sweeps, before which the elements with a force are listed anew, and before the third
+
+
 @cache
-def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False, axes: bool = False):
+def list_busy(term: Term, dtype, multipliers: bool):
+    """Kernel of one thread: busy = (count, elements in order) that may have a force, of a term with ``idle``.
+
+    Such are those with λ, and those near where there is one: within the way of the prediction from ``before`` and of the
+    correction so far. It is found before the first and the third sweep, and before one in LISTED_EVERY; ``sweep`` counts them.
+    """
+    vec3, _ = types(dtype)
+    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    y_of, idle, rest_of = local_coordinate(term, dtype, True), term.idle, load(rest_type)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        rest: wp.array(dtype=rest_type),
+        # state in
+        before: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        lambdas: wp.array(dtype=lambda_type),
+        # in and out
+        sweep: wp.array(dtype=wp.int32),
+        busy: wp.array(dtype=wp.int32),
+    ):
+        now = sweep[0]
+        sweep[0] = now + 1
+        if now != 2 and now % LISTED_EVERY != 0:
+            return
+        count = wp.int32(0)
+        for e in range(stencil.shape[0]):
+            i = stencil[e, 0]
+            r = rest_of(rest, e)
+            listed = idle(y_of(stencil, e, r, x, d), r, wp.length(x[i] - before[i]) + wp.length(d[i])) == 0
+            if wp.static(multipliers):
+                listed = listed or not (lambdas[e] == lambda_type(dtype(0.0)))
+            if listed:
+                count += 1
+                busy[count] = e
+        busy[0] = count
+
+    return find
+
+
+@cache
+def correct_in_place(
+    term: Term,
+    dtype,
+    scalar: bool,
+    multipliers: bool = False,
+    per_step: bool = False,
+    axes: bool = False,
+    listed: bool = False,
+):
     """Kernel of a Gauss–Seidel sweep: each element sees what those before it did; d += ω Δx, λ += ω Δλ.
 
     A thread takes ``each`` elements one after the other, from first + thread·each on: on a GPU 1 of a colour, in which no two
     share a vertex that moves, or all of a copy, on the CPU all; of a negative ``each`` as many, from the last to the first.
-    Pins are never written, so elements may share them.
+    Pins are never written, so elements may share them. With ``listed`` one thread takes those of :func:`list_busy` alone.
     """
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
@@ -329,8 +388,13 @@ def correct_in_place(term: Term, dtype, scalar: bool, multipliers: bool = False,
         lambdas: wp.array(dtype=lambda_type),
         d: wp.array(dtype=vec3),
     ):
-        for k in range(wp.abs(turn.each)):
+        count = wp.abs(turn.each)
+        if wp.static(listed):
+            count = turn.busy[0]
+        for k in range(count):
             e = nth_of_thread(turn.first, turn.each, wp.tid(), k)
+            if wp.static(listed):
+                e = turn.busy[1 + wp.where(turn.each < 0, count - 1 - k, k)]
             r = rest_of(rest, e)
             before = lambda_type(dtype(0.0))
             if wp.static(multipliers):

@@ -155,30 +155,35 @@ def bend(d: Any, r: Any):
 
 
 @wp.func
-def idle(y: Any, rest: Any):
-    """Whether a vertex is farther than r from the half-space, or from a ball about the collider."""
-    away = y[0] - wp.vector(rest[0], rest[1], rest[2])
-    found = wp.int32(0)
-    if wp.isfinite(rest[7]):
-        radius = rest[7] + rest[8] + rest[9] + rest[10] + rest[11]
-        if wp.dot(away, away) > y.dtype(1.0001) * radius * wp.abs(radius):
-            found = 1
+def beyond(x: Any, position: Any, u: Any, w: Any, half: Any, radius: Any, reach: Any):
+    """Whether x is farther than ``reach`` from a half-space, or from a ball about another collider; quicker than the gap."""
+    away = x - position
+    found = wp.bool(False)
+    if wp.isfinite(half[0]):
+        size = half[0] + half[1] + half[2] + radius + reach
+        found = wp.dot(away, away) > type(w)(1.0001) * size * wp.abs(size)
     else:
-        two = y.dtype(2.0)
+        two = type(w)(2.0)
         n = wp.vector(
-            two * (rest[3] * rest[4] - rest[6] * rest[5]),
-            y.dtype(1.0) - two * (rest[3] * rest[3] + rest[5] * rest[5]),
-            two * (rest[4] * rest[5] + rest[6] * rest[3]),
+            two * (u[0] * u[1] - w * u[2]), type(w)(1.0) - two * (u[0] * u[0] + u[2] * u[2]), two * (u[1] * u[2] + w * u[0])
         )
-        if wp.dot(n, away) > y.dtype(1.01) * rest[11]:
-            found = 1
+        found = wp.dot(n, away) > type(w)(1.01) * reach
     return found
+
+
+@wp.func
+def idle(y: Any, rest: Any, reach: Any):
+    """Whether a vertex is farther than r + reach from the half-space, or from a ball about the collider."""
+    position = wp.vector(rest[0], rest[1], rest[2])
+    u = wp.vector(rest[3], rest[4], rest[5])
+    half = wp.vector(rest[7], rest[8], rest[9])
+    return wp.where(beyond(y[0], position, u, rest[6], half, rest[10], rest[11] + reach), wp.int32(1), wp.int32(0))
 
 
 @wp.func
 def energy(y: Any, rest: Any):
     u = y.dtype(0.0)
-    if idle(y, rest) == 0:
+    if idle(y, rest, y.dtype(0.0)) == 0:
         d, _n = gap(y, rest)
         u = potential(d, rest[11])
     return u
@@ -187,7 +192,7 @@ def energy(y: Any, rest: Any):
 @wp.func
 def gradient(y: Any, rest: Any):
     g = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    if idle(y, rest) == 0:
+    if idle(y, rest, y.dtype(0.0)) == 0:
         d, n = gap(y, rest)
         g[0] = slope(d, rest[11]) * n
     return g

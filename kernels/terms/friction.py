@@ -29,8 +29,8 @@ def measure(rest: Any):
 
 
 @wp.func
-def idle(y: Any, rest: Any):
-    """Whether the vertex has no contact in the step."""
+def idle(y: Any, rest: Any, reach: Any):
+    """Whether the vertex has no contact in the step, wherever it is."""
     return wp.where(rest[6] > y.dtype(0.0), wp.int32(0), wp.int32(1))
 
 
@@ -51,9 +51,12 @@ def energy(y: Any, rest: Any):
 
 @wp.func
 def gradient(y: Any, rest: Any):
-    u = slip(y, rest)
-    l = wp.length(u)
-    return wp.matrix_from_rows(wp.where(l > rest[6], rest[6] / wp.max(l, rest[6]), y.dtype(1.0)) * u)
+    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
+    if rest[6] > y.dtype(0.0):
+        u = slip(y, rest)
+        l = wp.length(u)
+        g[0] = wp.where(l > rest[6], rest[6] / wp.max(l, rest[6]), y.dtype(1.0)) * u
+    return g
 
 
 @wp.func

@@ -173,6 +173,8 @@ class GaussSeidelSweep(_Sweep):
         kind: One of :data:`IN_PLACE`.
         spread: The number of sweeps that finite stiffness is spread over, or None.
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares sweeps by colour; None for one thread.
+        before: Positions where the step began (N,), by which one thread of the CPU lists the elements that may have a force, of
+            terms with ``idle``; or None.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs are swept last; or None.
 
     Attributes:
@@ -191,6 +193,7 @@ class GaussSeidelSweep(_Sweep):
         spread=None,
         correction=None,
         pool=None,
+        before=None,
         pairs=None,
     ):
         self.pairs = pairs
@@ -206,10 +209,23 @@ class GaussSeidelSweep(_Sweep):
         refreshed = [elements for elements in self.elements if elements.refresh and not elements.cells]
         self._refreshed = [elements for elements in refreshed if elements.refresh.when == EVALUATION]
         more = multipliers, spread is not None, model.mobility is not None
+        listing = before is not None and model.device.is_cpu and self.pool.threads == 1
+        self._lists = [listing and self._list_of(*each, before) for each in self.with_multipliers()]
         self._kernels = [
-            model.kernel(*_correction(elements, model.dtype, key), *more)
-            for elements, key in zip(model.terms, self._keys, strict=True)
+            model.kernel(*_correction(elements, model.dtype, key), *more, *([True] if listed else []))
+            for elements, key, listed in zip(model.terms, self._keys, self._lists, strict=True)
         ]
+
+    def _list_of(self, elements, multipliers, key, before):
+        """(kernel, arguments, counter of sweeps, list) of a term with ``idle``; else None."""
+        term, dtype, scalar = key
+        if term.idle is None or scalar or elements.cells:
+            return None
+        model = self.model
+        kernel = model.kernel(kernels.list_busy, term, dtype, multipliers is not None)
+        given = [elements.stencil, elements.rest, before, self.x, self.correction, multipliers]
+        sweep, busy = (wp.zeros(n, dtype=wp.int32, device=model.device) for n in (1, 1 + elements.count))
+        return kernel, given, sweep, busy
 
     def _by_colour(self, elements):
         """The elements of all copies by colour, and the range of each colour."""
@@ -225,7 +241,8 @@ class GaussSeidelSweep(_Sweep):
         """Launches d = 0, λ = 0, once x̃ is there."""
         if self.pairs is not None:
             self.pairs.launch_no_multipliers()
-        for array in (self.correction, *self.multipliers):
+        counters = [each[2] for each in self._lists if each]
+        for array in (self.correction, *self.multipliers, *counters):
             if array is not None:
                 array.zero_()
 
@@ -250,6 +267,9 @@ class GaussSeidelSweep(_Sweep):
             elif cells:
                 of_elements = [cells.offsets, cells.shape, *of_elements]
             each = (cells or elements).per_copy if self.ordered else 1
+            if self._lists[i]:
+                find, listed, sweep, busy = self._lists[i]
+                model.launch(find, 1, listed, [sweep, busy])
             for first, count in self.ranges[i][::way]:
                 before, part = pool.part(count // each)
                 # A thread of the CPU takes all its elements in one loop, in half of the time that as many threads take.
@@ -257,6 +277,8 @@ class GaussSeidelSweep(_Sweep):
                 turn = kernels.sweep_turn(model.dtype)()
                 turn.first, turn.each = first + before * each, way * each_thread
                 turn.h, turn.sweeps, turn.relaxation = self.h, self.spread, self.relaxation
+                if self._lists[i]:
+                    turn.busy = busy
                 given = [*of_elements, model.local_mobility, self.x, turn]
                 if part:
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])

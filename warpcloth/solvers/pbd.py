@@ -123,7 +123,7 @@ class PBDStepper(LaunchedStepper):
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         given = model, self.state.x, self.h, options.sweep, options.relaxation
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool, pairs=self.pairs)
+            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool, before=self.x_before, pairs=self.pairs)
         else:
             self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread, pairs=self.pairs)
         self.model = model.with_terms(self.sweep.elements)

@@ -128,6 +128,11 @@ class Stepper:
         """The list that :meth:`warpcloth.contact.collider_steps.ColliderSteps.inside` returns, for the steps so far."""
         return [] if self.colliders is None else self.colliders.inside()
 
+    @property
+    def x_before(self):
+        """Positions where the step began, (N,) [m], or None if there are no colliders."""
+        return None if self.colliders is None else self.colliders.x_before
+
     def follow_contact(self):
         """Makes steps keep the positions where they began and what the filter changed, and refresh contact whatever is near.
 

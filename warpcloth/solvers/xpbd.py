@@ -146,7 +146,7 @@ class XPBDStepper(LaunchedStepper):
         given = model, self.state.x, self.he, options.sweep, options.relaxation
         more = {"scalar": options.form == "scalar", "multipliers": True}
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool, pairs=self.pairs)
+            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool, before=self.x_before, pairs=self.pairs)
         else:
             self.sweep = JacobiSweep(*given, **more, pairs=self.pairs)
         self.model = model.with_terms(self.sweep.elements)
