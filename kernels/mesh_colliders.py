@@ -500,10 +500,11 @@ def bound_triangles(dtype):
 
 
 @cache
-def find_facets(dtype, at_vertex: bool):
+def find_facets(dtype, at_vertex: bool, anywhere: bool = False):
     """Kernel over the elements of contact with one mesh, at the start of a step: the facets of each vertex.
 
-    They are those ``at_vertex``, as explicit steps take them; else those at its prediction, x + h v + h² g, which slides
+    They are those ``at_vertex``, as explicit steps take them, or with ``anywhere`` those at the vertex, the nearest of them
+    however far it is, as equilibria take them; else those at its prediction, x + h v + h² g, which slides
     along what it meets on its way. If it ends where the nearest facet is unlike the last along which it slid, or there is none,
     that one comes first: beyond a thin collider there would be no force that leads back. If it meets nothing, they are
     those at the vertex, from which other forces may pull it as far as it would go.
@@ -555,7 +556,10 @@ def find_facets(dtype, at_vertex: bool):
         radius = r
         farthest = r
         row = wp.int32(-1)
-        if wp.static(at_vertex):
+        if wp.static(anywhere):
+            radius = dtype(2.0) * r
+            farthest = dtype(FAR)
+        elif wp.static(at_vertex):
             way = wp.length(to_local(motion.after[copy, collider], x[i] + h * v[i]) - p)
             row = listed(mesh, collider, before, per_frame, p, way, r, lists, i)
         else:

@@ -14,9 +14,11 @@ from warpcloth.cli import main
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
+from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.kernels.terms.contact import CONTACT
+from warpcloth.scenes import drape
 from warpcloth.solvers.solver import Stepper
 
 R = 1e-3
@@ -411,6 +413,24 @@ def test_steps_without_contact_end_where_those_with_it_do(name, away, monkeypatc
     assert stepper.colliders.steps.numpy() == [1] and (stepper.iterations == other.iterations or away == 2.0)
 
 
+@pytest.mark.filterwarnings("ignore:threads is . on . cores")
+def test_sweeps_over_lists_are_those_over_all(device):
+    """To the bit, while a sheet falls onto a ball and comes to lie on it: several threads list no elements."""
+    if device != "cpu":
+        pytest.skip("lists are for one thread of the CPU")
+    record = wc.XPBD(substeps=2, iterations=20)
+    steppers = [record.bind(drape.scene(n=10).build(threads=threads)) for threads in (1, 2)]
+    busy = [each[3] for each in steppers[0].sweep._lists if each]
+    assert len(busy) == 4 and not any(steppers[1].sweep._lists)
+    for _ in range(14):
+        for stepper in steppers:
+            stepper.frame()
+    counts = [int(each.numpy()[0]) for each in busy]
+    assert max(counts) > 0 and min(counts) == 0  # of the floor, which is far below
+    one, two = (stepper.state.x.numpy() for stepper in steppers)
+    assert (one == two).all()
+
+
 @pytest.mark.parametrize("name", ("newton", "xpbd"))
 def test_what_falls_again_leaves_its_anchors(name, monkeypatch):
     """To the bit as if all steps had contact, and as a run that is recorded, for which all steps refresh contact."""
@@ -507,6 +527,49 @@ def test_an_equilibrium_rests_on_a_plane():
     rest = wc.equilibrium(scene)
     assert rest.status.ok
     np.testing.assert_allclose(rest.points[:, 1], 0.9e-3, rtol=1e-6)
+
+
+def meshed(shape):
+    """A collider as triangles, and how far these are from its surface at most."""
+    if isinstance(shape, wc.Sphere):
+        ball = trimesh.creation.icosphere(subdivisions=4, radius=shape.radius)
+        sagitta = ball.edges_unique_length.max() ** 2 / (6.0 * shape.radius)  # of a circumscribed circle, L/√3 in radius
+        return wc.MeshCollider(ball.vertices, ball.faces, position=shape.position), sagitta
+    if isinstance(shape, wc.Box):
+        box = trimesh.creation.box(shape.size)
+        return wc.MeshCollider(box.vertices, box.faces, position=shape.position), 0.0
+    grid = wc.Mesh.grid(5, 5, size=4.0)
+    return wc.MeshCollider(grid.points - [1.75, 0.0, 1.75], grid.triangles), 0.0
+
+
+@pytest.mark.parametrize(
+    ("shape", "height", "pins"),
+    [
+        pytest.param(wc.Plane(), 0.02, None, id="plane"),
+        pytest.param(wc.Box(size=(0.2, 0.1, 0.3), position=(0.25, -0.1, 0.25)), 0.0, [0, 6, 42, 48], id="box"),
+        pytest.param(wc.Sphere(radius=0.2, position=(0.25, -0.205, 0.25)), 0.0, [0, 6, 42, 48], id="sphere"),
+    ],
+)
+def test_an_equilibrium_on_a_mesh_is_that_on_its_shape(shape, height, pins):
+    """A sheet that lies on it, or hangs over it by its corners."""
+    mesh, off = meshed(shape)
+    fields = {"n": 7, "height": height} | ({} if pins is None else {"pins": pins})
+    one, two = (wc.equilibrium(falling([each], **fields)) for each in (shape, mesh))
+    for each in (one, two):
+        assert each.status.result is Result.CONVERGED and each.stable
+        assert (shape.distances(each.points) < R).sum() >= 3
+    assert np.abs(one.points - two.points).max() < off + 1e-9
+
+
+def test_an_equilibrium_in_a_groove():
+    """Of an open mesh of two slopes, which a sheet falls into from above: the nearest half-spaces change on its way."""
+    points = np.array([[-2, 2, -2], [-2, 2, 2], [0, 0, -2], [0, 0, 2], [2, 2, -2], [2, 2, 2]])
+    groove = wc.MeshCollider(points * [0.25, 0.1, 0.25] + [0.25, -0.15, 0.25], [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    rest = wc.equilibrium(falling([groove], n=5, height=0.08), record="reactions")
+    assert rest.status.result is Result.CONVERGED and rest.stable
+    assert groove.distances(rest.points).min() > 0.5 * R
+    (force,) = rest.collider_forces.values()
+    np.testing.assert_allclose(force, [0.0, -9.81 * 0.15 * 0.5**2, 0.0], atol=1e-7)
 
 
 REFUSED = {

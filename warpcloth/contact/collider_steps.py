@@ -35,6 +35,7 @@ class ColliderSteps:
         steps_per_frame: Steps a frame.
         part: Where in a step its forces are taken, from 0, its start, to 1; 0 is that of explicit steps, whose contact is
             ``bounded``.
+        resting: Whether it is not a solver but an equilibrium, whose rounds are its steps, with h = 0.
 
     Attributes:
         terms: The elements of the model, those of contact as steps take them.
@@ -53,7 +54,7 @@ class ColliderSteps:
             after :meth:`note_pushes`.
     """
 
-    def __init__(self, model, state, h, steps_per_frame, part):
+    def __init__(self, model, state, h, steps_per_frame, part, resting=False):
         self.model, self.h, self.part, device = model, h, part, model.device
         self.steps_per_frame = steps_per_frame
         declared = model.colliders
@@ -83,7 +84,7 @@ class ColliderSteps:
         if declared.meshes is not None:
             given = {"steps": self.steps, "per_frame": 2 * steps_per_frame, "ahead": self._given[-1], "h": h}
             given |= {"r": declared.distance, "least": self.least, "landing": LANDING * declared.distance}
-            self.meshes = MeshSteps(model, self.poses, self.bounded, **given)
+            self.meshes = MeshSteps(model, self.poses, self.bounded, resting, **given)
         self._filter = model.kernel(kernels.filter_step if self.meshes is None else mesh_kernels.filter_meshes, model.dtype)
         if model.mobility is not None:
             self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(kernels.hold_locked, model.dtype)

@@ -14,6 +14,7 @@ class MeshSteps:
         model: The :class:`warpcloth.model.model.Model` of a scene with meshes among its colliders.
         poses: Those of the step, a :func:`warpcloth.kernels.colliders.step_poses`.
         bounded: Whether it is that of an explicit method.
+        resting: Whether it is that of an equilibrium, whose vertices may move any distance from where they are.
         **given: The numbers and ``steps`` of :func:`warpcloth.kernels.mesh_colliders.motions`.
 
     Attributes:
@@ -22,8 +23,8 @@ class MeshSteps:
         given: The numbers and ``steps``, by name.
     """
 
-    def __init__(self, model, poses, bounded, **given):
-        self.model, self._bounded, self._facets = model, bounded, {}
+    def __init__(self, model, poses, bounded, resting=False, **given):
+        self.model, self._bounded, self._resting, self._facets = model, bounded, resting, {}
         self._meshes = model.colliders.meshes.own(model)
         self.geometry, self.motion = self._meshes.geometry, kernels.motions(model.dtype)()
         self.given = given
@@ -76,7 +77,7 @@ class MeshSteps:
             most = 1 + max(each.facet for each in model.terms if each.collider == c)
             facet_type = kernels.facet_type(model.dtype)
             self._facets[c] = wp.zeros((model.count, most), dtype=facet_type, device=model.device)
-            find = model.kernel(kernels.find_facets, model.dtype, self.motion.ahead == 0)
+            find = model.kernel(kernels.find_facets, model.dtype, self.motion.ahead == 0, self._resting)
         facets = self._facets[c]
 
         def launch(elements, x, v):

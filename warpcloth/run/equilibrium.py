@@ -11,13 +11,14 @@ from ..base.checks import choice, number, whole
 from ..base.limits import MOST_FRAMES
 from ..base.turns import in_turn
 from ..base.types import Precision
+from ..contact.collider_steps import ColliderSteps
 from ..contact.self_steps import SelfSteps
 from ..core.state import State
 from ..core.status import Residual, Result, Status, digits, sentence
 from ..numerics.minimise import Minimiser
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
-from ..terms.refresh import Moment
+from ..terms.refresh import STEP, Moment
 from .history import Evaluation, checked_record, collider_names
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
@@ -72,8 +73,11 @@ def equilibrium(
     keyframes. Pressure follows the cloth: its forces are held constant while the cloth settles, then computed again, until they
     balance. ``stable`` and ``lowest_eigenvalue`` are for these forces. Colliders stand at their last keyframe, however they
     came there, and free vertices must start outside them. With friction there are many rest shapes, and the motion decides
-    among them, so colliders and self-contact with friction are refused: run such a scene with damping until it rests. Colliders
-    that are meshes are refused too.
+    among them, so colliders and self-contact with friction are refused: run such a scene with damping until it rests.
+
+    Of colliders that are meshes each vertex meets the half-spaces that touch them nearest to it, see
+    :mod:`warpcloth.kernels.mesh_colliders`. These are found again, and the cloth settles again, until they no longer change the
+    balance; no vertex crosses a triangle on its straight way from one of these rounds to the next.
 
     With self-contact all iterates stay apart, pins included: pins with keyframes move as far as cloth lets them, and if they do
     not arrive, the iterations are used up. The areas of contact are held constant while the cloth settles, then computed again,
@@ -104,8 +108,8 @@ def equilibrium(
         :class:`Equilibrium`.
 
     Raises:
-        ValueError: If an argument is not allowed, a stiffness is infinite, a collider is a mesh, there is friction, a free
-            vertex starts inside a collider at its last keyframe, or cloth crosses cloth at the start.
+        ValueError: If an argument is not allowed, a stiffness is infinite, there is friction, a free vertex starts inside a
+            collider at its last keyframe, or cloth crosses cloth at the start.
 
     Examples:
         >>> import warpcloth as wc
@@ -125,6 +129,10 @@ def equilibrium(
     model = scene.build(device=device, dtype=dtype)
     refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
     base = wp.clone(model.positions)
+    contact = None
+    if model.colliders is not None and model.colliders.meshes is not None:
+        contact = ColliderSteps(model, State(base, model.vectors(), 1), 0.0, 1, 1.0, resting=True)
+        model = model.with_terms(contact.terms)
     pairs = None
     if scene.self_contact is not None:
         pairs = SelfSteps(model, State(base, model.vectors(), 1), h=0.0, steps_per_frame=1, bounded=False, colliders=None)
@@ -132,13 +140,18 @@ def equilibrium(
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
     descent = _Descent(minimiser, base, tolerance, iterations)
     for part in range(1, load_steps + 1):
-        result = _settle_all(model, base, descent, part / load_steps)
+        result = _settle_on_meshes(model, base, descent, part / load_steps, contact)
     # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
     if result in SETTLED and minimiser.curves_down(tolerance):
         base.assign(base.numpy() + _nudge(model))
         # What is left unbalanced compresses the edges of a nearly straight chain by many times itself, and curves the energy.
         descent.tolerance *= 0.01
-        result = descent.run(1.0, _frequency_scale(model)) if pairs is None else _settle_all(model, base, descent, 1.0)
+        if contact is not None:
+            contact.launch_end(base, model.vectors())
+        if contact is None and pairs is None:
+            result = descent.run(1.0, _frequency_scale(model))
+        else:
+            result = _settle_on_meshes(model, base, descent, 1.0, contact)
         if result in SETTLED and minimiser.curves_down(tolerance):
             result = Result.SADDLE
     residual, began = descent.residual, result.value
@@ -173,8 +186,6 @@ def equilibrium(
 def _with_colliders_at_rest(scene):
     """The scene with moving colliders where their last keyframe has them; refuses friction."""
     for collider in scene.colliders:
-        if collider.facets:
-            raise ValueError(f"the collider {collider.label} is a mesh, which only steps take; run the scene until it rests")
         if collider.friction:
             raise ValueError(
                 f"the collider {collider.label} has friction {collider.friction:g}, with which there are many rest shapes and "
@@ -301,6 +312,30 @@ def _settle_all(model, base, descent, part):
         if descent.used >= descent.iterations:
             return result if arrived else Result.ITERATIONS_USED_UP
         if arrived and descent.balanced(set_loads):
+            return result
+        descent.used += 1
+
+
+def _settle_on_meshes(model, base, descent, part, contact):
+    """Settles as :func:`_settle_all`; with meshes again, until the half-spaces that are nearest now leave it in balance.
+
+    Only scenes with meshes have ``contact``, a :class:`warpcloth.contact.collider_steps.ColliderSteps`.
+    """
+    if contact is None:
+        return _settle_all(model, base, descent, part)
+
+    def find_facets():
+        model.refresh(STEP, Moment(base))
+
+    velocity = model.vectors()  # which a round has not
+    while True:
+        find_facets()
+        result = _settle_all(model, base, descent, part)
+        contact.notes.cut.zero_()
+        contact.launch_end(base, velocity)
+        if result is Result.DIVERGED or descent.used >= descent.iterations:
+            return result
+        if not contact.notes.cut.numpy().any() and (result not in SETTLED or descent.balanced(find_facets)):
             return result
         descent.used += 1
 
