@@ -14,7 +14,7 @@ from .terms import contact
 from .terms.contact import local_gap, turned
 from .vectors import types
 
-local_gap_of, turned_by, slope_of, DELTA, beyond_reach = local_gap, turned, contact.slope, contact.DELTA, contact.beyond
+local_gap_of, turned_by, slope_of, DELTA, beyond_of = local_gap, turned, contact.slope, contact.DELTA, contact.beyond
 ROUNDS = wp.constant(6)  # in which a vertex that colliders stop is looked at again
 SLIDING = wp.constant(2)  # of these, in which it slides; then its way is only shortened, which ends
 MARCHES = wp.constant(32)  # planes that a vertex meets on its way past a collider, at most
@@ -72,14 +72,14 @@ def of_pose(dtype):
 
 
 @cache
-def out_of_reach(dtype):
-    """The device function (pose, core, radius, reach, x) → whether a collider is surely farther than ``reach`` from x."""
+def surely_apart(dtype):
+    """The device function (pose, core, radius, margin, x) → whether a collider is surely farther than ``margin`` from x."""
     vec3, _ = types(dtype)
     pose_type, _anchor = pose_types(dtype)
 
     @wp.func
-    def surely(pose: pose_type, core: vec3, radius: dtype, reach: dtype, x: vec3):
-        return beyond_reach(x, vec3(pose[0], pose[1], pose[2]), vec3(pose[3], pose[4], pose[5]), pose[6], core, radius, reach)
+    def surely(pose: pose_type, core: vec3, radius: dtype, margin: dtype, x: vec3):
+        return beyond_of(x, vec3(pose[0], pose[1], pose[2]), vec3(pose[3], pose[4], pose[5]), pose[6], core, radius, margin)
 
     return surely
 
@@ -198,7 +198,7 @@ def pose_collider(dtype):
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
     kept, behind, rest_type = kept_part(dtype), half_space(dtype), wp.types.vector(contact.PARAMETERS, dtype)
-    surely_out = out_of_reach(dtype)
+    surely_out = surely_apart(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_pose(
@@ -271,7 +271,7 @@ def anchor_vertices(dtype, bounded: bool):
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
-    rest_type, surely_out = wp.types.vector(8, dtype), out_of_reach(dtype)
+    rest_type, surely_out = wp.types.vector(8, dtype), surely_apart(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -450,7 +450,7 @@ def outside(dtype):
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
-    stopped, surely_out = stopped_by_shape(dtype), out_of_reach(dtype)
+    stopped, surely_out = stopped_by_shape(dtype), surely_apart(dtype)
     _along, velocity = sliding(dtype)
 
     @wp.func
@@ -482,8 +482,8 @@ def outside(dtype):
                 pose = poses.after[copy, c]
                 began = poses.before[copy, c]
                 # The move relative to a collider that stands is the move.
-                reach = wp.length(end - x) + rounded
-                if not (began == pose and surely_out(pose, shape.core[c], shape.radius[c], reach, x)):
+                margin = wp.length(end - x) + rounded
+                if not (began == pose and surely_out(pose, shape.core[c], shape.radius[c], margin, x)):
                     X = to_local(began, x)
                     X, less, by, hit = stopped(
                         X,

@@ -74,7 +74,7 @@ class Term:
             local step where u is not ½‖y − p(y)‖²; or None.
         prox_from: (y, v, rest, compliance) → the same of u as it is about y, the position before the step, for an energy of
             which v may be nearer to another branch, such as the far side of a ball; or None.
-        idle: (y, rest, reach) → 1 where there is surely no force within ``reach`` of y, which is quicker to tell than the
+        idle: (y, rest, margin) → 1 where there is surely no force within ``margin`` of y, which is quicker to tell than the
             force, else 0; of terms with K = 1; or None.
         secant: (y, rest) → s, from 0 to 1: where p moves with y, y − p is s times the distance to a point that moves less, and
             constraint rows, which hold p fixed in an iteration, take that point and s k instead; or None.

@@ -155,29 +155,29 @@ def bend(d: Any, r: Any):
 
 
 @wp.func
-def beyond(x: Any, position: Any, u: Any, w: Any, half: Any, radius: Any, reach: Any):
-    """Whether x is farther than ``reach`` from a half-space, or from a ball about another collider; quicker than the gap."""
+def beyond(x: Any, position: Any, u: Any, w: Any, half: Any, radius: Any, margin: Any):
+    """Whether x is farther than ``margin`` from a half-space, or from a ball about another collider; quicker than the gap."""
     away = x - position
     found = wp.bool(False)
     if wp.isfinite(half[0]):
-        size = half[0] + half[1] + half[2] + radius + reach
+        size = half[0] + half[1] + half[2] + radius + margin
         found = wp.dot(away, away) > type(w)(1.0001) * size * wp.abs(size)
     else:
         two = type(w)(2.0)
         n = wp.vector(
             two * (u[0] * u[1] - w * u[2]), type(w)(1.0) - two * (u[0] * u[0] + u[2] * u[2]), two * (u[1] * u[2] + w * u[0])
         )
-        found = wp.dot(n, away) > type(w)(1.01) * reach
+        found = wp.dot(n, away) > type(w)(1.01) * margin
     return found
 
 
 @wp.func
-def idle(y: Any, rest: Any, reach: Any):
-    """Whether a vertex is farther than r + reach from the half-space, or from a ball about the collider."""
+def idle(y: Any, rest: Any, margin: Any):
+    """Whether a vertex is farther than r + margin from the half-space, or from a ball about the collider."""
     position = wp.vector(rest[0], rest[1], rest[2])
     u = wp.vector(rest[3], rest[4], rest[5])
     half = wp.vector(rest[7], rest[8], rest[9])
-    return wp.where(beyond(y[0], position, u, rest[6], half, rest[10], rest[11] + reach), wp.int32(1), wp.int32(0))
+    return wp.where(beyond(y[0], position, u, rest[6], half, rest[10], rest[11] + margin), wp.int32(1), wp.int32(0))
 
 
 @wp.func

@@ -29,7 +29,7 @@ def measure(rest: Any):
 
 
 @wp.func
-def idle(y: Any, rest: Any, reach: Any):
+def idle(y: Any, rest: Any, margin: Any):
     """Whether the vertex has no contact in the step, wherever it is."""
     return wp.where(rest[6] > y.dtype(0.0), wp.int32(0), wp.int32(1))
 
