@@ -71,6 +71,37 @@ def spread_compliance(dtype):
 
 
 @cache
+def prox_step(term: Term, dtype):
+    """The device functions A (M, M) → s, its largest sum of a row, and (y, rest, s, α̃, λ) → rows. No eigenvalue is above s."""
+    M, y_type = wp.constant(term.rows), wp.types.matrix((term.rows, 3), dtype)
+    rest_type, square = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, term.rows), dtype)
+    prox, prox_from = term.prox, term.prox_from
+
+    @wp.func
+    def largest_sum(A: square):
+        largest = dtype(0.0)
+        for m in range(M):
+            total = dtype(0.0)
+            for n in range(M):
+                total += wp.abs(A[m, n])
+            largest = wp.max(largest, total)
+        return largest
+
+    @wp.func
+    def rows_of(y: y_type, r: rest_type, largest: dtype, compliance: dtype, before: y_type):
+        rows = y_type()
+        if wp.where(compliance < dtype(wp.inf), largest, dtype(0.0)) != dtype(0.0):
+            v = y - largest * before
+            if wp.static(prox_from is None):
+                rows = (prox(v, r, largest / compliance) - y) / largest
+            else:
+                rows = (prox_from(y, v, r, largest / compliance) - y) / largest
+        return rows
+
+    return largest_sum, rows_of
+
+
+@cache
 def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: bool = True):
     """The device function (y, rest, inverse masses w of the corners, α̃, λ, sweeps) → (Δλ, rows (M, 3)); λ 0 if not
     ``multipliers``.
@@ -80,9 +111,10 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     corners = wp.types.vector(term.vertices, dtype)
-    weight, project, prox, prox_from = term.weight, term.project, term.prox, term.prox_from
+    weight, project, prox = term.weight, term.project, term.prox
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
     spread, share_of = spread_compliance(dtype), to_corner(term, dtype)
+    largest_sum, rows_of = prox_step(term, dtype)
     if project is not None and prox is None and term.rows > 2:
         raise NotImplementedError(f"{term.name} projects {term.rows} rows; two at most")
 
@@ -135,20 +167,7 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
             system += w[i] * wp.outer(weight(r, i), weight(r, i))
         if wp.static(per_step):
             compliance = spread(wp.trace(system) * dtype(wp.static(1.0 / term.rows)), compliance, sweeps)
-        # No eigenvalue is above the largest sum of a row.
-        largest = dtype(0.0)
-        for m in range(M):
-            total = dtype(0.0)
-            for n in range(M):
-                total += wp.abs(system[m, n])
-            largest = wp.max(largest, total)
-        rows = y_type()
-        if wp.where(compliance < dtype(wp.inf), largest, dtype(0.0)) != dtype(0.0):
-            v = y - largest * before
-            if wp.static(prox_from is None):
-                rows = (prox(v, r, largest / compliance) - y) / largest
-            else:
-                rows = (prox_from(y, v, r, largest / compliance) - y) / largest
+        rows = rows_of(y, r, largest_sum(system), compliance, before)
         return rows, rows
 
     if scalar:
@@ -162,9 +181,10 @@ def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     corners, system_type = wp.types.matrix((term.vertices, 3), dtype), wp.types.matrix((term.rows, term.rows), dtype)
-    weight, project, prox, prox_from = term.weight, term.project, term.prox, term.prox_from
+    weight, project, prox = term.weight, term.project, term.prox
     constraint, constraint_gradient = term.constraint, term.constraint_gradient
     spread, share_of = spread_compliance(dtype), to_corner(term, dtype)
+    largest_sum, rows_of = prox_step(term, dtype)
 
     @wp.func
     def system_of(r: rest_type, w: corners, axis: int):
@@ -215,20 +235,10 @@ def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
         for axis in range(3):
             system = system_of(r, w, axis)
             mean = wp.max(mean, wp.trace(system) * dtype(wp.static(1.0 / term.rows)))
-            for m in range(M):
-                total = dtype(0.0)
-                for n in range(M):
-                    total += wp.abs(system[m, n])
-                largest = wp.max(largest, total)
+            largest = wp.max(largest, largest_sum(system))
         if wp.static(per_step):
             compliance = spread(mean, compliance, sweeps)
-        rows = y_type()
-        if wp.where(compliance < dtype(wp.inf), largest, dtype(0.0)) != dtype(0.0):
-            v = y - largest * before
-            if wp.static(prox_from is None):
-                rows = (prox(v, r, largest / compliance) - y) / largest
-            else:
-                rows = (prox_from(y, v, r, largest / compliance) - y) / largest
+        rows = rows_of(y, r, largest, compliance, before)
         return rows, rows
 
     if scalar:

@@ -83,9 +83,9 @@ def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_la
 def begin_friction(dtype, bounded: bool):
     """Kernel over pairs, where a step begins: w, n, kA and μN, and which are acting: those with an area or friction.
 
-    kA is that of the contact of the last step, which ``kept`` it, so that the mean of N is that of the force of contact; of
-    explicit steps, whose contact is evaluated where the step begins, that of this step. So it is in a copy that has made no
-    ``steps``, and of pairs that were not kept, if areas changed within the last step because it was ``relisted``.
+    kA is that of the contact of the last step, which ``kept`` it, so that the mean of N is the force of contact. It is that of
+    this step in three cases: in explicit steps, whose contact is evaluated where the step begins; in a copy that has made no
+    ``steps``; and for a pair that was not kept, if areas changed within the last step because it was ``relisted``.
     """
 
     @wp.kernel(module=f"{friction_module(dtype)}.{bounded}", enable_backward=False)
