@@ -16,7 +16,7 @@ from warpcloth.cli.bench import _contact
 from warpcloth.core.capture import Segment
 from warpcloth.lab import benchmarks
 from warpcloth.lab.bandwidth import measure as bandwidth
-from warpcloth.lab.benchmarks import Run, SolverBenchmark, contacts, standard
+from warpcloth.lab.benchmarks import Run, SolverBenchmark, contacts, self_contacts, standard
 from warpcloth.lab.counts import compulsory_bytes, elements_of, launches_of
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.results import exponent, growth, ratios, write_csv
@@ -137,8 +137,23 @@ def test_what_self_contact_costs(device):
         1e6 * (row["ms"] - row["ms_without"]) / (row["vertices"] * 4 * 3)
     )  # floor, ball and cloth
     assert row["pairs"] > 0 and 0.0 < row["lists"] <= 1.0 and 0.0 < row["kept"] <= 1.0 and row["least_gap"] > 0.0
+    assert row["list_ns"] > 0.0 and row["areas_ns"] > 0.0
     said = _contact(row)
-    assert f"; {row['pairs']} pairs, {row['lists']:.2g} lists a substep, " in said and said.endswith(" m")
+    assert f"; {row['pairs']} pairs, {row['lists']:.2g} lists a substep, " in said and said.endswith(
+        f", the areas of its pairs {row['areas_ns']:.3g}"
+    )
+
+
+def test_self_contact_is_measured_flat_and_folded():
+    """Nothing touches a flat sheet; layers of a folded one are a contact distance apart, and not nearer."""
+    listed = self_contacts(dtype="float64")
+    assert [each.scene.parameters["layers"] for each in listed] == [1, 2] * 4
+    assert {each.setup.solver for each in listed} == {"explicit", "newton", "xpbd", "pbd"}
+    flat, folded = (SceneRef("folded", {"n": 9, "layers": layers}).load() for layers in (1, 2))
+    assert (flat.positions == flat.mesh.points).all()
+    assert np.ptp(folded.positions[:, 1]) == pytest.approx(folded.self_contact.distance)
+    one = [row(n, n**2) | {"list_ns": 9.0, "areas_ns": n**0.5} for n in (4, 8, 16)]
+    assert growth(one)[0]["list"][0] == pytest.approx(1.0) and growth(one)[0]["areas"][0] == pytest.approx(1.25)
 
 
 def test_growth_with_triangles():

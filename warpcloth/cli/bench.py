@@ -13,7 +13,8 @@ from .terminal import Bar, Interrupted, aligned, check_writable, say
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
 scene net. The scene resting then shows what contact costs, for colliders of each shape, touched and far away, and for meshes of
-growing size. All of it takes several minutes. Rows are measured one after another, each in its own process. If neither dt nor
+growing size, and the scene folded what self-contact costs, of a sheet that falls flat and of one that is folded in two. All of
+it takes many minutes. Rows are measured one after another, each in its own process. If neither dt nor
 substeps is given, the step is chosen as by 'warpcloth run'.
 
 Columns:
@@ -106,14 +107,14 @@ def _benchmarks(arguments, device):
     Raises:
         ValueError: They do not go together, or one of them is wrong.
     """
-    from ..lab.benchmarks import SolverBenchmark, contacts, standard
+    from ..lab.benchmarks import SolverBenchmark, contacts, self_contacts, standard
     from ..lab.measurements import SceneRef, Setup
     from ..solvers import SOLVERS
 
     given = {"device": str(device), **values_of(arguments, "dtype", "frames", "copies", "threads")}
     if arguments.scene is None:
         _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which must stand before it")
-        return [*standard(**given), *contacts(**given)]
+        return [*standard(**given), *contacts(**given), *self_contacts(**given)]
     _source, values, scene = named_scene(arguments)
     parameters = {name: values[name] for name in assignments(arguments.p)}
     arguments.solver = arguments.solver or DEFAULT
@@ -185,7 +186,10 @@ def _text(facts):
         words = [each["solver"], *(f"{name}={value}" for name, value in each["options"].items())]
         over = each["over"]
         powers = [f"{p:.2f}" + ("" if error is None else f" ± {error:.2f}") for p, error in (each["frame"], each["iteration"])]
-        lines.append(f"{' '.join(words)}: a frame grows as {over}^{powers[0]}, an iteration as {over}^{powers[1]}")
+        line = f"{' '.join(words)}: a frame grows as {over}^{powers[0]}, an iteration as {over}^{powers[1]}"
+        if "list" in each:
+            line += f", a list of near pairs as {over}^{each['list'][0]:.2f}, their areas as {over}^{each['areas'][0]:.2f}"
+        lines.append(line)
     return "\n".join(lines)
 
 
@@ -220,6 +224,8 @@ def _contact(row):
         gap = "none" if row["least_gap"] is None else f"{row['least_gap']:.2g} m"
         kept = f"{100.0 * row['kept']:.4g} % of moves kept, least gap {gap}"
         said.append(f"{row['pairs']:,} pairs, {row['lists']:.2g} lists a substep, {kept}")
+    if row.get("list_ns") is not None:
+        said.append(f"a list takes {row['list_ns']:.3g} ns a vertex, the areas of its pairs {row['areas_ns']:.3g}")
     return "; ".join(said)
 
 

@@ -4,12 +4,13 @@ import contextlib
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import warp as wp
 
-from ..core.capture import Mirror
+from ..core.capture import Mirror, Segment
 from ..core.status import Result
 from ..mesh.ordering import order_of_run
 from ..scene.mesh_collider import MeshCollider
@@ -18,7 +19,7 @@ from .measurements import SceneRef, Setup
 
 # Frames before the first that counts, and seconds after which no further one is begun once there are three.
 _WARM_UP, _SECONDS, _FEWEST = 2, 10.0, 3
-OF_SELF_CONTACT = ("pairs", "lists", "kept", "least_gap")
+OF_SELF_CONTACT = ("pairs", "lists", "kept", "least_gap", "list_ns", "areas_ns")
 
 
 def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
@@ -53,6 +54,8 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
           without any contact [ms], and the difference over vertices, substeps and colliders, of which self-contact is one [ns].
         - ``pairs``, ``lists``, ``kept``, ``least_gap``: With self-contact the most pairs in a list, the number of lists of a
           step, the fraction of moves that its filter kept, and the least gap in any frame [m], of all copies.
+        - ``list_ns``, ``areas_ns``: With self-contact the time per vertex of listing near pairs, and of finding their gaps and
+          areas, where the run ended [ns].
         - ``memory``: The most that was taken, of the process on a CPU and of Warp's memory pool on CUDA [bytes].
     """
     names = (
@@ -144,12 +147,26 @@ def _warm(stepper, model, points, frames, elements):
 
 
 def _self_contact(stepper):
-    """Counts of self-contact in all steps so far, and the least gap."""
+    """Counts of self-contact in all steps so far, the least gap, and what a list and the areas of its pairs take."""
     pairs = stepper.pairs
     lists, steps = (int(array.numpy().max()) for array in (pairs.lists, pairs.steps))
     gap = float(pairs.least_gap.min())
     values = pairs.most, lists / steps, 1.0 - float(pairs.share.mean()), gap if np.isfinite(gap) else None
-    return dict(zip(OF_SELF_CONTACT, values, strict=True))
+    vertices, x = stepper.model.count, stepper.state.x
+    times = [1e9 * _seconds(Segment(x.device, partial(each, x))) / vertices for each in (pairs.launch_list, pairs.launch_areas)]
+    return dict(zip(OF_SELF_CONTACT, (*values, *times), strict=True))
+
+
+def _seconds(segment):
+    """The time of a segment, a median [s]."""
+    times = []
+    for _ in range(5):
+        wp.synchronize_device(segment.device)
+        began = time.perf_counter()
+        segment()
+        wp.synchronize_device(segment.device)
+        times.append(time.perf_counter() - began)
+    return float(np.median(times))
 
 
 def _run_frame(stepper, points):
