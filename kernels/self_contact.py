@@ -199,9 +199,13 @@ def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
     else:
         w, inside = edge_edge(zero, b - a, c - a, d - a)
     y = w[1] * (b - a) + w[2] * (c - a) + w[3] * (d - a)
-    if inside == 1 and not of_vertex:  # the weights of nearly parallel edges have too few digits
+    if inside == 1:  # the weights of nearly parallel edges, and in thin triangles, have too few digits
         normal = wp.cross(b - a, d - c)
-        y = wp.dot(normal, a - c) / wp.dot(normal, normal) * normal
+        if of_vertex:
+            normal = wp.cross(c - b, d - b)
+        square = wp.dot(normal, normal)
+        if square > ZERO:
+            y = wp.dot(normal, a - c) / square * normal
     return w, y, inside
 
 
@@ -993,6 +997,10 @@ def cut_by_planes(dtype):
         if first + second > ZERO:
             part = wp.clamp(second / (first + second), CLAMPED, ONE - CLAMPED)
         offset = highest + part * (lowest - highest)
+        if lowest - highest < KEPT * wp.length(y):  # by rounding y does not separate the sides, which then stay
+            for i in range(4):
+                wp.atomic_min(share, s[i], ZERO)
+            return
         for i in range(4):
             if approaches[i] > ZERO:
                 room = wp.where(i < sides, ONE, -ONE) * (position[i] - offset) - margin

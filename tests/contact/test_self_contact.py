@@ -553,6 +553,39 @@ def test_planes_between_edges_that_are_nearly_parallel(length, device):
     assert (np.minimum(a, b) - np.maximum(c, d) > 0.9 * gap).all()
 
 
+@pytest.mark.parametrize("angle", [1e-5, 1e-3, 0.1])
+def test_planes_of_a_vertex_above_a_thin_triangle(angle, device):
+    """Triangles 10 m long with such an angle, and a vertex 5 µm above their inside: y separates all as above."""
+    rng, gap, count = np.random.default_rng(4), 5e-6, 600
+    q = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    length = rng.uniform(5.0, 10.0, (2, count, 1))
+    a, b = np.zeros((count, 3)), length[0] * q[:, 0]
+    c = length[1] * (np.cos(angle) * q[:, 0] + np.sin(angle) * q[:, 1])
+    w = 0.05 + 0.85 * rng.dirichlet([1.0, 1.0, 1.0], count)
+    w /= w.sum(axis=1)[:, None]
+    p = w[:, :1] * a + w[:, 1:2] * b + w[:, 2:] * c + gap * q[:, 2]
+    points, out = np.stack([p, a, b, c]), wp.zeros(count, dtype=wp.vec3d, device=device)
+    given = [wp.array(each, dtype=wp.vec3d, device=device) for each in points]
+    wp.launch(nearest_of_triangle, count, given, [out], device=device)
+    y = out.numpy()
+    n = y / np.linalg.norm(y, axis=1)[:, None]
+    a, b, c = (np.einsum("ij,ij->i", n, each - p) for each in points[1:])
+    assert (-np.maximum(np.maximum(a, b), c) > 0.9 * gap).all()
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def nearest_of_triangle(
+    a: wp.array(dtype=wp.vec3d),
+    b: wp.array(dtype=wp.vec3d),
+    c: wp.array(dtype=wp.vec3d),
+    d: wp.array(dtype=wp.vec3d),
+    out: wp.array(dtype=wp.vec3d),
+):
+    i = wp.tid()
+    _w, y, _inside = nearest(True, a[i], b[i], c[i], d[i])
+    out[i] = y
+
+
 @wp.kernel(module="unique", enable_backward=False)
 def nearest_of_edges(
     a: wp.array(dtype=wp.vec3d),
