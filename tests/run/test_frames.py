@@ -78,10 +78,10 @@ def test_the_next_frames_come_while_one_is_in_use(device):
     with closing(frames_of(stepper, 10, 2)) as frames:
         next(frames)
         for _ in range(3):
-            assert computed.acquire(timeout=60.0)  # the one in use and two more
+            assert computed.acquire(timeout=600.0)  # the one in use and two more
         assert count[0] == 3 and not computed.acquire(timeout=0.05)
         next(frames)
-        assert computed.acquire(timeout=60.0)
+        assert computed.acquire(timeout=600.0)
     assert count[0] <= 4 and not threads()
 
 

@@ -139,7 +139,7 @@ sys.exit(main(sys.argv[2:]))
 def test_the_command_line_resumes_what_a_signal_ended(number, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command = ["run", "hanging", "-p", "n=6", "--solver", "xpbd", "-s", "substeps=2", "iterations=2"]
-    ended = subprocess.run([sys.executable, "-c", KILLED, str(int(number)), *command], capture_output=True, timeout=120)
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(int(number)), *command], capture_output=True, timeout=600)
     assert ended.returncode == (-number if number == signal.SIGKILL else 128 + number), ended.stderr.decode()
     assert len(FrameSequence("hanging.usdc")) == (20 if number == signal.SIGKILL else 26)
     code, out, err = run(capfd, *command, "--resume")

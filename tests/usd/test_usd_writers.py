@@ -131,7 +131,7 @@ def test_an_output_has_one_writer_at_a_time(tmp_path):
             return str(error)
 
     for _ in range(20):
-        together = threading.Barrier(2, timeout=60.0)
+        together = threading.Barrier(2, timeout=600.0)
         with ThreadPoolExecutor(2) as pool:
             found = list(pool.map(run, (1.0, -1.0)))
         assert str(output) in found
