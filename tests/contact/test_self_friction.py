@@ -9,6 +9,7 @@ import warpcloth as wc
 from warpcloth.contact.self_steps import SelfSteps
 from warpcloth.core.hessian import Hessian
 from warpcloth.core.sums import Sums
+from warpcloth.scenes import cards
 
 SLOW = pytest.mark.slow
 SOLVERS = {
@@ -285,6 +286,33 @@ def test_turns_with_the_cloth(device):
         found.append(out.numpy())
     assert np.abs(found[0]).max() > 1e-3
     assert found[1] == pytest.approx(found[0] @ turn.T, abs=1e-12)
+
+
+@pytest.mark.parametrize(("name", "friction"), [("xpbd", 0.6), ("xpbd", 0.2), ("newton", 0.35)])
+def test_cards(name, friction, device):
+    """They stand at an angle of 20° if friction is above (0.97² − cos 40°)/sin 40° = 0.27, and fall within 1.5 s else."""
+    scene = cards.scene(friction=friction)
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
+    for _ in range(24 if friction > 0.27 else 36):
+        stepper.frame()
+    moved = np.abs(stepper.state.x.numpy() - scene.positions).max()
+    assert stepper.cut == 0.0
+    assert moved < 1e-3 if friction > 0.27 else moved > 0.05
+
+
+@SLOW  # 1440 frames of two cards
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_cards_stand_for_a_minute(dtype, device):
+    """From 30 s on they move by less than 1e-7 m, some last places of float32 coordinates, and in float64 not at all."""
+    stepper = SOLVERS["xpbd"].bind(cards.scene().build(device=device, dtype=dtype))
+    found = []
+    for frame in range(1440):
+        stepper.frame()
+        if frame >= 720:
+            found.append(np.array(stepper.state.x.numpy()))
+    moved = np.ptp(found, axis=0).max()
+    print(dtype, moved)
+    assert moved < (1e-7 if dtype == "float32" else 1e-12)
 
 
 @pytest.mark.parametrize("solver", [wc.PBD(substeps=4), wc.HierarchicalPBD(substeps=4)])

@@ -158,6 +158,10 @@ class SelfFriction:
         if self._rubbing is not None:
             self._launch(friction_sweeps.count_rubbing, model.count, [self.pairs, self.rubbed], [self._rubbing])
 
+    def launch_release(self):
+        """Launches the end of all that is kept, where a step had no pairs."""
+        self._kept.pairs.first.zero_()
+
     def launch_relisted(self):
         """Notes that pairs, and so their areas, are others within the step."""
         wp.copy(self._step.relisted, self._one)

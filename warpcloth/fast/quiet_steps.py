@@ -83,3 +83,5 @@ class QuietSteps:
     def _launch_count(self, end):
         model = self._pairs.model
         model.launch(self._count, model.copies, [], [self._pairs.steps])
+        if self._pairs.friction is not None:
+            self._pairs.friction.launch_release()

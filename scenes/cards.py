@@ -1,0 +1,33 @@
+"""Two cards that lean on each other, on a floor: friction between them and on the floor holds them up.
+
+The top of the first rests on the face of the second, at ρ = 0.97 of its length, and is as much shorter. At an angle θ to the
+vertical they stand if friction between them is above (ρ² − cos 2θ)/sin 2θ, as moments about the floor say.
+"""
+
+import numpy as np
+
+import warpcloth as wc
+
+
+def scene(angle: float = 20.0, friction: float = 0.6, floor: float = 0.5, n: int = 4, duration: float = 2.0):
+    """Angle to the vertical [degrees], friction between the cards and on the floor, vertices a side, duration [s]."""
+    wc.checks.whole("n", n, least=2)
+    wc.checks.number("angle", angle, above=0.0)
+    length, width, distance, theta = 0.088, 0.063, 1e-3, np.radians(angle)
+    c, s, gap = np.cos(theta), np.sin(theta), 0.9 * distance  # which the default stiffness leaves below a sheet
+    top = 0.97 * length * np.array([-s, c]) - gap * np.array([c, s])
+    cards = {}
+    for name, high, side in (("first", top, s), ("second", length * np.array([-s, c]), -s)):
+        card = wc.Mesh.grid(n, n, size=(high[1] / c, width), pattern="alternating")
+        xy = high + (card.points[:, :1] - high[1] / c) * [side, c] + [0.0, gap]
+        cards[name] = wc.Mesh(np.column_stack([xy, card.points[:, 2]]), card.triangles)
+    return wc.Scene(
+        wc.Mesh.join(cards),
+        density=0.3,
+        terms=[wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-2)],
+        colliders=[wc.Plane(friction=floor, name="floor")],
+        contact=wc.Contact(distance=distance),
+        self_contact=wc.SelfContact(distance=distance, friction=friction),
+        duration=duration,
+        name="cards",
+    )
