@@ -895,6 +895,7 @@ def find_ways(dtype):
         # out
         ways: wp.array(dtype=wp.vec2d),
         share: wp.array(dtype=wp.float64),
+        least_share: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
         start = exact(x[i])
@@ -904,6 +905,7 @@ def find_ways(dtype):
         since = start - exact(begun[i]) - (exact(x[one]) - exact(begun[one]))
         ways[i] = wp.vec2d(wp.length(move - common[i // per_copy]) + WIDE * wp.length(since), far)
         share[i] = ONE
+        least_share[i] = ZERO
 
     return find_each_way
 
@@ -925,6 +927,9 @@ def cut_by_planes(dtype):
     A plane normal to y lies between the two sides, and divides their gap in the ratio of their approaches; each side has at
     least CLAMPED of it. The ``common`` move of all vertices of a copy does not count as an approach. A pair that is ``open``
     gets no plane, nor does one whose ``gap`` is so wide that no plane would cut the moves that :func:`find_ways` bounds.
+
+    A vertex that is as near to a plane as it may be, and does not approach it, moves by the ``least_share`` or more, or not at
+    all: the roundings of shorter moves, which are alike in many steps, would take it nearer.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -947,6 +952,7 @@ def cut_by_planes(dtype):
         least: wp.float64,
         # in and out
         share: wp.array(dtype=wp.float64),
+        least_share: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
         if e >= pairs.counts[0] + pairs.counts[1]:
@@ -1002,11 +1008,13 @@ def cut_by_planes(dtype):
                 wp.atomic_min(share, s[i], ZERO)
             return
         for i in range(4):
+            room = wp.where(i < sides, ONE, -ONE) * (position[i] - offset) - margin
             if approaches[i] > ZERO:
-                room = wp.where(i < sides, ONE, -ONE) * (position[i] - offset) - margin
                 t = KEPT * wp.max(room, ZERO) / approaches[i]
                 if t < share[s[i]]:
                     wp.atomic_min(share, s[i], t)
+            elif room <= ZERO:
+                wp.atomic_max(least_share, s[i], ULP * far / wp.max(-approaches[i], wp.float64(1e-300)))
 
     return cut_by_each_plane
 
@@ -1035,6 +1043,7 @@ def keep_apart(dtype):
     def keep_each_apart(
         # state in
         share: wp.array(dtype=wp.float64),
+        least_share: wp.array(dtype=wp.float64),
         x_ref: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
         common: wp.array(dtype=wp.vec3d),
@@ -1055,9 +1064,11 @@ def keep_apart(dtype):
         far = bounded_share(move, most)
         t = wp.min(far, share[i])
         if t < ONE:
+            if t < least_share[i]:
+                t = ZERO
             end = exact(x_ref[i]) + u + t * move
             x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
-            wp.atomic_add(cuts, copy, wp.where(t < far, 0, 1), 1)
+            wp.atomic_add(cuts, copy, wp.where(share[i] < far, 0, 1), 1)
         else:
             x[i] = target[i]
 

@@ -58,6 +58,15 @@ TOUCHING = {
     "curtain": {"nx": 13, "ny": 9, "duration": 1.0},
     "character": {"duration": 0.5},
 }
+FOLDING = {
+    "loop": {"elements": 16},
+    "stack": {"sheets": 3, "n": 5, "duration": 0.6},
+    "fold": {"nx": 3, "ny": 13, "folds": 2},
+    "twist": {"around": 12, "along": 8, "turns": 1.5, "duration": 0.8},
+    "knot": {"along": 40, "across": 1, "duration": 0.8},
+    "funnel": {"n": 9, "duration": 0.8},
+    "sleeve": {"around": 12, "along": 6, "duration": 0.6},
+}
 QUICK = {
     "newton": wc.Newton(substeps=4),
     "explicit": wc.Explicit(substeps=256),

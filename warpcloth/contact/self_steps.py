@@ -80,7 +80,8 @@ class SelfSteps:
         self.proximity = Proximity(model, declared.distance, self.skin)
         device = model.device
         self.x_before, self._target, self._from, self._other, self._begun_at = (model.vectors() for _ in range(5))
-        self._ways, self._share = (wp.zeros(model.count, dtype=kind, device=device) for kind in (wp.vec2d, wp.float64))
+        self._ways = wp.zeros(model.count, dtype=wp.vec2d, device=device)
+        self._share, self._least_share = (wp.zeros(model.count, dtype=wp.float64, device=device) for _ in range(2))
         self._slope, self._iterates, self._touching = model.scalars(), False, None
         self._colliders, self._cut_before = colliders, None
         self.energies = wp.zeros(model.count, dtype=wp.float64, device=device)
@@ -580,7 +581,8 @@ class SelfSteps:
     def _launch_apart(self, x, target):
         model = self.model
         wp.copy(self._from, x)
-        given = [self._share, self._from, target, self._common, self._walking, model.per_copy, WAY * self.skin]
+        given = [self._share, self._least_share, self._from, target, self._common, self._walking]
+        given += [model.per_copy, WAY * self.skin]
         self._launch(kernels.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
@@ -610,14 +612,14 @@ class SelfSteps:
         if self.moves_together:
             self._launch(kernels.common_move, model.copies, [*wanted, model.per_copy], [self._common])
         given = [*wanted, self._common, self._begun_at, model.per_copy]
-        self._launch(kernels.find_ways, model.count, given, [self._ways, self._share])
+        self._launch(kernels.find_ways, model.count, given, [self._ways, self._share, self._least_share])
         gap, open = self.begun.gap, None
         if self.tangles is not None:
             gap, open = None, self._open  # gaps are infinite where a pair is left out of contact
             self.tangles.launch_open(self.pairs.stencils, self.pairs.counts, open)
         given = [self.pairs, gap, open, *wanted, self._common, self._ways]
         given += [model.per_copy, FLOOR * self.declared.distance]
-        self._launch(kernels.cut_by_planes, len(self.pairs.stencils), given, [self._share])
+        self._launch(kernels.cut_by_planes, len(self.pairs.stencils), given, [self._share, self._least_share])
 
     # Of methods whose iterates base + d stay apart too.
 
