@@ -119,8 +119,9 @@ def test_all_meet(name, scene, device):
     newton = newton_step(declared, device)
     x, stepper = after_one_step(declared, MINIMISE[name], device)
     assert np.abs(x - newton).max() < 1e-8
-    assert np.abs(newton_step(replace(declared, free_axes=None), device) - newton).max() > 1e-3
     assert stepper.residual[0] < 1e-6
+    if name == "newton":  # which says for all that the locks matter
+        assert np.abs(newton_step(replace(declared, free_axes=None), device) - newton).max() > 1e-3
 
 
 PROJECT = {name: solver for name, solver in LOCKING.items() if isinstance(solver, (wc.PBD, wc.HierarchicalPBD, wc.XPBD))}
