@@ -9,7 +9,7 @@ import pytest
 
 from warpcloth.chart.failures import plot_failure
 from warpcloth.cli import main
-from warpcloth.lab import cotangents, friction, isometry, locking, rank, tunnelling
+from warpcloth.lab import cotangents, crossing, friction, isometry, locking, rank, tunnelling
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.failures import COLUMNS, FAILURES, failure_chart, write_csv
 from warpcloth.lab.panels import Map, point
@@ -333,6 +333,57 @@ def test_few_iterations_mistake_friction(device):
     assert abs(found[0] - 0.3) > 0.1 and found[1] == pytest.approx(0.3, abs=1e-3)
 
 
+# --- 17. Sheets that cross one another.
+
+
+def test_lines_of_crossing():
+    """The energy of explicit steps stops √2 times the speed that it stops at a wall, and half of v on each side is 49 m/s."""
+    by_key = {panel.key: panel.laws for panel in crossing.PANELS}
+    assert by_key["explicit, without"]["½ρv² = kr²"](1e-3) == pytest.approx(0.44294, rel=1e-4)
+    assert by_key["newton, filter"]["v = kr²h/(2ρδ)"](1e-3) == pytest.approx(49.05, rel=1e-4)
+    assert by_key["pbd, filter"]["v h = r + skin"](1e-2) == pytest.approx(100.0 * (1e-3 + 0.35 * 0.05 * 2.0**0.5))
+    assert len(by_key["pbd, filter"]) == 1 and len(by_key) == 12
+
+
+def test_sheets_cross_without_the_filter_where_theory_says(device):
+    """Explicit steps of 1 ms by the energy, from 0.443 m/s; those of 20 ms of Newton's method from 1.29 m/s, by the phase."""
+
+    def crossed(solver, step, speeds):
+        return [p["value"] for p in crossing.measure(solver, "without", [step], speeds, device)]
+
+    assert crossed("explicit", 1e-3, [0.4, 0.5]) == [0.0, 100.0]
+    none, some = crossed("newton", 0.02, [0.05, 4.0])
+    assert none == 0.0 and some >= 25.0
+
+
+@pytest.fixture(scope="module")
+def crossings(device):
+    """The chart of two steps and two speeds."""
+    with ThreadPoolExecutor(1) as executor, pytest.MonkeyPatch.context() as patch:
+        for name, values in (("STEPS", [2e-3, 1 / 24]), ("SPEEDS", [1.0, 100.0]), ("PHASES", [0.0, 0.5])):
+            patch.setattr(crossing, name, np.array(values))
+        return failure_chart("crossing", device, store=Store(), executor=executor)
+
+
+def test_no_solver_lets_sheets_cross(crossings):
+    """At 1 and 100 m/s, of steps to 1/24 s; without the filter they cross with each that is shown."""
+    kept = [row for row in crossings["rows"] if "filter" in row["panel"]]
+    assert len(kept) == 32 and {row["series"] for row in kept} == {"stays apart", "refused"}
+    assert {row["panel"] for row in kept if row["series"] == "refused"} == {"explicit, filter"}
+    left = {row["panel"] for row in crossings["rows"] if row["series"] == "crosses"}
+    assert left == {f"{solver}, without" for solver in crossing.SHOWN["without"]}
+
+
+def test_edges_that_go_through_triangles():
+    """One sheet above another, through it, and beside it."""
+    grid = crossing.sheets(1e-2, 0.0).mesh
+    below, triangles = grid.points[:9], grid.triangles[:8]
+    tilted = below @ np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    moves = np.array([[0.01, 0.01, 0.0], [0.003, 0.004, 0.002], [0.2, 0.0, 0.0]])
+    others = np.stack([below, tilted, tilted]) + moves[:, None]
+    assert crossing.cross(np.stack([below] * 3), others, triangles).tolist() == [False, True, False]
+
+
 # --- Tables, pictures, command.
 
 
@@ -390,7 +441,7 @@ def test_maps_are_drawn(tunnels, tmp_path, monkeypatch):
         assert sorted(cells.get_array().compressed()) == sorted(value for value in shown if value is not None)
         assert len(axes.lines) == len(panel.laws) + (panel.key == "newton, filter")
     words = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert words[-2:] == ["a vertex passes the wall", "refused"] and set(words[:-2]) == set(tunnelling.LAWS)
+    assert words[-2:] == ["a sheet passes", "refused"] and set(words[:-2]) == set(tunnelling.LAWS)
     of_friction = [point("xpbd", kind, x, 0.0, y=0.3) for x, kind in enumerate(friction.KINDS)]
     of_friction.append(point("creep", "xpbd", 0.5, 0.0))
     plot_failure(tmp_path / "b.svg", {"failure": "friction", "title": friction.TITLE, "rows": of_friction})

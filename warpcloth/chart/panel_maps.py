@@ -79,8 +79,8 @@ def add_keys(figure, maps, lines):
     keys = [Line2D([], [], color="black", linestyle=dashes, label=label) for label, dashes in lines.items()]
     kinds = dict.fromkeys(kind for _, panel, _ in maps for kind in panel.kinds)
     keys += [Patch(color=colour, label=kind) for kind, colour in zip(kinds, _KINDS, strict=False)]
-    if any(panel.crossed for _, panel, _ in maps):
-        keys.append(Line2D([], [], color="tab:red", marker="x", linestyle="", label="a vertex passes the wall"))
+    for crossed in dict.fromkeys(panel.crossed for _, panel, _ in maps if panel.crossed):
+        keys.append(Line2D([], [], color="tab:red", marker="x", linestyle="", label=f"a sheet {crossed}"))
     keys += [Patch(**_REFUSED, label="refused")] * any(cells is not None for *_, cells in maps)
     style = {"frameon": False, "fontsize": _LETTERS, "labelcolor": GREY, "ncols": min(len(keys), 8)}
     figure.legend(handles=keys, loc="outside lower center", **style)

@@ -44,6 +44,7 @@ Failures:
   rank         rotations fitted to points in a plane, on a line or at one position
   tunnelling   fast cloth against a thin collider, with and without the filter of contact
   friction     cloth on slopes: where it sticks, creeps and slides
+  crossing     sheets that fly at each other, with and without the filter of self-contact
 In the chart, points are measured and lines are closed forms. Measurements are stored and reused.
 
   warpcloth chart failure slivers -o slivers.png --csv slivers.csv

@@ -6,7 +6,7 @@ dictionaries with ``panel``, ``series``, ``x``, ``y`` (of maps), ``value`` (None
 
 from ..base.checks import choice
 from ..base.outputs import write_table
-from . import cotangents, friction, isometry, locking, rank, slivers, tunnelling
+from . import cotangents, crossing, friction, isometry, locking, rank, slivers, tunnelling
 from .campaign import collect
 from .machine import machine
 from .panels import Map
@@ -19,6 +19,7 @@ FAILURES = {
     "rank": rank,
     "tunnelling": tunnelling,
     "friction": friction,
+    "crossing": crossing,
 }
 COLUMNS = ("panel", "series", "x", "y", "value", "law", "expected", "reason", "machine")
 

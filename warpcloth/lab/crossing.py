@@ -1,0 +1,159 @@
+"""Two sheets that fly at each other, over their relative speed and the step, with the filter of self-contact and without it.
+
+Without the filter, pairs are found where a step begins, and nothing looks at the way between. Explicit steps know contact only
+within the distance r: from v h = r on a step can end beyond the other sheet, where the energy pushes on, and from 2r unnoticed.
+Their energy also gives way, if ½kr² is less than that of the motion, ½(ρ/2)v² of two free sheets of density ρ.
+
+The other methods know the side of each pair that is listed where the step begins: nearer than r and the skin. A minimiser of
+such a step has sheets apart by d where kτ²/d, with τ = r/2, stops half of v on each side, ρv/2h; below δ = r/1000 the energy
+is a parabola, with which they may end beyond one another.
+"""
+
+import numpy as np
+
+from ..base.turns import in_turn
+from ..contact.self_steps import SKIN
+from ..kernels.terms.contact import FLOOR
+from ..mesh.mesh import Mesh
+from ..scene.scene import Scene
+from ..scene.self_contact import SelfContact
+from ..solvers import SOLVERS
+from ..terms import Spring
+from .measurements import task
+from .panels import Map, point
+from .tunnelling import DENSITY, DISTANCE, RATE, STIFFNESS
+
+TITLE = "17. Sheets that fly at each other: without the filter of self-contact they cross"
+SIDE = 0.1  # of the sheets [m]
+# Of one sheet against the other [°]: without the filter all of each is in contact, as theory has it, with it in no special way.
+TURN = {"without": 0.0, "filter": 5.0}
+LISTED = DISTANCE + SKIN * 0.5 * SIDE * np.sqrt(2.0)  # from which pairs are listed [m]
+STEPS = np.geomspace(5e-4, 1.0 / 24.0, 7)  # [s]
+SPEEDS = np.geomspace(0.1, 100.0, 10)  # [m/s]
+PHASES = np.arange(4) / 4.0  # of a step, by which sheets start farther apart
+SHOWN = {"without": ("explicit", "newton", "xpbd", "pbd"), "filter": tuple(SOLVERS)}
+
+_QUADRATIC, _DEEP = "½ρv² = kr²", "v = kr²h/(2ρδ)"
+LAWS = {
+    "v h = r": lambda h: DISTANCE / h,
+    "v h = 2r": lambda h: 2.0 * DISTANCE / h,
+    "v h = r + skin": lambda h: LISTED / h,
+    _QUADRATIC: lambda h: DISTANCE * RATE * np.sqrt(2.0),
+    _DEEP: lambda h: 0.5 * RATE**2 * DISTANCE * h / FLOOR,
+}
+
+
+def _panel(solver, kept):
+    if solver == "explicit":
+        names = ["v h = r", "v h = 2r", _QUADRATIC]
+    else:
+        # PBD has no stiffness of contact.
+        names = ["v h = r + skin", *[_DEEP] * ("pbd" not in solver or solver == "xpbd")]
+    filtered = kept == "filter"
+    return Map(
+        f"{solver}, {kept}",
+        f"{solver}, with the filter" if filtered else f"{solver}, without the filter",
+        "step h [s]",
+        "relative speed v [m/s]",
+        scales=("log", "log"),
+        laws={name: LAWS[name] for name in names},
+        value="flights in which a move was cut short [%]" if filtered else "flights in which sheets cross [%]",
+        colours="Blues" if filtered else "Reds",
+        crossed="crosses" if filtered else None,
+    )
+
+
+PANELS = tuple(_panel(solver, kept) for kept, solvers in SHOWN.items() for solver in solvers)
+
+
+def tasks(device):
+    """One for each panel."""
+    given = {"steps": STEPS.tolist(), "speeds": SPEEDS.tolist(), "device": device}
+    return [task(measure, solver=solver, kept=kept, **given) for kept, solvers in SHOWN.items() for solver in solvers]
+
+
+def measure(solver, kept, steps, speeds, device):
+    """Points of one panel: of flights from all phases the share that was cut, or in which sheets crossed [%]."""
+    panel, found = _panel(solver, kept).key, []
+    for h in steps:
+        try:
+            crossed, cut = meetings(solver, kept, h, speeds, device)
+        except ValueError as error:
+            found += [point(panel, "refused", h, None, str(error), y=v) for v in speeds]
+            continue
+        for v, through, short in zip(speeds, crossed, cut, strict=True):
+            series = "crosses" if through > 0.0 else "stays apart"
+            found.append(point(panel, series, h, 100.0 * (short if kept == "filter" else through), y=v))
+    return found
+
+
+def sheets(h, turn):
+    """A scene of two sheets of nine vertices, one of them turned by some degrees, with steps of h as frames."""
+    grid, (c, s) = Mesh.grid(3, 3, size=SIDE), (np.cos(np.radians(turn)), np.sin(np.radians(turn)))
+    below = grid.points - [0.5 * SIDE, 0.0, 0.5 * SIDE]
+    above = below @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) + [0.0, 2.0 * DISTANCE, 0.0]
+    return Scene(
+        Mesh(np.concatenate([below, above]), np.concatenate([grid.triangles, grid.triangles + 9])),
+        density=DENSITY,
+        terms=[Spring(stiffness=0.1)],
+        gravity=(0.0, 0.0, 0.0),
+        fps=1.0 / h,
+        duration=h,
+        self_contact=SelfContact(DISTANCE, STIFFNESS),
+    )
+
+
+@in_turn
+def meetings(solver, kept, h, speeds, device):
+    """Shares of the flights in which sheets ever end a step crossed or beyond one another, and that were cut, (S,) each.
+
+    Sheets start r and a part of a step apart. They fly until the slowest have passed one another, or turned round.
+
+    Raises:
+        ValueError: The solver refuses the step.
+    """
+    scene = sheets(h, TURN[kept])
+    speed, phase = (each.ravel() for each in np.meshgrid(speeds, PHASES, indexing="ij"))
+    positions = np.repeat(scene.mesh.points[None], len(speed), axis=0)
+    positions[:, 9:, 1] = (DISTANCE + phase * speed * h)[:, None]
+    velocities = np.zeros_like(positions)
+    velocities[:, :9, 1], velocities[:, 9:, 1] = 0.5 * speed[:, None], -0.5 * speed[:, None]
+    vary = {"positions": positions, "velocities": velocities}
+    model = scene.build(device=device, dtype="float64", copies=len(speed), vary=vary)
+    stepper = SOLVERS[solver](substeps=1).bind(model)
+    if kept != "filter":
+        without_filter(stepper)
+    crossed = np.zeros(len(speed), dtype=bool)
+    for _ in range(int(4.0 * DISTANCE / (min(speeds) * h) + 4.0 / (RATE * h)) + 8):
+        stepper.step()
+        x = stepper.state.x.numpy().reshape(positions.shape)
+        below, above = x[:, :9], x[:, 9:]
+        aside = np.linalg.norm((above - below).mean(axis=1)[:, [0, 2]], axis=1)  # as sheets are that go round one another
+        crossed |= (above[..., 1].max(axis=1) < below[..., 1].min(axis=1)) & (aside < 0.5 * SIDE)
+        crossed |= cross(below, above, scene.mesh.triangles[:8])
+    return (each.reshape(len(speeds), -1).mean(axis=1) for each in (crossed, stepper.cut > 0.0))
+
+
+def without_filter(stepper):
+    """Takes the filter of self-contact away from a stepper, at the end of steps and of the iterates of Newton's method."""
+    pairs = stepper.pairs
+    pairs.launch_end = pairs.launch_relist = pairs.launch_limit = lambda *given: None
+    pairs.launch_first = lambda base, d: d.zero_()
+    stepper.record_again()
+
+
+def cross(one, other, triangles):
+    """Whether an edge of one sheet goes through a triangle of the other, of positions (B, n, 3) of both; (B,)."""
+    edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+    found = np.zeros(len(one), dtype=bool)
+    for x, y in ((one, other), (other, one)):
+        p, q = (x[:, edges[:, k], None] for k in (0, 1))
+        a, b, c = (y[:, None, triangles[:, k]] for k in (0, 1, 2))
+        through = _volume(a, b, c, p) * _volume(a, b, c, q) < 0.0
+        sides = np.stack([_volume(p, q, a, b), _volume(p, q, b, c), _volume(p, q, c, a)])
+        found |= (through & ((sides > 0.0).all(axis=0) | (sides < 0.0).all(axis=0))).any(axis=(1, 2))
+    return found
+
+
+def _volume(a, b, c, d):
+    return (np.cross(b - a, c - a) * (d - a)).sum(axis=-1)
