@@ -912,7 +912,7 @@ def find_ways(dtype):
 
 @wp.func
 def margin_of(least: wp.float64, far: wp.float64):
-    """The least distance to a plane that either side keeps, where no coordinate is above ``far``.
+    """Half the distance that two sides keep, where no coordinate is above ``far``.
 
     So 4 units in the last place of float32 remain between the sides; frames are stored in float32.
     """
@@ -924,9 +924,10 @@ def margin_of(least: wp.float64, far: wp.float64):
 def cut_by_planes(dtype):
     """Kernel over pairs: lowers the ``share`` of its wanted move from x that each vertex may make.
 
-    A plane normal to y lies between the two sides, and divides their gap in the ratio of their approaches; each side has at
-    least CLAMPED of it. The ``common`` move of all vertices of a copy does not count as an approach. A pair that is ``open``
-    gets no plane, nor does one whose ``gap`` is so wide that no plane would cut the moves that :func:`find_ways` bounds.
+    A plane normal to y lies between the two sides, and divides their gap, less the distance that they keep, in the ratio of
+    their approaches; each side has at least CLAMPED of it. The ``common`` move of all vertices of a copy does not count as an
+    approach. A pair that is ``open`` gets no plane, nor does one whose ``gap`` is so wide that no plane would cut the moves
+    that :func:`find_ways` bounds.
 
     A vertex that is as near to a plane as it may be, and does not approach it, moves by the ``least_share`` or more, or not at
     all: the roundings of shorter moves, which are alike in many steps, would take it nearer.
@@ -971,7 +972,7 @@ def cut_by_planes(dtype):
                 way[1] = wp.max(way[1], each[0])
         margin = margin_of(least, far)
         if gap:
-            # Wherever the plane lies, it cuts no approaches that add up to KEPT·gap − KEPT/CLAMPED·margin or less.
+            # However the gap is divided, approaches that add up to so much or less are not cut.
             if way[0] + way[1] <= WIDE * gap[e] - KEPT / CLAMPED * margin:
                 return
         if open:
@@ -1002,15 +1003,17 @@ def cut_by_planes(dtype):
         part = SIDE
         if first + second > ZERO:
             part = wp.clamp(second / (first + second), CLAMPED, ONE - CLAMPED)
-        offset = highest + part * (lowest - highest)
         if lowest - highest < KEPT * wp.length(y):  # by rounding y does not separate the sides, which then stay
             for i in range(4):
                 wp.atomic_min(share, s[i], ZERO)
             return
+        between = wp.max(lowest - highest - wp.float64(2.0) * margin, ZERO)
         for i in range(4):
-            room = wp.where(i < sides, ONE, -ONE) * (position[i] - offset) - margin
+            room = highest - position[i] + part * between
+            if i < sides:
+                room = position[i] - lowest + (ONE - part) * between
             if approaches[i] > ZERO:
-                t = KEPT * wp.max(room, ZERO) / approaches[i]
+                t = KEPT * room / approaches[i]
                 if t < share[s[i]]:
                     wp.atomic_min(share, s[i], t)
             elif room <= ZERO:

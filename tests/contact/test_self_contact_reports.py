@@ -100,6 +100,19 @@ def test_frames_too_coarse_for_the_gap_are_named(dtype, device):
     assert far.too_near.startswith("in frame 3 first, at vertex ") and "the least gap is 6e-06 m" in far.too_near
 
 
+@pytest.mark.parametrize("far", [0.0, 700.0])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_the_filter_leaves_the_least_gap(far, dtype, device):
+    """Where only one of two sides comes nearer too: a soft sheet sinks on another one at rest, also where float32 is coarse."""
+    least = max(1e-3 * DISTANCE, 4.0 * 2.0**-23 * far)
+    scene = sheets(self_contact=wc.SelfContact(DISTANCE, 1e-3), gravity=np.array([0.0, -9.81, 0.0]), pins=np.arange(16))
+    scene = replace(scene, positions=scene.positions + far, mesh=wc.Mesh(scene.mesh.points + far, scene.mesh.triangles))
+    found = wc.simulate(scene, wc.XPBD(substeps=8, iterations=4), device=device, dtype=dtype, frames=8, record="pairs")
+    assert found.self_contact.too_near is None
+    assert found.self_contact.least_gap >= least
+    assert found.pairs["least gap"][-1] < 4.0 * least
+
+
 def test_a_resumed_run_has_the_same_record(tmp_path, device):
     def stop(frame, _frames):
         if frame == 12:
