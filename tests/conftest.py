@@ -21,10 +21,10 @@ def device(request):
     return request.config.getoption("--device")
 
 
-@pytest.fixture(scope="session", autouse=True)
-def default_device(request):
-    """Arrays for which a test names no device are on the tested one, also where a machine has a GPU."""
-    wp.set_device(request.config.getoption("--device"))
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Arrays for which a test names no device are on the tested one, or on the CPU if the test takes no `device`."""
+    wp.set_device(item.config.getoption("--device") if "device" in item.fixturenames else "cpu")
 
 
 def pytest_collection_modifyitems(config, items):
