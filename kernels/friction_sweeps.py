@@ -9,8 +9,10 @@ from functools import cache
 
 import warp as wp
 
-from .self_contact import ONE, ZERO, free_move, near_pairs
 from .self_friction import RubbedPairs, friction_module, stretch_of
+from .self_gaps import ONE, ZERO
+from .self_pairs import near_pairs
+from .self_sweeps import free_move
 from .vectors import types
 
 

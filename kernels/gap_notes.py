@@ -7,12 +7,13 @@ from functools import cache
 
 import warp as wp
 
-from . import self_contact
-from .self_contact import StepPairs, module_of, near_pairs, vertex_of
+from . import self_gaps
+from .self_gaps import ONE, ZERO, vertex_of
+from .self_pairs import StepPairs, module_of, near_pairs
+from .self_planes import ULP
 from .vectors import types
 
-nearest_points = self_contact.nearest
-ZERO, ONE, ULP = self_contact.ZERO, self_contact.ONE, self_contact.ULP
+nearest_points = self_gaps.nearest
 FOUR = wp.constant(wp.float64(4.0))
 FIRST = wp.constant(wp.int64(2**62))
 

@@ -11,8 +11,9 @@ import warp as wp
 
 from .constraint_rows import ROUNDINGS, RowLayout, row_values
 from .rotation import epsilon
-from .self_contact import StepPairs, near_pairs, nearest, signed_gap, vertex_of
 from .self_friction import RubbedPairs, edge_tangent, stretch_of
+from .self_gaps import nearest, signed_gap, vertex_of
+from .self_pairs import StepPairs, near_pairs
 from .terms import contact
 from .vectors import types
 

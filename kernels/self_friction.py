@@ -13,7 +13,8 @@ from functools import cache
 
 import warp as wp
 
-from .self_contact import ONE, SIDE, ZERO, StepPairs, near_pairs, vertex_of
+from .self_gaps import ONE, SIDE, ZERO, vertex_of
+from .self_pairs import StepPairs, near_pairs
 from .terms import contact
 from .vectors import types
 

@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .self_contact import ZERO, nearest, vertex_of
+from .self_gaps import ZERO, nearest, vertex_of
 from .vectors import types
 
 MODULE = "warpcloth.tangles"

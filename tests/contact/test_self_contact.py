@@ -11,7 +11,7 @@ from support.scenes import scene
 from warpcloth.contact.self_steps import SelfSteps, crossings
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
-from warpcloth.kernels.self_contact import nearest
+from warpcloth.kernels.self_gaps import nearest
 
 SLOW = pytest.mark.slow
 SOLVERS = {

@@ -5,9 +5,8 @@ import warp as wp
 
 from ..core.scan import Scan
 from ..kernels import friction_sweeps
-from ..kernels import self_contact as kernels_of_pairs
 from ..kernels import self_friction as kernels
-from ..kernels.self_contact import near_pairs
+from ..kernels.self_pairs import fill_corners, near_pairs, sort_corners
 
 # Rows of the arrays of a list for each pair that there is room for.
 ROWS = {"stencils": 1, "corners": 4, "slips": 1}
@@ -15,7 +14,7 @@ LISTS = "stencils", "counts", "first", "corners"
 
 
 def acting_sizes(model, room):
-    """Sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.self_contact.near_pairs`, by name."""
+    """Sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.self_pairs.near_pairs`, by name."""
     return {"acting": room, "number": 1, "corner_counts": model.count, "first": model.count + 1, "corners": 4 * room}
 
 
@@ -28,7 +27,7 @@ class Slips:
 
     Attributes:
         room: As given.
-        pairs: A :func:`warpcloth.kernels.self_contact.near_pairs`, without distances.
+        pairs: A :func:`warpcloth.kernels.self_pairs.near_pairs`, without distances.
         slips: (room,), see :func:`warpcloth.kernels.self_friction.end_friction`.
         relisted: (1,) int32, whether pairs were listed again within the step.
         grow: A function of a number of pairs that makes room for as many, by default that of this object alone.
@@ -101,7 +100,7 @@ class SelfFriction:
         bounded: Whether contact is that of explicit steps.
 
     Attributes:
-        pairs: Those of the step, a :func:`warpcloth.kernels.self_contact.near_pairs` without distances.
+        pairs: Those of the step, a :func:`warpcloth.kernels.self_pairs.near_pairs` without distances.
         rubbed: :class:`warpcloth.kernels.self_friction.RubbedPairs`.
         start: Positions where the step began, (N,) [m].
     """
@@ -111,7 +110,7 @@ class SelfFriction:
         self.start, self._step, self._rubbing = model.vectors(), Slips(model, slips.room), None
         self._vertices, self._one = Scan(model, model.count), wp.ones(1, dtype=wp.int32, device=model.device)
         made = kernels.set_stretch, kernels.find_friction, kernels.add_friction, kernels.sum_friction
-        made += kernels_of_pairs.fill_corners, kernels_of_pairs.sort_corners
+        made += fill_corners, sort_corners
         made += kernels.add_friction_diagonal, kernels.add_friction_products, kernels.end_friction, kernels.set_contact
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._begin = model.kernel(kernels.begin_friction, model.dtype, bounded)
@@ -151,8 +150,8 @@ class SelfFriction:
         given = [self.pairs, pairs, begun, kept.pairs, kept.slips, self._steps, kept.relisted, model.per_copy, self._friction]
         model.launch(self._begin, kept.room, given, [self.rubbed])
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
-        self._launch(kernels_of_pairs.fill_corners, kept.room, [], [self.pairs])
-        self._launch(kernels_of_pairs.sort_corners, model.count, [], [self.pairs])
+        self._launch(fill_corners, kept.room, [], [self.pairs])
+        self._launch(sort_corners, model.count, [], [self.pairs])
         given = [self.pairs, x, kept.pairs, kept.slips, self._steps, model.per_copy]
         self._launch(kernels.set_stretch, kept.room, given, [self.rubbed])
         if self._rubbing is not None:

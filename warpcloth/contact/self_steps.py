@@ -10,8 +10,7 @@ from ..core.capture import Mirror
 from ..core.scan import Scan
 from ..core.status import Stopped
 from ..core.sums import Sums
-from ..kernels import gap_notes
-from ..kernels import self_contact as kernels
+from ..kernels import gap_notes, self_contact, self_filter, self_pairs, self_planes, self_sweeps
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from .proximity import Proximity
@@ -104,26 +103,26 @@ class SelfSteps:
         self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
         self._count = model.kernel(count_step)
         made = (
-            kernels.begin_pairs,
-            kernels.set_areas,
-            kernels.fill_corners,
-            kernels.sort_corners,
-            kernels.add_forces,
-            kernels.sum_energies,
-            kernels.add_diagonal,
+            self_pairs.begin_pairs,
+            self_pairs.set_areas,
+            self_pairs.fill_corners,
+            self_pairs.sort_corners,
+            self_contact.add_forces,
+            self_contact.sum_energies,
+            self_contact.add_diagonal,
         )
-        made += kernels.limit_direction, kernels.precondition, kernels.take_descent, kernels.add_positions
+        made += self_filter.limit_direction, self_filter.precondition, self_filter.take_descent, self_filter.add_positions
         made += (
-            kernels.add_products,
-            kernels.find_ways,
-            kernels.cut_by_planes,
-            kernels.keep_apart,
-            kernels.end_filter,
-            kernels.common_move,
+            self_contact.add_products,
+            self_planes.find_ways,
+            self_planes.cut_by_planes,
+            self_filter.keep_apart,
+            self_filter.end_filter,
+            self_planes.common_move,
             gap_notes.note_gaps,
         )
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
-        self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
+        self._find = model.kernel(self_contact.find_forces, model.dtype, bounded)
         self.moves_together = free
         self._vertices = Scan(model, model.count)
         self._few = int(SHARE * model.per_copy)
@@ -134,7 +133,7 @@ class SelfSteps:
             colliders.end_again()
             self._mobile = wp.zeros(model.count, dtype=model.dtype, device=device)
             self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
-            for factory in (kernels.find_held, kernels.push_pairs):
+            for factory in (self_filter.find_held, self_filter.push_pairs):
                 self._kernels[factory] = model.kernel(factory, model.dtype)
         self.friction, self.stale = None, False
         self._hold()
@@ -269,12 +268,12 @@ class SelfSteps:
         def room(dtype):
             return wp.zeros(capacity, dtype=dtype, device=device)
 
-        self.pairs = kernels.near_pairs(self.model.dtype)()
+        self.pairs = self_pairs.near_pairs(self.model.dtype)()
         for name in ("stencils", "counts", "rows", "distances"):
             setattr(self.pairs, name, getattr(found, name))
         for name, size in acting_sizes(self.model, capacity).items():
             setattr(self.pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
-        self.begun, self.forces = kernels.StepPairs(), kernels.PairForces()
+        self.begun, self.forces = self_pairs.StepPairs(), self_contact.PairForces()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
         self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
         self.forces.normal, self.forces.weights = room(wp.vec3d), room(wp.vec4d)
@@ -282,7 +281,7 @@ class SelfSteps:
         self._open = room(wp.int32) if self.declared.crossing_start == "run" else None
         self.multipliers = room(wp.float64)
         if self._touching is not None:
-            self._swept = kernels.SweptPairs()
+            self._swept = self_sweeps.SweptPairs()
             self._swept.touches, self._swept.normal, self._swept.weights = room(wp.int32), room(wp.vec3d), room(wp.vec4d)
             self._swept.gap, self._swept.multiplier = room(wp.float64), room(wp.float64)
 
@@ -381,7 +380,7 @@ class SelfSteps:
         """Lists the pairs at x and notes their number. A list at ``found`` was made before and does not count again."""
         self.proximity.launch(x)
         given = [self.proximity.counts, int(x is not self.proximity.found)]
-        self.model.launch(kernels.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
+        self.model.launch(self_pairs.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
 
     def launch_areas(self, x):
         """Fixes the side and the area of each listed pair, and so which are acting."""
@@ -391,15 +390,15 @@ class SelfSteps:
             self.tangles.launch_leave_out(self.pairs.stencils, self.pairs.counts, self.begun.gap)
         self.pairs.number.zero_()
         given = [self.pairs, self._areas, x, self.declared.stiffness]
-        self._launch(kernels.set_areas, count, given, [self.begun])
+        self._launch(self_pairs.set_areas, count, given, [self.begun])
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
-        self._launch(kernels.fill_corners, count, [], [self.pairs])
-        self._launch(kernels.sort_corners, self.model.count, [], [self.pairs])
+        self._launch(self_pairs.fill_corners, count, [], [self.pairs])
+        self._launch(self_pairs.sort_corners, self.model.count, [], [self.pairs])
 
     def _launch_sides(self, x):
         """Fixes the side of each listed pair, and its gap."""
         wp.copy(self._begun_at, x)
-        self._launch(kernels.begin_pairs, len(self.pairs.stencils), [self.pairs, x], [self.begun])
+        self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), [self.pairs, x], [self.begun])
 
     def _relist(self, x):
         self.launch_list(x)
@@ -413,13 +412,13 @@ class SelfSteps:
 
     def add_gradient(self, out):
         """out (N,) += ∂U/∂x."""
-        self._launch(kernels.add_forces, self.model.count, [self.pairs, self.forces], [out])
+        self._launch(self_contact.add_forces, self.model.count, [self.pairs, self.forces], [out])
         if self.friction is not None:
             self.friction.add_gradient(out)
 
     def add_energy(self, sums, out):
         """out (B,) += U."""
-        self._launch(kernels.sum_energies, self.model.count, [self.pairs, self.forces], [self.energies])
+        self._launch(self_contact.sum_energies, self.model.count, [self.pairs, self.forces], [self.energies])
         if self.friction is not None:
             self.friction.add_energies(self.energies)
         sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
@@ -427,14 +426,14 @@ class SelfSteps:
     def add_diagonal(self, diagonal, values):
         """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
         given = [self.pairs, self.model.inverse_mass, diagonal, self.forces]
-        self._launch(kernels.add_diagonal, self.model.count, given, [values])
+        self._launch(self_contact.add_diagonal, self.model.count, given, [values])
         if self.friction is not None:
             self.friction.add_diagonal(diagonal, values)
 
     def add_products(self, p, q, active):
         """q += A p of its blocks off the diagonal, for the copies that are ``active`` (B,)."""
         given = [self.pairs, self.model.inverse_mass, self.forces, p, active, self.model.per_copy]
-        self._launch(kernels.add_products, self.model.count, given, [q])
+        self._launch(self_contact.add_products, self.model.count, given, [q])
         if self.friction is not None:
             self.friction.add_products(p, q, active)
         self.model.lock(q)
@@ -470,16 +469,18 @@ class SelfSteps:
         if self.friction is not None:
             self.friction.sweeps(in_turn)
         if in_turn and model.device.is_cpu:
-            self._sweep = model.kernel(kernels.sweep_pairs, *key)
+            self._sweep = model.kernel(self_sweeps.sweep_pairs, *key)
             return
         self._touching = wp.zeros(model.count, dtype=wp.float64, device=model.device)
-        self._press, self._move = (model.kernel(factory, *key) for factory in (kernels.press_pairs, kernels.move_by_pairs))
-        for factory in (kernels.touch_pairs, kernels.count_touching, kernels.keep_pairs):
+        self._press, self._move = (
+            model.kernel(factory, *key) for factory in (self_sweeps.press_pairs, self_sweeps.move_by_pairs)
+        )
+        for factory in (self_sweeps.touch_pairs, self_sweeps.count_touching, self_sweeps.keep_pairs):
             self._kernels[factory] = model.kernel(factory, model.dtype)
         self._hold()
 
     def launch_sweep(self, x, correction, h, adds, backward=False):
-        """Moves the vertices of all pairs, see :func:`warpcloth.kernels.self_contact.sweep_pairs` and its neighbours.
+        """Moves the vertices of all pairs, see :func:`warpcloth.kernels.self_sweeps.sweep_pairs` and its neighbours.
 
         Args:
             x: x̃ (N,) [m].
@@ -507,13 +508,13 @@ class SelfSteps:
             model.launch(self._sweep, 1, given, [multipliers, self.forces, correction])
             return
         count, N, swept = len(self.pairs.stencils), model.count, self._swept
-        self._launch(kernels.touch_pairs, count, [self.pairs, self.begun, multipliers, x, correction], [swept])
-        self._launch(kernels.count_touching, N, [self.pairs, swept], [self._touching])
+        self._launch(self_sweeps.touch_pairs, count, [self.pairs, self.begun, multipliers, x, correction], [swept])
+        self._launch(self_sweeps.count_touching, N, [self.pairs, swept], [self._touching])
         given = [self.pairs, mobility, self.begun, self._touching, multipliers, h, not adds]
         model.launch(self._press, count, given, [swept])
         model.launch(self._move, N, [self.pairs, mobility, swept, multipliers, self.forces], [correction])
         if adds:
-            self._launch(kernels.keep_pairs, count, [self.pairs, swept], [multipliers, self.forces])
+            self._launch(self_sweeps.keep_pairs, count, [self.pairs, swept], [multipliers, self.forces])
 
     def launch_end(self, x, v, move=None):
         """Walks from where the step began to x as far as pairs stay apart; v and ``move`` (N,) follow.
@@ -527,7 +528,7 @@ class SelfSteps:
         if self._cut_before is not None:
             colliders = self._colliders
             given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
-            self._launch(kernels.walk_from_start, model.count, given, [self.x_before])
+            self._launch(self_filter.walk_from_start, model.count, given, [self.x_before])
         wp.copy(self._target, x)
         wp.copy(x, self.x_before)
         if self._iterates:
@@ -540,7 +541,7 @@ class SelfSteps:
             wp.capture_while(self._within, self._launch_let_out, x=x)
             self._colliders.launch_inside(x, self._from)
         given = [model.inverse_mass, self._target, x, model.per_copy, self.h]
-        self._launch(kernels.end_filter, model.count, given, [v, move, self.cut])
+        self._launch(self_filter.end_filter, model.count, given, [v, move, self.cut])
         model.launch(self._count, model.copies, [], [self.steps])
         if self.friction is not None:
             self.friction.launch_end(x)
@@ -576,14 +577,14 @@ class SelfSteps:
         self._launch_apart(x, self._target)
         self._proceed.zero_()
         given = [self._few, NEAR_ROUNDS, FAR_ROUNDS]
-        model.launch(kernels.another_round, model.copies, given, [self._cuts, self._rounds, self._walking, self._proceed])
+        model.launch(self_filter.another_round, model.copies, given, [self._cuts, self._rounds, self._walking, self._proceed])
 
     def _launch_apart(self, x, target):
         model = self.model
         wp.copy(self._from, x)
         given = [self._share, self._least_share, self._from, target, self._common, self._walking]
         given += [model.per_copy, WAY * self.skin]
-        self._launch(kernels.keep_apart, model.count, given, [x, self._cuts])
+        self._launch(self_filter.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
         """Finds the vertices that cloth holds back in a collider that has come over them, and where they would be outside."""
@@ -592,7 +593,7 @@ class SelfSteps:
         self._colliders.launch_out(out, self._from)
         self._within.zero_()
         given = [model.inverse_mass, x, out, self._turns, OUT_ROUNDS]
-        self._launch(kernels.find_held, model.count, given, [self._mobile, self._within])
+        self._launch(self_filter.find_held, model.count, given, [self._mobile, self._within])
 
     def _launch_let_out(self, x):
         """Walks on to where the vertices that are held back are outside, and other cloth makes way for them."""
@@ -600,7 +601,7 @@ class SelfSteps:
         self._relist(x)
         for _ in range(SWEEPS):
             given = [self.pairs, self._mobile, self.begun, x, LEFT * self.declared.distance]
-            self._launch(kernels.push_pairs, 1, given, [out])
+            self._launch(self_filter.push_pairs, 1, given, [out])
         self._launch_planes(x, out, None)
         self._launch_apart(x, out)
         model.launch(self._count, 1, [], [self._turns])
@@ -610,16 +611,16 @@ class SelfSteps:
         """Finds the share of each wanted move that planes leave."""
         model, wanted = self.model, [x, target, direction]
         if self.moves_together:
-            self._launch(kernels.common_move, model.copies, [*wanted, model.per_copy], [self._common])
+            self._launch(self_planes.common_move, model.copies, [*wanted, model.per_copy], [self._common])
         given = [*wanted, self._common, self._begun_at, model.per_copy]
-        self._launch(kernels.find_ways, model.count, given, [self._ways, self._share, self._least_share])
+        self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
         gap, open = self.begun.gap, None
         if self.tangles is not None:
             gap, open = None, self._open  # gaps are infinite where a pair is left out of contact
             self.tangles.launch_open(self.pairs.stencils, self.pairs.counts, open)
         given = [self.pairs, gap, open, *wanted, self._common, self._ways]
         given += [model.per_copy, FLOOR * self.declared.distance]
-        self._launch(kernels.cut_by_planes, len(self.pairs.stencils), given, [self._share, self._least_share])
+        self._launch(self_planes.cut_by_planes, len(self.pairs.stencils), given, [self._share, self._least_share])
 
     # Of methods whose iterates base + d stay apart too.
 
@@ -632,11 +633,11 @@ class SelfSteps:
     def iterates(self):
         """Says that these methods are used."""
         self._iterates, model = True, self.model
-        self._kernels[kernels.shorten] = model.kernel(kernels.shorten, model.dtype)
+        self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)
         self._longest, self._ones = model.scalars(), wp.ones(model.count, dtype=model.dtype, device=model.device)
         if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
-            self._kernels[kernels.walk_from_start] = model.kernel(kernels.walk_from_start, model.dtype)
+            self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 
     def launch_relist(self, base, d, launch):
         """Lists the pairs at base + d, and launches ``launch``, if vertices have moved far since the last list."""
@@ -656,18 +657,18 @@ class SelfSteps:
         copy where energy does not fall along what is left it is P·right, with the preconditioner P, cut short likewise.
         """
         model, N = self.model, self.model.count
-        self._launch(kernels.precondition, N, [preconditioner, right], [self._other])
+        self._launch(self_filter.precondition, N, [preconditioner, right], [self._other])
         for each in (direction, self._other):
             sums.largest(self._ones, each, self._longest)
-            self._launch(kernels.shorten, N, [self._longest, model.per_copy, WAY * self.skin], [each])
+            self._launch(self_filter.shorten, N, [self._longest, model.per_copy, WAY * self.skin], [each])
             self._launch_planes(self.x_before, None, each)
             given = [self._share, self._common, model.per_copy, WAY * self.skin]
-            self._launch(kernels.limit_direction, N, given, [each])
+            self._launch(self_filter.limit_direction, N, given, [each])
         sums.dot(gradient, direction, self._slope)
-        self._launch(kernels.take_descent, N, [self._slope, self._other, model.per_copy], [direction])
+        self._launch(self_filter.take_descent, N, [self._slope, self._other, model.per_copy], [direction])
 
     def _add(self, a, b, sign, out):
-        self._launch(kernels.add_positions, self.model.count, [a, b, sign], [out])
+        self._launch(self_filter.add_positions, self.model.count, [a, b, sign], [out])
 
 
 def _gaps(nearest):

@@ -1,0 +1,333 @@
+"""Factories of the kernels of the filter, which moves cloth as far as the planes of :mod:`.self_planes` let each vertex go.
+
+The filter ends each step. It also shortens the directions of a minimiser whose iterates must stay apart.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .self_gaps import ONE, ZERO, vertex_of
+from .self_pairs import StepPairs, module_of, near_pairs
+from .vectors import types
+
+
+@wp.func
+def bounded_share(move: wp.vec3d, most: wp.float64):
+    """The largest share of a move, up to 1, that is no longer than ``most``."""
+    size = wp.length(move)
+    far = ONE
+    if size > most:
+        far = most / size
+    return far
+
+
+@cache
+def keep_apart(dtype):
+    """Kernel over vertices: x ← x + u + t(δ − u), u the ``common`` move, t at most the ``share`` that planes leave.
+
+    ``most`` bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B, 2) counts the vertices that planes
+    cut short, and those that this bound alone cut short. Copies that do not ``walk`` stay.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def keep_each_apart(
+        # state in
+        share: wp.array(dtype=wp.float64),
+        least_share: wp.array(dtype=wp.float64),
+        x_ref: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        common: wp.array(dtype=wp.vec3d),
+        walk: wp.array(dtype=wp.int32),
+        # parameters
+        per_copy: int,
+        most: wp.float64,
+        # out
+        x: wp.array(dtype=vec3),
+        cuts: wp.array2d(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        if walk[copy] == 0:
+            return
+        u = common[copy]
+        move = exact(target[i]) - exact(x_ref[i]) - u
+        far = bounded_share(move, most)
+        t = wp.min(far, share[i])
+        if t < ONE:
+            if t < least_share[i]:
+                t = ZERO
+            end = exact(x_ref[i]) + u + t * move
+            x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
+            wp.atomic_add(cuts, copy, wp.where(share[i] < far, 0, 1), 1)
+        else:
+            x[i] = target[i]
+
+    return keep_each_apart
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def another_round(
+    # parameters
+    few: int,
+    near_rounds: int,
+    far_rounds: int,
+    # in and out
+    cuts: wp.array2d(dtype=wp.int32),
+    rounds: wp.array(dtype=wp.int32),
+    # out
+    walk: wp.array(dtype=wp.int32),
+    proceed: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies: whether a copy walks on in another round.
+
+    It does so while planes cut more than ``few`` vertices, for at most ``near_rounds``, and while the bound of the list cuts
+    one, for at most ``far_rounds``. ``proceed`` is 1 if any copy walks on.
+    """
+    c = wp.tid()
+    rounds[c] = rounds[c] + 1
+    walk[c] = 0
+    if (cuts[c, 0] > few and rounds[c] < near_rounds) or (cuts[c, 1] > 0 and rounds[c] < far_rounds):
+        walk[c] = 1
+        proceed[0] = 1
+    cuts[c, 0] = 0
+    cuts[c, 1] = 0
+
+
+@cache
+def end_filter(dtype):
+    """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and over h to v; counts them."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def end_each_filter(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        target: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        h: dtype,
+        # in and out
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        cut: wp.array(dtype=wp.int64),
+    ):
+        i = wp.tid()
+        change = x[i] - target[i]
+        if wp.length_sq(change) > dtype(0.0):
+            wp.atomic_add(cut, i // per_copy, wp.int64(1))
+            v[i] = v[i] + change / h
+            if move:
+                move[i] = move[i] + change
+
+    return end_each_filter
+
+
+@cache
+def walk_from_start(dtype):
+    """Kernel over vertices: sets x to where the step began, in copies whose colliders have cut a move since ``before``."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def walk_each_from_start(
+        # state in
+        x_before: wp.array(dtype=vec3),
+        before: wp.array(dtype=wp.int64),
+        cut: wp.array(dtype=wp.int64),
+        # parameters
+        per_copy: int,
+        # out
+        x: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if cut[i // per_copy] > before[i // per_copy]:
+            x[i] = x_before[i]
+
+    return walk_each_from_start
+
+
+@cache
+def find_held(dtype):
+    """Kernel over vertices: sets ``within`` if any must move to get ``outside`` of colliders; ``mobile`` is 1/m, 0 of those.
+
+    After ``most`` turns ``within`` is not set any more.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_each_held(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        outside: wp.array(dtype=vec3),
+        turns: wp.array(dtype=wp.int32),
+        # parameters
+        most: int,
+        # out
+        mobile: wp.array(dtype=dtype),
+        within: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        w = inverse_mass[i]
+        if wp.length_sq(outside[i] - x[i]) > dtype(0.0):
+            w = dtype(0.0)
+            if turns[0] < most:
+                within[0] = 1
+        mobile[i] = w
+
+    return find_each_held
+
+
+@cache
+def push_pairs(dtype):
+    """Kernel of one thread: each pair in turn moves its targets apart along n, to its gap at x or to ``left`` if less."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def push_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        mobile: wp.array(dtype=dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        # parameters
+        left: wp.float64,
+        # in and out
+        target: wp.array(dtype=vec3),
+    ):
+        count = wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0])
+        for e in range(count):
+            s = pairs.stencils[e]
+            n = step.normal[e]
+            w = step.weights[e]
+            gap = step.gap[e]
+            W = ZERO
+            for i in range(4):
+                W += w[i] * w[i] * wp.float64(mobile[s[i]])
+                gap += w[i] * wp.dot(n, exact(target[s[i]]) - exact(x[s[i]]))
+            short = wp.min(step.gap[e], left) - gap
+            if short > ZERO and W > ZERO:
+                for i in range(4):
+                    move = w[i] * wp.float64(mobile[s[i]]) * short / W * n
+                    target[s[i]] = target[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+
+    return push_each_pair
+
+
+@cache
+def shorten(dtype):
+    """Kernel over vertices: p ← p most/max‖pⱼ‖ in copies where that shortens it."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def shorten_each_direction(
+        # state in
+        longest: wp.array(dtype=wp.float64),
+        # parameters
+        per_copy: int,
+        most: wp.float64,
+        # in and out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if longest[i // per_copy] > most:
+            p[i] = dtype(most / longest[i // per_copy]) * p[i]
+
+    return shorten_each_direction
+
+
+@cache
+def limit_direction(dtype):
+    """Kernel over vertices: p ← u + t(p − u), as :func:`keep_apart`."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def limit_each_direction(
+        # state in
+        share: wp.array(dtype=wp.float64),
+        common: wp.array(dtype=wp.vec3d),
+        # parameters
+        per_copy: int,
+        most: wp.float64,
+        # in and out
+        direction: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        u = common[i // per_copy]
+        move = exact(direction[i]) - u
+        t = wp.min(bounded_share(move, most), share[i])
+        if t < ONE:
+            end = u + t * move
+            direction[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
+
+    return limit_each_direction
+
+
+@cache
+def precondition(dtype):
+    """Kernel over vertices: p = P r."""
+    vec3, mat33 = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def precondition_each(
+        # state in
+        preconditioner: wp.array(dtype=mat33),
+        r: wp.array(dtype=vec3),
+        # out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        p[i] = preconditioner[i] * r[i]
+
+    return precondition_each
+
+
+@cache
+def take_descent(dtype):
+    """Kernel over vertices: p = the other direction, in copies where the slope along p is not below 0."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def take_each_descent(
+        # state in
+        slope: wp.array(dtype=wp.float64),
+        other: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        # in and out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if not slope[i // per_copy] < ZERO:
+            p[i] = other[i]
+
+    return take_each_descent
+
+
+@cache
+def add_positions(dtype):
+    """Kernel over vertices: out = a + sign·b."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def add_each_position(
+        # state in
+        a: wp.array(dtype=vec3),
+        b: wp.array(dtype=vec3),
+        # parameters
+        sign: dtype,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        out[i] = a[i] + sign * b[i]
+
+    return add_each_position

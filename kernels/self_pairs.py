@@ -1,0 +1,232 @@
+"""Factories of the kernels that fix the pairs of cloth with itself where a step begins: their gaps, their areas, which act.
+
+A pair acts if it has an area A, which stays as it is within the step.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .proximity import sort
+from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
+from .vectors import types
+
+# Triangles that meet share the area of a vertex. The part of one falls to 0 where it is farther than the nearest by SHARING·r.
+SHARING = wp.constant(wp.float64(0.25))
+# Two edges count less if sin² of the angle between them is below this, and not at all if they are parallel.
+PARALLEL = wp.constant(wp.float64(1e-3))
+
+
+@cache
+def near_pairs(dtype):
+    """The struct of the pairs that are near, see :class:`warpcloth.contact.proximity.Proximity`.
+
+    ``counts`` has the number of pairs of a vertex and a triangle, which come first, and that of pairs of edges. Those of vertex
+    i with triangles are from ``rows`` [i] to rows[i+1]. The contact of a pair begins at its distance in ``distances`` [m].
+
+    ``acting`` lists the pairs that have an area in a step; there are ``number`` of them, which are few. On the CPU they are in
+    order. ``corners`` lists 4·pair + corner of the acting pairs at vertex i from ``first`` [i] to first[i+1], sorted.
+    ``corner_counts`` is scratch that is 0 between launches.
+    """
+
+    @wp.struct
+    class Pairs:
+        stencils: wp.array(dtype=wp.vec4i)
+        counts: wp.array(dtype=wp.int32)
+        rows: wp.array(dtype=wp.int32)
+        acting: wp.array(dtype=wp.int32)
+        number: wp.array(dtype=wp.int32)
+        corner_counts: wp.array(dtype=wp.int32)
+        first: wp.array(dtype=wp.int32)
+        corners: wp.array(dtype=wp.int32)
+        distances: wp.array(dtype=dtype)
+
+    return Pairs
+
+
+@wp.struct
+class StepPairs:
+    """n, d, w and kA [N/m] of each pair at the start of a step."""
+
+    normal: wp.array(dtype=wp.vec3d)
+    gap: wp.array(dtype=wp.float64)
+    weights: wp.array(dtype=wp.vec4d)
+    stiffness: wp.array(dtype=wp.float64)
+
+
+@cache
+def module_of(dtype):
+    return f"warpcloth.self_contact.{dtype.__name__}"
+
+
+@cache
+def begin_pairs(dtype):
+    """Kernel over pairs, where a step begins: n, d and w at x."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def begin_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        # out
+        step: StepPairs,
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        s = pairs.stencils[e]
+        w, y, _inside = nearest(e < pairs.counts[0], exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        d = wp.length(y)
+        step.gap[e] = d
+        step.weights[e] = w
+        step.normal[e] = y / wp.max(d, wp.float64(1e-300))
+
+    return begin_each_pair
+
+
+@wp.func
+def share_a_vertex(a: wp.vec4i, b: wp.vec4i):
+    """Whether the triangles of two pairs share a vertex."""
+    found = wp.bool(False)
+    for i in range(1, 4):
+        for j in range(1, 4):
+            if a[i] == b[j]:
+                found = True
+    return found
+
+
+@wp.func
+def part_of_area(gap: wp.float64, least: wp.float64, r: wp.float64):
+    return wp.max(ONE - (gap - least) / (SHARING * r), ZERO)
+
+
+@cache
+def set_areas(dtype):
+    """Kernel over pairs, where a step begins: kA, and which are acting.
+
+    Half the area of a vertex goes to triangles on each side of it. Triangles that meet share this half if they are about
+    equally near. The area of a pair of edges is (A₁ + … + A₄)/12. It counts only as far as the pair is nearer than those of its
+    vertices with triangles on the same side, and less if the edges are nearly parallel. So crossed folds have contact too, and
+    where two layers lie flat on one another the areas of all pairs add up to that of one layer.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def set_each_area(
+        # elements
+        pairs: near_pairs(dtype),
+        areas: wp.array(dtype=wp.float64),
+        # state in
+        x: wp.array(dtype=vec3),
+        # parameters
+        stiffness: wp.float64,
+        # in and out
+        step: StepPairs,
+    ):
+        e = wp.tid()
+        triangles = pairs.counts[0]
+        if e >= triangles + pairs.counts[1]:
+            return
+        s = pairs.stencils[e]
+        r = wp.float64(pairs.distances[e])
+        n = step.normal[e]
+        gap = step.gap[e]
+        area = ZERO
+        if e < triangles:
+            first = pairs.rows[s[0]]
+            end = pairs.rows[s[0] + 1]
+            least = gap
+            for other in range(first, end):
+                if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                    least = wp.min(least, step.gap[other])
+            own = part_of_area(gap, least, r)
+            if own > ZERO:
+                total = ZERO
+                for other in range(first, end):
+                    if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                        total += part_of_area(step.gap[other], least, r)
+                area = SIDE * areas[s[0]] * own / total
+        else:
+            least = wp.float64(wp.inf)
+            for i in range(4):
+                sign = wp.where(i < 2, ONE, -ONE)
+                for other in range(pairs.rows[s[i]], pairs.rows[s[i] + 1]):
+                    if least <= gap and least < wp.float64(wp.inf):
+                        break  # most end here
+                    if step.gap[other] < least and sign * wp.dot(n, step.normal[other]) > SIDE:
+                        least = step.gap[other]
+            nearer = ONE
+            if least < wp.float64(wp.inf):
+                nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)
+            if nearer > ZERO:
+                ab = exact(x[s[1]]) - exact(x[s[0]])
+                cd = exact(x[s[3]]) - exact(x[s[2]])
+                normal = wp.cross(ab, cd)
+                z = wp.min(wp.dot(normal, normal) / (PARALLEL * wp.dot(ab, ab) * wp.dot(cd, cd)), ONE)
+                total = areas[s[0]] + areas[s[1]] + areas[s[2]] + areas[s[3]]
+                area = nearer * z * (wp.float64(2.0) - z) * total / wp.float64(12.0)
+        step.stiffness[e] = stiffness * area
+        if area > ZERO:
+            pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
+            for i in range(4):
+                wp.atomic_add(pairs.corner_counts, s[i], 1)
+
+    return set_each_area
+
+
+@cache
+def fill_corners(dtype):
+    """Kernel over pairs: lists the corners of acting pairs at each vertex. It counts ``corner_counts`` down to 0."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def fill_each_corner(
+        # in and out
+        pairs: near_pairs(dtype),
+    ):
+        t = pairs.number[0] - 1 - wp.tid()
+        if t >= 0:
+            e = pairs.acting[t]
+            s = pairs.stencils[e]
+            for i in range(4):
+                pairs.corners[pairs.first[s[i]] + wp.atomic_sub(pairs.corner_counts, s[i], 1) - 1] = 4 * e + i
+
+    return fill_each_corner
+
+
+@cache
+def sort_corners(dtype):
+    """Kernel over vertices: sorts the corners of each."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def sort_each(
+        # in and out
+        pairs: near_pairs(dtype),
+    ):
+        i = wp.tid()
+        sort(pairs.corners, pairs.first[i], pairs.first[i + 1])
+
+    return sort_each
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def note_list(
+    # state in
+    counts: wp.array(dtype=wp.int32),
+    # parameters
+    made: int,
+    # in and out
+    most: wp.array(dtype=wp.int32),
+    lists: wp.array(dtype=wp.int32),
+    # out
+    listed: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies: the most pairs in any list; how many lists, ``made`` of them new; and whether this has pairs."""
+    c = wp.tid()
+    if c == 0:
+        listed[0] = wp.min(counts[0] + counts[1], 1)
+    most[c] = wp.max(most[c], counts[0] + counts[1])
+    lists[c] = lists[c] + made

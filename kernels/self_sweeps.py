@@ -1,0 +1,295 @@
+"""Factories of the kernels that sweep over pairs of cloth with itself, one by one or, as Jacobi, all at once."""
+
+from functools import cache
+
+import warp as wp
+
+from .self_contact import PairForces
+from .self_gaps import ZERO, gap_along, nearest, signed_gap, vertex_of
+from .self_pairs import StepPairs, module_of, near_pairs
+from .terms import contact
+from .vectors import types
+
+gap_after = contact.gap_after
+
+
+@wp.struct
+class SweptPairs:
+    """Of each pair in a Jacobi sweep: whether it touches, its n, w and d, and the λ that it gets."""
+
+    touches: wp.array(dtype=wp.int32)
+    normal: wp.array(dtype=wp.vec3d)
+    weights: wp.array(dtype=wp.vec4d)
+    gap: wp.array(dtype=wp.float64)
+    multiplier: wp.array(dtype=wp.float64)
+
+
+@cache
+def free_move(dtype, axes: bool):
+    """The device function (inverse masses, i, v) → W v, in float64; inverse masses are those of each axis with ``axes``."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.func
+    def alike(inverse_mass: wp.array(dtype=dtype), i: int, v: wp.vec3d):
+        return wp.float64(inverse_mass[i]) * v
+
+    @wp.func
+    def by_axis(inverse_mass: wp.array(dtype=vec3), i: int, v: wp.vec3d):
+        return wp.cw_mul(exact(inverse_mass[i]), v)
+
+    return by_axis if axes else alike
+
+
+@cache
+def sweep_pairs(dtype, axes: bool):
+    """Kernel of one thread: each acting pair in turn takes its force away, then adds that of the prox at the gap without it.
+
+    With d̂ = n·Σwᵢxᵢ without the force of the pair and W = Σ wᵢ²/mᵢ, λ = (d* − d̂)/W, where d* solves
+    (d* − d̂)/W = −kAhₑ²φ′(d*) in closed form, and Δxᵢ = wᵢ λ n/mᵢ. M(x − x̃) = Σ wᵢλn then holds with the n and w that pairs have
+    at x, and a fixed point is the minimiser of the step. Without ``multipliers`` nothing is taken away (PBD).
+    """
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+    moved = free_move(dtype, axes)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sweep_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=vec3 if axes else dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        # parameters
+        h: wp.float64,
+        hard: bool,
+        backward: bool,
+        # in and out
+        multipliers: wp.array(dtype=wp.float64),
+        forces: PairForces,
+        correction: wp.array(dtype=vec3),
+    ):
+        count = pairs.number[0]
+        for turn in range(count):
+            e = pairs.acting[wp.where(backward, count - 1 - turn, turn)]
+            k = step.stiffness[e]
+            r = wp.float64(pairs.distances[e])
+            s = pairs.stencils[e]
+            before = ZERO
+            if multipliers:
+                before = multipliers[e]
+            a = at(x, correction, s[0])
+            b = at(x, correction, s[1])
+            c = at(x, correction, s[2])
+            d = at(x, correction, s[3])
+            of_vertex = e < pairs.counts[0]
+            if before != ZERO or gap_along(of_vertex, step.normal[e], a, b, c, d) < r:
+                w, y, inside = nearest(of_vertex, a, b, c, d)
+                gap, n = signed_gap(y, step.normal[e], inside)
+                if before != ZERO or gap < r:
+                    W = ZERO
+                    left = gap
+                    for i in range(4):
+                        push = w[i] * moved(inverse_mass, s[i], n)
+                        W += w[i] * wp.dot(n, push)
+                        if before != ZERO:
+                            left -= forces.weights[e][i] * before * wp.dot(push, forces.normal[e])
+                    after = ZERO
+                    if W > ZERO and left < r:
+                        compliance = wp.float64(wp.inf)
+                        if not hard:
+                            compliance = W * k * h * h
+                        after = (gap_after(left, r, compliance) - left) / W
+                    for i in range(4):
+                        move = w[i] * after * n
+                        if before != ZERO:
+                            move -= forces.weights[e][i] * before * forces.normal[e]
+                        move = moved(inverse_mass, s[i], move)
+                        correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+                    if multipliers:
+                        multipliers[e] = after
+                        forces.weights[e] = w
+                        forces.normal[e] = n
+
+    return sweep_each_pair
+
+
+@cache
+def touch_pairs(dtype):
+    """Kernel over acting pairs of a Jacobi sweep: n, w and d where they touch or have a force; λ is of :func:`press_pairs`."""
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def touch_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        step: StepPairs,
+        multipliers: wp.array(dtype=wp.float64),
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        # out
+        swept: SweptPairs,
+    ):
+        t = wp.tid()
+        if t >= pairs.number[0]:
+            return
+        e = pairs.acting[t]
+        swept.touches[e] = 0
+        before = ZERO
+        if multipliers:
+            before = multipliers[e]
+        s = pairs.stencils[e]
+        r = wp.float64(pairs.distances[e])
+        a = at(x, correction, s[0])
+        b = at(x, correction, s[1])
+        c = at(x, correction, s[2])
+        d = at(x, correction, s[3])
+        of_vertex = e < pairs.counts[0]
+        if before == ZERO and gap_along(of_vertex, step.normal[e], a, b, c, d) >= r:
+            return
+        w, y, inside = nearest(of_vertex, a, b, c, d)
+        gap, n = signed_gap(y, step.normal[e], inside)
+        if before != ZERO or gap < r:
+            swept.touches[e] = 1
+            swept.gap[e] = gap
+            swept.weights[e] = w
+            swept.normal[e] = n
+
+    return touch_each_pair
+
+
+@cache
+def count_touching(dtype):
+    """Kernel over vertices: how many pairs of a vertex touch."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def count_touching_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        swept: SweptPairs,
+        # out
+        touching: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        total = ZERO
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            total += wp.float64(swept.touches[pairs.corners[k] // 4])
+        touching[i] = total
+
+    return count_touching_pairs
+
+
+@cache
+def press_pairs(dtype, axes: bool):
+    """Kernel over acting pairs of a Jacobi sweep: the λ of the prox, with D = Σ nᵢwᵢ²/mᵢ for W; nᵢ pairs touch at i.
+
+    D is at least J W Jᵀ of all of them, so the sum of the moves never overshoots. The fixed point is that of
+    :func:`sweep_pairs`.
+    """
+    moved = free_move(dtype, axes)
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def press_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=vec3 if axes else dtype),
+        # state in
+        step: StepPairs,
+        touching: wp.array(dtype=wp.float64),
+        multipliers: wp.array(dtype=wp.float64),
+        # parameters
+        h: wp.float64,
+        hard: bool,
+        # in and out
+        swept: SweptPairs,
+    ):
+        t = wp.tid()
+        if t >= pairs.number[0]:
+            return
+        e = pairs.acting[t]
+        if swept.touches[e] == 0:
+            return
+        s = pairs.stencils[e]
+        r = wp.float64(pairs.distances[e])
+        n = swept.normal[e]
+        D = ZERO
+        for i in range(4):
+            w = swept.weights[e][i]
+            D += touching[s[i]] * w * w * wp.dot(n, moved(inverse_mass, s[i], n))
+        left = swept.gap[e]
+        if multipliers:
+            left -= D * multipliers[e]
+        after = ZERO
+        if D > ZERO and left < r:
+            compliance = wp.float64(wp.inf)
+            if not hard:
+                compliance = D * step.stiffness[e] * h * h
+            after = (gap_after(left, r, compliance) - left) / D
+        swept.multiplier[e] = after
+
+    return press_each_pair
+
+
+@cache
+def move_by_pairs(dtype, axes: bool):
+    """Kernel over vertices of a Jacobi sweep: d += W Σ wᵢ(λn − λ'n') over the pairs that touch, λ'n' of the last sweep."""
+    vec3, _ = types(dtype)
+    moved = free_move(dtype, axes)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def move_each_by_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=vec3 if axes else dtype),
+        # state in
+        swept: SweptPairs,
+        multipliers: wp.array(dtype=wp.float64),
+        forces: PairForces,
+        # in and out
+        correction: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        total = wp.vec3d()
+        for k in range(pairs.first[i], pairs.first[i + 1]):
+            e = pairs.corners[k] // 4
+            if swept.touches[e] == 1:
+                corner = pairs.corners[k] - 4 * e
+                total += swept.weights[e][corner] * swept.multiplier[e] * swept.normal[e]
+                if multipliers:
+                    if multipliers[e] != ZERO:
+                        total -= forces.weights[e][corner] * multipliers[e] * forces.normal[e]
+        move = moved(inverse_mass, i, total)
+        correction[i] = correction[i] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+
+    return move_each_by_pairs
+
+
+@cache
+def keep_pairs(dtype):
+    """Kernel over acting pairs of a Jacobi sweep: keeps λ, w and n for the next sweep."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def keep_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        swept: SweptPairs,
+        # out
+        multipliers: wp.array(dtype=wp.float64),
+        forces: PairForces,
+    ):
+        t = wp.tid()
+        if t >= pairs.number[0]:
+            return
+        e = pairs.acting[t]
+        if swept.touches[e] == 1:
+            multipliers[e] = swept.multiplier[e]
+            forces.weights[e] = swept.weights[e]
+            forces.normal[e] = swept.normal[e]
+
+    return keep_each_pair
