@@ -537,10 +537,43 @@ def extend_boxes(dtype):
     return extend_each_box
 
 
+@wp.func
+def note_moved(active: wp.array(dtype=wp.int32), copy: int, moved: wp.array(dtype=wp.int32), some: wp.array(dtype=wp.int32)):
+    found = wp.bool(True)
+    if active:
+        found = active[copy] != 0
+    if found:
+        moved[copy] = 1
+        some[0] = 1
+
+
+@cache
+def take_moved(dtype):
+    """Kernel over vertices: out = x in copies that have ``moved``."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def take_each_moved(
+        # state in
+        x: wp.array(dtype=vec3),
+        moved: wp.array(dtype=wp.int32),
+        # parameters
+        per_copy: int,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if moved[i // per_copy] != 0:
+            out[i] = x[i]
+
+    return take_each_moved
+
+
 @cache
 def find_motion(dtype):
-    """Kernel over vertices: moved = 1 if one has moved on from ``found``, relative to the middle of its piece, by more than
-    ``most``; stale = 1 if ``found`` is not where the pairs were listed."""
+    """Kernel over vertices: moved = 1 of the copies that are ``active``, or of all, in which one has moved on from ``found``,
+    relative to the middle of its piece, by more than ``most``; some = 1 if there is such a copy; stale = 1 if ``found`` is not
+    where the pairs were listed."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -550,11 +583,13 @@ def find_motion(dtype):
         found: wp.array(dtype=vec3),
         listed: wp.array(dtype=vec3),
         # parameters
+        active: wp.array(dtype=wp.int32),
         most: dtype,
         # in and out
         pieces: pieces(dtype),
         # out
         moved: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
         stale: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
@@ -565,7 +600,7 @@ def find_motion(dtype):
             c = pieces.centre[p]
             own = wp.length((x[i] - found[i]) - (x[c] - found[c]))
             if not (own <= most):
-                moved[0] = 1
+                note_moved(active, p // pieces.per_copy, moved, some)
             if pieces.per_copy > 1:
                 if own > pieces.motion[p]:
                     wp.atomic_max(pieces.motion, p, own)
@@ -575,8 +610,8 @@ def find_motion(dtype):
 
 @cache
 def compare_motions(dtype):
-    """Kernel over pieces: moved = 1 if it and a later one of its copy may have come nearer by more than ``most``, and than what
-    their boxes were farther apart than ``radius``, the distance within which pairs are listed."""
+    """Kernel over pieces: moved and some as of :func:`find_motion` if it and a later one of its copy may have come nearer by
+    more than ``most``, and than what their boxes were farther apart than ``radius``, within which pairs are listed."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -586,10 +621,12 @@ def compare_motions(dtype):
         found: wp.array(dtype=vec3),
         pieces: pieces(dtype),
         # parameters
+        active: wp.array(dtype=wp.int32),
         radius: dtype,
         most: dtype,
         # out
         moved: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
     ):
         p = wp.tid()
         c = pieces.centre[p]
@@ -599,6 +636,6 @@ def compare_motions(dtype):
             gap = wp.max(pieces.lower[p] - pieces.upper[q], pieces.lower[q] - pieces.upper[p])
             gap = wp.max(gap, vec3())
             if not (nearer <= most + wp.max(wp.length(gap) - radius, dtype(0.0))):
-                moved[0] = 1
+                note_moved(active, p // pieces.per_copy, moved, some)
 
     return compare_each_motion

@@ -314,7 +314,7 @@ def take_descent(dtype):
 
 @cache
 def add_positions(dtype):
-    """Kernel over vertices: out = a + sign·b."""
+    """Kernel over vertices: out = a + sign·b in the copies that are ``active``, or in all."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -324,10 +324,15 @@ def add_positions(dtype):
         b: wp.array(dtype=vec3),
         # parameters
         sign: dtype,
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
         # out
         out: wp.array(dtype=vec3),
     ):
         i = wp.tid()
+        if active:
+            if active[i // per_copy] == 0:
+                return
         out[i] = a[i] + sign * b[i]
 
     return add_each_position

@@ -86,7 +86,7 @@ def begin_friction(dtype, bounded: bool):
 
     kA is that of the contact of the last step, which ``kept`` it, so that the mean of N is the force of contact. It is that of
     this step in three cases: in explicit steps, whose contact is evaluated where the step begins; in a copy that has made no
-    ``steps``; and for a pair that was not kept, if areas changed within the last step because it was ``relisted``.
+    ``steps``; and for a pair that was not kept, if areas changed within the last step because the copy was ``relisted``.
     """
 
     @wp.kernel(module=f"{friction_module(dtype)}.{bounded}", enable_backward=False)
@@ -118,7 +118,7 @@ def begin_friction(dtype, bounded: bool):
         if gap < r:
             if wp.static(not bounded):
                 if steps[s[0] // per_copy] > 0:
-                    if relisted[0] == 0:
+                    if relisted[s[0] // per_copy] == 0:
                         k = ZERO
                     for j in range(kept.first[s[0]], kept.first[s[0] + 1]):
                         q = kept.corners[j] // 4
@@ -138,6 +138,18 @@ def begin_friction(dtype, bounded: bool):
                 wp.atomic_add(pairs.corner_counts, s[i], 1)
 
     return begin_friction_of_pairs
+
+
+@wp.kernel(module="warpcloth.self_friction", enable_backward=False)
+def note_relisted(
+    # state in
+    copies: wp.array(dtype=wp.int32),
+    # in and out
+    relisted: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies: relisted = 1 of these."""
+    c = wp.tid()
+    relisted[c] = wp.max(relisted[c], copies[c])
 
 
 @cache

@@ -546,20 +546,28 @@ def test_quiet_explicit_steps_are_those_with_contact(speed, device):
 
 
 @each_solver
-def test_copies(name, device):
-    """Each of two copies moves as one alone, to the bit, and again after it was put back."""
-    scene = layers(turn=17.0, speed=3.0)  # of which the filter cuts some copies and not others
-    alone, both = (SOLVERS[name].bind(scene.build(device=device, copies=copies)) for copies in (1, 2))
+@pytest.mark.parametrize("fields", [{}, {"distance": 0.15, "stiffness": 100.0}], ids=["thin", "thick"])
+def test_copies(name, fields, device):
+    """Each of two copies, at speeds of their own, moves as one alone, to the bit, and again after it was put back.
+
+    Of these the filter cuts one and not the other, and lists are made anew at other times; of thick sheets the areas are of
+    pairs that are farther apart than the skin.
+    """
+    scene = layers(turn=17.0, speed=1.0, n=5, **fields)
+    velocities = np.stack([3.0 * scene.velocities, 0.1 * scene.velocities])
+    steppers = [SOLVERS[name].bind(scene.build(device=device, copies=copies)) for copies in (1, 1, 2)]
+    for stepper, given in zip(steppers, (velocities[:1], velocities[1:], velocities), strict=True):
+        stepper.reset(velocities=given)
+    both = steppers.pop()
     for again in (False, True):
         if again:
-            both.reset([True, False])
+            both.reset([True, False], velocities=velocities)
         for _ in range(2):
             both.frame()
-            if not again:
-                alone.frame()
-        first, second = both.state.x.numpy().reshape(2, -1, 3)
-        assert (first == alone.state.x.numpy()).all()
-        assert (second == first).all() != again
+            for stepper in steppers[again:]:
+                stepper.frame()
+        for found, stepper in zip(both.state.x.numpy().reshape(2, -1, 3), steppers, strict=True):
+            assert (found == stepper.state.x.numpy()).all()
 
 
 @pytest.mark.parametrize("length", [0.1, 1.0, 14.0])
@@ -687,6 +695,22 @@ def test_starts_that_are_refused(device):
     through[40, 1] -= 0.04
     with pytest.raises(ValueError, match=r"edge .* and triangle .* cross at the start"):
         wc.Newton(substeps=1).bind(replace(scene, positions=through).build(device=device))
+
+
+@pytest.mark.parametrize(("stretch", "away"), [(1.0, 0.05), (3.0, 0.28)])
+@pytest.mark.parametrize("crossed", [0, 1, 2])
+def test_crossings_at_the_start_that_are_refused(crossed, stretch, away, device):
+    """Of a mesh of three triangles at one edge, each is crossed near this edge, or far from all where it is stretched."""
+    angles = 2.0 * np.pi / 3.0 * np.arange(3)
+    out = np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1)
+    across = 0.03 * np.cross(out[crossed], [0.0, 1.0, 0.0])
+    near = away * out[crossed] + np.stack([-across, across, across + np.array([0.0, 0.03, 0.0])])
+    points = np.concatenate([[[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]], np.sqrt(0.75) * out, near])
+    mesh = wc.Mesh(points / stretch, [[0, 1, 2], [0, 1, 3], [0, 1, 4], [5, 6, 7]])
+    contact = wc.SelfContact(distance=5e-3, stiffness=1e4)
+    scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)], positions=points, self_contact=contact)
+    with pytest.raises(ValueError, match=f"edge 5–. and triangle 0–1–{crossed + 2} cross at the start"):
+        steps_of(scene, device)
 
 
 def test_crossings():

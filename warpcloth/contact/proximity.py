@@ -32,7 +32,7 @@ class Proximity:
         counts: (2,) int32: how many pairs of either kind were found, which may be more than the capacity.
         rows: Pairs rows[i] to rows[i+1] are those of vertex i and a triangle; those of edges follow, by the first of the two.
         found: Positions of the last list, (N,) [m]. Whoever sets them calls :meth:`launch_kept` before the list is used.
-        flag: (1,) int32, see :meth:`moved`.
+        flag, copies: (1,) and (B,) int32, see :meth:`moved`.
         listed: Positions of which the list in the arrays is, (N,) [m].
         centre: The vertex in the middle of each connected piece of all copies.
     """
@@ -57,6 +57,7 @@ class Proximity:
         self.found = model.vectors()  # no surface, from which all have moved
         self.listed = model.vectors()  # those of the pairs in the arrays
         self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self.copies = model.scalars(wp.int32)
         self._rows = Scan(model, model.count + self._edges)
         self._pairs_of = {each: model.kernel(kernels.find_pairs, model.dtype, each) for each in (False, True)}
         self._launch = model.launcher(
@@ -65,6 +66,7 @@ class Proximity:
                 model.dtype,
             ),
             ((kernels.begin_boxes, kernels.extend_boxes, kernels.find_motion, kernels.compare_motions), model.dtype),
+            ((kernels.take_moved,), model.dtype),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
@@ -153,6 +155,19 @@ class Proximity:
         for name, value in self._arrays.items():
             setattr(self._pairs, name, value)
 
+    def set_skin(self, skin):
+        """Sets another skin; the list is then made anew wherever :meth:`launch_kept` is called."""
+        self._surface.skin = skin
+        self.listed.fill_(np.nan)
+
+    def launch_moved(self, x):
+        """Launches the detection at x (N,) in ``copies``, and where it was before in the others.
+
+        So the pairs of a copy do not depend on the others.
+        """
+        self._launch(kernels.take_moved, self.model.count, [x, self.copies, self.model.per_copy], [self.found])
+        self.launch(self.found)
+
     def launch(self, x):
         """Launches the detection at positions x (N,)."""
         surface, grid, pairs, N = self._surface, self._grid, self._pairs, self.model.count
@@ -186,8 +201,10 @@ class Proximity:
         flag = self.moved(x, part)
         wp.capture_if(flag, launch, lambda x: wp.capture_if(self._stale, lambda: launch(self.found)), x=x)
 
-    def moved(self, x, part=0.5):
+    def moved(self, x, part=0.5, active=None):
         """Launches flag = 1 where pairs may be missing at x (N,), else 0, and returns it; for :func:`warp.capture_if`.
+
+        ``copies`` are 1 of those of which pairs may be missing.
 
         It is 0 while each vertex has moved by at most a ``part`` of the skin since the last detection, relative to the vertex
         in the middle of its connected piece. Two pieces may have come nearer by twice that, and by as much as their boxes were
@@ -197,18 +214,19 @@ class Proximity:
             x: Positions [m].
             part: At most ½, at which no pair within its r_c is missing where the flag is 0. With less, vertices may still move
                 by a ½ − ``part`` of the skin each, relative to one another, before one is.
+            active: The copies that count (B,) int32, or None for all.
         """
-        self.flag.zero_()
-        self._stale.zero_()
+        for array in (self.flag, self.copies, self._stale):
+            array.zero_()
         several = self._pieces.per_copy > 1
         if several:
             self._pieces.motion.zero_()
-        given = [x, self.found, self.listed, part * self.skin]
-        self._launch(kernels.find_motion, self.model.count, given, [self._pieces, self.flag, self._stale])
+        given = [x, self.found, self.listed, active, part * self.skin]
+        self._launch(kernels.find_motion, self.model.count, given, [self._pieces, self.copies, self.flag, self._stale])
         if several:
             wp.capture_if(self._stale, lambda: self._launch_boxes(self.found))
-            given = [x, self.found, self._pieces, self.distance + self.skin, 2.0 * part * self.skin]
-            self._launch(kernels.compare_motions, len(self._pieces.centre), given, [self.flag])
+            given = [x, self.found, self._pieces, active, self.distance + self.skin, 2.0 * part * self.skin]
+            self._launch(kernels.compare_motions, len(self._pieces.centre), given, [self.copies, self.flag])
         return self.flag
 
     @property

@@ -29,13 +29,13 @@ class Slips:
         room: As given.
         pairs: A :func:`warpcloth.kernels.self_pairs.near_pairs`, without distances.
         slips: (room,), see :func:`warpcloth.kernels.self_friction.end_friction`.
-        relisted: (1,) int32, whether pairs were listed again within the step.
+        relisted: (B,) int32, whether pairs were listed again within the step.
         grow: A function of a number of pairs that makes room for as many, by default that of this object alone.
     """
 
     def __init__(self, model, room):
         self.model, self.grow, self._arrays = model, self.hold, {}
-        for name, rows in (("counts", 2), ("first", model.count + 1), ("relisted", 1)):
+        for name, rows in (("counts", 2), ("first", model.count + 1), ("relisted", model.copies)):
             self._arrays[name] = wp.zeros(rows, dtype=wp.int32, device=model.device)
         self.hold(room)
 
@@ -108,7 +108,7 @@ class SelfFriction:
     def __init__(self, model, slips, steps, friction, bounded):
         self.model, self._kept, self._steps, self._friction = model, slips, steps, friction
         self.start, self._step, self._rubbing = model.vectors(), Slips(model, slips.room), None
-        self._vertices, self._one = Scan(model, model.count), wp.ones(1, dtype=wp.int32, device=model.device)
+        self._vertices = Scan(model, model.count)
         made = kernels.set_stretch, kernels.find_friction, kernels.add_friction, kernels.sum_friction
         made += fill_corners, sort_corners
         made += kernels.add_friction_diagonal, kernels.add_friction_products, kernels.end_friction, kernels.set_contact
@@ -161,9 +161,9 @@ class SelfFriction:
         """Launches the end of all that is kept, where a step had no pairs."""
         self._kept.pairs.first.zero_()
 
-    def launch_relisted(self):
-        """Notes that pairs, and so their areas, are others within the step."""
-        wp.copy(self._step.relisted, self._one)
+    def launch_relisted(self, copies):
+        """Notes that pairs, and so their areas, are others within the step, in these copies (B,) int32."""
+        self.model.launch(kernels.note_relisted, self.model.copies, [copies], [self._step.relisted])
 
     def launch_contact(self, pairs, begun):
         """Takes kA of the contact of the step from another list of pairs, which may have been made within it."""

@@ -11,6 +11,7 @@ from ..core.scan import Scan
 from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels import gap_notes, self_contact, self_filter, self_pairs, self_planes, self_sweeps
+from ..kernels.proximity import take_moved
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from .proximity import Proximity
@@ -120,6 +121,7 @@ class SelfSteps:
             self_filter.end_filter,
             self_planes.common_move,
             gap_notes.note_gaps,
+            take_moved,
         )
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._find = model.kernel(self_contact.find_forces, model.dtype, bounded)
@@ -195,12 +197,15 @@ class SelfSteps:
             Pairs nearer than the least distance, how many of them are of a vertex, the gap of the first [m], edges that go
             through triangles, and the least distance [m].
         """
+        points = x.numpy().astype(np.float64)
+        self.proximity.set_skin(max(self.skin, SKIN * self._longest_edge(points)))
         self.launch_begin(x)
         while self.overflowed:
             self.grow()
             self.launch_begin(x)
+        self.proximity.set_skin(self.skin)
         of_vertices, of_edges = self.proximity.counts.numpy()
-        stencils, points = self.proximity.stencils.numpy()[: of_vertices + of_edges], x.numpy().astype(np.float64)
+        stencils = self.proximity.stencils.numpy()[: of_vertices + of_edges]
         found, least = self.begun.gap.numpy()[: len(stencils)], FLOOR * self.declared.distance
         ulps = 6.0 * float(np.finfo(np.float32).eps) * np.abs(points).max(initial=0.0, where=np.isfinite(points))
         least += ulps
@@ -214,6 +219,12 @@ class SelfSteps:
         ]
         gap = found[np.argmax(found < least)] if len(near) else np.inf
         return near, split, gap, through, least
+
+    def _longest_edge(self, points):
+        """The length [m] of the longest edge of all copies; edges may be longer than at rest where a run starts."""
+        points = points.reshape(self.model.copies, -1, 3)[:, self.model.in_model(self.model.scene.mesh.edges)]
+        lengths = np.linalg.norm(points[:, :, 1] - points[:, :, 0], axis=2)
+        return lengths.max(initial=0.0, where=np.isfinite(lengths))
 
     def at_start(self):
         """U [J] at the start, and how many pairs touch there times ½Σ(r − d)² [m²], both (B,)."""
@@ -240,7 +251,7 @@ class SelfSteps:
                 wp.copy(array, before)
 
     def _triangles_of(self, edges):
-        """The triangles of the model that each of some edges (E, 2) is in, two (E, 2, 3), the same twice at a border."""
+        """The triangles of the model that each of some edges (E, 2) is in, (E, m, 3); the last again where they are fewer."""
         mesh, n = self.model.scene.mesh, self.model.per_copy
         triangles = np.asarray(self.model.in_model(mesh.triangles), dtype=np.int64)
         sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -249,8 +260,9 @@ class SelfSteps:
         local = np.sort(edges % n, axis=1).astype(np.int64)
         wanted = local[:, 0] * n + local[:, 1]
         first, last = (np.searchsorted(keys[order], wanted, side) for side in ("left", "right"))
-        ends = np.stack([np.minimum(first, len(keys) - 1), np.maximum(last - 1, 0)], axis=1)
-        return triangles[order[ends] // 3] + (edges[:, :1] // n * n)[:, :, None]
+        most = np.arange((last - first).max(initial=1))
+        at = np.minimum(first[:, None] + most, last[:, None] - 1)
+        return triangles[order[at] // 3] + (edges[:, :1] // n * n)[:, :, None]
 
     def _refuse_pair(self, parts, why):
         model, named = self.model, []
@@ -377,32 +389,38 @@ class SelfSteps:
             self.friction.launch_begin(self.pairs, self.begun, x)
 
     def launch_list(self, x):
-        """Lists the pairs at x and notes their number. A list at ``found`` was made before and does not count again."""
-        self.proximity.launch(x)
+        """Lists the pairs and notes their number: at x in the copies that have moved. A list at ``found`` does not count again.
+
+        Follows :meth:`warpcloth.contact.proximity.Proximity.moved`.
+        """
+        self.proximity.launch_moved(x)
         given = [self.proximity.counts, int(x is not self.proximity.found)]
         self.model.launch(self_pairs.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
 
-    def launch_areas(self, x):
-        """Fixes the side and the area of each listed pair, and so which are acting."""
+    def launch_areas(self, x, copies=None):
+        """Fixes the side and the area of each listed pair, and so which are acting, in all or some ``copies`` (B,) int32."""
         count = len(self.pairs.stencils)
-        self._launch_sides(x)
+        self._launch_sides(x, copies)
         if self.tangles is not None:
             self.tangles.launch_leave_out(self.pairs.stencils, self.pairs.counts, self.begun.gap)
         self.pairs.number.zero_()
-        given = [self.pairs, self._areas, x, self.declared.stiffness]
+        given = [self.pairs, self._areas, self._begun_at, self.declared.stiffness]
         self._launch(self_pairs.set_areas, count, given, [self.begun])
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
         self._launch(self_pairs.fill_corners, count, [], [self.pairs])
         self._launch(self_pairs.sort_corners, self.model.count, [], [self.pairs])
 
-    def _launch_sides(self, x):
-        """Fixes the side of each listed pair, and its gap."""
-        wp.copy(self._begun_at, x)
-        self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), [self.pairs, x], [self.begun])
+    def _launch_sides(self, x, copies=None):
+        """Fixes the side of each listed pair, and its gap: in ``copies`` at x, in the others where they were fixed before."""
+        if copies is None:
+            wp.copy(self._begun_at, x)
+        else:
+            self._launch(take_moved, self.model.count, [x, copies, self.model.per_copy], [self._begun_at])
+        self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), [self.pairs, self._begun_at], [self.begun])
 
     def _relist(self, x):
         self.launch_list(x)
-        self._launch_sides(x)
+        self._launch_sides(x, self.proximity.copies)
 
     def launch_forces(self, x, correction=None):
         """Finds the forces of the pairs at x, or x + correction, which the methods below add up."""
@@ -548,9 +566,10 @@ class SelfSteps:
         if self.tangles is not None:
             self.tangles.launch_free(x)
 
-    def launch_fresh(self, x, launch):
-        """Calls ``launch`` with x if a vertex has moved so far since the last list that the next walk might miss a pair."""
-        wp.capture_if(self.proximity.moved(x, WAY), launch, x=x)
+    def launch_fresh(self, x, launch, active=None):
+        """Calls ``launch`` with x if a vertex, of a copy that is ``active`` or of any, has moved so far since the last list
+        that the next walk might miss a pair."""
+        wp.capture_if(self.proximity.moved(x, WAY, active), launch, x=x)
 
     def _walk(self, x):
         """Moves x towards the target as far as pairs stay apart. On a long way lists are made anew."""
@@ -561,15 +580,15 @@ class SelfSteps:
         wp.capture_while(self._proceed, self._launch_round, x=x)
 
     def _launch_round(self, x):
-        self.launch_fresh(x, self._relist)
+        self.launch_fresh(x, self._relist, self._walking)
         if self._iterates:
-            self._launch_areas_again(x)
+            self._launch_areas_again(x, self._walking)
         self._launch_walk(x)
 
-    def _launch_areas_again(self, x):
-        self.launch_areas(x)
+    def _launch_areas_again(self, x, copies):
+        self.launch_areas(x, copies)
         if self.friction is not None:
-            self.friction.launch_relisted()
+            self.friction.launch_relisted(copies)
 
     def _launch_walk(self, x):
         model = self.model
@@ -598,7 +617,8 @@ class SelfSteps:
     def _launch_let_out(self, x):
         """Walks on to where the vertices that are held back are outside, and other cloth makes way for them."""
         model, out = self.model, self._other
-        self._relist(x)
+        self.launch_fresh(x, self.launch_list)
+        self._launch_sides(x)
         for _ in range(SWEEPS):
             given = [self.pairs, self._mobile, self.begun, x, LEFT * self.declared.distance]
             self._launch(self_filter.push_pairs, 1, given, [out])
@@ -639,16 +659,17 @@ class SelfSteps:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 
-    def launch_relist(self, base, d, launch):
-        """Lists the pairs at base + d, and launches ``launch``, if vertices have moved far since the last list."""
-        self._add(base, d, 1.0, self.x_before)
+    def launch_relist(self, base, d, active, launch):
+        """Lists the pairs at base + d of copies that are ``active`` (B,), and launches ``launch``, if vertices have moved far
+        since the last list."""
+        self._add(base, d, 1.0, self.x_before, active)
 
         def relist(x):
             self.launch_list(x)
-            self._launch_areas_again(x)
+            self._launch_areas_again(x, self.proximity.copies)
             launch()
 
-        self.launch_fresh(self.x_before, relist)
+        self.launch_fresh(self.x_before, relist, active)
 
     def launch_limit(self, sums, gradient, preconditioner, right, direction):
         """Cuts the direction from the positions of :meth:`launch_relist` short, so that pairs stay apart along all of it.
@@ -667,8 +688,8 @@ class SelfSteps:
         sums.dot(gradient, direction, self._slope)
         self._launch(self_filter.take_descent, N, [self._slope, self._other, model.per_copy], [direction])
 
-    def _add(self, a, b, sign, out):
-        self._launch(self_filter.add_positions, self.model.count, [a, b, sign], [out])
+    def _add(self, a, b, sign, out, active=None):
+        self._launch(self_filter.add_positions, self.model.count, [a, b, sign, active, self.model.per_copy], [out])
 
 
 def _gaps(nearest):

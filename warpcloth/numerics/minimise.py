@@ -174,6 +174,7 @@ class Minimiser:
         before = self._policy.read().copy()
         self.clear()
         self._policy.write(int(HessianPolicy.RAW))
+        self._active.write(1)
         self._assemble()
         self._policy.write(before)
 
@@ -189,7 +190,7 @@ class Minimiser:
 
     def _launch_assemble(self):
         if self.pairs is not None:
-            self.pairs.launch_relist(self.base, self.correction, self.search.launch_again)
+            self.pairs.launch_relist(self.base, self.correction, self.active, self.search.launch_again)
         self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
         hessian, model = self.hessian, self.model
         self._launch(negate, model.count, [self.search.gradient], [self.right])
