@@ -13,7 +13,7 @@ from functools import cache
 import warp as wp
 
 from .clusters import fit
-from .constraint_rows import ROUNDINGS, RowLayout, first_row, row_values
+from .constraint_rows import ROUNDINGS, RowLayout, first_row, lowest_compliance, row_values
 from .rotation import epsilon
 from .term import Term
 from .transpose import gather, stored
@@ -58,7 +58,7 @@ def linearise_clusters(dtype):
             if not active:
                 alpha = dtype(1.0)
                 R = mat33()
-            excess = wp.max(least - alpha, dtype(0.0))
+            excess = wp.max(lowest_compliance(alpha, least) - alpha, dtype(0.0))
             alpha += excess
             row = vec3()
             force = vec3()

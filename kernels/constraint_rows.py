@@ -12,6 +12,7 @@ The factories share the key (term, dtype, scalar, curved). See :mod:`.constraint
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -89,12 +90,18 @@ def covector_row(term: Term, dtype, scalar: bool, curved: bool):
     return row_of if scalar else None
 
 
+@wp.func
+def lowest_compliance(alpha: Any, least: Any):
+    """Of the diagonal of J W Jᵀ: ``least`` for hard rows, and for soft ones, whose α̃ determines λ, no more than rounding."""
+    return wp.where(alpha == type(alpha)(0.0), least, epsilon(least))
+
+
 @cache
 def linearise(term: Term, dtype, scalar: bool, curved: bool):
     """Kernel over elements at x̃ + d: gap = C + α̃λ, the Jacobian, α̃ = 1/(kAh²), the inverse diagonal of J W Jᵀ + α̃.
 
-    α̃ is no less than ``least`` of the diagonal of J W Jᵀ, or redundant hard rows would leave λ undetermined; carried [m] is the
-    move of a vertex by which that holds them open, next to nothing but where they contradict one another.
+    α̃ of hard rows is no less than ``least`` of the diagonal of J W Jᵀ, or redundant ones would leave λ undetermined; carried
+    [m] is the move of a vertex by which that holds them open, next to nothing but where they contradict one another.
     residual [m] is the move of a vertex that closes the gap by itself, rounding [m] what of that and of the force precision
     does not hold. Of a hard row without direction the residual is |C|.
     """
@@ -176,7 +183,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
                 total += free * wp.dot(direction, direction)
                 most = wp.max(most, free * wp.length(direction))
             if j == 0:
-                excess = wp.max(least * total - alpha, dtype(0.0))
+                excess = wp.max(lowest_compliance(alpha, least) * total - alpha, dtype(0.0))
                 alpha += excess
                 rows.multipliers[s] = held
                 rows.gap[s] = c + alpha * held
@@ -234,7 +241,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
                     w = wp.abs(weight(r, i)[m])
                     total += inverse_mass[stencil[e, i]] * w * w
                     most = wp.max(most, inverse_mass[stencil[e, i]] * w)
-            excess = wp.max(least * total - alpha, dtype(0.0))
+            excess = wp.max(lowest_compliance(alpha, least) * total - alpha, dtype(0.0))
             total += alpha + excess
             inverted = wp.where(total == dtype(0.0), dtype(0.0), dtype(1.0) / total)
             row = vec3()

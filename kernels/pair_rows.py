@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from .constraint_rows import ROUNDINGS, RowLayout, row_values
+from .constraint_rows import ROUNDINGS, RowLayout, lowest_compliance, row_values
 from .rotation import epsilon
 from .self_friction import RubbedPairs, edge_tangent, stretch_of
 from .self_gaps import nearest, signed_gap, vertex_of
@@ -102,7 +102,7 @@ def linearise_pair_rows(dtype, curved: bool):
             return
         alpha = ONE / (k * h * h)
         total = steep * steep * moved
-        excess = wp.max(least * total - alpha, ZERO)
+        excess = wp.max(lowest_compliance(alpha, least) * total - alpha, ZERO)
         alpha += excess
         slopes.weights[e] = w
         slopes.first[e] = steep * n
@@ -189,7 +189,7 @@ def linearise_friction_rows(dtype):
         u = stretch(s, w, n, rubbed.stretch[e], start, x, d)
         k = wp.min(rubbed.stiffness[e], limit / wp.max(wp.length(u), wp.float64(1e-300)))
         alpha = ONE / (k * h * h)
-        excess = wp.max(least * moved - alpha, ZERO)
+        excess = wp.max(lowest_compliance(alpha, least) * moved - alpha, ZERO)
         alpha += excess
         inverse = ONE / (moved + alpha)
         slopes.weights[e] = w

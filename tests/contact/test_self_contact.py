@@ -202,11 +202,15 @@ def test_hanging_loops_are_elastica(kind, gamma, elements, depth, error, device)
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_a_stack_rests(dtype, device):
+@pytest.mark.parametrize(("dtype", "mesh"), [("float32", False), ("float64", False), ("float64", True)])
+def test_a_stack_rests(dtype, mesh, device):
     """Gaps of 12 sheets on a floor that move up and down only: all within r press on one another, in both stages of φ."""
     stack = scene("stack", sheets=12, n=4, friction=0.0)
-    stack = replace(stack, colliders=stack.colliders[:1], free_axes=np.tile([False, True, False], (12 * 16, 1)))
+    floor = stack.colliders[0]
+    if mesh:
+        corners = [[-1.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]]
+        floor = wc.MeshCollider(points=corners, triangles=[[0, 2, 1], [0, 3, 2]], name="floor")
+    stack = replace(stack, colliders=[floor], free_axes=np.tile([False, True, False], (12 * 16, 1)))
     rest = wc.equilibrium(stack, device=device, dtype=dtype, record=("energies", "reactions"))
     assert rest.status.ok and rest.stable, rest.status
     high, r, k = rest.points[:, 1].reshape(12, 16), stack.self_contact.distance, stack.self_contact.stiffness

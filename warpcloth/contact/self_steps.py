@@ -130,7 +130,7 @@ class SelfSteps:
         self._few = int(SHARE * model.per_copy)
         self.tangles, self._counted = None, None
         declared = model.colliders
-        self._lets_out = declared is not None and (declared.meshes is not None or any(declared.moves))
+        self._lets_out = colliders is not None and (declared.meshes is not None or any(declared.moves))
         if self._lets_out:
             colliders.end_again()
             self._mobile = wp.zeros(model.count, dtype=model.dtype, device=device)

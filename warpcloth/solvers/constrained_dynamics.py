@@ -59,11 +59,11 @@ class ConstrainedDynamics(ImplicitStep):
         stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
         linear: ``"cg"``, or ``"factorised"`` on the host.
 
-    Both linear solvers take redundant constraints: every α̃ is at least ε^0.7 of the diagonal of J W Jᵀ, so that the smallest
-    of all possible λ is found, and hard constraints keep a gap of that fraction of the move that they cause in a step (1e-11,
-    in float32 1e-5). Constraints that contradict one another end at a compromise; the status says so, and their violation is
-    the residual. A constraint between pins alone is left out, because it can move nothing. A hard spring of rest length 0 has
-    no direction and may not converge; XPBD takes it.
+    Both linear solvers take redundant constraints: α̃ of a hard one is at least ε^0.7 of the diagonal of J W Jᵀ, so that the
+    smallest of all possible λ is found, and hard constraints keep a gap of that fraction of the move that they cause in a step
+    (1e-11, in float32 1e-5). Hard constraints that contradict one another end at a compromise; the status says so, and their
+    violation is the residual. A constraint between pins alone is left out, because it can move nothing. A hard spring of rest
+    length 0 has no direction and may not converge; XPBD takes it.
 
     Raises:
         ValueError: If an option is not allowed.
