@@ -5,9 +5,15 @@ import signal
 import pytest
 import warp as wp
 
+from warpcloth.base.quiet import prepare_warp
+
 
 def pytest_configure():
-    """A shell ignores Ctrl-C in what it runs in the background, and what the tests start would inherit that."""
+    """Kernels of tests are compiled as those of runs, by the headers that are parsed for these.
+
+    A shell ignores Ctrl-C in what it runs in the background, and what the tests start would inherit that.
+    """
+    prepare_warp()
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

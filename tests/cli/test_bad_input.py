@@ -3,9 +3,12 @@
 import os
 import re
 import resource
+import shutil
 import subprocess
 import sys
+import threading
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ from pxr import Sdf, Usd
 
 import warpcloth as wc
 from support.stage_texts import CURVES, MOVED, STAGE
-from warpcloth.base import limits
+from warpcloth.base import kernel_cache, limits
 from warpcloth.base.quiet import initialise_warp
 from warpcloth.cli import main
 from warpcloth.cli.terminal import printable
@@ -473,7 +476,7 @@ def kernel(tmp_path, monkeypatch):
         x = wp.array([1.0, 2.0], dtype=float, device="cpu")
         wp.launch(double, 2, inputs=[x], device="cpu")
         assert x.numpy().tolist() == [2.0, 4.0]
-        (folder,) = tmp_path.iterdir()
+        (folder,) = tmp_path.glob("*double*")
         return {path.suffix: path for path in folder.iterdir()}
 
     return loaded_again
@@ -497,6 +500,28 @@ def test_a_broken_cache_mends_itself(kernel, ending):
         assert path.read_bytes() == whole or ending == ".o", damage
         path.unlink()
         kernel()
+
+
+def test_all_threads_read_headers_parsed_once(tmp_path, kernel, monkeypatch):
+    def compiled_again():
+        shutil.rmtree(kernel()[".o"].parent)
+        thread = threading.Thread(target=kernel)
+        thread.start()
+        thread.join()
+        return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+    kernel()
+    folder = tmp_path / "headers"
+    folder.mkdir()
+    for path in Path(kernel_cache.headers_folder()).glob("*.pch"):
+        shutil.copy(path, folder)
+    monkeypatch.setattr(kernel_cache, "headers_folder", lambda: str(folder))
+    copied = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert copied and compiled_again() == copied
+    # The compiler says that it cannot read these files, and removes the one that it tried.
+    for path in folder.iterdir():
+        path.write_bytes(b"cut")
+    assert len(compiled_again()) == len(copied) - 1
 
 
 def test_a_full_cache_is_said(tmp_path, kernel):

@@ -1,12 +1,18 @@
-"""Repairs Warp's cache of compiled kernels: broken files are compiled again, and a cache that cannot be written is an error."""
+"""Warp's cache of compiled kernels: broken files are compiled again, and a process reads headers that another one has parsed.
+
+A cache that cannot be written is an error.
+"""
 
 import errno
+import hashlib
 import os
 import shutil
 import tempfile
-from functools import wraps
+from functools import cache, wraps
 
-_ROOM = 2**22  # free bytes that the source and the binary of a kernel need
+_ROOM = 2**23  # free bytes that the source and the binary of a kernel, and the parsed headers, need
+_INSTANTIATE = "-fpch-instantiate-templates"
+HEADERS = "wp_headers"  # the start of the name of a folder in the cache
 
 
 def mend():
@@ -20,6 +26,57 @@ def mend():
 
     if not hasattr(wp.Module.load, "__wrapped__"):
         wp.Module.load = _mended(wp.Module.load)
+
+
+def parse_headers_once():
+    """Makes Warp parse its headers once for all processes and threads of a cache, for the CPU.
+
+    Every kernel includes Warp's headers, which take the compiler 2.6 s. Warp parses them once in each thread of each process
+    that compiles. Here the parsed headers are kept in a folder of the kernel cache, which `wp.clear_kernel_cache` removes, and
+    the compiler also instantiates the templates that the headers use themselves, which it would repeat for each kernel. The
+    code that it generates remains the same.
+    """
+    import warp as wp
+
+    flags = wp.config.cpu_compiler_flags
+    if flags is not None and _INSTANTIATE not in flags:
+        wp.config.cpu_compiler_flags = f"{flags} {_INSTANTIATE}"
+    runtime = wp._src.context.Runtime
+    if hasattr(runtime, "get_clang_pch_dir") and not hasattr(runtime.get_clang_pch_dir, "__wrapped__"):
+        runtime.get_clang_pch_dir = _kept(runtime.get_clang_pch_dir)
+
+
+def _kept(folder_of_thread):
+    @wraps(folder_of_thread)
+    def kept(runtime):
+        if runtime.llvm is None:
+            return folder_of_thread(runtime)
+        os.makedirs(headers_folder(), exist_ok=True)
+        return headers_folder()
+
+    return kept
+
+
+@cache
+def headers_folder():
+    """Returns the folder of parsed headers, in the cache that this process uses first."""
+    import warp as wp
+
+    return os.path.join(wp.config.kernel_cache_dir, f"{HEADERS}_{_compiler_digest()}")
+
+
+def _compiler_digest():
+    """Digests the headers, the compiler and the processor: the compiler refuses headers that were parsed for others."""
+    import warp as wp
+
+    processor = wp._src.context.runtime.llvm.wp_get_host_cpu_name()
+    digest = hashlib.sha256(wp.get_cpu_kernel_cache_key(cpu_compiler_flags="-march=native").encode() + processor)
+    for folder in ("native", "bin"):
+        with os.scandir(os.path.join(os.path.dirname(wp.__file__), folder)) as entries:
+            for entry in sorted(entries, key=lambda entry: entry.name):
+                status = entry.stat()
+                digest.update(f"{entry.path} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:8]
 
 
 def _mended(load):

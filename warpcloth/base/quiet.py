@@ -6,12 +6,12 @@ import tempfile
 from functools import cache
 
 from .checks import shown
-from .kernel_cache import described, mend
+from .kernel_cache import described, mend, parse_headers_once
 
 
 @cache
 def prepare_warp():
-    """Makes Warp leave out its news, and repair its cache of kernels: once, before it is initialised.
+    """Makes Warp leave out its news, repair its cache of kernels and keep parsed headers there: once, before it is initialised.
 
     Its log level is set to warnings if it is still the default; a level that the user sets, before or later, is kept.
     """
@@ -20,6 +20,7 @@ def prepare_warp():
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
     mend()
+    parse_headers_once()
 
 
 def find_device(name):
