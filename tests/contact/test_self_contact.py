@@ -8,7 +8,8 @@ import warp as wp
 
 import warpcloth as wc
 from support.scenes import scene
-from warpcloth.contact.self_steps import SelfSteps, crossings
+from warpcloth.contact.self_start import crossings
+from warpcloth.contact.self_steps import SelfSteps
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.self_gaps import nearest
@@ -119,14 +120,14 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, device):
 
     def energy(x):
         out = model.scalars()
-        pairs.launch_forces(model.array(x, model.vec3))
-        pairs.add_energy(sums, out)
+        pairs.forces.launch_forces(model.array(x, model.vec3))
+        pairs.forces.add_energy(sums, out)
         return out.numpy()[0]
 
     def gradient(x):
         out = model.vectors()
-        pairs.launch_forces(model.array(x, model.vec3))
-        pairs.add_gradient(out)
+        pairs.forces.launch_forces(model.array(x, model.vec3))
+        pairs.forces.add_gradient(out)
         return out.numpy()
 
     force, size, eta = gradient(x), np.abs(gradient(x)).sum(), 1e-7
@@ -146,8 +147,8 @@ def test_pressure_of_a_stack(count, device):
     pairs, model = steps_of(layers(count, gap=d, distance=r, stiffness=k), device)
     pairs.launch_begin(model.positions)
     out = model.vectors()
-    pairs.launch_forces(model.positions)
-    pairs.add_gradient(out)
+    pairs.forces.launch_forces(model.positions)
+    pairs.forces.add_gradient(out)
     top = -out.numpy()[-36:, 1].sum() / 0.25
 
     def f(d):
@@ -470,7 +471,7 @@ def test_violent_steps(steps, device):
         target = x.numpy() + 10.0 ** rng.uniform(-3.0, -0.8) * rng.normal(size=(model.count, 3))
         unfiltered += crossed(target, scene.mesh.triangles) > 0
         wp.copy(x, model.array(target, model.vec3))
-        pairs.launch_end(x, v)
+        pairs.filter.launch_end(x, v)
         assert not pairs.overflowed
         assert crossed(x.numpy(), scene.mesh.triangles) == 0, step
     assert unfiltered > 0.5 * steps

@@ -99,9 +99,9 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
     def energy(x):
         out = model.scalars()
         pairs.friction.launch_forces(model.array(x, model.vec3), None)
-        pairs.energies.zero_()
-        pairs.friction.add_energies(pairs.energies)
-        sums.sum(pairs.energies, model.per_copy, out)
+        pairs.forces.energies.zero_()
+        pairs.friction.add_energies(pairs.forces.energies)
+        sums.sum(pairs.forces.energies, model.per_copy, out)
         return out.numpy()[0]
 
     def gradient(x):
@@ -116,7 +116,7 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
     assert np.abs(force.sum(axis=0)).max() < 1e-13 * total
     hessian.assemble(model.array(x, model.vec3), 0.0)
     H = (hessian.matrix() + hessian.coupling()).toarray()
-    J, D = pairs.rows()
+    J, D = pairs.forces.rows()
     of_contact = J.shape[0] - 2 * int((pairs.friction.rubbed.limit.numpy() > 0.0).sum())
     friction = (J[of_contact:].T @ D.tocsr()[of_contact:, of_contact:] @ J[of_contact:]).toarray()
     assert H == pytest.approx((J.T @ D @ J).toarray(), abs=1e-9 * np.abs(H).max())

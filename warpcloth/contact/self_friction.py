@@ -191,7 +191,7 @@ class SelfFriction:
         self._launch(kernels.sum_friction, self.model.count, [self.pairs, self.rubbed, self._forces], [out])
 
     def add_diagonal(self, diagonal, values):
-        """As of :class:`warpcloth.contact.self_steps.SelfSteps`, like the next two."""
+        """Adds as :meth:`warpcloth.contact.self_forces.SelfForces.add_diagonal`, and the next two as their namesakes there."""
         given = [self.pairs, self.model.inverse_mass, diagonal, self.rubbed, self._forces]
         self._launch(kernels.add_friction_diagonal, self.model.count, given, [values])
 
@@ -218,7 +218,7 @@ class SelfFriction:
         )
 
     def sweeps(self, in_turn):
-        """As of :class:`warpcloth.contact.self_steps.SelfSteps`, like the next."""
+        """Prepares as :meth:`warpcloth.contact.self_forces.SelfForces.sweeps`; :meth:`launch_sweep` moves as there."""
         model, key = self.model, (self.model.dtype, self.model.mobility is not None)
         if in_turn and model.device.is_cpu:
             self._sweep = model.kernel(friction_sweeps.sweep_friction, *key)

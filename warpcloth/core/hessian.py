@@ -129,8 +129,8 @@ class Hessian:
             of_term.launch(x, correction, self.policy)
             model.launch(self._add_blocks, len(self.values), [*gather, of_term.blocks.flatten()], [self.values])
         if self.pairs is not None:
-            self.pairs.launch_forces(x, correction)
-            self.pairs.add_diagonal(self.diagonal, self.values)
+            self.pairs.forces.launch_forces(x, correction)
+            self.pairs.forces.add_diagonal(self.diagonal, self.values)
         if self._rows is not None:
             lock = model.kernel(linear.lock_blocks, model.dtype)
             model.launch(lock, len(self.values), [self._rows, self.columns, model.mobility], [self.values])
@@ -156,7 +156,7 @@ class Hessian:
         given = [self.offsets, self.columns, self.values, p, active, self.per_copy]
         self.model.launch(self._multiply, self.count, given, [q])
         if self.pairs is not None:
-            self.pairs.add_products(p, q, active)
+            self.pairs.forces.add_products(p, q, active)
 
     def invert_diagonal(self, out):
         """out = the inverse diagonal blocks."""
@@ -180,7 +180,7 @@ class Hessian:
         """The blocks of pairs off the diagonal at the last :meth:`assemble`, scipy (3N, 3N); None without pairs."""
         if self.pairs is None:
             return None
-        J, D = self.pairs.rows()
+        J, D = self.pairs.forces.rows()
         whole = (J.T @ D @ J).tocoo()
         off = whole.row // 3 != whole.col // 3
         whole.data[~off] = 0.0

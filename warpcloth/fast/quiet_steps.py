@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..contact.self_steps import WAY
+from ..contact.self_filter import WAY
 from ..kernels.fast.quiet_step import find_unquiet
 from ..kernels.loop import count_down
 from ..kernels.step import count_step
@@ -37,7 +37,8 @@ class QuietSteps:
         self._dim = model.copies, -(-model.per_copy // size)
         # Both below what the list and the filter allow, by more than rounding; all moves are then so near their mean.
         way = (1.0 - 1e-4) * WAY * pairs.skin
-        self._given = [model.per_copy, size, way, 0.49 * way if pairs.moves_together else way, pairs.moves_together]
+        together = pairs.filter.moves_together
+        self._given = [model.per_copy, size, way, 0.49 * way if together else way, together]
         self._count, self._count_down = model.kernel(count_step), model.kernel(count_down)
 
     def launch(self, steps, end):
@@ -59,8 +60,8 @@ class QuietSteps:
     def _launch_full(self, end):
         pairs, (x, _v) = self._pairs, self._plain.state
         pairs.launch_begin(x)
-        pairs.launch_forces(x)
-        pairs.add_gradient(self._plain.gradient)
+        pairs.forces.launch_forces(x)
+        pairs.forces.add_gradient(self._plain.gradient)
         self._plain.launch(1, end)
 
     def _launch_plain(self, end):

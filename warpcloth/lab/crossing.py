@@ -136,9 +136,9 @@ def meetings(solver, kept, h, speeds, device):
 
 def without_filter(stepper):
     """Takes the filter of self-contact away from a stepper, at the end of steps and of the iterates of Newton's method."""
-    pairs = stepper.pairs
-    pairs.launch_end = pairs.launch_relist = pairs.launch_limit = lambda *given: None
-    pairs.launch_first = lambda base, d: d.zero_()
+    kept = stepper.pairs.filter
+    kept.launch_end = kept.launch_relist = kept.launch_limit = lambda *given: None
+    kept.launch_first = lambda base, d: d.zero_()
     stepper.record_again()
 
 

@@ -119,7 +119,7 @@ class ContactSystem(CorrectedSystem):
     def _launch_assemble(self):
         self._hessian.assemble(self.x, 0.0, self._search.correction)
         if self._pairs is not None:
-            self._pairs.launch_forces(self.x, self._search.correction)
+            self._pairs.forces.launch_forces(self.x, self._search.correction)
 
     def start(self):
         """Before the first iteration of a step whose iterates stay where they are if φ would rise: no copy is careful."""
@@ -137,7 +137,7 @@ class ContactSystem(CorrectedSystem):
         self._assemble()
         blocks = self._blocks.read()[self._diagonal] * self._free[:, None, None]
         touching = np.flatnonzero(blocks.any(axis=(1, 2)))
-        J, D = (None, None) if self._pairs is None else self._pairs.rows()
+        J, D = (None, None) if self._pairs is None else self._pairs.forces.rows()
         pressing = len(touching) or (J is not None and J.shape[0])
         if not (pressing or self.careful.any()):
             return
@@ -188,11 +188,11 @@ class PairSystem(CorrectedSystem):
     def _launch_press(self):
         """U and ∂U/∂x at the trial."""
         pairs = self._pairs
-        pairs.launch_forces(self._x, self._trial.array)
+        pairs.forces.launch_forces(self._x, self._trial.array)
         self._energy.array.zero_()
-        pairs.add_energy(self._sums, self._energy.array)
+        pairs.forces.add_energy(self._sums, self._energy.array)
         self._pull.array.zero_()
-        pairs.add_gradient(self._pull.array)
+        pairs.forces.add_gradient(self._pull.array)
         self.model.lock(self._pull.array)
 
     def _pressed(self, d):
@@ -204,7 +204,7 @@ class PairSystem(CorrectedSystem):
         """w = t (A + JᵀDJ)⁻¹ ∇ψ at d, 0 < t ≤ 1, from the A⁻¹ ∇ψ that it is."""
         d, b, found = (array.numpy().astype(np.float64) for array in (d, gradient, w))
         energy, pull = self._pressed(d)
-        J, D = self._pairs.rows()
+        J, D = self._pairs.forces.rows()
         Aw = b
         if J.shape[0]:
 

@@ -190,7 +190,7 @@ class Minimiser:
 
     def _launch_assemble(self):
         if self.pairs is not None:
-            self.pairs.launch_relist(self.base, self.correction, self.active, self.search.launch_again)
+            self.pairs.filter.launch_relist(self.base, self.correction, self.active, self.search.launch_again)
         self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
         hessian, model = self.hessian, self.model
         self._launch(negate, model.count, [self.search.gradient], [self.right])
@@ -207,7 +207,7 @@ class Minimiser:
         if self.pairs is not None:
             self.hessian.invert_diagonal(self.preconditioner)
             given = self.search.gradient, self.preconditioner, self.right, self.search.direction
-            self.pairs.launch_limit(self.sums, *given)
+            self.pairs.filter.launch_limit(self.sums, *given)
         self.search.launch(self.active)
         self._launch_norms()
 

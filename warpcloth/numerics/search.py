@@ -54,7 +54,7 @@ class Search:
         if self.pairs is None:
             self.correction.zero_()
         else:
-            self.pairs.launch_first(self.base, self.correction)
+            self.pairs.filter.launch_first(self.base, self.correction)
         self.launch_again()
 
     def launch_again(self):
@@ -81,13 +81,13 @@ class Search:
         self._launch(kernels.set_trial, N, given, [self.trial, self.gradient])
         self.gradient_of.add(self.base, self.gradient, self.trial)
         if self.pairs is not None:
-            self.pairs.launch_forces(self.base, self.trial)
-            self.pairs.add_gradient(self.gradient)
+            self.pairs.forces.launch_forces(self.base, self.trial)
+            self.pairs.forces.add_gradient(self.gradient)
         self.inertia.add(self.trial, self.gradient)
         self.sums.sum(self.inertia.work, n, self.trial_energy)
         self.energy_of.add(self.base, self.trial_energy, self.trial)
         if self.pairs is not None:
-            self.pairs.add_energy(self.sums, self.trial_energy)
+            self.pairs.forces.add_energy(self.sums, self.trial_energy)
         self.sums.dot(self.gradient, self.direction, self.trial_slope)
 
     def _try_step(self):

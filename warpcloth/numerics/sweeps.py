@@ -124,16 +124,16 @@ class JacobiSweep(_Sweep):
         self.launch_start, self.launch, self.parts = sweeps.launch_start, sweeps.launch, sweeps.parts
         if pairs is not None:
             self._elements, self.pairs, self._adds = sweeps, pairs, multipliers
-            pairs.sweeps(in_turn=False)
+            pairs.forces.sweeps(in_turn=False)
             self.launch_start, self.launch, self.parts = self._launch_start, self._launch, self._parts
 
     def _launch_start(self):
-        self.pairs.launch_no_multipliers()
+        self.pairs.forces.launch_no_multipliers()
         self._elements.launch_start()
 
     def _launch(self):
         self._elements.launch(1)
-        self.pairs.launch_sweep(self.x, self.correction, self.h, self._adds)
+        self.pairs.forces.launch_sweep(self.x, self.correction, self.h, self._adds)
 
     def _parts(self, sweeps):
         return [(self._launch, sweeps)]
@@ -200,7 +200,7 @@ class GaussSeidelSweep(_Sweep):
         super().__init__(model, x, h, relaxation, scalar, multipliers, correction)
         self.multipliers_add = multipliers
         if pairs is not None:
-            pairs.sweeps(in_turn=True)
+            pairs.forces.sweeps(in_turn=True)
         self.pool, self.spread, self.ordered = pool or ThreadPool(1), spread or 1, kind == "sequential"
         self.ranges = [[(0, (elements.cells or elements).count)] for elements in model.terms]
         if kind == "coloured" and model.terms:
@@ -240,7 +240,7 @@ class GaussSeidelSweep(_Sweep):
     def launch_start(self):
         """Launches d = 0, λ = 0, once x̃ is there."""
         if self.pairs is not None:
-            self.pairs.launch_no_multipliers()
+            self.pairs.forces.launch_no_multipliers()
         counters = [each[2] for each in self._lists if each]
         for array in (self.correction, *self.multipliers, *counters):
             if array is not None:
@@ -288,4 +288,4 @@ class GaussSeidelSweep(_Sweep):
 
     def _sweep_pairs(self, backward):
         if self.pairs is not None:
-            self.pairs.launch_sweep(self.x, self.correction, self.h, self.multipliers_add, backward)
+            self.pairs.forces.launch_sweep(self.x, self.correction, self.h, self.multipliers_add, backward)

@@ -136,7 +136,7 @@ def equilibrium(
     pairs = None
     if scene.self_contact is not None:
         pairs = SelfSteps(model, State(base, model.vectors(), 1), h=0.0, steps_per_frame=1, bounded=False, colliders=None)
-        pairs.iterates()
+        pairs.filter.iterates()
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
     descent = _Descent(minimiser, base, tolerance, iterations)
     for part in range(1, load_steps + 1):
@@ -147,7 +147,7 @@ def equilibrium(
         # What is left unbalanced compresses the edges of a nearly straight chain by many times itself, and curves the energy.
         descent.tolerance *= 0.01
         if contact is not None:
-            contact.launch_end(base, model.vectors())
+            contact.filter.launch_end(base, model.vectors())
         if contact is None and pairs is None:
             result = descent.run(1.0, _frequency_scale(model))
         else:
@@ -332,7 +332,7 @@ def _settle_on_meshes(model, base, descent, part, contact):
         find_facets()
         result = _settle_all(model, base, descent, part)
         contact.notes.cut.zero_()
-        contact.launch_end(base, velocity)
+        contact.filter.launch_end(base, velocity)
         if result is Result.DIVERGED or descent.used >= descent.iterations:
             return result
         if not contact.notes.cut.numpy().any() and (result not in SETTLED or descent.balanced(find_facets)):

@@ -140,8 +140,8 @@ class Evaluation:
             self._dissipative.add(self._before, self.gradient, self._move)
         if self._pairs is not None:
             self._pairs.launch_begin(x)
-            self._pairs.launch_forces(x)
-            self._pairs.add_gradient(self.gradient)
+            self._pairs.forces.launch_forces(x)
+            self._pairs.forces.add_gradient(self.gradient)
         if self._pull:
             self._pull(self.gradient)
 
@@ -167,8 +167,8 @@ class Evaluation:
         if self._pairs is not None:
             total = model.scalars()
             self._pairs.launch_begin(x)
-            self._pairs.launch_forces(x)
-            self._pairs.add_energy(Sums(model), total)
+            self._pairs.forces.launch_forces(x)
+            self._pairs.forces.add_energy(Sums(model), total)
             found["self-contact"] = total.numpy()
         moved = self._host(x) - self._start
         if v is not None:

@@ -252,8 +252,8 @@ class ADMMStepper(ImplicitStepper):
         if self._gradient is not None:
             self._gradient.add(self.state.x, self._force, self.correction)
         if self.pairs is not None:
-            self.pairs.launch_forces(self.state.x, self.correction)
-            self.pairs.add_gradient(self._force)
+            self.pairs.forces.launch_forces(self.state.x, self.correction)
+            self.pairs.forces.add_gradient(self._force)
         self._inertia.add(self.correction, self._force)
         if self._whole_in_balance:
             self._sums.largest(model.inverse_mass, self._force, self._unbalanced.array)

@@ -97,7 +97,7 @@ class NewtonStepper(ImplicitStepper):
         super().__init__(options, model)
         model = self.model
         if self.pairs is not None:
-            self.pairs.iterates()
+            self.pairs.filter.iterates()
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.he**2, pairs=self.pairs)
         self.correction = self.minimiser.correction
         self._predict = Segment(model.device, self.launch_prediction)

@@ -209,7 +209,7 @@ class Stepper:
             self.colliders.correction, self.colliders.he = correction, self.he
             self.colliders.launch_end(*self.state, self.state.arrays.get("move before"))
         if self.pairs is not None:
-            self.pairs.launch_end(*self.state, self.state.arrays.get("move before"))
+            self.pairs.filter.launch_end(*self.state, self.state.arrays.get("move before"))
 
     def launch_end_of(self, pins, keyframes, count, x, v):
         """The end of an explicit step in x and v (N,): pins move on, and vertices are kept out of colliders."""
@@ -217,7 +217,7 @@ class Stepper:
         if self.colliders is not None:
             self.colliders.launch_end(x, v)
         if self.pairs is not None:
-            self.pairs.launch_end(x, v)
+            self.pairs.filter.launch_end(x, v)
 
     def take(self, steps):
         """Calls ``steps``, and again from the same state with more room as long as not all pairs that are near had some."""

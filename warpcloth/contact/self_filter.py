@@ -1,0 +1,225 @@
+"""The filter, which keeps cloth apart from itself in the steps of a solver and in its iterates."""
+
+import warp as wp
+
+from ..kernels import self_filter, self_planes
+from ..kernels.step import count_step
+from ..kernels.terms.contact import FLOOR
+
+# Rounds of the filter: planes are set anew in at most NEAR_ROUNDS, as long as they cut more than SHARE of the vertices; a way
+# that is longer than one list allows is walked in at most FAR_ROUNDS.
+SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
+# The longest way of a vertex in a round, relative to the common motion, over the skin. It may have gone as far since the list
+# was made, and so may the other vertex: both together come nearer by at most the skin.
+WAY = 0.25
+# Vertices that cloth holds back in a collider are let out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
+# keeps a gap to other cloth of LEFT times the contact distance, or that of before if it was less.
+OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
+
+
+class SelfFilter:
+    """Moves cloth as far as the pairs of a :class:`warpcloth.contact.self_steps.SelfSteps` stay apart.
+
+    Args:
+        contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
+        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
+
+    Attributes:
+        moves_together: Whether moves are relative to their mean, as nothing is pinned.
+    """
+
+    def __init__(self, contact, colliders):
+        self.model = model = contact.model
+        self._contact, self._colliders, self._cut_before, self._iterates = contact, colliders, None, False
+        device = model.device
+        self._target, self._from, self._other = (model.vectors() for _ in range(3))
+        self._ways = wp.zeros(model.count, dtype=wp.vec2d, device=device)
+        self._share, self._least_share = (wp.zeros(model.count, dtype=wp.float64, device=device) for _ in range(2))
+        self._common = wp.zeros(model.copies, dtype=wp.vec3d, device=device)
+        self._cuts = wp.zeros((model.copies, 2), dtype=wp.int32, device=device)
+        self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(2))
+        self._proceed = wp.zeros(1, dtype=wp.int32, device=device)
+        self._few, self._slope = int(SHARE * model.per_copy), model.scalars()
+        self.moves_together = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
+        made = self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move
+        made += self_filter.keep_apart, self_filter.end_filter, self_filter.add_positions
+        made += self_filter.limit_direction, self_filter.precondition, self_filter.take_descent
+        declared = model.colliders
+        self._lets_out = colliders is not None and (declared.meshes is not None or any(declared.moves))
+        if self._lets_out:
+            colliders.end_again()
+            self._mobile = wp.zeros(model.count, dtype=model.dtype, device=device)
+            self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+            made += self_filter.find_held, self_filter.push_pairs
+        self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
+        self._count = model.kernel(count_step)
+
+    def hold(self, room):
+        """Allocates room for so many pairs."""
+        run = self._contact.declared.crossing_start == "run"
+        self._open = wp.zeros(room, dtype=wp.int32, device=self.model.device) if run else None
+
+    def _launch(self, factory, dim, inputs, outputs):
+        self.model.launch(self._kernels[factory], dim, inputs, outputs)
+
+    def launch_begin(self):
+        """Notes where a step begins how often colliders have cut moves."""
+        if self._cut_before is not None:
+            wp.copy(self._cut_before, self._colliders.notes.cut)
+
+    def launch_end(self, x, v, move=None):
+        """Walks from where the step began to x as far as pairs stay apart; v and ``move`` (N,) follow.
+
+        After iterates that stay apart, the walk starts at the last of them. But this may be inside a collider, out of which the
+        filter of colliders has moved x: then too the walk starts where the step began, since that way is outside.
+        """
+        model = self.model
+        if self._contact.friction is not None and self._iterates:  # whose areas may be those of a list that was made on the way
+            self._contact.friction.launch_contact(self._contact.pairs, self._contact.begun)
+        if self._cut_before is not None:
+            colliders = self._colliders
+            given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
+            self._launch(self_filter.walk_from_start, model.count, given, [self._contact.x_before])
+        wp.copy(self._target, x)
+        wp.copy(x, self._contact.x_before)
+        if self._iterates:
+            self.launch_fresh(x, self._contact.relist)
+        self._walk(x)
+        if self._lets_out:
+            self._turns.zero_()
+            self._walking.fill_(1)
+            self._launch_held(x)
+            wp.capture_while(self._within, self._launch_let_out, x=x)
+            self._colliders.launch_inside(x, self._from)
+        given = [model.inverse_mass, self._target, x, model.per_copy, self._contact.h]
+        self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut])
+        model.launch(self._count, model.copies, [], [self._contact.steps])
+        if self._contact.friction is not None:
+            self._contact.friction.launch_end(x)
+        if self._contact.tangles is not None:
+            self._contact.tangles.launch_free(x)
+
+    def launch_fresh(self, x, launch, active=None):
+        """Calls ``launch`` with x if a vertex, of a copy that is ``active`` or of any, has moved so far since the last list
+        that the next walk might miss a pair."""
+        wp.capture_if(self._contact.proximity.moved(x, WAY, active), launch, x=x)
+
+    def _walk(self, x):
+        """Moves x towards the target as far as pairs stay apart. On a long way lists are made anew."""
+        self._rounds.zero_()
+        self._cuts.zero_()
+        self._walking.fill_(1)
+        self._launch_walk(x)
+        wp.capture_while(self._proceed, self._launch_round, x=x)
+
+    def _launch_round(self, x):
+        self.launch_fresh(x, self._contact.relist, self._walking)
+        if self._iterates:
+            self._launch_areas_again(x, self._walking)
+        self._launch_walk(x)
+
+    def _launch_areas_again(self, x, copies):
+        self._contact.launch_areas(x, copies)
+        if self._contact.friction is not None:
+            self._contact.friction.launch_relisted(copies)
+
+    def _launch_walk(self, x):
+        model = self.model
+        self._launch_planes(x, self._target, None)
+        self._launch_apart(x, self._target)
+        self._proceed.zero_()
+        given = [self._few, NEAR_ROUNDS, FAR_ROUNDS]
+        model.launch(self_filter.another_round, model.copies, given, [self._cuts, self._rounds, self._walking, self._proceed])
+
+    def _launch_apart(self, x, target):
+        model = self.model
+        wp.copy(self._from, x)
+        given = [self._share, self._least_share, self._from, target, self._common, self._walking]
+        given += [model.per_copy, WAY * self._contact.skin]
+        self._launch(self_filter.keep_apart, model.count, given, [x, self._cuts])
+
+    def _launch_held(self, x):
+        """Finds the vertices that cloth holds back in a collider that has come over them, and where they would be outside."""
+        model, out = self.model, self._other
+        wp.copy(out, x)
+        self._colliders.launch_out(out, self._from)
+        self._within.zero_()
+        given = [model.inverse_mass, x, out, self._turns, OUT_ROUNDS]
+        self._launch(self_filter.find_held, model.count, given, [self._mobile, self._within])
+
+    def _launch_let_out(self, x):
+        """Walks on to where the vertices that are held back are outside, and other cloth makes way for them."""
+        model, out = self.model, self._other
+        self.launch_fresh(x, self._contact.launch_list)
+        self._contact.launch_sides(x)
+        for _ in range(SWEEPS):
+            given = [self._contact.pairs, self._mobile, self._contact.begun, x, LEFT * self._contact.declared.distance]
+            self._launch(self_filter.push_pairs, 1, given, [out])
+        self._launch_planes(x, out, None)
+        self._launch_apart(x, out)
+        model.launch(self._count, 1, [], [self._turns])
+        self._launch_held(x)
+
+    def _launch_planes(self, x, target, direction):
+        """Finds the share of each wanted move that planes leave."""
+        model, wanted = self.model, [x, target, direction]
+        if self.moves_together:
+            self._launch(self_planes.common_move, model.copies, [*wanted, model.per_copy], [self._common])
+        given = [*wanted, self._common, self._contact.begun_at, model.per_copy]
+        self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
+        gap, open = self._contact.begun.gap, None
+        if self._contact.tangles is not None:
+            gap, open = None, self._open  # gaps are infinite where a pair is left out of contact
+            self._contact.tangles.launch_open(self._contact.pairs.stencils, self._contact.pairs.counts, open)
+        given = [self._contact.pairs, gap, open, *wanted, self._common, self._ways]
+        given += [model.per_copy, FLOOR * self._contact.declared.distance]
+        self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
+
+    # Of methods whose iterates base + d stay apart too.
+
+    def launch_first(self, base, d):
+        """d such that base + d is as far on the way from where the step began to base as pairs stay apart."""
+        wp.copy(self._target, base)
+        self._walk(self._contact.x_before)
+        self._add(self._contact.x_before, base, -1.0, d)
+
+    def iterates(self):
+        """Says that these methods are used."""
+        self._iterates, model = True, self.model
+        self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)
+        self._longest, self._ones = model.scalars(), wp.ones(model.count, dtype=model.dtype, device=model.device)
+        if self._colliders is not None and not self._lets_out:
+            self._cut_before = wp.zeros_like(self._colliders.notes.cut)
+            self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
+
+    def launch_relist(self, base, d, active, launch):
+        """Lists the pairs at base + d of copies that are ``active`` (B,), and launches ``launch``, if vertices have moved far
+        since the last list."""
+        self._add(base, d, 1.0, self._contact.x_before, active)
+
+        def relist(x):
+            self._contact.launch_list(x)
+            self._launch_areas_again(x, self._contact.proximity.copies)
+            launch()
+
+        self.launch_fresh(self._contact.x_before, relist, active)
+
+    def launch_limit(self, sums, gradient, preconditioner, right, direction):
+        """Cuts the direction from the positions of :meth:`launch_relist` short, so that pairs stay apart along all of it.
+
+        A direction longer than lists allow is shortened as a whole: cut at each vertex alone it would stretch stiff cloth. Of a
+        copy where energy does not fall along what is left it is P·right, with the preconditioner P, cut short likewise.
+        """
+        model, N = self.model, self.model.count
+        self._launch(self_filter.precondition, N, [preconditioner, right], [self._other])
+        for each in (direction, self._other):
+            sums.largest(self._ones, each, self._longest)
+            self._launch(self_filter.shorten, N, [self._longest, model.per_copy, WAY * self._contact.skin], [each])
+            self._launch_planes(self._contact.x_before, None, each)
+            given = [self._share, self._common, model.per_copy, WAY * self._contact.skin]
+            self._launch(self_filter.limit_direction, N, given, [each])
+        sums.dot(gradient, direction, self._slope)
+        self._launch(self_filter.take_descent, N, [self._slope, self._other, model.per_copy], [direction])
+
+    def _add(self, a, b, sign, out, active=None):
+        self._launch(self_filter.add_positions, self.model.count, [a, b, sign, active, self.model.per_copy], [out])

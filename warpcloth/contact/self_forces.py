@@ -1,0 +1,164 @@
+"""Forces of contact between near parts of cloth, in the steps of a solver."""
+
+import numpy as np
+import warp as wp
+
+from ..kernels import self_contact, self_sweeps
+
+
+class SelfForces:
+    """Energy, gradient, second derivatives and sweeps of the pairs of a :class:`warpcloth.contact.self_steps.SelfSteps`.
+
+    They include friction, if there is any.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        bounded: Whether contact is that of explicit steps, without the logarithm.
+
+    Attributes:
+        energies: Those of the pairs by their first vertex, (N,) [J].
+        friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
+    """
+
+    def __init__(self, model, bounded):
+        self.model, self.friction, self._touching = model, None, None
+        self.energies = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        made = self_contact.add_forces, self_contact.sum_energies, self_contact.add_diagonal, self_contact.add_products
+        self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
+        self._find = model.kernel(self_contact.find_forces, model.dtype, bounded)
+
+    def hold(self, pairs, begun):
+        """Takes the arrays of pairs, and allocates as much room for their forces.
+
+        Args:
+            pairs: :func:`warpcloth.kernels.self_pairs.near_pairs`.
+            begun: :class:`warpcloth.kernels.self_pairs.StepPairs`.
+        """
+        self.pairs, self.begun, device = pairs, begun, self.model.device
+
+        def room(dtype):
+            return wp.zeros(len(pairs.stencils), dtype=dtype, device=device)
+
+        self._found = self_contact.PairForces()
+        self._found.normal, self._found.weights = room(wp.vec3d), room(wp.vec4d)
+        self._found.energy, self._found.slope, self._found.bend = (room(wp.float64) for _ in range(3))
+        self.multipliers = room(wp.float64)
+        if self._touching is not None:
+            self._swept = self_sweeps.SweptPairs()
+            self._swept.touches, self._swept.normal, self._swept.weights = room(wp.int32), room(wp.vec3d), room(wp.vec4d)
+            self._swept.gap, self._swept.multiplier = room(wp.float64), room(wp.float64)
+
+    def _launch(self, factory, dim, inputs, outputs):
+        self.model.launch(self._kernels[factory], dim, inputs, outputs)
+
+    def launch_forces(self, x, correction=None):
+        """Finds the forces of the pairs at x, or x + correction, which the methods below add up."""
+        self.model.launch(self._find, len(self.pairs.stencils), [self.pairs, self.begun, x, correction], [self._found])
+        if self.friction is not None:
+            self.friction.launch_forces(x, correction)
+
+    def add_gradient(self, out):
+        """out (N,) += ∂U/∂x."""
+        self._launch(self_contact.add_forces, self.model.count, [self.pairs, self._found], [out])
+        if self.friction is not None:
+            self.friction.add_gradient(out)
+
+    def add_energy(self, sums, out):
+        """out (B,) += U."""
+        self._launch(self_contact.sum_energies, self.model.count, [self.pairs, self._found], [self.energies])
+        if self.friction is not None:
+            self.friction.add_energies(self.energies)
+        sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
+
+    def add_diagonal(self, diagonal, values):
+        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
+        given = [self.pairs, self.model.inverse_mass, diagonal, self._found]
+        self._launch(self_contact.add_diagonal, self.model.count, given, [values])
+        if self.friction is not None:
+            self.friction.add_diagonal(diagonal, values)
+
+    def add_products(self, p, q, active):
+        """q += A p of its blocks off the diagonal, for the copies that are ``active`` (B,)."""
+        given = [self.pairs, self.model.inverse_mass, self._found, p, active, self.model.per_copy]
+        self._launch(self_contact.add_products, self.model.count, given, [q])
+        if self.friction is not None:
+            self.friction.add_products(p, q, active)
+        self.model.lock(q)
+
+    def rows(self):
+        """Of the pairs that press at the last :meth:`launch_forces`: J, whose rows are wᵢn, and kAφ″; the host reads them.
+
+        Friction has rows of its own, along the plane normal to n.
+
+        Returns:
+            J, scipy (pairs, 3N) without columns of what does not move, and D, scipy diagonal (pairs, pairs) [N/m]; ∂²U/∂x² is
+            JᵀDJ.
+        """
+        from scipy.sparse import csr_matrix, diags
+
+        model, bend = self.model, self._found.bend.numpy()
+        acting = np.sort(self.pairs.acting.numpy()[: self.pairs.number.numpy()[0]])
+        press = acting[bend[acting] != 0.0]
+        found = [array.numpy()[press] for array in (self.pairs.stencils, self._found.weights, self._found.normal)]
+        found.append(bend[press])
+        if self.friction is not None:
+            found = [np.concatenate(each) for each in zip(found, self.friction.rows(), strict=True)]
+        stencils, w, n, bend = found
+        columns = 3 * stencils.astype(np.int64)[:, :, None] + np.arange(3)
+        values = w[:, :, None] * n[:, None, :] * (model.coordinate_mobility() > 0.0)[columns]
+        starts = 12 * np.arange(len(bend) + 1)
+        J = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(bend), 3 * model.count))
+        return J, diags(bend)
+
+    def sweeps(self, in_turn):
+        """Says that sweeps will move pairs in turn, or all at once, as devices with many threads must."""
+        model, key = self.model, (self.model.dtype, self.model.mobility is not None)
+        if self.friction is not None:
+            self.friction.sweeps(in_turn)
+        if in_turn and model.device.is_cpu:
+            self._sweep = model.kernel(self_sweeps.sweep_pairs, *key)
+            return
+        self._touching = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self._press, self._move = (
+            model.kernel(factory, *key) for factory in (self_sweeps.press_pairs, self_sweeps.move_by_pairs)
+        )
+        for factory in (self_sweeps.touch_pairs, self_sweeps.count_touching, self_sweeps.keep_pairs):
+            self._kernels[factory] = model.kernel(factory, model.dtype)
+        self.hold(self.pairs, self.begun)
+
+    def launch_sweep(self, x, correction, h, adds, backward=False):
+        """Moves the vertices of all pairs, see :func:`warpcloth.kernels.self_sweeps.sweep_pairs` and its neighbours.
+
+        Args:
+            x: x̃ (N,) [m].
+            correction: d (N,) [m].
+            h: Step [s].
+            adds: Whether multipliers add up over sweeps; else pairs are hard.
+            backward: Whether pairs move from the last to the first, where they move in turn.
+        """
+        if self.friction is not None and backward:
+            self.friction.launch_sweep(x, correction, h, backward)
+        self._launch_sweep(x, correction, h, adds, backward)
+        if self.friction is not None and not backward:
+            self.friction.launch_sweep(x, correction, h, backward)
+
+    def launch_no_multipliers(self):
+        """Launches λ = 0 of all pairs."""
+        self.multipliers.zero_()
+        if self.friction is not None:
+            self.friction.multipliers.zero_()
+
+    def _launch_sweep(self, x, correction, h, adds, backward):
+        model, mobility, multipliers = self.model, self.model.local_mobility, self.multipliers if adds else None
+        if self._touching is None:
+            given = [self.pairs, mobility, self.begun, x, h, not adds, backward]
+            model.launch(self._sweep, 1, given, [multipliers, self._found, correction])
+            return
+        count, N, swept = len(self.pairs.stencils), model.count, self._swept
+        self._launch(self_sweeps.touch_pairs, count, [self.pairs, self.begun, multipliers, x, correction], [swept])
+        self._launch(self_sweeps.count_touching, N, [self.pairs, swept], [self._touching])
+        given = [self.pairs, mobility, self.begun, self._touching, multipliers, h, not adds]
+        model.launch(self._press, count, given, [swept])
+        model.launch(self._move, N, [self.pairs, mobility, swept, multipliers, self._found], [correction])
+        if adds:
+            self._launch(self_sweeps.keep_pairs, count, [self.pairs, swept], [multipliers, self._found])
