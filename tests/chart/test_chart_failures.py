@@ -115,9 +115,8 @@ def test_what_has_no_stiffness_slides_on(device):
     """Springs alone: three lengths of edge keep the curvature to (κh)², others lose more and more of it."""
     h = locking.CURVATURE / 10
     assert np.abs(of(locking.let_go("equilateral", 0.0, device), "time", "equilateral")[1] - 1.0).max() < h**2
-    for degrees in (0.0, 40.0):
-        t, kept = of(locking.let_go("jittered", degrees, device), "time", f"jittered, turned by {degrees:g}°")
-        assert t[-1] == 20.0 and kept[-1] < 0.7 and kept[t < 0.2].min() > 0.9
+    t, kept = of(locking.let_go("jittered", 40.0, device), "time", "jittered, turned by 40°")
+    assert t[-1] == 20.0 and kept[-1] < 0.7 and kept[t < 0.2].min() > 0.9
 
 
 # --- 10. to 13., which are measured at once.

@@ -117,7 +117,7 @@ def place(tmp_path_factory):
     return tmp_path_factory.mktemp("generated")
 
 
-STAGES, counts = generated(100, 4600)
+STAGES, counts = generated(100, 1000)
 
 
 @counts
@@ -150,7 +150,7 @@ def texts_of_meshes():
     }
 
 
-FILES, counts = generated(40, 800)
+FILES, counts = generated(40, 300)
 
 
 @counts
@@ -179,7 +179,7 @@ def arrays(ending):
     return file.getvalue()
 
 
-ARRAYS, counts = generated(60, 700)
+ARRAYS, counts = generated(60, 300)
 
 
 @counts

@@ -458,7 +458,7 @@ def test_pins_bear_what_lies_on_them(device):
     assert animation.energies["self-contact"] == pytest.approx(0.5 * weight**2 / (1e4 * 0.25), rel=1e-6)
 
 
-@pytest.mark.parametrize("steps", [20, pytest.param(400, marks=SLOW)])
+@pytest.mark.parametrize("steps", [20, pytest.param(100, marks=SLOW)])
 def test_violent_steps(steps, device):
     """Of random moves of up to a third of the sheet, from wherever the last ended, nothing crosses."""
     scene = folded(gravity=np.zeros(3))
@@ -750,7 +750,7 @@ def crossing_pairs(points, triangles):
     return {tuple(sorted(pair)) for pair in predicates.find_self_intersections(stored, triangles.astype(np.int64))[1].tolist()}
 
 
-# What remains of a start is for all solvers one; the larger crossings have one that is explicit, that minimises, and that sweeps.
+# What stays of a start is one for all solvers; larger crossings have one that is explicit, that minimises, and that sweeps.
 @pytest.mark.parametrize(
     ("name", "start"),
     [

@@ -133,9 +133,7 @@ def test_ladders_are_of_one_method_each_and_go_on():
 SCENES = [
     ("hanging", {"n": 6}, 12),
     ("chain", {"links": 5}, 12),
-    pytest.param("hanging", {"n": 10}, 20, marks=pytest.mark.slow),
-    pytest.param("cantilever", {"elements": 8}, 20, marks=pytest.mark.slow),
-    pytest.param("chain", {}, 30, marks=pytest.mark.slow),
+    pytest.param("cantilever", {"elements": 6}, 10, marks=pytest.mark.slow),  # with all solvers
 ]
 
 
