@@ -292,6 +292,27 @@ def add_collider_work(dtype):
 
 
 @cache
+def add_rubbing_work(dtype):
+    """Kernel over vertices, after a step: work against friction += ∇H·Δx, ∇H where the step takes its forces."""
+    vec3, _ = types(dtype)
+    product = wide_dot(dtype)
+
+    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
+    def add_each_rubbing(
+        # state in
+        gradient: wp.array(dtype=vec3),
+        x_before: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # in and out
+        against_friction: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        against_friction[i] = against_friction[i] + product(gradient[i], x[i] - x_before[i])
+
+    return add_each_rubbing
+
+
+@cache
 def add_filter_work(dtype):
     """Kernel over vertices, after a step: work of the filter += ½m(v² − v₋²) − (m g + f)·(x − x₋), x₋ and v₋ without it.
 

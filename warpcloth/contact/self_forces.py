@@ -70,6 +70,13 @@ class SelfForces:
             self.friction.add_energies(self.energies)
         sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
 
+    def add_stored(self, sums, out):
+        """out (B,) += the part of U that is of the springs of friction."""
+        if self.friction is not None:
+            self.energies.zero_()
+            self.friction.add_energies(self.energies)
+            sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
+
     def add_diagonal(self, diagonal, values):
         """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
         given = [self.pairs, self.model.inverse_mass, diagonal, self._found]

@@ -107,6 +107,7 @@ class SelfFriction:
 
     def __init__(self, model, slips, steps, friction, bounded):
         self.model, self._kept, self._steps, self._friction = model, slips, steps, friction
+        self._bounded = bounded
         self.start, self._step, self._rubbing = model.vectors(), Slips(model, slips.room), None
         self._vertices = Scan(model, model.count)
         made = kernels.set_stretch, kernels.find_friction, kernels.add_friction, kernels.sum_friction
@@ -174,6 +175,12 @@ class SelfFriction:
         """Finds the forces at x, or x + correction, which the methods below add up."""
         given = [self.pairs, self.rubbed, self.start, x, correction]
         self._launch(kernels.find_friction, self._kept.room, given, [self._forces])
+
+    def launch_acting(self, x, out):
+        """Sets out (N,) to ∂U/∂x where the step that ended at x took its forces: explicit ones where it began, others at x."""
+        self.launch_forces(self.start if self._bounded else x, None)
+        out.zero_()
+        self.add_gradient(out)
 
     def launch_end(self, x):
         """Keeps the pairs of the step, and how far they are stretched at x."""

@@ -61,7 +61,8 @@ def _other_names(scene):
     others = ["self-contact"] * (scene.self_contact is not None) + ["kinetic", "gravity"]
     others += ["work of pins"] * scene.pins.moves + ["work of loads"] * bool(scene.loads)
     others += ["work of colliders"] * moved + ["work of the filter"] * bool(scene.colliders)
-    return others + ["heat of friction"] * bool(scene.rubbing)
+    of_cloth = scene.self_contact is not None and scene.self_contact.friction > 0.0
+    return others + ["heat of friction"] * (of_cloth or bool(scene.rubbing))
 
 
 def collider_names(scene: Scene) -> list[str]:
@@ -82,7 +83,8 @@ class Evaluation:
 
     Attributes:
         names: Names of the energies.
-        names_of_friction: Those of them that friction stores.
+        names_of_friction: Those of them that friction with colliders stores.
+        stored: U of the springs of friction of cloth with itself, of the last :meth:`energies`, (B,) [J].
         hidden: Whether some forces are those of multipliers.
         gradient: ∂U/∂x of the last :meth:`launch`, (N,) [N].
         pulls: :class:`warpcloth.contact.present.ColliderPulls` of it, or None without colliders.
@@ -101,7 +103,7 @@ class Evaluation:
         self._pins, self._held = model.in_model(model.scene.pins.vertices), model.scene.pins.held
         self._mass = model.mass.numpy().astype(np.float64).reshape(model.copies, -1)
         self._gravity = model.gravity.numpy().astype(np.float64)[:, None]
-        self._start, self._energies = self._host(model.positions), None
+        self._start, self._energies, self.stored = self._host(model.positions), None, np.zeros(model.copies)
         self.names = energy_names(model.scene)
         self._term_names = _term_names(model.scene)
         self.names_of_friction = [
@@ -165,11 +167,12 @@ class Evaluation:
                 energy.add(x, total)
             found[name] = found.get(name, 0.0) + total.numpy()
         if self._pairs is not None:
-            total = model.scalars()
+            total, stored, sums = model.scalars(), model.scalars(), Sums(model)
             self._pairs.launch_begin(x)
             self._pairs.forces.launch_forces(x)
-            self._pairs.forces.add_energy(Sums(model), total)
-            found["self-contact"] = total.numpy()
+            self._pairs.forces.add_energy(sums, total)
+            self._pairs.forces.add_stored(sums, stored)
+            found["self-contact"], self.stored = total.numpy(), stored.numpy()
         moved = self._host(x) - self._start
         if v is not None:
             with np.errstate(over="ignore"):  # of a copy that diverges
@@ -256,7 +259,11 @@ class History:
         self._total, self._each_step = np.zeros((5, model.copies)), None
         self._seen = self._counted()
         x, v = stepper.state
-        if self._moving or self._driven or self._filtered:
+        self._pulls_itself = None
+        if asked and stepper.pairs is not None and stepper.pairs.friction is not None:
+            self._pulls_itself, self._rubbed = model.vectors(), True
+            self._rub = model.kernel(kernels.add_rubbing_work, model.dtype)
+        if self._moving or self._driven or self._filtered or self._pulls_itself:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
         self._note()
@@ -319,6 +326,7 @@ class History:
             self._begin()
             for _ in range(self._stepper.steps_per_frame):
                 self._stepper.step()
+                self._add_rubbing()
                 self._make_room()
                 self._each_step()
             for total, work in zip(self._total, self._works, strict=True):
@@ -328,6 +336,13 @@ class History:
                 self._total[4] += np.concatenate([cuts.elastic() for cuts, _touches, _vertices in self._touches])
         self._frame += 1
         self._note()
+
+    def _add_rubbing(self):
+        """Adds the work against friction of cloth with itself in the step that ended; what is recorded lists pairs anew."""
+        if self._pulls_itself is not None:
+            friction, x = self._stepper.pairs.friction, self._stepper.state.x
+            friction.launch_acting(x, self._pulls_itself)
+            self.model.launch(self._rub, self.model.count, [self._pulls_itself, friction.start, x], [self._works[3]])
 
     def _make_room(self):
         """Makes room for all pairs of self-contact at the present state, and records what launches them again."""
@@ -354,7 +369,7 @@ class History:
                 energies["work of loads"] = self._total[1].copy()
             energies["work of colliders"], energies["work of the filter"] = self._total[2].copy(), self._total[4].copy()
             if self._rubbed:
-                stored = sum(energies[name] for name in evaluation.names_of_friction)
+                stored = evaluation.stored + sum(energies[name] for name in evaluation.names_of_friction)
                 energies["heat of friction"] = self._total[3] - stored
             found["energies"] = np.stack([energies[name] for name in self.names], axis=-1)
         if "reactions" in self._record:
