@@ -1,4 +1,4 @@
-"""Two strips in a loose reef knot, which is pulled tight by their ends."""
+"""Two strips in a loose reef knot, which is pulled tight by their ends, against the friction between them."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,13 +19,16 @@ LINE = np.array(
 )
 
 
-def scene(along: int = 120, across: int = 5, width: float = 0.02, pull: float = 0.1, duration: float = 2.0):
-    """Edges along a strip and across it, its width [m], way of each end [m], duration [s]."""
+def scene(
+    along: int = 120, across: int = 5, width: float = 0.02, pull: float = 0.1, friction: float = 0.02, duration: float = 2.0
+):
+    """Edges along a strip and across it, its width [m], way of each end [m], friction of the strips, duration [s]."""
     wc.checks.whole("along", along, 40)
     wc.checks.whole("across", across, 1)
     for name, value in {"width": width, "duration": duration}.items():
         wc.checks.number(name, value, above=0.0)
     wc.checks.number("pull", pull)
+    wc.checks.number("friction", friction, least=0.0)
     fps, points = 25.0, width * np.concatenate([LINE, LINE[-2::-1] * [1.0, -1.0, 1.0]])
     spline = CubicSpline(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))], points)
     fine = np.linspace(0.0, spline.x[-1], 4000)
@@ -48,7 +51,7 @@ def scene(along: int = 120, across: int = 5, width: float = 0.02, pull: float = 
         terms=[wc.Spring(pairs="edges", stiffness=500.0, damping=0.05), wc.QuadraticBending(stiffness=1e-5)],
         pins=wc.Pins(held, positions[held] + np.multiply.outer(ease, way)),
         gravity=(0.0, 0.0, 0.0),
-        self_contact=wc.SelfContact(distance=1e-3, stiffness=1e6),
+        self_contact=wc.SelfContact(distance=1e-3, stiffness=1e6, friction=friction),
         duration=duration,
         fps=fps,
         name="knot",

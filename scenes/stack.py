@@ -10,7 +10,7 @@ import warpcloth as wc
 
 
 def scene(sheets: int = 5, n: int = 24, size: float = 0.4, press: float = 0.5, friction: float = 0.3, duration: float = 2.0):
-    """Sheets, vertices a side, side [m], gap under the ball over sheets times r, friction of ball and floor, duration [s]."""
+    """Sheets, vertices a side, side [m], gap under the ball over sheets times r, friction of all, duration [s]."""
     wc.checks.whole("sheets", sheets, 1)
     wc.checks.whole("n", n, 2)
     for name, value in {"size": size, "press": press, "duration": duration}.items():
@@ -36,7 +36,7 @@ def scene(sheets: int = 5, n: int = 24, size: float = 0.4, press: float = 0.5, f
             wc.Sphere(radius=radius, position=ball, friction=friction, name="ball"),
         ],
         contact=wc.Contact(distance=distance),
-        self_contact=wc.SelfContact(distance=distance),
+        self_contact=wc.SelfContact(distance=distance, friction=friction),
         duration=duration,
         fps=fps,
         name="stack",

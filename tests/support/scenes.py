@@ -46,6 +46,9 @@ SMALL = {
     "usd_cloth": {},
     "bar_twist": {"cells": 2},
     "bunny": {"stiffness": 10.0, "bending": 1e-4},
+    "cards": {"n": 3},
+    "loop": {"elements": 16},
+    "stack": {"sheets": 2, "n": 4},
 }
 TOUCHING = {
     "incline": {"n": 4},
@@ -59,6 +62,7 @@ TOUCHING = {
     "character": {"duration": 0.5},
 }
 FOLDING = {
+    "cards": {"n": 3, "friction": 0.1},
     "loop": {"elements": 16},
     "stack": {"sheets": 3, "n": 5, "duration": 0.6},
     "fold": {"nx": 3, "ny": 13, "folds": 2},
