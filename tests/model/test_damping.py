@@ -122,7 +122,7 @@ def test_the_rate_has_the_order_of_the_integrator(name, integrator, order, devic
     def at(t):
         return scene.positions + t * v + 0.5 * t * t * a
 
-    for h in (4e-3, 2e-3, 1e-3):
+    for h in (2e-3, 1e-3):
         if integrator == "euler":
             x, rate, D = at(h), v + h * a, Dissipation(scene, h, device)
         elif integrator == "bdf2":
@@ -283,7 +283,7 @@ def test_a_damped_oscillator(name, device):
     assert errors[-1] < 0.05 * 0.25
 
 
-@pytest.mark.parametrize("beta", [0.0, 0.5, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize("beta", [0.0, 1.0, 10.0])
 def test_limit_of_the_explicit_step_falls(beta, device):
     """z² − z(2 − h²ω² − hβ) + 1 − hβ = 0 leaves the unit circle at z = −1, where h²ω² + 2hβ = 4."""
     omega = 2.0
@@ -337,12 +337,12 @@ def test_momentum_is_kept(name, solver, device):
         return np.concatenate([(mass * v).sum(axis=0), np.cross(x, mass * v).sum(axis=0)])
 
     before, scale = momenta(), (mass * np.abs(scene.velocities)).sum()
-    for _ in range(50):
+    for _ in range(20):
         stepper.step()
     change = np.abs(momenta() - before)
     assert change[:3].max() < 1e-9 * scale
-    # The explicit force is taken at x + h v, of which the moment about x is of order h, for 50 steps of h.
-    assert change[3:].max() < (2e-3 if isinstance(solver, wc.Explicit) else 1e-9) * scale
+    # The explicit force is taken at x + h v, of which the moment about x is of order h, for 20 steps of h.
+    assert change[3:].max() < (8e-4 if isinstance(solver, wc.Explicit) else 1e-9) * scale
 
 
 @pytest.mark.parametrize("solver", [wc.Explicit(substeps=1), wc.Newton(substeps=1, tolerance=1e-12, integrator="midpoint")])

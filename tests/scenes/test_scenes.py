@@ -9,7 +9,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.meshes import PAIR
-from support.scenes import FOLDING, LIVELY, QUICK, SMALL, TOUCHING, scene
+from support.scenes import FOLDING, QUICK, SMALL, TOUCHING, scene
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result, digits, sentence
@@ -163,15 +163,6 @@ def test_a_copy_that_diverges_leaves_the_others_alone(device):
     softer = replace(cloth, terms=[replace(cloth.terms[0], stiffness=50.0), *cloth.terms[1:]])
     alone = wc.simulate(softer, solver, device=device, frames=12, dtype="float64").points
     assert np.array_equal(animation.points[:, 2], alone)
-
-
-@pytest.mark.parametrize("name", LIVELY)
-def test_fast_is_not_diverged(name, device):
-    """Energy that the start holds may turn into speed."""
-    make, mesh = LIVELY[name]
-    lively = wc.Scene(mesh, duration=0.1, **make(mesh))
-    animation = wc.simulate(lively, wc.Explicit(substeps=4000), device=device, dtype="float64")
-    assert animation.status.ok, animation.status
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
