@@ -246,7 +246,7 @@ exec(check, names)
 CHECKS = {
     "docs/scenes.md": """
 assert animation.status.ok and animation.status.message.startswith("converged")
-assert animation.points.shape == (61, 1024, 3) and animation.points[-1].shape == (1024, 3)
+assert animation.points.shape == (61, 576, 3) and animation.points[-1].shape == (576, 3)
 """,
     "docs/batches.md": "assert ends == 2 * 64",
 }

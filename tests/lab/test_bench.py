@@ -267,6 +267,7 @@ def test_the_command_compares(folder, capsys):
         assert [each["verdict"] for each in json.loads(capsys.readouterr().out)["rows"]] == ["faster", "slower", ""]
 
 
+@pytest.mark.slow
 def test_the_command_measures(folder, device, capsys):
     environment = dict(os.environ)
     command = ["bench", "hanging", "-p", "bending=0", "--solver", "explicit", "--sizes", "6", "4", "6", "--frames", "3"]

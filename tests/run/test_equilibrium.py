@@ -61,9 +61,7 @@ def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("gamma", "bending"), zip(GAMMAS, 3 * ("quadratic", "dihedral"), strict=True)
-)  # both in a narrow strip
+@pytest.mark.parametrize(("gamma", "bending"), list(zip(GAMMAS, 3 * ["quadratic", "dihedral"], strict=True)))
 def test_a_wide_sheet_is_the_elastica(gamma, bending, device):
     """As wide as long and nearly inextensible its edges stay flat: H/W at Γ to 1.5 %.
 
