@@ -21,13 +21,18 @@ potential, slope, bend = contact.potential, contact.slope, contact.bend
 
 @wp.struct
 class PairForces:
-    """n, w, kAφ [J], kAφ′ [N] and kAφ″ [N/m] of each pair at some positions."""
+    """n, w, kAφ [J], kAφ′ [N] and kAφ″ [N/m] of each pair at some positions.
+
+    On the CPU ``pressing`` lists the pairs that have a force, in order; there are ``count`` (1,) of them.
+    """
 
     normal: wp.array(dtype=wp.vec3d)
     weights: wp.array(dtype=wp.vec4d)
     energy: wp.array(dtype=wp.float64)
     slope: wp.array(dtype=wp.float64)
     bend: wp.array(dtype=wp.float64)
+    pressing: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
 
 
 @cache
@@ -77,6 +82,8 @@ def find_forces(dtype, bounded: bool):
                 forces.energy[e] = k * potential(gap, r)
                 forces.slope[e] = k * slope(gap, r)
                 forces.bend[e] = k * bend(gap, r)
+            if forces.pressing:
+                forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
 
     return find_forces_of_pairs
 

@@ -42,15 +42,44 @@ def free_move(dtype, axes: bool):
 
 
 @cache
+def find_reaches(dtype):
+    """Kernel over acting pairs: by how much the gap at x along the n of the start of the step is above the contact distance."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_each_reach(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        step: StepPairs,
+        x: wp.array(dtype=vec3),
+        # out
+        reach: wp.array(dtype=wp.float64),
+    ):
+        t = wp.tid()
+        if t >= pairs.number[0]:
+            return
+        e = pairs.acting[t]
+        s = pairs.stencils[e]
+        gap = gap_along(e < pairs.counts[0], step.normal[e], exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        reach[t] = gap - wp.float64(pairs.distances[e])
+
+    return find_each_reach
+
+
+@cache
 def sweep_pairs(dtype, axes: bool):
     """Kernel of one thread: each acting pair in turn takes its force away, then adds that of the prox at the gap without it.
 
     With d̂ = n·Σwᵢxᵢ without the force of the pair and W = Σ wᵢ²/mᵢ, λ = (d* − d̂)/W, where d* solves
     (d* − d̂)/W = −kAhₑ²φ′(d*) in closed form, and Δxᵢ = wᵢ λ n/mᵢ. M(x − x̃) = Σ wᵢλn then holds with the n and w that pairs have
     at x, and a fixed point is the minimiser of the step. Without ``multipliers`` nothing is taken away (PBD).
+
+    A pair whose ``reach`` at x, see :func:`find_reaches`, the corrections have not closed has no force, and costs little.
     """
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
+    at, exact = vertex_of(dtype)
     moved = free_move(dtype, axes)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -60,6 +89,7 @@ def sweep_pairs(dtype, axes: bool):
         inverse_mass: wp.array(dtype=vec3 if axes else dtype),
         # state in
         step: StepPairs,
+        reach: wp.array(dtype=wp.float64),
         x: wp.array(dtype=vec3),
         # parameters
         h: wp.float64,
@@ -72,18 +102,26 @@ def sweep_pairs(dtype, axes: bool):
     ):
         count = pairs.number[0]
         for turn in range(count):
-            e = pairs.acting[wp.where(backward, count - 1 - turn, turn)]
-            k = step.stiffness[e]
-            r = wp.float64(pairs.distances[e])
+            own = wp.where(backward, count - 1 - turn, turn)
+            e = pairs.acting[own]
             s = pairs.stencils[e]
+            of_vertex = e < pairs.counts[0]
             before = ZERO
             if multipliers:
                 before = multipliers[e]
+            if before == ZERO:
+                p0 = exact(correction[s[0]])
+                p1 = exact(correction[s[1]])
+                p2 = exact(correction[s[2]])
+                p3 = exact(correction[s[3]])
+                if reach[own] + gap_along(of_vertex, step.normal[e], p0, p1, p2, p3) > ZERO:
+                    continue
+            k = step.stiffness[e]
+            r = wp.float64(pairs.distances[e])
             a = at(x, correction, s[0])
             b = at(x, correction, s[1])
             c = at(x, correction, s[2])
             d = at(x, correction, s[3])
-            of_vertex = e < pairs.counts[0]
             if before != ZERO or gap_along(of_vertex, step.normal[e], a, b, c, d) < r:
                 w, y, inside = nearest(of_vertex, a, b, c, d)
                 gap, n = signed_gap(y, step.normal[e], inside)

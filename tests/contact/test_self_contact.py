@@ -13,6 +13,7 @@ from warpcloth.contact.self_steps import SelfSteps
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.self_gaps import nearest
+from warpcloth.solvers.solver import Stepper
 
 SLOW = pytest.mark.slow
 SOLVERS = {
@@ -548,6 +549,27 @@ def test_quiet_explicit_steps_are_those_with_contact(speed, device):
     assert ends[0] == ends[2]
     assert (stepper.pairs.lists.numpy() > (1 if speed else 0)).all()
     assert stepper.pairs.steps.numpy().tolist() == [240, 240]
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.02, 5.0])
+@pytest.mark.parametrize("name", ["xpbd", "newton"])
+def test_far_steps_are_those_with_contact(name, speed, device, monkeypatch):
+    """To the bit, of sheets that fall, that bend within the bounds of the list and beyond, and whose moves are long."""
+    scene = layers(1, gravity=np.array([0.0, -9.81, 0.0]))
+    bent = speed * np.sin(9.0 * scene.positions[:, :1]) * [0.3, 1.0, 0.0]
+    ends, alone = [], 0
+    for find_twin in (Stepper.find_twin, lambda stepper: None):
+        monkeypatch.setattr(Stepper, "find_twin", find_twin)
+        stepper = SOLVERS[name].bind(replace(scene, velocities=bent).build(device=device, copies=2))
+        for _ in range(3):
+            for _ in range(stepper.steps_per_frame):
+                stepper.step()
+                alone += stepper.clear_steps is not None and stepper.clear_steps.near.numpy()[0] == 0
+            stepper.frame()
+        ends.append(stepper.state.copy())
+    assert ends[0] == ends[1]
+    assert ends[0].arrays["steps of self-contact"].numpy().tolist() == [6 * stepper.steps_per_frame] * 2
+    assert (alone > 0) == (speed < 1.0)
 
 
 @each_solver

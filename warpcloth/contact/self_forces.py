@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels import self_contact, self_sweeps
+from ..kernels.fast import pair_scatter
 
 
 class SelfForces:
@@ -21,9 +22,12 @@ class SelfForces:
     """
 
     def __init__(self, model, bounded):
-        self.model, self.friction, self._touching = model, None, None
+        self.model, self.friction, self._touching, self._reach = model, None, None, None
         self.energies = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         made = self_contact.add_forces, self_contact.sum_energies, self_contact.add_diagonal, self_contact.add_products
+        if model.device.is_cpu:
+            made = pair_scatter.scatter_forces, pair_scatter.scatter_energies
+            made += pair_scatter.scatter_diagonal, pair_scatter.scatter_products
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._find = model.kernel(self_contact.find_forces, model.dtype, bounded)
 
@@ -42,7 +46,11 @@ class SelfForces:
         self._found = self_contact.PairForces()
         self._found.normal, self._found.weights = room(wp.vec3d), room(wp.vec4d)
         self._found.energy, self._found.slope, self._found.bend = (room(wp.float64) for _ in range(3))
+        if device.is_cpu:
+            self._found.pressing, self._found.count = room(wp.int32), wp.zeros(1, dtype=wp.int32, device=device)
         self.multipliers = room(wp.float64)
+        if self._reach is not None:
+            self._reach = room(wp.float64)
         if self._touching is not None:
             self._swept = self_sweeps.SweptPairs()
             self._swept.touches, self._swept.normal, self._swept.weights = room(wp.int32), room(wp.vec3d), room(wp.vec4d)
@@ -53,19 +61,30 @@ class SelfForces:
 
     def launch_forces(self, x, correction=None):
         """Finds the forces of the pairs at x, or x + correction, which the methods below add up."""
+        if self.model.device.is_cpu:
+            self._found.count.zero_()
         self.model.launch(self._find, len(self.pairs.stencils), [self.pairs, self.begun, x, correction], [self._found])
         if self.friction is not None:
             self.friction.launch_forces(x, correction)
 
+    def _sum(self, gather, scatter, inputs, outputs):
+        """Launches a sum over pairs: one thread of the CPU takes them in turn, other devices take vertices."""
+        if self.model.device.is_cpu:
+            self._launch(scatter, 1, inputs, outputs)
+        else:
+            self._launch(gather, self.model.count, inputs, outputs)
+
     def add_gradient(self, out):
         """out (N,) += ∂U/∂x."""
-        self._launch(self_contact.add_forces, self.model.count, [self.pairs, self._found], [out])
+        self._sum(self_contact.add_forces, pair_scatter.scatter_forces, [self.pairs, self._found], [out])
         if self.friction is not None:
             self.friction.add_gradient(out)
 
     def add_energy(self, sums, out):
         """out (B,) += U."""
-        self._launch(self_contact.sum_energies, self.model.count, [self.pairs, self._found], [self.energies])
+        if self.model.device.is_cpu:
+            self.energies.zero_()
+        self._sum(self_contact.sum_energies, pair_scatter.scatter_energies, [self.pairs, self._found], [self.energies])
         if self.friction is not None:
             self.friction.add_energies(self.energies)
         sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
@@ -80,14 +99,14 @@ class SelfForces:
     def add_diagonal(self, diagonal, values):
         """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
         given = [self.pairs, self.model.inverse_mass, diagonal, self._found]
-        self._launch(self_contact.add_diagonal, self.model.count, given, [values])
+        self._sum(self_contact.add_diagonal, pair_scatter.scatter_diagonal, given, [values])
         if self.friction is not None:
             self.friction.add_diagonal(diagonal, values)
 
     def add_products(self, p, q, active):
         """q += A p of its blocks off the diagonal, for the copies that are ``active`` (B,)."""
         given = [self.pairs, self.model.inverse_mass, self._found, p, active, self.model.per_copy]
-        self._launch(self_contact.add_products, self.model.count, given, [q])
+        self._sum(self_contact.add_products, pair_scatter.scatter_products, given, [q])
         if self.friction is not None:
             self.friction.add_products(p, q, active)
         self.model.lock(q)
@@ -124,6 +143,8 @@ class SelfForces:
             self.friction.sweeps(in_turn)
         if in_turn and model.device.is_cpu:
             self._sweep = model.kernel(self_sweeps.sweep_pairs, *key)
+            self._kernels[self_sweeps.find_reaches] = model.kernel(self_sweeps.find_reaches, model.dtype)
+            self._reach = wp.zeros(len(self.pairs.stencils), dtype=wp.float64, device=model.device)
             return
         self._touching = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         self._press, self._move = (
@@ -149,16 +170,18 @@ class SelfForces:
         if self.friction is not None and not backward:
             self.friction.launch_sweep(x, correction, h, backward)
 
-    def launch_no_multipliers(self):
-        """Launches λ = 0 of all pairs."""
+    def launch_sweep_start(self, x):
+        """Launches λ = 0 of all pairs, where sweeps begin at x̃ (N,)."""
         self.multipliers.zero_()
+        if self._touching is None:
+            self._launch(self_sweeps.find_reaches, len(self.pairs.stencils), [self.pairs, self.begun, x], [self._reach])
         if self.friction is not None:
             self.friction.multipliers.zero_()
 
     def _launch_sweep(self, x, correction, h, adds, backward):
         model, mobility, multipliers = self.model, self.model.local_mobility, self.multipliers if adds else None
         if self._touching is None:
-            given = [self.pairs, mobility, self.begun, x, h, not adds, backward]
+            given = [self.pairs, mobility, self.begun, self._reach, x, h, not adds, backward]
             model.launch(self._sweep, 1, given, [multipliers, self._found, correction])
             return
         count, N, swept = len(self.pairs.stencils), model.count, self._swept

@@ -128,7 +128,7 @@ class JacobiSweep(_Sweep):
             self.launch_start, self.launch, self.parts = self._launch_start, self._launch, self._parts
 
     def _launch_start(self):
-        self.pairs.forces.launch_no_multipliers()
+        self.pairs.forces.launch_sweep_start(self.x)
         self._elements.launch_start()
 
     def _launch(self):
@@ -240,7 +240,7 @@ class GaussSeidelSweep(_Sweep):
     def launch_start(self):
         """Launches d = 0, λ = 0, once x̃ is there."""
         if self.pairs is not None:
-            self.pairs.forces.launch_no_multipliers()
+            self.pairs.forces.launch_sweep_start(self.x)
         counters = [each[2] for each in self._lists if each]
         for array in (self.correction, *self.multipliers, *counters):
             if array is not None:

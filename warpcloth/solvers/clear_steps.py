@@ -12,15 +12,16 @@ from ..kernels.loop import count_down
 from ..terms.refresh import STEP
 
 
-class ClearSteps:
-    """Gives the steps in which no vertex comes near a collider to a twin of a stepper that knows none.
+class TwinSteps:
+    """Gives the steps in which nothing comes near to a twin of a stepper that has no contact.
 
-    Before a step, twice the way of the prediction tells. Where that was not enough, the step is taken again with contact, so
-    that all steps end at the minimiser of one problem.
+    Before a step a test tells. Where that was not enough, the step is taken again with contact, so that all steps end at the
+    minimiser of one problem. A subclass has ``_launch_look``, the test and what keeps the state in ``_kept``;
+    ``_launch_check``, the test after the step; and ``_launch_count``, after a step without contact.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`, bound to a model with colliders.
-        twin: One of the same options on that model without, which shares its state.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+        twin: One of the same options on the model without contact, which shares its state.
 
     Attributes:
         twin: As given.
@@ -28,51 +29,15 @@ class ClearSteps:
     """
 
     def __init__(self, stepper, twin):
-        self.stepper, self.twin, model, colliders = stepper, twin, stepper.model, stepper.colliders
-        self.near, self._followed = wp.zeros(1, dtype=wp.int32, device=model.device), False
+        self.stepper, self.twin, device = stepper, twin, stepper.model.device
+        self.near, self._left = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self._kept = {name: wp.zeros_like(array) for name, array in twin.state.arrays.items()}
-        radii = np.zeros((model.count, 4))
-        radii[:, 3] = -1.0
-        if model.pins is None and not any(model.colliders.moves):
-            radii[model.inverse_mass.numpy() == 0.0, 3] = np.inf  # pins may stand near
-        clear = kernels.balls(model.dtype)()
-        clear.balls = model.array(radii, wp.types.vector(4, model.dtype))
-        clear.found = wp.zeros(model.count, dtype=wp.int32, device=model.device)
-        clear.drift, clear.distance = colliders.drift, model.colliders.distance
-        self._bounds = shapes(model.dtype)()
-        halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
-        self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
-        self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy, stepper.h]]
-        self._out = [clear, self.near]
-        self._finds = [model.kernel(kernels.near_colliders, model.dtype, ended) for ended in (False, True)]
-        self._contact = [elements for elements in model.terms if elements.collider is not None]
-        self._left = wp.zeros_like(self.near)
-
-    def follow(self):
-        """Makes steps without contact refresh its terms as well."""
-        self._followed = True
-        self.stepper.colliders.follow()
 
     def record(self):
         """Records what :meth:`step` launches."""
-        launches = self._launch_look, self._launch_check, self._restore, self.stepper.colliders.launch_count
+        launches = self._launch_look, self._launch_check, self._restore, self._launch_count
         self._segments = [Segment(self.stepper.model.device, launch) for launch in launches]
         self._read = Mirror(self.near)
-
-    def parts(self, touching):
-        """The parts of steps that are launches, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with
-        contact; the twin has as many."""
-        found = [(self._launch_look, 1)]
-        for (own, times), (clear, _times) in zip(touching[:-1], self.twin.parts[:-1], strict=True):
-            found.append((partial(wp.capture_if, self.near, own, clear), times))
-        (own, times), (clear, _times) = touching[-1], self.twin.parts[-1]
-
-        def last():
-            clear()
-            self._launch_check()
-            wp.capture_if(self.near, lambda: self._launch_again(touching), self.stepper.colliders.launch_count)
-
-        return [*found, (partial(wp.capture_if, self.near, own, last), times)]
 
     def step(self, touching):
         """Takes a step of a method that returns to the host: ``touching`` takes it with contact."""
@@ -93,6 +58,65 @@ class ClearSteps:
     def constraint_forces(self, touching, clear):
         """The function of an array that launches ``touching`` or ``clear``, functions of it, as the last step was."""
         return lambda out: wp.capture_if(self.near, lambda: touching(out), lambda: clear(out))
+
+    def _restore(self):
+        for name, array in self.twin.state.arrays.items():
+            wp.copy(array, self._kept[name])
+
+    def _launch_in_turn(self, launch, times):
+        """A loop of the device."""
+        self._left.fill_(times)
+        wp.capture_while(self._left, partial(self._launch_one, launch, self.stepper.model.kernel(count_down)))
+
+    def _launch_one(self, launch, count):
+        launch()
+        self.stepper.model.launch(count, 1, [], [self._left])
+
+
+class ClearSteps(TwinSteps):
+    """Gives the steps in which no vertex comes near a collider to a twin of a stepper that knows none.
+
+    Before a step, twice the way of the prediction tells.
+    """
+
+    def __init__(self, stepper, twin):
+        super().__init__(stepper, twin)
+        model, colliders, self._followed = stepper.model, stepper.colliders, False
+        radii = np.zeros((model.count, 4))
+        radii[:, 3] = -1.0
+        if model.pins is None and not any(model.colliders.moves):
+            radii[model.inverse_mass.numpy() == 0.0, 3] = np.inf  # pins may stand near
+        clear = kernels.balls(model.dtype)()
+        clear.balls = model.array(radii, wp.types.vector(4, model.dtype))
+        clear.found = wp.zeros(model.count, dtype=wp.int32, device=model.device)
+        clear.drift, clear.distance = colliders.drift, model.colliders.distance
+        self._bounds = shapes(model.dtype)()
+        halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
+        self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
+        self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy, stepper.h]]
+        self._out = [clear, self.near]
+        self._finds = [model.kernel(kernels.near_colliders, model.dtype, ended) for ended in (False, True)]
+        self._contact = [elements for elements in model.terms if elements.collider is not None]
+
+    def follow(self):
+        """Makes steps without contact refresh its terms as well."""
+        self._followed = True
+        self.stepper.colliders.follow()
+
+    def parts(self, touching):
+        """The parts of steps that are launches, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with
+        contact; the twin has as many."""
+        found = [(self._launch_look, 1)]
+        for (own, times), (clear, _times) in zip(touching[:-1], self.twin.parts[:-1], strict=True):
+            found.append((partial(wp.capture_if, self.near, own, clear), times))
+        (own, times), (clear, _times) = touching[-1], self.twin.parts[-1]
+
+        def last():
+            clear()
+            self._launch_check()
+            wp.capture_if(self.near, lambda: self._launch_again(touching), self.stepper.colliders.launch_count)
+
+        return [*found, (partial(wp.capture_if, self.near, own, last), times)]
 
     def _launch_look(self):
         """Launches what finds whether the step is near, and keeps the state."""
@@ -115,17 +139,10 @@ class ClearSteps:
         (elements, others), model = self._given, self.stepper.model
         model.launch(self._finds[find], model.count, [*elements, self._kept["x"], self._kept["v"], end, *others], self._out)
 
-    def _restore(self):
-        for name, array in self.twin.state.arrays.items():
-            wp.copy(array, self._kept[name])
+    def _launch_count(self):
+        self.stepper.colliders.launch_count()
 
     def _launch_again(self, touching):
-        model = self.stepper.model
         self._restore()
         for launch, times in touching:
-            self._left.fill_(times)
-            wp.capture_while(self._left, partial(self._launch_one, launch, model.kernel(count_down)))
-
-    def _launch_one(self, launch, count):
-        launch()
-        self.stepper.model.launch(count, 1, [], [self._left])
+            self._launch_in_turn(launch, times)

@@ -39,7 +39,7 @@ class ImplicitStepper(Stepper):
         if self.clear_steps is None:
             self.take(self._iterate)
         else:
-            self.clear_steps.step(self._iterate)
+            self.clear_steps.step(lambda: self.take(self._iterate))
 
     def _iterate(self):
         ended = iterate(self, self.options.tolerance, self.options.iterations)

@@ -17,6 +17,7 @@ from ..model.damping import damped_terms
 from ..numerics.integrators import INTEGRATORS
 from ..terms.refresh import STEP
 from .clear_steps import ClearSteps
+from .far_steps import FarSteps
 
 
 class Stepper:
@@ -70,7 +71,7 @@ class Stepper:
             self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
             self.model = model = model.with_terms(self.colliders.terms)
         self.pairs, self._kept = None, None
-        if model.scene.self_contact is not None:
+        if model.scene.self_contact is not None and self.lead is None:
             self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
         if integrator is not None:
             self.integrator = INTEGRATORS[integrator](self)
@@ -86,16 +87,16 @@ class Stepper:
         return stepper
 
     def find_twin(self):
-        """Makes ``clear_steps`` if there are colliders, unless the residual of a twin has another meaning."""
+        """Makes ``clear_steps`` if there are colliders or self-contact, unless the residual of a twin has another meaning."""
         model = self._bound_to
-        if model.colliders is None or self.pairs is not None:
+        if not FarSteps.serve(self) if self.pairs is not None else model.colliders is None:
             return
         if self.options.residual_on(model) != self.options.residual_on(model.without_colliders()):
             return
         twin = type(self).__new__(type(self))
         twin._motion, twin.lead = tuple(self.state), self
         twin.__init__(self.options, model.without_colliders())
-        self.clear_steps = ClearSteps(self, twin)
+        self.clear_steps = (ClearSteps if self.pairs is None else FarSteps)(self, twin)
 
     @property
     def results(self):

@@ -1,0 +1,88 @@
+"""Steps of cloth with self-contact in which nothing comes near anything, without contact."""
+
+from functools import partial
+
+import warp as wp
+
+from ..contact.self_filter import WAY
+from ..kernels.fast.far_step import far_limits, find_far, find_near
+from ..kernels.step import count_step
+from .clear_steps import TwinSteps
+
+# Sweeps of a step that are recorded one by one; more are a loop of the device.
+UNROLLED = 64
+
+
+class FarSteps(TwinSteps):
+    """Gives the steps in which no pair is listed, and none can come near, to a twin of a stepper that has no self-contact.
+
+    Before a step, the list and the way h v of each vertex tell. The tests are those of
+    :class:`warpcloth.fast.quiet_steps.QuietSteps`.
+    """
+
+    def __init__(self, stepper, twin):
+        super().__init__(stepper, twin)
+        model, pairs = stepper.model, stepper.pairs
+        self._others = [name for name in self._kept if name not in ("x", "v")]
+        limits = self._limits = far_limits(model.dtype)()
+        limits.per_copy, limits.size = model.per_copy, model.per_copy if model.device.is_cpu else 1
+        self._dim = model.copies, -(-model.per_copy // limits.size)
+        # Both below what the list and the filter allow, by more than rounding; all moves are then so near their mean.
+        limits.h, limits.way, limits.together = stepper.h, (1.0 - 1e-4) * WAY * pairs.skin, pairs.filter.moves_together
+        limits.most = 0.49 * limits.way if limits.together else limits.way
+        self._find_near, self._find_far = (model.kernel(each, model.dtype) for each in (find_near, find_far))
+        self._count = model.kernel(count_step)
+
+    @staticmethod
+    def serve(stepper):
+        """Whether they can: each copy is one piece, nothing else moves it, and it starts without crossings."""
+        pairs, model = stepper.pairs, stepper.model
+        one = len(pairs.proximity.centre) == model.copies
+        return one and stepper.count is None and model.colliders is None and pairs.tangles is None
+
+    def parts(self, touching):
+        """The one part of steps that are launches, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those
+        with contact."""
+        return [(partial(self._launch_step, touching), 1)]
+
+    def _launch_step(self, touching):
+        self._launch_look()
+        wp.capture_if(self.near, self._restore, self._launch_clear)
+        wp.capture_if(self.near, partial(self._launch_again, touching), self._launch_count)
+
+    def _launch_clear(self):
+        self._launch_parts(self.twin.parts)
+        self._launch_check()
+
+    def _launch_again(self, touching):
+        self._restore()
+        self._launch_parts(touching)
+
+    def _launch_parts(self, parts):
+        for launch, times in parts:
+            if times <= UNROLLED:
+                for _ in range(times):
+                    launch()
+            else:
+                self._launch_in_turn(launch, times)
+
+    def _launch_look(self):
+        """Launches what finds whether the step is near, and keeps the state."""
+        stepper, pairs, kept = self.stepper, self.stepper.pairs, self._kept
+        near, (x, v) = pairs.proximity, stepper.state
+        wp.copy(self.near, pairs.listed)
+        for name in self._others:
+            wp.copy(kept[name], self.twin.state.arrays[name])
+        given = [near.centre, near.found, near.listed, x, v, self._limits]
+        stepper.model.launch(self._find_near, self._dim, given, [kept["x"], kept["v"], self.near])
+
+    def _launch_check(self):
+        """Launches what finds whether it was."""
+        given = [self._kept["x"], self.stepper.state.x, self._limits]
+        self.stepper.model.launch(self._find_far, self._dim, given, [self.near])
+
+    def _launch_count(self):
+        pairs, model = self.stepper.pairs, self.stepper.model
+        model.launch(self._count, model.copies, [], [pairs.steps])
+        if pairs.friction is not None:
+            pairs.friction.launch_release()
