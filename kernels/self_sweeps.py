@@ -42,20 +42,20 @@ def free_move(dtype, axes: bool):
 
 
 @cache
-def find_reaches(dtype):
+def find_clearances(dtype):
     """Kernel over acting pairs: by how much the gap at x along the n of the start of the step is above the contact distance."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def find_each_reach(
+    def find_each_clearance(
         # elements
         pairs: near_pairs(dtype),
         # state in
         step: StepPairs,
         x: wp.array(dtype=vec3),
         # out
-        reach: wp.array(dtype=wp.float64),
+        clearance: wp.array(dtype=wp.float64),
     ):
         t = wp.tid()
         if t >= pairs.number[0]:
@@ -63,9 +63,9 @@ def find_reaches(dtype):
         e = pairs.acting[t]
         s = pairs.stencils[e]
         gap = gap_along(e < pairs.counts[0], step.normal[e], exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
-        reach[t] = gap - wp.float64(pairs.distances[e])
+        clearance[t] = gap - wp.float64(pairs.distances[e])
 
-    return find_each_reach
+    return find_each_clearance
 
 
 @cache
@@ -76,7 +76,7 @@ def sweep_pairs(dtype, axes: bool):
     (d* − d̂)/W = −kAhₑ²φ′(d*) in closed form, and Δxᵢ = wᵢ λ n/mᵢ. M(x − x̃) = Σ wᵢλn then holds with the n and w that pairs have
     at x, and a fixed point is the minimiser of the step. Without ``multipliers`` nothing is taken away (PBD).
 
-    A pair whose ``reach`` at x, see :func:`find_reaches`, the corrections have not closed has no force, and costs little.
+    A pair whose ``clearance`` at x, see :func:`find_clearances`, corrections have not closed has no force, and costs little.
     """
     vec3, _ = types(dtype)
     at, exact = vertex_of(dtype)
@@ -89,7 +89,7 @@ def sweep_pairs(dtype, axes: bool):
         inverse_mass: wp.array(dtype=vec3 if axes else dtype),
         # state in
         step: StepPairs,
-        reach: wp.array(dtype=wp.float64),
+        clearance: wp.array(dtype=wp.float64),
         x: wp.array(dtype=vec3),
         # parameters
         h: wp.float64,
@@ -114,7 +114,7 @@ def sweep_pairs(dtype, axes: bool):
                 p1 = exact(correction[s[1]])
                 p2 = exact(correction[s[2]])
                 p3 = exact(correction[s[3]])
-                if reach[own] + gap_along(of_vertex, step.normal[e], p0, p1, p2, p3) > ZERO:
+                if clearance[own] + gap_along(of_vertex, step.normal[e], p0, p1, p2, p3) > ZERO:
                     continue
             k = step.stiffness[e]
             r = wp.float64(pairs.distances[e])

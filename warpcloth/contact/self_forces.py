@@ -22,7 +22,7 @@ class SelfForces:
     """
 
     def __init__(self, model, bounded):
-        self.model, self.friction, self._touching, self._reach = model, None, None, None
+        self.model, self.friction, self._touching, self._clearance = model, None, None, None
         self.energies = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         made = self_contact.add_forces, self_contact.sum_energies, self_contact.add_diagonal, self_contact.add_products
         if model.device.is_cpu:
@@ -49,8 +49,8 @@ class SelfForces:
         if device.is_cpu:
             self._found.pressing, self._found.count = room(wp.int32), wp.zeros(1, dtype=wp.int32, device=device)
         self.multipliers = room(wp.float64)
-        if self._reach is not None:
-            self._reach = room(wp.float64)
+        if self._clearance is not None:
+            self._clearance = room(wp.float64)
         if self._touching is not None:
             self._swept = self_sweeps.SweptPairs()
             self._swept.touches, self._swept.normal, self._swept.weights = room(wp.int32), room(wp.vec3d), room(wp.vec4d)
@@ -143,8 +143,8 @@ class SelfForces:
             self.friction.sweeps(in_turn)
         if in_turn and model.device.is_cpu:
             self._sweep = model.kernel(self_sweeps.sweep_pairs, *key)
-            self._kernels[self_sweeps.find_reaches] = model.kernel(self_sweeps.find_reaches, model.dtype)
-            self._reach = wp.zeros(len(self.pairs.stencils), dtype=wp.float64, device=model.device)
+            self._kernels[self_sweeps.find_clearances] = model.kernel(self_sweeps.find_clearances, model.dtype)
+            self._clearance = wp.zeros(len(self.pairs.stencils), dtype=wp.float64, device=model.device)
             return
         self._touching = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         self._press, self._move = (
@@ -174,14 +174,14 @@ class SelfForces:
         """Launches λ = 0 of all pairs, where sweeps begin at x̃ (N,)."""
         self.multipliers.zero_()
         if self._touching is None:
-            self._launch(self_sweeps.find_reaches, len(self.pairs.stencils), [self.pairs, self.begun, x], [self._reach])
+            self._launch(self_sweeps.find_clearances, len(self.pairs.stencils), [self.pairs, self.begun, x], [self._clearance])
         if self.friction is not None:
             self.friction.multipliers.zero_()
 
     def _launch_sweep(self, x, correction, h, adds, backward):
         model, mobility, multipliers = self.model, self.model.local_mobility, self.multipliers if adds else None
         if self._touching is None:
-            given = [self.pairs, mobility, self.begun, self._reach, x, h, not adds, backward]
+            given = [self.pairs, mobility, self.begun, self._clearance, x, h, not adds, backward]
             model.launch(self._sweep, 1, given, [multipliers, self._found, correction])
             return
         count, N, swept = len(self.pairs.stencils), model.count, self._swept
