@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from .clear_elements import is_clear
 from .local import local_coordinate
 from .memory import load, load_shared, store
 from .rotation import epsilon
@@ -149,7 +150,10 @@ def stiffness_scale(term: Term, dtype):
 
 @cache
 def admm_elements(term: Term, dtype):
-    """The struct of the elements of a term as ADMM has them: W² = r s k A, and z, u, gap = W²(y − z), change of W²z [N]."""
+    """The struct of the elements of a term as ADMM has them: W² = r s k A, and z, u, gap = W²(y − z), change of W²z [N].
+
+    ``clear`` is that of :mod:`.clear_elements`, of terms that have it.
+    """
     y_type = wp.types.matrix((term.rows, 3), dtype)
 
     @wp.struct
@@ -161,6 +165,7 @@ def admm_elements(term: Term, dtype):
         u: wp.array(dtype=y_type)
         gap: wp.array(dtype=y_type)
         change: wp.array(dtype=y_type)
+        clear: wp.array(dtype=dtype)
 
     return AdmmElements
 
@@ -185,13 +190,18 @@ def start_admm(term: Term, dtype):
         e = wp.tid()
         of.z[e] = y_of(stencil, e, rest[e], x, x)
         of.u[e] = y_type()
+        of.gap[e] = y_type()
+        of.change[e] = y_type()
 
     return start
 
 
 @cache
 def split(term: Term, dtype):
-    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², then u += y − z; gap and change."""
+    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², then u += y − z; gap and change.
+
+    An element whose vertex is within its ``clear`` has u, gap and change 0, and is passed over until it is not.
+    """
     vec3, _ = types(dtype)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     y_of, measure, minimise = local_coordinate(term, dtype, True), term.measure, local_minimiser(term, dtype)
@@ -211,6 +221,11 @@ def split(term: Term, dtype):
         of: admm_elements(term, dtype),
     ):
         e = wp.tid()
+        if wp.static(term.clearance is not None):
+            if of.clear.shape[0] > 0:
+                if is_clear(of.clear[e], d[stencil[e, 0]]):
+                    return
+                of.clear[e] = dtype(0.0)
         r = rest_of(rest, e)
         part = shared(of.ratio, e) * shared(of.scale, e)
         w2 = part * shared(of.stiffness, e) * measure(r)
@@ -270,6 +285,9 @@ def scatter_admm(term: Term, dtype):
         force: wp.array(dtype=vec3),
     ):
         e = wp.tid()
+        if wp.static(term.clearance is not None):
+            if of.clear.shape[0] > 0 and of.clear[e] > dtype(0.0):
+                return
         r = rest_of(rest, e)
         gap = take(of.gap, e)
         change = take(of.change, e)

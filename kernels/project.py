@@ -317,20 +317,19 @@ LISTED_EVERY = wp.constant(16)  # sweeps, before which the elements with a force
 
 @cache
 def list_busy(term: Term, dtype, multipliers: bool):
-    """Kernel of one thread: busy = (count, elements in order) that may have a force, of a term with ``idle``.
+    """Kernel of one thread: busy = (count, elements in order) that may have a force, of a term with ``clear``.
 
     Such are those with λ, and those near where there is one: within the way of the prediction from ``before`` and of the
     correction so far. It is found before the first and the third sweep, and before one in LISTED_EVERY; ``sweep`` counts them.
     """
     vec3, _ = types(dtype)
-    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    y_of, idle, rest_of = local_coordinate(term, dtype, True), term.idle, load(rest_type)
+    lambda_type = wp.types.matrix((term.rows, 3), dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def find(
         # elements
         stencil: wp.array2d(dtype=wp.int32),
-        rest: wp.array(dtype=rest_type),
+        clear: wp.array(dtype=dtype),
         # state in
         before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
@@ -347,8 +346,7 @@ def list_busy(term: Term, dtype, multipliers: bool):
         count = wp.int32(0)
         for e in range(stencil.shape[0]):
             i = stencil[e, 0]
-            r = rest_of(rest, e)
-            listed = idle(y_of(stencil, e, r, x, d), r, wp.length(x[i] - before[i]) + wp.length(d[i])) == 0
+            listed = not (clear[e] > wp.length(x[i] - before[i]) + dtype(2.0) * wp.length(d[i]))
             if wp.static(multipliers):
                 listed = listed or not (lambdas[e] == lambda_type(dtype(0.0)))
             if listed:

@@ -76,6 +76,8 @@ class Term:
             which v may be nearer to another branch, such as the far side of a ball; or None.
         idle: (y, rest, margin) → 1 where there is surely no force within ``margin`` of y, which is quicker to tell than the
             force, else 0; of terms with K = 1; or None.
+        clearance: (y, rest) → a distance within which of y there is surely no force, 0 or less where there may be one at y; of
+            terms with ``idle``; or None.
         secant: (y, rest) → s, from 0 to 1: where p moves with y, y − p is s times the distance to a point that moves less, and
             constraint rows, which hold p fixed in an iteration, take that point and s k instead; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices.
@@ -109,6 +111,7 @@ class Term:
     prox: Any = None
     prox_from: Any = None
     idle: Any = None
+    clearance: Any = None
     secant: Any = None
     linear: bool = False
     quadratic: bool = False

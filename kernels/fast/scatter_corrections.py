@@ -7,6 +7,7 @@ from functools import cache
 
 import warp as wp
 
+from ..clear_elements import is_clear
 from ..memory import load, load_shared, store
 from ..project import element_change, multiplier_type
 from ..term import Term
@@ -18,6 +19,7 @@ from ..vectors import types
 def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
     """Kernel over elements: adds factorₑ Δxᵢ [m] of every element to out, factorₑ Δλ to λ.
 
+    Elements whose vertex is within its ``clear``, of terms that have it, are passed over until it is not.
     For the CPU, in order: nothing is atomic. One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
     """
     vec3, _ = types(dtype)
@@ -35,6 +37,7 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
         rest: wp.array(dtype=rest_type),
         inverse_mass: wp.array(dtype=dtype),
         factor: wp.array(dtype=dtype),
+        clear: wp.array(dtype=dtype),
         # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
@@ -46,6 +49,11 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
         out: wp.array(dtype=vec3),
     ):
         e = wp.tid()
+        if wp.static(term.clearance is not None):
+            if clear.shape[0] > 0:
+                if is_clear(clear[e], d[stencil[e, 0]]):
+                    return
+                clear[e] = dtype(0.0)
         r = rest_of(rest, e)
         before = lambda_type(dtype(0.0))
         if wp.static(multipliers):

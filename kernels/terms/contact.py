@@ -84,8 +84,12 @@ def local_gap(X: Any, half: Any, radius: Any):
 def gap(y: Any, rest: Any):
     """Signed distance of a vertex and the outward normal, in space."""
     u = wp.vector(rest[3], rest[4], rest[5])
-    X = turned(-u, rest[6], y[0] - wp.vector(rest[0], rest[1], rest[2]))
-    d, n = local_gap(X, wp.vector(rest[7], rest[8], rest[9]), rest[10])
+    half = wp.vector(rest[7], rest[8], rest[9])
+    away = y[0] - wp.vector(rest[0], rest[1], rest[2])
+    l = wp.length(away)
+    if wp.max(half) == y.dtype(0.0) and l > y.dtype(0.0):  # a sphere, which no rotation changes
+        return l - rest[10], away / l
+    d, n = local_gap(turned(-u, rest[6], away), half, rest[10])
     return d, turned(u, rest[6], n)
 
 
@@ -178,6 +182,13 @@ def idle(y: Any, rest: Any, margin: Any):
     u = wp.vector(rest[3], rest[4], rest[5])
     half = wp.vector(rest[7], rest[8], rest[9])
     return wp.where(beyond(y[0], position, u, rest[6], half, rest[10], rest[11] + margin), wp.int32(1), wp.int32(0))
+
+
+@wp.func
+def clearance(y: Any, rest: Any):
+    """d − r, less what rounding may take."""
+    d, _n = gap(y, rest)
+    return y.dtype(0.999) * (d - rest[11])
 
 
 @wp.func
@@ -343,6 +354,7 @@ CONTACT = Term(
     prox=prox,
     prox_from=prox_from,
     idle=idle,
+    clearance=clearance,
     constraint=constraint,
     constraint_gradient=constraint_gradient,
     constraint_hessian=constraint_hessian,

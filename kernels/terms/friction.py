@@ -35,6 +35,12 @@ def idle(y: Any, rest: Any, margin: Any):
 
 
 @wp.func
+def clearance(y: Any, rest: Any):
+    """Any distance where there is no contact in the step."""
+    return wp.where(rest[6] > y.dtype(0.0), y.dtype(0.0), y.dtype(wp.inf))
+
+
+@wp.func
 def slip(y: Any, rest: Any):
     """u."""
     n = wp.vector(rest[3], rest[4], rest[5])
@@ -124,6 +130,7 @@ FRICTION = Term(
     project=project,
     prox=prox,
     idle=idle,
+    clearance=clearance,
     secant=secant,
     bounded=BOUNDED_FRICTION,
 )

@@ -9,6 +9,7 @@ import warp as wp
 
 from ..kernels import colliders as kernels
 from ..kernels import mesh_colliders as mesh_kernels
+from ..kernels.clear_elements import find_clear
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..kernels.terms.friction import FRICTION
@@ -89,6 +90,7 @@ class ColliderSteps:
         if model.mobility is not None:
             self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(kernels.hold_locked, model.dtype)
             self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
+        self._finds_clear = model.device.is_cpu and not (self.bounded or resting)
         self.terms = []
         for elements in model.terms:
             c = elements.collider
@@ -115,7 +117,10 @@ class ColliderSteps:
             launch = None
         term = elements.term.bounded if self.bounded else elements.term
         refresh = Refresh(STEP, partial(self._refresh, first, launch))
-        return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=refresh)
+        clear = None
+        if self._finds_clear:
+            clear = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
+        return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=refresh, clear=clear)
 
     def _refresh(self, first, launch, model, elements, moment):
         """Where a step begins: by the first of the terms for all of them, then for each."""
@@ -165,6 +170,13 @@ class ColliderSteps:
     def launch_move(self):
         """Launches the poses of the step that begins."""
         self.model.launch(self._move, self._dim, self._given, [self.poses])
+
+    def launch_clear(self, terms, x):
+        """Launches what finds how far the vertices of ``terms`` may move from x̃ in this step before they touch."""
+        for elements in terms:
+            if elements.clear is not None:
+                kernel = self.model.kernel(find_clear, elements.term, self.model.dtype)
+                self.model.launch(kernel, elements.count, [elements.stencil, elements.rest, x], [elements.clear])
 
     def launch_count(self):
         """Launches what counts a step."""

@@ -2,6 +2,7 @@
 
 from ..base.turns import in_turn
 from ..kernels import assemble
+from ..kernels.clear_elements import add_gradient
 from ..terms.refresh import EVALUATION, Moment
 from .transpose import Transpose
 
@@ -12,8 +13,11 @@ class Gradient:
     @in_turn
     def __init__(self, model, corrected=False, terms=None):
         self.model, self.terms = model, model.terms if terms is None else terms
-        self._sums = []
+        self._sums, self._clear = [], []
         for elements in self.terms:
+            if corrected and elements.clear is not None:
+                self._clear.append((elements, model.kernel(add_gradient, elements.term, model.dtype)))
+                continue
             factories = assemble.scatter_gradient, assemble.gather_gradient
             data = assemble.elastic(elements.term, model.dtype)()
             data.stencil, data.stiffness = elements.stencil, elements.stiffness
@@ -27,3 +31,5 @@ class Gradient:
             if correction is not None:
                 data.d = correction
             transpose.add(data, out)
+        for elements, kernel in self._clear:
+            self.model.launch(kernel, 1, [*elements.arguments, elements.clear, x, correction], [out])

@@ -26,6 +26,6 @@ class ScatterSweeps(JacobiSweeps):
             for elements, kernel, factor, lambdas in zip(
                 model.terms, self._kernels, self._factors, self.multipliers, strict=True
             ):
-                given = [*elements.arguments, model.inverse_mass, factor, self.x, d, *self._given]
+                given = [*elements.arguments, model.inverse_mass, factor, elements.clear, self.x, d, *self._given]
                 model.launch(kernel, elements.count, given, [lambdas, self._total])
             model.launch(self._apply, model.count, [self._scale], [self._total, d])

@@ -29,6 +29,8 @@ class DeviceElements:
         cells: :class:`Cells` or :class:`SparseCells` that the elements are the vertices of, or None.
         collider: Index of the collider of the scene that they are the contact with or the friction on, or None.
         facet: Of contact with a mesh which of its facets they are with.
+        clear: How far each vertex may move from x̃ in a step before there is a force, see
+            :mod:`warpcloth.kernels.clear_elements`, (B·E,) [m]; None for those that always look.
     """
 
     label: str
@@ -43,6 +45,7 @@ class DeviceElements:
     cells: Cells | SparseCells | None = None
     collider: int | None = None
     facet: int = 0
+    clear: wp.array | None = None
 
     @property
     def arguments(self):
@@ -110,6 +113,8 @@ class DeviceElements:
         changed = {name: change(getattr(self, name)) for name in ("stencil", "stiffness", "rest")}
         if self.damping is not None:
             changed["damping"] = change(self.damping)
+        if self.clear is not None:  # found anew in each step
+            changed["clear"] = wp.zeros_like(self.clear)
         return replace(self, **changed, refresh=self.refresh and self.refresh.with_arrays(change), cells=cells)
 
     def at_limit(self, points):

@@ -4,8 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror, Segment
-from ..core.hessian import Hessian
-from ..kernels.term import HessianPolicy
+from ..kernels.clear_elements import add_hessian
 from .search import HALVINGS, Search
 
 # Of ‖b‖ in the norm of A⁻¹, to which systems are solved closely.
@@ -96,12 +95,16 @@ class ContactSystem(CorrectedSystem):
     def __init__(self, model, x, linear, sums, s, pairs=None):
         super().__init__(model, linear)
         self.x, self._pairs = x, pairs
-        touching = [elements for elements in model.terms if elements.collider is not None]
-        self._hessian = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=touching)
+        self._touching = [
+            (elements, model.kernel(add_hessian, elements.term, model.dtype))
+            for elements in model.terms
+            if elements.collider is not None
+        ]
         self._search = Search(model, x, sums, s, pairs)
-        self._diagonal = self._hessian.diagonal.numpy()
-        self._free = model.inverse_mass.numpy() > 0.0
-        self._blocks = Mirror(self._hessian.values)
+        free = model.coordinate_mobility().reshape(-1, 3) > 0.0
+        self._held = np.flatnonzero(~free.all(axis=1))
+        self._moves = (free[:, :, None] & free[:, None, :])[self._held]
+        self._blocks = Mirror(wp.zeros(model.count, dtype=model.mat33, device=model.device))
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
         self._active = Mirror(model.scalars(wp.int32))
         self.record()
@@ -117,7 +120,10 @@ class ContactSystem(CorrectedSystem):
         self._shorten = Segment(device, lambda: search.launch(self._active.array))
 
     def _launch_assemble(self):
-        self._hessian.assemble(self.x, 0.0, self._search.correction)
+        self._blocks.array.zero_()
+        for elements, kernel in self._touching:
+            given = [*elements.arguments, elements.clear, self.x, self._search.correction]
+            self.model.launch(kernel, elements.count, given, [self._blocks.array])
         if self._pairs is not None:
             self._pairs.forces.launch_forces(self.x, self._search.correction)
 
@@ -135,8 +141,9 @@ class ContactSystem(CorrectedSystem):
         """w = (A + D)⁻¹ ∇φ at d, of careful copies t times that, from the A⁻¹ ∇φ that it is."""
         wp.copy(self._search.correction, d)
         self._assemble()
-        blocks = self._blocks.read()[self._diagonal] * self._free[:, None, None]
-        touching = np.flatnonzero(blocks.any(axis=(1, 2)))
+        blocks = self._blocks.read()
+        blocks[self._held] = np.where(self._moves, blocks[self._held], 0.0)
+        touching = np.flatnonzero(blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2])  # semi-definite, with 0 trace is 0
         J, D = (None, None) if self._pairs is None else self._pairs.forces.rows()
         pressing = len(touching) or (J is not None and J.shape[0])
         if not (pressing or self.careful.any()):

@@ -174,7 +174,7 @@ class GaussSeidelSweep(_Sweep):
         spread: The number of sweeps that finite stiffness is spread over, or None.
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares sweeps by colour; None for one thread.
         before: Positions where the step began (N,), by which one thread of the CPU lists the elements that may have a force, of
-            terms with ``idle``; or None.
+            terms with ``clear``; or None.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs are swept last; or None.
 
     Attributes:
@@ -217,13 +217,13 @@ class GaussSeidelSweep(_Sweep):
         ]
 
     def _list_of(self, elements, multipliers, key, before):
-        """(kernel, arguments, counter of sweeps, list) of a term with ``idle``; else None."""
+        """(kernel, arguments, counter of sweeps, list) of a term with ``clear``; else None."""
         term, dtype, scalar = key
-        if term.idle is None or scalar or elements.cells:
+        if elements.clear is None or scalar:
             return None
         model = self.model
         kernel = model.kernel(kernels.list_busy, term, dtype, multipliers is not None)
-        given = [elements.stencil, elements.rest, before, self.x, self.correction, multipliers]
+        given = [elements.stencil, elements.clear, before, self.x, self.correction, multipliers]
         sweep, busy = (wp.zeros(n, dtype=wp.int32, device=model.device) for n in (1, 1 + elements.count))
         return kernel, given, sweep, busy
 

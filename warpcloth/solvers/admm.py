@@ -228,6 +228,8 @@ class ADMMStepper(ImplicitStepper):
         of = kernels.admm_elements(elements.term, model.dtype)()
         of.stiffness, of.ratio, of.scale = elements.stiffness, model.per_element(ratio), model.per_element(scale)
         of.z, of.u, of.gap, of.change = (wp.zeros(elements.count, dtype=kind, device=model.device) for _ in range(4))
+        if elements.clear is not None:
+            of.clear = elements.clear
         return of
 
     # What the segments record.

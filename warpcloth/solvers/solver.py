@@ -202,6 +202,8 @@ class Stepper:
         if self.pairs is not None:
             self.pairs.launch_begin(self.state.x)
         self.integrator.launch_prediction()
+        if self.colliders is not None:
+            self.colliders.launch_clear(self.model.terms, self.state.x)
 
     def launch_finish(self, correction):
         """x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser."""

@@ -1,0 +1,142 @@
+"""Factories of kernels over elements of K = 1 of which most are surely without force, on the CPU, where one thread takes all.
+
+``clear`` has for each element how far its vertex may move from x̃ before there can be a force, 0 or less where there may be one
+now. An element whose correction d is shorter is passed over before its rest state is read.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from .local import local_coordinate
+from .memory import load, load_shared
+from .term import HessianPolicy, Term
+from .vectors import types
+
+CLAMP = wp.constant(int(HessianPolicy.CLAMP))
+
+
+@wp.func
+def is_clear(radius: Any, d: Any):
+    """Whether a vertex that moved by d is within its radius; not if either is not finite."""
+    return radius > type(radius)(0.0) and wp.dot(d, d) < radius * radius
+
+
+@cache
+def find_clear(term: Term, dtype):
+    """Kernel over elements at x̃, once the rest states of a step are there: clear, see above."""
+    vec3, _ = types(dtype)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, clearance, rest_of = local_coordinate(term, dtype, False), term.clearance, load(rest_type)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        rest: wp.array(dtype=rest_type),
+        # state in
+        x: wp.array(dtype=vec3),
+        # out
+        clear: wp.array(dtype=dtype),
+    ):
+        e = wp.tid()
+        r = rest_of(rest, e)
+        clear[e] = clearance(y_of(stencil, e, r, x, x), r)
+
+    return find
+
+
+@cache
+def add_energy(term: Term, dtype):
+    """Kernel of one thread: out[copy] += Σ kₑ Aₑ u(yₑ) [J], in double precision."""
+    vec3, _ = types(dtype)
+    rest_type, u, measure = wp.types.vector(term.parameters, dtype), term.energy, term.measure
+    y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        clear: wp.array(dtype=dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        # in and out
+        out: wp.array(dtype=wp.float64),
+    ):
+        for e in range(stencil.shape[0]):
+            if not is_clear(clear[e], d[stencil[e, 0]]):
+                r = rest_of(rest, e)
+                value = wp.float64(number(stiffness, e) * measure(r) * u(y_of(stencil, e, r, x, d), r))
+                out[e // per_copy] = out[e // per_copy] + value
+
+    return add
+
+
+@cache
+def add_gradient(term: Term, dtype):
+    """Kernel of one thread: out[vertex] += kₑ Aₑ ∂u/∂y [N]."""
+    vec3, _ = types(dtype)
+    rest_type, gradient, measure = wp.types.vector(term.parameters, dtype), term.gradient, term.measure
+    y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        clear: wp.array(dtype=dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # in and out
+        out: wp.array(dtype=vec3),
+    ):
+        for e in range(stencil.shape[0]):
+            i = stencil[e, 0]
+            if not is_clear(clear[e], d[i]):
+                r = rest_of(rest, e)
+                g = gradient(y_of(stencil, e, r, x, d), r)
+                out[i] = out[i] + (number(stiffness, e) * measure(r)) * g[0]
+
+    return add
+
+
+@cache
+def add_hessian(term: Term, dtype):
+    """Kernel over elements: out[vertex] += kₑ Aₑ ∂²u/∂y² [N/m], made semi-definite; on any device, as no two share a vertex.
+
+    ``clear`` may be None.
+    """
+    vec3, mat33 = types(dtype)
+    rest_type, hessian, measure = wp.types.vector(term.parameters, dtype), term.hessian, term.measure
+    y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        clear: wp.array(dtype=dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # in and out
+        out: wp.array(dtype=mat33),
+    ):
+        e = wp.tid()
+        i = stencil[e, 0]
+        if clear.shape[0] > 0:
+            if is_clear(clear[e], d[i]):
+                return
+        r = rest_of(rest, e)
+        out[i] = out[i] + (number(stiffness, e) * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, CLAMP)
+
+    return add
