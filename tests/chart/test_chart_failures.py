@@ -9,13 +9,19 @@ import pytest
 
 from warpcloth.chart.failures import plot_failure
 from warpcloth.cli import main
-from warpcloth.lab import cotangents, crossing, friction, isometry, locking, rank, tunnelling
+from warpcloth.lab import cotangents, crossing, friction, isometry, locking, physics, rank, tunnelling
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.failures import COLUMNS, FAILURES, failure_chart, write_csv
 from warpcloth.lab.panels import Map, point
 
 pytestmark = pytest.mark.host
 EPS = np.finfo(np.float64).eps
+
+
+@pytest.fixture(autouse=True)
+def solved_once(monkeypatch):
+    """No rest shape is solved for again for its time."""
+    monkeypatch.setattr(physics, "_BRIEF", 0.0)
 
 
 def of(points, panel, series):
