@@ -147,7 +147,7 @@ def equilibrium(
         # What is left unbalanced compresses the edges of a nearly straight chain by many times itself, and curves the energy.
         descent.tolerance *= 0.01
         if contact is not None:
-            contact.filter.launch_end(base, model.vectors())
+            contact.launch_end(base, model.vectors())
         if contact is None and pairs is None:
             result = descent.run(1.0, _frequency_scale(model))
         else:
@@ -332,7 +332,7 @@ def _settle_on_meshes(model, base, descent, part, contact):
         find_facets()
         result = _settle_all(model, base, descent, part)
         contact.notes.cut.zero_()
-        contact.filter.launch_end(base, velocity)
+        contact.launch_end(base, velocity)
         if result is Result.DIVERGED or descent.used >= descent.iterations:
             return result
         if not contact.notes.cut.numpy().any() and (result not in SETTLED or descent.balanced(find_facets)):
