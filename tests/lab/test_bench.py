@@ -149,7 +149,7 @@ def test_self_contact_is_measured_flat_and_folded():
     listed = self_contacts(dtype="float64")
     assert [each.scene.parameters["layers"] for each in listed] == [1, 2] * 4
     assert {each.setup.solver for each in listed} == {"explicit", "newton", "xpbd", "pbd"}
-    flat, folded = (SceneRef("folded", {"n": 9, "layers": layers}).load() for layers in (1, 2))
+    flat, folded = (SceneRef("folded_sheet", {"n": 9, "layers": layers}).load() for layers in (1, 2))
     assert (flat.positions == flat.mesh.points).all()
     assert np.ptp(folded.positions[:, 1]) == pytest.approx(folded.self_contact.distance)
     one = [row(n, n**2) | {"list_ns": 9.0, "areas_ns": n**0.5} for n in (4, 8, 16)]

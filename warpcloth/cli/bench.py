@@ -13,9 +13,9 @@ from .terminal import Bar, Interrupted, aligned, check_writable, say
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
 scene net. The scene resting then shows what contact costs, for colliders of each shape, touched and far away, and for meshes of
-growing size, and the scene folded what self-contact costs, of a sheet that falls flat and of one that is folded in two. All of
-it takes many minutes. Rows are measured one after another, each in its own process. If neither dt nor
-substeps is given, the step is chosen as by 'warpcloth run'.
+growing size. The scene folded_sheet shows what self-contact costs, for a sheet that falls flat and for one that is folded in
+two. All of it takes many minutes. Rows are measured one after another, each in its own process. If neither dt nor substeps is
+given, the step is chosen as by 'warpcloth run'.
 
 Columns:
   ms a frame  time of a frame after warm-up, with its points copied to the host: median

@@ -92,7 +92,7 @@ def contacts(**given):
     return [SolverBenchmark(SceneRef("resting"), setup, variants=variants, **given) for setup, variants in setups]
 
 
-# Of `folded`: solvers with their sizes, flat and folded in two.
+# Of `folded_sheet`: solvers with their sizes, flat and folded in two.
 _FOLDED = (
     ("explicit", {}, (32, 64, 128), (32, 64)),
     ("newton", {"substeps": 1}, (32, 64, 128), (32, 64)),
@@ -102,13 +102,13 @@ _FOLDED = (
 
 
 def self_contacts(**given):
-    """Returns what self-contact costs on the scene ``folded``: a sheet that falls flat, and one that is folded in two.
+    """Returns what self-contact costs on the scene ``folded_sheet``: a sheet that falls flat, and one that is folded in two.
 
     Args:
         given: Further fields of each :class:`SolverBenchmark`.
     """
     return [
-        SolverBenchmark(SceneRef("folded", {"layers": layers}), Setup(solver, options), sizes, **given)
+        SolverBenchmark(SceneRef("folded_sheet", {"layers": layers}), Setup(solver, options), sizes, **given)
         for solver, options, *of in _FOLDED
         for layers, sizes in enumerate(of, 1)
     ]

@@ -1,4 +1,4 @@
-"""A square cloth of 1 m that falls, folded in two with its layers a gap apart, or flat: what self-contact costs."""
+"""A square cloth of 1 m that falls, flat or folded in two with a gap between layers; `bench` measures self-contact on it."""
 
 import numpy as np
 
@@ -25,5 +25,5 @@ def scene(n: int = 64, layers: int = 2, gap: float = 1e-3, distance: float = 1e-
         positions=points,
         self_contact=wc.SelfContact(distance=distance),
         duration=duration,
-        name="folded",
+        name="folded_sheet",
     )
