@@ -528,6 +528,33 @@ def test_lists_are_kept(count, device):
     assert (pairs.proximity.stencils.numpy()[:number] == listed[:number]).all()
 
 
+@pytest.mark.parametrize("ratio", [1.5, 2.0])
+def test_areas_do_not_depend_on_the_age_of_a_list(ratio, device):
+    """Of thick folded cloth, where pairs beyond the contact distance share areas: forces are the same with a new list."""
+    scene = folded(gap=0.01)
+    scene = replace(scene, self_contact=wc.SelfContact(distance=ratio * scene.mesh.edge_lengths.max(), stiffness=1e4))
+    pairs, model = steps_of(scene, device)
+    rng, forces = np.random.default_rng(0), []
+    for _ in range(4):
+        x = scene.positions + 0.006 * rng.normal(size=scene.positions.shape) * [0.2, 1.0, 0.2]
+        moves = rng.normal(size=x.shape)
+        moved = x + 0.1 * pairs.skin * moves / np.linalg.norm(moves, axis=1)[:, None]
+        for points in (x, moved, moved):
+            if len(forces) % 3 != 1:
+                pairs.start_again()
+            points, out = model.array(points, model.vec3), model.vectors()
+            pairs.launch_begin(points)
+            while pairs.overflowed:
+                pairs.grow()
+                pairs.launch_begin(points)
+            assert ((pairs.proximity.found.numpy() == points.numpy()).all()) == (len(forces) % 3 != 1)
+            pairs.forces.launch_forces(points)
+            pairs.forces.add_gradient(out)
+            forces.append(out.numpy())
+        assert np.abs(forces[-1]).max() > 0.0
+        assert (forces[-1] == forces[-2]).all()
+
+
 @pytest.mark.parametrize("speed", [0.0, 1.0, 20.0])
 def test_quiet_explicit_steps_are_those_with_contact(speed, device):
     """To the bit, of a sheet that falls, of copies that bend and are listed anew, and where moves are long; so are frames."""

@@ -22,6 +22,9 @@ from .self_start import check_reset, check_start
 # It is more than 0.29: an edge that goes through a triangle with sides of at most 1 is nearer than that to one of them. And it
 # is less than 0.5, the height of a right-angled triangle on its longest side if that is 1, so that a flat grid has no pairs.
 SKIN = 0.35
+# The least skin, over the contact distance. While a list is kept, two parts come nearer by up to half of the skin, and areas
+# depend on pairs up to a quarter of the contact distance (SHARING) farther apart than it: else they would depend on its age.
+THICK = 0.5
 
 
 class TooNear(NamedTuple):
@@ -70,7 +73,7 @@ class SelfSteps:
     def __init__(self, model, state, h, steps_per_frame, bounded, colliders):
         declared = model.scene.self_contact
         self.model, self.h, self.declared = model, h, declared
-        self.skin = SKIN * float(model.scene.mesh.edge_lengths.max())
+        self.skin = max(SKIN * float(model.scene.mesh.edge_lengths.max()), THICK * declared.distance)
         self.proximity = Proximity(model, declared.distance, self.skin)
         device = model.device
         self.x_before, self.begun_at = model.vectors(), model.vectors()
