@@ -158,7 +158,7 @@ class Stencils(NamedTuple):
         masses, zero = self.array(inverse_mass.ravel(), self.scalar), self.places(np.zeros_like(self.x))
         factor = self.array(np.ones(len(self.x)), self.scalar)
         kernel = scatter_corrections.scatter_correction(self.term, self.scalar, self.term.project is None)
-        self.launch(kernel, *self.elements, masses, factor, self.places(), zero, h, 1, None, out)
+        self.launch(kernel, *self.elements, masses, factor, None, self.places(), zero, h, 1, None, out)
         return out.numpy().reshape(self.x.shape)
 
     def weights(self):
