@@ -9,7 +9,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.meshes import PAIR
-from support.scenes import FOLDING, QUICK, SMALL, TOUCHING, scene
+from support.scenes import FOLDING, QUICK, SMALL, TOUCHING, explicit_steps, scene, taken
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result, digits, sentence
@@ -282,7 +282,7 @@ FOLDED = ("bar_twist", "bunny")
 )
 def test_every_solver_runs_every_scene(name, solver, device, tmp_path):
     """The frames in the file are those in memory, and nothing diverges."""
-    declared, method = _taken(scene(name, **SMALL[name]), solver, device)
+    declared, method = taken(scene(name, **SMALL[name]), solver, device)
     if name in FOLDED and isinstance(QUICK[solver], wc.ProjectiveDynamics):
         with pytest.raises(
             ValueError, match=r"cannot take DihedralBending, .*; Explicit, Newton, ADMM, PBD, HierarchicalPBD, XPBD or"
@@ -320,30 +320,12 @@ def test_no_vertex_is_inside_a_collider(name, solver, device):
     if solver == "projective dynamics":
         method = replace(method, iterations=10)
     if solver == "explicit":
-        method = _explicit(declared, device)
+        method = explicit_steps(declared, device)
     animation = wc.simulate(declared, method, device=device, frames=min(declared.frames, 30))
     assert animation.status.ok, animation.status
     for frame, points in enumerate(animation.points.astype(np.float64)):
         for collider in declared.colliders:
             assert collider.distances(points, frame).min() > 0.0, (frame, collider.label)
-
-
-def _taken(declared, solver, device):
-    """A scene without what a solver refuses, and the solver, explicit steps with those that contact of cloth needs."""
-    method, contact = QUICK[solver], declared.self_contact
-    if "pbd" in solver and solver != "xpbd":
-        declared = replace(declared, colliders=[replace(each, friction=0.0) for each in declared.colliders])
-        if contact is not None:
-            declared = replace(declared, self_contact=replace(contact, friction=0.0))
-    if solver == "explicit" and contact is not None:
-        method = _explicit(declared, device)
-    return declared, method
-
-
-def _explicit(declared, device):
-    """With steps of at most half the limit."""
-    limit, _ = step_limits(declared.build(device=device))
-    return wc.Explicit(substeps=int(np.ceil(2.0 / (declared.fps * limit))))
 
 
 @pytest.mark.parametrize(
@@ -357,7 +339,7 @@ def _explicit(declared, device):
 )
 def test_no_cloth_crosses_cloth(name, solver, device):
     """At any frame, by exact predicates, at a step a frame, in float32."""
-    declared, method = _taken(scene(name, **FOLDING[name]), solver, device)
+    declared, method = taken(scene(name, **FOLDING[name]), solver, device)
     if solver != "explicit":
         method = replace(method, substeps=1)
     animation = wc.simulate(declared, method, device=device, frames=min(declared.frames, 20))
@@ -369,7 +351,7 @@ def test_no_cloth_crosses_cloth(name, solver, device):
 def test_roundings_do_not_add_up_to_a_crossing(device):
     """Pins of a cylinder that is wrung hard, held back by a few roundings in each step, once took an edge through another."""
     twist = scene("twist", around=12, along=8, duration=0.8)
-    points = wc.simulate(twist, _explicit(twist, device), device=device, frames=14).points
+    points = wc.simulate(twist, explicit_steps(twist, device), device=device, frames=14).points
     assert not wc.intersections(points, twist.mesh).counts.any()
 
 

@@ -1,9 +1,13 @@
 """The scenes of the package at sizes that take a moment, and some that move a lot."""
 
+from dataclasses import replace
 from importlib import import_module
+
+import numpy as np
 
 import warpcloth as wc
 from support.meshes import PAIR
+from warpcloth.solvers.explicit import step_limits
 
 
 def scene(name, **parameters):
@@ -84,3 +88,21 @@ QUICK = {
     "constrained dynamics": wc.ConstrainedDynamics(substeps=4, iterations=4),
     "constrained dynamics searching": wc.ConstrainedDynamics(substeps=4, iterations=4, stabilisation="line-search"),
 }
+
+
+def taken(declared, solver, device):
+    """A scene without what a solver refuses, and the solver, explicit steps with those that contact of cloth needs."""
+    method, contact = QUICK[solver], declared.self_contact
+    if "pbd" in solver and solver != "xpbd":
+        declared = replace(declared, colliders=[replace(each, friction=0.0) for each in declared.colliders])
+        if contact is not None:
+            declared = replace(declared, self_contact=replace(contact, friction=0.0))
+    if solver == "explicit" and contact is not None:
+        method = explicit_steps(declared, device)
+    return declared, method
+
+
+def explicit_steps(declared, device):
+    """Explicit steps of at most half the limit."""
+    limit, _ = step_limits(declared.build(device=device))
+    return wc.Explicit(substeps=int(np.ceil(2.0 / (declared.fps * limit))))
