@@ -1,6 +1,6 @@
-"""Cloth simulation: every classic method on the same scene, from energies written once, on NVIDIA Warp, writing USD.
+"""Cloth simulation on NVIDIA Warp: every classic method on one scene, energies written once, output to USD.
 
-A name is imported from its module when it is first used, and Warp with it.
+Each public name is imported from its module when it is first used, and Warp with it.
 """
 
 import sys
@@ -8,12 +8,12 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from .base import interrupts as interrupts  # first: it handles interrupts while the other modules load, which takes a second
+from .base import interrupts as interrupts  # first, so that it handles interrupts while the other modules load
 from .base.collector import collector_paused
 from .base.extensions import load_installed
 from .base.quiet import prepare_warp
 
-if TYPE_CHECKING:  # the table below, as type checkers read it
+if TYPE_CHECKING:  # the table below, for type checkers
     from .analysis.analysis import Analyzer as Analyzer
     from .analysis.analysis import analyze as analyze
     from .analysis.compare import Comparison as Comparison
@@ -52,7 +52,7 @@ if TYPE_CHECKING:  # the table below, as type checkers read it
     from .terms.loads import Pressure as Pressure
     from .terms.loads import Traction as Traction
 
-# The module of each public name; those of the two catalogues are added to them.
+# The module of each public name. The names of the two catalogues are added.
 _MODULES = {
     "Analyzer": "analysis.analysis",
     "analyze": "analysis.analysis",
@@ -93,7 +93,7 @@ _MODULES = {
 _CATALOGUES = ("solvers", "terms")
 
 
-if not TYPE_CHECKING:  # a type checker would find every name in it, those misspelt too
+if not TYPE_CHECKING:  # with __getattr__, a type checker would accept any name
 
     def __getattr__(name):
         if name.startswith("__") and name != "__all__":  # Python and its tools ask every module for these
@@ -102,7 +102,7 @@ if not TYPE_CHECKING:  # a type checker would find every name in it, those missp
             if name == "__all__":
                 value = [*_MODULES, *(public for room in _CATALOGUES for public in _from(room, "__all__"))]
             else:
-                import_module(".usd", __name__)  # whatever is used may be given a stage
+                import_module(".usd", __name__)  # any function may be given a stage
                 value = _find(name)
                 prepare_warp()
                 load_installed()
@@ -115,7 +115,7 @@ def _find(name):
     for catalogue in _CATALOGUES:
         if name in _from(catalogue, "__all__"):
             return _from(catalogue, name)
-    if find_spec(f".{name}", __name__):  # a package of this one, such as solvers
+    if find_spec(f".{name}", __name__):  # a subpackage, such as solvers
         return import_module(f".{name}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
@@ -129,5 +129,5 @@ def __dir__():
     return sys.modules[__name__].__all__
 
 
-if sys.modules.get("warp"):  # whose settings may be changed from here on
+if sys.modules.get("warp"):  # the user may change its settings from here on
     prepare_warp()

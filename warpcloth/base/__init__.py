@@ -1,1 +1,1 @@
-"""Checks, files, messages and locks that every other room needs."""
+"""Checks, output files, messages and locks that all other packages use."""

@@ -1,4 +1,4 @@
-"""Checks of single values that users give; the error names the parameter, the value and the rule."""
+"""Checks of single values that users give. Each error names the parameter, the value and the rule."""
 
 import math
 import reprlib
@@ -15,12 +15,16 @@ _SHORT.maxother = _SHORT.maxstring = 60
 
 
 def shown(value: object) -> str:
-    """A value in one line that is not long, for the sentence of an error."""
+    """Returns a value as one short line of text, for error messages."""
     return " ".join(_SHORT.repr(value.item() if isinstance(value, np.generic) else value).split())
 
 
 def number(name: str, value: Any, above: float | None = None, least: float | None = None) -> None:
-    """Checks that an option is a finite number."""
+    """Checks that an option is a finite number, greater than ``above`` and no less than ``least``, where they are given.
+
+    Raises:
+        ValueError: It is not.
+    """
     rule = "that is finite" if above is least is None else f"above {above:g}" if above is not None else f"of {least:g} or more"
     if isinstance(value, float) and math.isinf(value) and value > 0.0 and rule != "that is finite":
         rule += ", and finite"
@@ -38,7 +42,11 @@ def _is_finite(value):
 
 
 def whole(name: str, value: Any, least: int, most: int = MOST) -> None:
-    """Checks that an option is a whole number from ``least`` to ``most``."""
+    """Checks that an option is a whole number from ``least`` to ``most``.
+
+    Raises:
+        ValueError: It is not.
+    """
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name} is {shown(value)}; it must be a whole number of {least} or more")
     if value > most:
@@ -46,13 +54,17 @@ def whole(name: str, value: Any, least: int, most: int = MOST) -> None:
 
 
 def choice(name: str, value: object, allowed: Collection[str]) -> None:
-    """Checks that an option is one of some words."""
+    """Checks that an option is one of the ``allowed`` strings.
+
+    Raises:
+        ValueError: It is not.
+    """
     if not isinstance(value, str) or value not in allowed:
         raise ValueError(f"{name} is {shown(value)}; it must be one of {', '.join(map(repr, allowed))}")
 
 
 def as_array(value: object) -> np.ndarray:
-    """``value`` as NumPy reads it; what is no array, such as rows of different lengths, as None."""
+    """Converts ``value`` to an array; where NumPy cannot, as for rows of different lengths, returns an array of None."""
     try:
         return np.asarray(value)
     except (TypeError, ValueError):
@@ -60,10 +72,10 @@ def as_array(value: object) -> np.ndarray:
 
 
 def numeric(name: str, value: object, rule: str) -> np.ndarray:
-    """``value`` as a read-only float64 array of its own.
+    """Copies ``value`` to a read-only float64 array.
 
     Raises:
-        ValueError: If it is no number and no array of numbers, which texts and truth values are not.
+        ValueError: It is neither a number nor an array of numbers. Strings and booleans are not numbers.
     """
     array = as_array(value)
     if array.dtype.kind not in "iuf" and array.size:
@@ -74,7 +86,11 @@ def numeric(name: str, value: object, rule: str) -> np.ndarray:
 
 
 def array(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
-    """``value`` as a read-only float64 array of ``shape``, all finite."""
+    """Copies ``value`` to a read-only float64 array of ``shape``.
+
+    Raises:
+        ValueError: It has another shape, or is not finite.
+    """
     found = numeric(name, value, f"have shape {shape}")
     if found.shape != shape:
         raise ValueError(f"{name} has shape {found.shape}; it must be {shape}")
@@ -83,7 +99,7 @@ def array(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def refuse(name: str, values: np.ndarray, wrong: ArrayLike, rule: str) -> None:
-    """Refuses an array where ``wrong`` is true anywhere, naming the first such entry."""
+    """Raises a ValueError that names the first entry of an array where ``wrong`` is true, if there is one."""
     where = np.argwhere(wrong)
     if len(where):
         index = where[0].tolist()

@@ -1,4 +1,4 @@
-"""Python's garbage collector."""
+"""Pauses Python's garbage collector."""
 
 import contextlib
 import gc
@@ -6,7 +6,7 @@ import gc
 
 @contextlib.contextmanager
 def uncollected():
-    """Disables the garbage collector meanwhile. Yields whether it was enabled."""
+    """Disables the garbage collector inside the block. Yields whether it was enabled."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -20,12 +20,12 @@ def uncollected():
 def collector_paused():
     """Pauses the garbage collector while modules load.
 
-    All that they make stays. Looking through it for garbage, again and again as it grows, takes a third of the time to start.
+    The objects of modules are not garbage. Searching them again and again takes a third of the start-up time.
     """
     with uncollected() as enabled:
         try:
             yield
         finally:
-            if enabled and not gc.get_freeze_count():  # what is frozen stays so
+            if enabled and not gc.get_freeze_count():  # leave objects that others froze alone
                 gc.freeze()
-                gc.unfreeze()  # leaves all of it in the oldest generation, without a look at it
+                gc.unfreeze()  # moves all objects to the oldest generation without searching them

@@ -1,4 +1,4 @@
-"""Keys of what a run depends on: a scene, and the code of this package."""
+"""Hashes of what a run depends on: its scene, and the code of this package."""
 
 import hashlib
 import os
@@ -12,10 +12,10 @@ from .extensions import extensions
 
 
 def scene_digest(scene):
-    """A hash of all of a scene that its motion depends on, whatever it is called and how long it goes on.
+    """Hashes everything in a scene that its motion depends on; its duration is left out.
 
     Raises:
-        ValueError: Something in it is no data.
+        ValueError: A field cannot be hashed, see :func:`digest_of`.
     """
     mesh = scene.mesh
     facts = [mesh.points, mesh.triangles, mesh.edges, mesh.grid_shape, scene.vertex_masses, scene.positions, scene.velocities]
@@ -27,10 +27,10 @@ def scene_digest(scene):
 
 
 def digest_of(facts):
-    """A hash of numbers, texts, lists, arrays and records of these.
+    """Hashes numbers, strings, lists, arrays and dataclasses of these.
 
     Raises:
-        ValueError: Something is none of these.
+        ValueError: A value is of another type.
     """
     digest = hashlib.sha256()
     for fact in facts:
@@ -39,7 +39,7 @@ def digest_of(facts):
 
 
 def _add(digest, value):
-    """Adds a value so that other values add other bytes: each with its kind, and of what has parts their number."""
+    """Adds a value with its type and, for lists, its length, so that different values always add different bytes."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, (bool, int, float, str)):
@@ -59,7 +59,7 @@ def _add(digest, value):
 
 
 def source_digest():
-    """A hash of the code of this package and of extensions: what another version measured is measured again."""
+    """Hashes the code of this package and of extensions, so that measurements of another version are not reused."""
     files = [file for files in extensions().values() for file in files]
     if not files:
         return package_digest()
@@ -71,9 +71,9 @@ def source_digest():
 
 @cache
 def package_digest():
-    """A hash of the code of this package."""
+    """Hashes the code of this package."""
     root, digest = Path(__file__).parents[1], hashlib.sha256()
-    folders = os.walk(root, followlinks=True)  # in a checkout the folder of kernels is a link
+    folders = os.walk(root, followlinks=True)  # in a checkout, kernels/ is a link
     files = [Path(folder) / name for folder, _, names in folders for name in names if name.endswith(".py")]
     for path in sorted(files, key=lambda path: path.relative_to(root).as_posix()):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())

@@ -1,7 +1,7 @@
-"""Energies and solvers from outside this package: modules that register them, by entry points, by name or by file.
+"""Extensions: modules outside this package that register energies and solvers, loaded by entry point, name or file.
 
-A module registers a record by :func:`warpcloth.terms.register` or :func:`warpcloth.solvers.register` when it is imported. Its
-code counts where results are kept, and goes with the measurements to other processes and machines.
+On import, a module calls :func:`warpcloth.terms.register` or :func:`warpcloth.solvers.register`. Its code is part of the hash
+under which measurements are kept, and is sent to other processes and machines that measure.
 """
 
 import importlib
@@ -12,18 +12,18 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
-# Installed packages name their modules in this group, see docs/extending.md.
+# Entry-point group in which installed packages name their modules, see docs/extending.md.
 GROUP = "warpcloth.extensions"
-_names: set[str] = set()  # of modules that registered something, or were loaded to do so
-_files: set[str] = set()  # names of modules that were loaded by the path of a file
+_names: set[str] = set()  # modules that registered something, or were loaded for that
+_files: set[str] = set()  # modules that were loaded from the path of a file
 
 
 @cache
 def load_installed():
-    """Imports, once, the modules that installed packages name in :data:`GROUP`.
+    """Imports the modules that installed packages name in :data:`GROUP`, on the first call only.
 
     Warns:
-        UserWarning: One of them cannot be imported.
+        UserWarning: A module cannot be imported.
     """
     for point in entry_points(group=GROUP):
         try:
@@ -36,10 +36,10 @@ def load_extension(name):
     """Imports a module that registers energies and solvers.
 
     Args:
-        name: Name of the module, or path of a .py file; a file replaces another of its name that was loaded before.
+        name: Name of the module, or path of a .py file. A file replaces a file of the same name that was loaded before.
 
     Raises:
-        ValueError: It cannot be imported.
+        ValueError: The module cannot be imported.
     """
     try:
         if name.endswith(".py"):
@@ -52,7 +52,7 @@ def load_extension(name):
 
 
 def load_only(names):
-    """Imports modules, and forgets those that were loaded for others: a worker of a cluster measures for many."""
+    """Imports modules and forgets extensions loaded before: a worker of a cluster measures for several clients."""
     _names.clear()
     for name in names:
         load_extension(name)
@@ -78,17 +78,17 @@ def _run_file(path):
 
 
 def note(record):
-    """Notes the module of a record that is registered."""
+    """Remembers the module that registers a record, unless it is part of this package."""
     if record.__module__.partition(".")[0] != __name__.partition(".")[0]:
         _names.add(record.__module__)
 
 
 def extensions():
-    """Returns the files of the modules from outside that this process uses.
+    """Returns the files of the extensions that this process uses.
 
     Returns:
-        dict: The paths of each by what :func:`load_extension` takes: the name of a module of a package, which stands for all
-        files of that package, or the path of the only file; sorted.
+        dict: Paths of source files by the argument for :func:`load_extension`: for a module in a package its name, with all
+        files of the package; else the path of its one file.
     """
     found = {}
     for name in sorted(_names & set(sys.modules)):

@@ -1,4 +1,4 @@
-"""Handles interrupts by Ctrl-C, and in the command by SIGTERM too, so that a file that is being finished is finished first."""
+"""Handles Ctrl-C, and in the command SIGTERM too, so that a file is completed before the process ends."""
 
 import os
 import signal
@@ -10,18 +10,18 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
-    """The user interrupted; the message says what is saved, and where."""
+    """Raised when the user interrupts. The message says what is saved, and where."""
 
 
 @contextmanager
 def deferred(patience=1):
-    """Holds an interrupt back until this block has ended; a second one is raised at once.
+    """Delays an interrupt until the end of the block; a second interrupt is raised at once.
 
-    This applies to the main thread, since interrupts arrive nowhere else. A signal without a handler, which ends the process as
-    SIGTERM does outside the command, is left alone.
+    Only the main thread receives interrupts, so in other threads this does nothing. A signal without a handler, such as
+    SIGTERM outside the command, ends the process as before.
 
     Args:
-        patience: How many interrupts are held back; 0 if this block runs because of an interrupt.
+        patience: Number of interrupts to delay; 0 if the block runs because of an interrupt.
     """
     if not patience or threading.current_thread() is not threading.main_thread():
         yield
@@ -48,12 +48,12 @@ def deferred(patience=1):
 
 @contextmanager
 def recording(recorder, frames):
-    """Closes a recorder of frames, however the block ends.
+    """Closes a recorder when the block ends, also after an error.
 
     Args:
-        recorder: Object with ``frames``, the number of frames it was given, ``close()``, and ``saved()``, which says where they
-            are.
-        frames: Number of frames it would be given in all, after the first.
+        recorder: Object with ``frames``, the number of frames recorded so far, ``close()``, and ``saved()``, which returns a
+            text that says where they are.
+        frames: Number of frames of the whole run, without frame 0.
 
     Raises:
         Interrupted: The user interrupted; the message says which frames are saved.
@@ -69,11 +69,11 @@ def recording(recorder, frames):
 
 
 class Interrupts:
-    """Interrupts of the command: SIGTERM acts like Ctrl-C, and further signals cannot disturb the message about the first.
+    """Handles the interrupts of a command: SIGTERM acts like Ctrl-C. The command sets ``over`` before its last message.
 
     Attributes:
-        code: Exit code, 128 plus the number of the signal, as in shells: 130 for Ctrl-C, 143 for SIGTERM.
-        over: Whether signals are ignored from now on.
+        code: Exit code: 128 plus the signal number, as in shells, so 130 for Ctrl-C and 143 for SIGTERM.
+        over: Whether to ignore further signals.
     """
 
     def __init__(self):
@@ -83,20 +83,20 @@ class Interrupts:
         self._before = {}
         if threading.current_thread() is threading.main_thread():
             own = {signal.SIGINT: (signal.default_int_handler, leave), signal.SIGTERM: (signal.SIG_DFL, leave)}
-            for number, replaced in own.items():  # leave other handlers, and signals that are ignored, alone
+            for number, replaced in own.items():  # keep foreign handlers and ignored signals
                 if signal.getsignal(number) in replaced:
                     self._before[number] = signal.signal(number, self._interrupt)
         self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
         return self
 
     def __exit__(self, *error):
-        self.over = True  # set first, so that a signal from here on is ignored
+        self.over = True  # first, so that signals are ignored from here on
         sys.unraisablehook = self._hook
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def _unraisable(self, unraisable):
-        """Raises an interrupt again that came in a destructor, where Python drops it."""
+        """Repeats an interrupt that came during a destructor, where Python drops exceptions."""
         if not issubclass(unraisable.exc_type, KeyboardInterrupt):
             self._hook(unraisable)
         elif not self.over:
@@ -106,7 +106,7 @@ class Interrupts:
 
     @contextmanager
     def loading(self):
-        """Makes an interrupt end the process at once, because an import may swallow an exception."""
+        """Makes an interrupt end the process at once inside the block, because an import may swallow exceptions."""
         self._loading = True
         try:
             yield
@@ -122,17 +122,17 @@ class Interrupts:
 
 
 def leave(number, _frame):
-    """Ends the process at once, without a traceback, because an import may swallow an exception."""
-    with suppress(Exception):  # the signal may have come in the middle of another flush
+    """Ends the process at once, without a traceback, with the exit code of a signal."""
+    with suppress(Exception):  # the signal may have interrupted another flush
         sys.stdout.flush()
     os.write(2, b"warpcloth: interrupted\n")
     os._exit(128 + number)
 
 
 def leave_while_loading():
-    """Makes interrupts end the command while its modules load, which takes a second, and after its last message.
+    """Makes an interrupt end the command at once while its modules load, which takes a second, and after its last message.
 
-    The processes that it starts for measurements end silently.
+    The worker processes that it starts for measurements end without a message.
     """
     if threading.current_thread() is not threading.main_thread():
         return

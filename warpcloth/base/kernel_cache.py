@@ -1,6 +1,6 @@
-"""Warp's cache of compiled kernels: broken files are compiled again, and a process reads headers that another one has parsed.
+"""Repairs Warp's cache of compiled kernels, and shares its parsed C++ headers between processes.
 
-A cache that cannot be written is an error.
+A cache that cannot be written raises an error.
 """
 
 import errno
@@ -10,17 +10,17 @@ import shutil
 import tempfile
 from functools import cache, wraps
 
-_ROOM = 2**23  # free bytes that the source and the binary of a kernel, and the parsed headers, need
+_ROOM = 2**23  # bytes that the source and binary of a module and the parsed headers need
 _INSTANTIATE = "-fpch-instantiate-templates"
-HEADERS = "wp_headers"  # the start of the name of a folder in the cache
+HEADERS = "wp_headers"  # first part of the name of their folder in the cache
 
 
 def mend():
     """Makes Warp repair its cache when it loads a module.
 
-    A killed process or a full disk may leave a truncated binary or description, which Warp then fails to load every time. In
-    that case the files of the module are removed and it is compiled once more. LLVM ends the process if there is no room for a
-    binary; this is checked first and raised as an error.
+    A killed process or a full disk may leave truncated files, which Warp then fails to load every time. Here the files of the
+    module are removed, and it is compiled again. LLVM ends the process if the disk has no room for a binary, so that is
+    checked before.
     """
     import warp as wp
 
@@ -29,12 +29,12 @@ def mend():
 
 
 def parse_headers_once():
-    """Makes Warp parse its headers once for all processes and threads of a cache, for the CPU.
+    """Makes Warp keep its parsed headers in the kernel cache, for kernels on the CPU.
 
-    Every kernel includes Warp's headers, which take the compiler 2.6 s. Warp parses them once in each thread of each process
-    that compiles. Here the parsed headers are kept in a folder of the kernel cache, which `wp.clear_kernel_cache` removes, and
-    the compiler also instantiates the templates that the headers use themselves, which it would repeat for each kernel. The
-    code that it generates remains the same.
+    Every kernel includes Warp's headers, which take the compiler 2.6 s to parse. Warp parses them once in each thread of each
+    process; here all processes share one precompiled header. It also instantiates the templates that the headers use, which
+    the compiler would otherwise repeat for each kernel. The generated code is the same. `wp.clear_kernel_cache` removes the
+    folder.
     """
     import warp as wp
 
@@ -59,14 +59,14 @@ def _kept(folder_of_thread):
 
 @cache
 def headers_folder():
-    """Returns the folder of parsed headers, in the cache that this process uses first."""
+    """Returns the folder of parsed headers, in the kernel cache that is set when this is first called."""
     import warp as wp
 
     return os.path.join(wp.config.kernel_cache_dir, f"{HEADERS}_{_compiler_digest()}")
 
 
 def _compiler_digest():
-    """Digests the headers, the compiler and the processor: the compiler refuses headers that were parsed for others."""
+    """Hashes the headers, the compiler and the processor, for the compiler refuses headers that were parsed for others."""
     import warp as wp
 
     processor = wp._src.context.runtime.llvm.wp_get_host_cpu_name()
@@ -94,11 +94,11 @@ def _mended(load):
             return load(module, device, block_dim, *arguments, **options)
         try:
             loaded = load(module, device, block_dim, *arguments, **options)
-            # The linker may accept a binary that lacks a kernel; CUDA notices that itself.
+            # The linker of the CPU may accept a binary that lacks a kernel; CUDA raises an error.
             if device.is_cpu and any(loaded.get_kernel_hooks(kernel).forward is None for kernel in list(loaded.kernel_names)):
-                raise RuntimeError(f"{folder}: a kernel is not there")
+                raise RuntimeError(f"{folder}: a kernel is missing")
             return loaded
-        except Exception:  # many kinds; if these files are not the cause it is raised again
+        except Exception:  # of many types; if the files are not the cause, the second load raises it again
             refuse_full(os.path.dirname(folder))
             shutil.rmtree(folder, ignore_errors=True)
             module.execs.pop(key, None)
@@ -109,10 +109,10 @@ def _mended(load):
 
 
 def refuse_full(cache):
-    """Refuses a folder that has no room for a binary.
+    """Checks that a folder has room for a binary.
 
     Raises:
-        OSError: The folder is full or cannot be written.
+        OSError: The disk is full, or the folder cannot be written.
     """
     try:
         with tempfile.TemporaryFile(dir=cache) as file:
@@ -122,6 +122,6 @@ def refuse_full(cache):
 
 
 def described(error, cache):
-    """Returns the error of a cache, with a name for its folder."""
+    """Returns an OSError like ``error`` whose message says that the folder is the kernel cache."""
     where = f"{cache}, where Warp keeps compiled kernels (WARP_CACHE_PATH names another folder)"
     return OSError(error.errno or errno.EIO, error.strerror or str(error), where)

@@ -1,16 +1,16 @@
-"""Refuses, before anything runs, sizes that exceed the free memory or disk, and counts that would never end."""
+"""Upper limits of counts, and checks that arrays and files fit in the free memory and disk before a run starts."""
 
 import os
 import shutil
 
-# Most steps of a frame, iterations of a step, and copies. Each takes a microsecond at least, so more take minutes or hours.
+# Largest number of steps a frame, iterations a step, and copies. Each takes at least a microsecond.
 MOST = 10_000_000
-# Most frames, since their numbers are time codes of a stage, see `usd.values.MOST_TIME_CODE`.
+# Largest number of frames, because their numbers are time codes of a stage, see `usd.values.MOST_TIME_CODE`.
 MOST_FRAMES = 1_000_000_000
 
 
 def available_memory():
-    """Returns the bytes that this process can still allocate, from the Linux kernel and the control group; None if unknown."""
+    """Returns the bytes that this process can still allocate, as Linux and its control group say; None if unknown."""
     found = []
     for path, key in (
         ("/proc/meminfo", "MemAvailable:"),
@@ -21,7 +21,7 @@ def available_memory():
             with open(path) as file:
                 words = next(line.removeprefix(key).split() for line in file if line.startswith(key))
             found.append(int(words[0]) * (1024 if key else 1))
-        except (OSError, StopIteration, ValueError):  # not Linux, or the word "max", which means no limit
+        except (OSError, StopIteration, ValueError):  # not Linux; or the word "max", no limit
             found.append(None)
     free, limit, used = found
     rooms = [free] if limit is None or used is None else [free, limit - used]
@@ -29,11 +29,11 @@ def available_memory():
 
 
 def refuse_memory(what, size):
-    """Refuses an option that takes more memory than is free.
+    """Checks that the arrays of an option fit in the free memory.
 
     Args:
-        what: The option and its value, as the start of a sentence: "frames is 1000000000".
-        size: Bytes that it takes.
+        what: Option and value, which begin the error message: "frames is 1000000000".
+        size: Bytes needed.
 
     Raises:
         ValueError: Fewer bytes are free.
@@ -46,10 +46,15 @@ def refuse_memory(what, size):
 
 
 def refuse_disk(what, size, folder):
-    """Refuses an option that takes more space than is free on the disk of a folder, which must exist.
+    """Checks that the files of an option fit on the disk of a folder, which must exist.
+
+    Args:
+        what: As for `refuse_memory`.
+        size: Bytes needed.
+        folder: Folder of the files.
 
     Raises:
-        ValueError: Less space is free.
+        ValueError: Fewer bytes are free.
     """
     room = shutil.disk_usage(folder).free
     if size > room:

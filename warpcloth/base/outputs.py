@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Output files that are written under a temporary name and renamed when complete, and locks against other writers."""
 
 import contextlib
 import csv
@@ -11,13 +11,13 @@ import warnings
 
 from .interrupts import deferred
 
-# Of the files that USD writes and reads as stages.
+# Endings of USD stages.
 STAGE_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 TEXT = {"encoding": "utf-8", "newline": ""}
 
 
 def check_apart(outputs, inputs=()):
-    """Refuses files that would be written over one another or over an input; None is no file.
+    """Checks that no output file is written twice or replaces an input. Entries that are None are skipped.
 
     Raises:
         ValueError: Two outputs are one file, or one is an input.
@@ -33,24 +33,25 @@ def check_apart(outputs, inputs=()):
 
 
 class Output:
-    """A file that is written under another name, and renamed at `close`, so that a failure leaves an earlier result whole.
+    """A file that is written under a temporary name and renamed by `close`, so that a failure leaves an older file whole.
 
-    As a context manager it closes the file at the end, and with the rows so far if the user interrupts; other errors discard
-    it.
+    As a context manager it closes the file at the end of the block. An interrupt keeps what is written so far; any other error
+    discards it.
 
     Attributes:
-        path: The file, once it is closed.
-        finished: Whether it is closed.
+        path: Path of the finished file.
+        file: The open temporary file.
+        finished: Whether the file is closed and renamed.
     """
 
     def __init__(self, path, mode, **options):
-        """Opens ``file``, what is written until then, as ``open`` does.
+        """Opens the temporary file, in the folder of ``path``, with the mode and options of `open`.
 
         Raises:
             FileNotFoundError: The folder does not exist.
             ValueError: The path is a folder or a device.
         """
-        target = os.path.realpath(path)  # of a link the file that it stands for
+        target = os.path.realpath(path)  # replace the file behind a link, not the link
         self.folder = os.path.dirname(target)
         if not os.path.isdir(self.folder):
             raise FileNotFoundError(f"{path}: the folder {self.folder} does not exist")
@@ -70,7 +71,7 @@ class Output:
             self.discard()
 
     def close(self):
-        """Finishes the file; once is enough."""
+        """Completes the file and renames it. Further calls do nothing."""
         if self.file.closed:
             return
         try:
@@ -84,23 +85,23 @@ class Output:
             raise
 
     def discard(self):
-        """Leaves what was there before, unless the file is finished."""
+        """Removes the temporary file; an older file at the path stays."""
         for part in (self.file, *self.parts()):
-            with contextlib.suppress(OSError):  # what a full disk does not take is not wanted
+            with contextlib.suppress(OSError):  # a full disk fails to write the buffer, which is not needed
                 part.close()
         with contextlib.suppress(FileNotFoundError):
             os.remove(self._unfinished)
 
     def finish(self):
-        """Writes what is known at the end only."""
+        """Writes what is known only at the end; for subclasses."""
 
     def parts(self):
-        """Further files that are open."""
+        """Returns further open files; for subclasses."""
         return ()
 
 
 def write_table(path, columns, rows):
-    """Writes a table of comma-separated values: the names of its columns, and rows of as many values; None is an empty cell.
+    """Writes comma-separated values: a line of column names, then the rows. None gives an empty cell.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -112,10 +113,10 @@ def write_table(path, columns, rows):
 
 
 class Lock:
-    """Locks an output against other writers by a file `.<name>.lock` beside it, which is unlocked when its process ends.
+    """Locks an output against other writers, by a file `.<name>.lock` beside it.
 
-    A killed process leaves a file that blocks nobody and that the next writer removes when it is done. In network folders the
-    lock holds for all machines if the file system supports that.
+    The lock ends with its process. A killed process leaves the file, which blocks nobody, and which the next writer removes.
+    In network folders the lock holds for all machines if the file system supports that.
 
     Args:
         output: Path of the output.
@@ -133,7 +134,7 @@ class Lock:
         while True:
             try:
                 file = open(self._path, "a+", encoding="utf-8", opener=_open_itself)
-            except PermissionError:  # the file of another user; if there is no file, the folder cannot be written
+            except PermissionError:  # another user's file; without a file the folder cannot be written, and this raises again
                 file = open(self._path, encoding="utf-8", opener=_open_itself)
             try:
                 _lock(file)
@@ -148,19 +149,19 @@ class Lock:
                 raise BlockingIOError(
                     f"{output}: is being written by {holder or 'another run'}; wait until it ends, or give another output"
                 ) from None
-            # Otherwise the last writer has removed this file in the meantime, and the next one would make another.
+            # The last writer may have removed this file between the two calls. Then try again with a new one.
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(file.fileno()), os.stat(self._path)):
                     break
             file.close()
         self._file = file
-        with contextlib.suppress(OSError):  # a full disk; the text is only for the message
+        with contextlib.suppress(OSError):  # the disk may be full, and the text is only for the error message
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}")
             file.flush()
 
     def release(self):
-        """Lets others write. Further calls do nothing, nor do calls in a process that was forked from the writer's."""
+        """Releases the lock. Further calls do nothing, nor do calls in a forked process."""
         if self._file is None or self._process != os.getpid():
             return
         with contextlib.suppress(OSError):
@@ -170,7 +171,7 @@ class Lock:
 
 
 def _open_itself(path, flags):
-    """Opens a file that is no link, since what is written would replace the text of the file that a link stands for."""
+    """Opens a file but follows no link, because writing would replace the text of the file behind it."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
@@ -179,7 +180,7 @@ def _lock(file):
     if sys.platform == "win32":
         import msvcrt
 
-        file.seek(2**20)  # beyond the text, because others cannot read locked bytes
+        file.seek(2**20)  # beyond the text, because others cannot read locked bytes on Windows
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
     else:
         import fcntl

@@ -1,4 +1,4 @@
-"""Silences Warp's greeting, its lines on modules and its native line about a missing CUDA driver, unless they are asked for."""
+"""Initialises Warp without its greeting, its messages about modules and its message about a missing CUDA driver."""
 
 import os
 import sys
@@ -11,9 +11,9 @@ from .kernel_cache import described, mend, parse_headers_once
 
 @cache
 def prepare_warp():
-    """Makes Warp leave out its news, repair its cache of kernels and keep parsed headers there: once, before it is initialised.
+    """Sets Warp's log level to warnings, and makes it repair its kernel cache and keep parsed headers there.
 
-    Its log level is set to warnings if it is still the default; a level that the user sets, before or later, is kept.
+    A log level that the user sets, before or later, is kept.
     """
     import warp as wp
 
@@ -24,7 +24,7 @@ def prepare_warp():
 
 
 def find_device(name):
-    """Returns the Warp device of a name, after :func:`initialise_warp`.
+    """Initialises Warp and returns the device of a name, such as "cpu" or "cuda:0".
 
     Raises:
         ValueError: This machine has no such device.
@@ -34,14 +34,14 @@ def find_device(name):
     initialise_warp()
     try:
         return wp.get_device(name)
-    except (TypeError, ValueError, RuntimeError):  # not a name, or the name of no device
+    except (TypeError, ValueError, RuntimeError):
         there = ", ".join(device.alias for device in wp.get_devices())
         raise ValueError(f"device is {shown(name)}; on this machine there are {there}") from None
 
 
 @cache
 def initialise_warp():
-    """Initialises Warp after :func:`prepare_warp`, without its line about a missing driver if only the CPU is asked for.
+    """Initialises Warp after :func:`prepare_warp`, and hides its message about a missing CUDA driver.
 
     Raises:
         OSError: The folder of compiled kernels cannot be made.

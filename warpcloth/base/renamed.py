@@ -1,4 +1,4 @@
-"""Old names of parameters: they work for one release, with a DeprecationWarning that gives the new name."""
+"""Old names of parameters, which work for one more release, with a DeprecationWarning that gives the new name."""
 
 import functools
 import warnings
@@ -9,9 +9,9 @@ Record = TypeVar("Record")
 
 
 def renamed(**names: str) -> Callable[[Record], Record]:
-    """Decorates a record whose fields had other names: ``@renamed(stiffness="correction")`` takes and reads the old one too.
+    """Decorates a dataclass with renamed fields: ``@renamed(stiffness="correction")`` accepts and reads ``stiffness`` too.
 
-    The record keeps the names in ``renamed_fields``, new name by old name.
+    The class keeps the dict from old to new names as ``renamed_fields``.
     """
 
     def decorate(record: Any) -> Any:
@@ -37,7 +37,7 @@ def _read(old: str, record: object) -> Any:
 
 
 def new_name(record: Any, name: str, stacklevel: int = 3) -> str:
-    """Returns the present name of a field of a record, with a warning if ``name`` is its old one."""
+    """Returns the present name of a field, and warns if ``name`` is its old name."""
     new = getattr(record, "renamed_fields", {}).get(name, name)
     if new != name:
         warnings.warn(f"{record.__name__}: {name} is now called {new}", DeprecationWarning, stacklevel)

@@ -1,4 +1,4 @@
-"""Values that are written as texts, on the command line and in axes of charts: numbers, words and ``name=value``."""
+"""Converts text to values and values to text, for the command line, for the axes of charts and for JSON."""
 
 import inspect
 import json
@@ -18,7 +18,7 @@ _TRUTH = dict.fromkeys(("true", "yes", "on", "1"), True) | dict.fromkeys(("false
 
 
 def parameters_of(function):
-    """Returns the `inspect.Parameter` of each parameter of a function, or of a record of options, by name."""
+    """Returns the `inspect.Parameter` of each named parameter of a function or class, by name."""
     by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     found = inspect.signature(function, eval_str=True).parameters
     return {name: parameter for name, parameter in found.items() if parameter.kind in by_name}
@@ -26,19 +26,19 @@ def parameters_of(function):
 
 @cache
 def words_of(record):
-    """Returns the words of the options of a record that take nothing but words, by name: those annotated as Literal."""
+    """Returns the allowed words of each field of a dataclass that is annotated as Literal, by name."""
     hints = typing.get_type_hints(record)
     return {name: typing.get_args(hint) for name, hint in hints.items() if typing.get_origin(hint) is typing.Literal}
 
 
 def camel_case(name):
-    """A name as USD has it: ``stretch_1`` is ``stretch1``, ``area_ratio`` is ``areaRatio``."""
+    """Returns a name in USD's style: ``area_ratio`` becomes ``areaRatio``."""
     first, *others = name.split("_")
     return first + "".join(word.capitalize() for word in others)
 
 
 def numbered(labels, taken=()):
-    """The labels, numbered where one occurs twice or is taken."""
+    """Returns the labels, each with a number appended if it occurred before or is ``taken``."""
     found = []
     for label in labels:
         name, number = label, 1
@@ -50,10 +50,10 @@ def numbered(labels, taken=()):
 
 
 def assignments(texts):
-    """A dict from texts of the form ``name=value``.
+    """Returns a dict of strings from texts of the form ``name=value``.
 
     Raises:
-        ValueError: A text of another form, or a name that stands twice.
+        ValueError: A text has another form, or a name occurs twice.
     """
     result = {}
     for text in texts:
@@ -67,10 +67,10 @@ def assignments(texts):
 
 
 def options(record, texts):
-    """Arguments for the dataclass ``record`` from text by name, converted by its annotations.
+    """Converts text by name to arguments of the dataclass ``record``, by its annotations.
 
     Raises:
-        ValueError: A name or a value that it does not take.
+        ValueError: It has no such field, or the field does not take the value.
     """
     hints = typing.get_type_hints(record)
     kinds = {field.name: hints[field.name] for field in fields(record)}
@@ -82,12 +82,12 @@ def options(record, texts):
 
 
 def convert(name, text, kinds):
-    """``text`` as the first of bool, int, float, str that is in ``kinds`` and takes it; "none" where None is.
+    """Converts ``text`` to the first of bool, int, float and str that is in ``kinds`` and accepts it.
 
-    Nothing is evaluated: a number is what `float` takes, or two of these with a / between them.
+    If ``kinds`` has the type of None, "none" gives None. A number is text that `float` accepts, or two such with a / between.
 
     Raises:
-        ValueError: If none takes it.
+        ValueError: No type accepts it.
     """
     if type(None) in kinds and text.lower() == "none":
         return None
@@ -104,7 +104,11 @@ def convert(name, text, kinds):
 
 
 def fraction(name, text):
-    """A share of the whole, written as 1% or 0.01; above 1 it is refused, as a percentage without its sign."""
+    """Returns the fraction that a text such as 1% or 0.01 gives.
+
+    Raises:
+        ValueError: It is not a number above 0, or is above 1, as a percentage without its sign would be.
+    """
     value = convert(name, text.removesuffix("%"), (float,)) / (100.0 if text.endswith("%") else 1.0)
     number(name, value, above=0.0)
     if value > 1.0:
@@ -113,7 +117,11 @@ def fraction(name, text):
 
 
 def milliseconds(name, text):
-    """A time in ms, written as 16ms, 0.016s or 16."""
+    """Returns the time [ms] that a text such as 16ms, 0.016s or 16 gives.
+
+    Raises:
+        ValueError: It is not a number above 0.
+    """
     unit = next((unit for unit in ("ms", "s") if text.endswith(unit)), "")
     value = convert(name, text.removesuffix(unit).strip(), (float,)) * (1e3 if unit == "s" else 1.0)
     number(name, value, above=0.0)
@@ -148,7 +156,7 @@ def _kinds(annotation):
 
 
 def kinds_of_parameter(parameter):
-    """Returns the types that a parameter takes: those of its annotation, or else that of its default."""
+    """Returns the types of a parameter, from its annotation or else from its default."""
     if parameter.annotation is not parameter.empty:
         return _kinds(parameter.annotation)
     if parameter.default is None or parameter.default is parameter.empty:
@@ -157,22 +165,23 @@ def kinds_of_parameter(parameter):
 
 
 def allowed(names):
+    """Returns the end of an error message that lists the allowed names."""
     return f"allowed are {', '.join(names)}" if names else "it takes none"
 
 
 def json_text(value, nan="nan", **options):
-    """Returns ``value`` as JSON, with infinite numbers, which JSON does not have, as "inf" and "-inf", and NaN as ``nan``.
+    """Returns ``value`` as JSON. Infinite numbers become the strings "inf" and "-inf", and NaN becomes ``nan``.
 
     Args:
-        value: Dictionaries, lists, arrays, numbers and texts; anything else is written as its text.
-        nan: None to write null.
-        options: As of `json.dumps`.
+        value: Dicts, lists, arrays, numbers and strings; of any other object, its string.
+        nan: A string, or None for null.
+        options: Those of `json.dumps`.
     """
     return json.dumps(_strict(value, nan), allow_nan=False, **options)
 
 
 def _strict(value, nan):
-    """``value`` in types that JSON has."""
+    """Converts ``value`` to types that JSON has."""
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, dict):

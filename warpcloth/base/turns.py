@@ -1,11 +1,10 @@
-"""Makes the threads of one process take turns with Warp, which does not protect its shared state.
+"""A lock through which the threads of one process take turns with Warp, whose global state is not thread-safe.
 
-The graph that is being recorded, the loaded modules and the overloads of kernels belong to the whole process. Threads that bind
-or step at the same time get wrong arrays, or end the process. So every call that records, launches or allocates waits for its
-turn: building a model, binding, each step or frame, each solve of :class:`warpcloth.Arap`, each measure of a frame,
-:func:`warpcloth.equilibrium`, :func:`warpcloth.svd` and the like. Several calls of :func:`warpcloth.simulate` alternate frame
-by frame; work between frames, such as writing a file or ``progress``, does not wait. A thread that has the turn may take it
-again. Other libraries that use Warp in the same process do not take turns.
+Graph capture, loaded modules and kernel overloads belong to the whole process. Threads that bind or step at the same time get
+wrong arrays or crash. So every call that captures, launches or allocates holds the lock: building a model, binding, each step
+or frame, each solve of :class:`warpcloth.Arap`, each measure of a frame, :func:`warpcloth.equilibrium`, :func:`warpcloth.svd`
+and the like. Several calls of :func:`warpcloth.simulate` alternate frame by frame. Work between frames, such as writing a file
+or calling ``progress``, does not hold it. The lock is re-entrant. Other libraries that use Warp in this process do not take it.
 """
 
 import os
@@ -17,7 +16,7 @@ from .types import Call
 
 
 class _Turn:
-    """The turn of one thread, and of those that work for it."""
+    """A re-entrant lock that its owner can share with threads that work for it."""
 
     def __init__(self):
         self._lock, self._here = threading.RLock(), threading.local()
@@ -36,7 +35,7 @@ class _Turn:
 
     @contextmanager
     def shared(self):
-        """Lets this thread work within the turn of another thread, which waits for it."""
+        """Lets this thread work while another thread holds the lock and waits for it."""
         self._here.shared = True
         try:
             yield
@@ -45,23 +44,23 @@ class _Turn:
 
 
 TURN = _Turn()
-if hasattr(os, "register_at_fork"):  # a child process has only this thread, and would wait forever for another
+if hasattr(os, "register_at_fork"):  # a forked child lacks the thread that holds the lock, and would wait forever
     os.register_at_fork(before=TURN.__enter__, after_in_parent=TURN.__exit__, after_in_child=TURN.__exit__)
 
 
 def in_turn(function: Call) -> Call:
-    """Wraps a function so that it waits for its thread's turn."""
+    """Wraps a function so that it holds the lock while it runs."""
 
     @wraps(function)
     def waiting(*args, **kwargs):
         with TURN:
             return function(*args, **kwargs)
 
-    return waiting  # type: ignore[return-value]  # which has the parameters of the function
+    return waiting  # type: ignore[return-value]  # it has the parameters of the function
 
 
 def methods_in_turn(kind, *names):
-    """Makes those of the named methods that a class itself defines wait for their turn."""
+    """Wraps the named methods by `in_turn`, those that the class itself defines."""
     for name in names:
         if name in vars(kind):
             setattr(kind, name, in_turn(vars(kind)[name]))

@@ -1,4 +1,4 @@
-"""Types that annotations share. Shapes and units of arrays are in the docstrings."""
+"""Types for annotations. Docstrings give the shapes and units of arrays."""
 
 from collections.abc import Callable
 from os import PathLike
@@ -15,9 +15,9 @@ Call = TypeVar("Call", bound=Callable)
 
 
 class Converted(Generic[Taken, Kept]):
-    """Annotates a field of a record that takes one type and keeps another: ``gravity: Converted[ArrayLike, np.ndarray]``.
+    """Annotates a field that is given as one type and kept as another: ``gravity: Converted[ArrayLike, np.ndarray]``.
 
-    It is for type checkers, which read it as a descriptor; nothing of it is there when the program runs.
+    Type checkers read it as a descriptor. It does nothing at run time.
     """
 
     if TYPE_CHECKING:
@@ -28,8 +28,8 @@ class Converted(Generic[Taken, Kept]):
 
 
 def default(value: object) -> Any:
-    """Returns the default of a field that is annotated as `Converted`; ``dataclasses.MISSING`` for one that must be given.
+    """Returns the default of a `Converted` field; ``dataclasses.MISSING`` makes it a required field.
 
-    Type checkers take a field for a descriptor only where it has a default.
+    Type checkers treat a field as a descriptor only if it has a default.
     """
     return value

@@ -2,7 +2,7 @@
 
 
 def installed_version():
-    """Returns the version that is installed; None in a checkout that is not."""
+    """Returns the installed version, or None if the package is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
