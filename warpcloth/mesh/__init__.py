@@ -1,3 +1,3 @@
-"""Meshes and sequences of them: built, selected from, ordered and loaded from files."""
+"""Meshes and mesh sequences: construction, vertex selections, vertex order and files."""
 
-from . import loading as loading  # enters its reader of files
+from . import loading as loading  # registers its reader of files

@@ -1,24 +1,25 @@
-"""Second derivatives of a function on a mesh, for each triangle, from gradients that are single-valued on edges.
+"""Second derivatives κ of a function on a mesh, one symmetric 2×2 matrix for each triangle.
 
-For a function f of the vertices,
+For a function f of the vertices and a triangle T of area A,
 
     κ_T = 1/A Σ_e l_e sym(n_e ⊗ g_e)
 
-over the edges e of a triangle T, n_e the outward normal. g_e is the gradient in the middle of e. Its part along the edge is
-the difference of the two ends. Its part across the edge is the mean of the two triangles at e, each from a quadratic function
-through its own corners: through the opposite vertices of its three neighbours too, or where these do not fix it, as at the
-boundary, fitted by least squares to all vertices of the triangles around. So κ_T of a quadratic function is exact on flat
-meshes. The triangles around are unfolded into the plane of T: of a curved mesh only the lengths of edges count.
+over the edges e of T, with length l_e and outward normal n_e. g_e is the gradient of f at the midpoint of e, the same for both
+triangles at e. Its component along e is the difference of f at the two ends over l_e. Its component across e is the mean over
+the two triangles. Each triangle takes it from a quadratic function: the one through its three corners and the opposite vertices
+of its three neighbours. Where these six do not determine one, as at the boundary, the quadratic is fitted by least squares to
+the vertices of the surrounding triangles. So κ_T of a quadratic function is exact on flat meshes. Neighbours are unfolded into
+the plane of T, so that a curved mesh counts by its edge lengths alone.
 """
 
 import numpy as np
 
-_RANK = 1e-2  # smallest singular value over the largest below which six vertices do not fix a quadratic function
-_RINGS = 4  # of triangles around, at most, until they do
+_RANK = 1e-2  # ratio of the smallest to the largest singular value below which vertices do not determine a quadratic function
+_RINGS = 4  # largest number of rings of triangles to fit to
 
 
 def side_axes(mesh):
-    """Two axes in the plane of each triangle, the first along its first side, (T, 2, 3) unit vectors."""
+    """Returns two orthogonal unit vectors in the plane of each triangle, the first along its first side, (T, 2, 3)."""
     x = mesh.points[mesh.triangles]
     side, other = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
     side = side / np.linalg.norm(side, axis=1)[:, None]
@@ -27,7 +28,7 @@ def side_axes(mesh):
 
 
 def curvature_operator(mesh):
-    """K as a scipy sparse matrix (3T, n): rows from 3t to 3t + 3 of K f are κ₁₁, κ₂₂, κ₁₂ of triangle t [unit of f, 1/m²].
+    """Returns K, a scipy sparse matrix (3T, n): rows 3t to 3t + 2 of K f are κ₁₁, κ₂₂, κ₁₂ of triangle t [unit of f/m²].
 
     The axes are those of :func:`side_axes`.
 
@@ -58,7 +59,7 @@ def curvature_operator(mesh):
     tangential = csr_array((slopes, (np.repeat(np.arange(3 * T), 2), ends.ravel())), shape=(3 * T, n))
 
     def summed(direction):
-        """Σ l/A sym(n ⊗ direction) of the sides of each triangle, (3T, 3T)."""
+        """Returns Σ l/A sym(n ⊗ direction) over the sides of each triangle, (3T, 3T)."""
         both = outward[..., :, None] * direction[..., None, :]
         both = (both + both.swapaxes(2, 3)) * (0.5 * length / area[:, None])[..., None, None]
         entries = both[:, :, [0, 1, 0], [0, 1, 1]].swapaxes(1, 2)  # (T, 3 entries, 3 sides)
@@ -69,9 +70,9 @@ def curvature_operator(mesh):
 
 
 def _partners(mesh):
-    """The side 3t + k of the other triangle at each side (T, 3), −1 at the boundary; side k runs from corner k to k + 1."""
+    """Returns the side 3t + k that coincides with each side (T, 3), −1 at the boundary. Side k joins corners k and k + 1."""
     order, first, count = mesh._sides
-    if len(mesh.hinges):  # which refuses what is no surface
+    if len(mesh.hinges):  # raises for edges of three triangles
         shared = first[count == 2]
         one, two = order[shared], order[shared + 1]
     else:
@@ -82,7 +83,7 @@ def _partners(mesh):
 
 
 def _beyond(a, b, inside, ab, ac, bc):
-    """Points in the plane at distances ac and bc from a and b (…, 2), on the other side of ab than ``inside``."""
+    """Returns the points c of the plane at distances ac and bc from a and b (…, 2), across ab from ``inside``."""
     along = (b - a) / np.asarray(ab)[..., None]
     s = np.asarray((ac**2 - bc**2 + ab**2) / (2.0 * ab))
     normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
@@ -91,11 +92,11 @@ def _beyond(a, b, inside, ab, ac, bc):
 
 
 def _bubbles(points, origin, slope):
-    """The barycentric coordinates λ_k of points (…, J, 2), and the functions λ_k λ_{k+1}, which are 0 at the corners.
+    """Returns barycentric coordinates λ_k of points, and the bubble functions λ_k λ_{k+1}, both (…, J, 3).
 
     Args:
-        points: NaN where there is none; all is 0 there.
-        origin: The first corner (…, 2).
+        points: (…, J, 2), NaN for unused entries, where both are 0.
+        origin: First corner (…, 2).
         slope: Gradients of λ (…, 3, 2).
     """
     there = np.isfinite(points[..., :1])
@@ -106,15 +107,15 @@ def _bubbles(points, origin, slope):
 
 
 def _fixes(bubbles):
-    """Whether values at these points, and at the corners, fix a quadratic function (…,)."""
+    """Whether values at these points and at the corners determine a quadratic function, (…,)."""
     sizes = np.linalg.svd(bubbles, compute_uv=False)
     return sizes[..., 2:].sum(axis=-1) > _RANK * sizes[..., 0]
 
 
 def _normal_derivatives(mesh, p, outward, length, partner):
-    """The outward derivative in the middle of each side, of the quadratic of its own triangle, (3T, n).
+    """Returns the matrix (3T, n) of outward derivatives at the midpoint of each side, of the quadratic of its triangle.
 
-    That is the linear function through the corners, and three bubbles that are fitted to what the values around have beyond it.
+    The quadratic is the linear function through the corners plus three bubble functions, fitted to the other vertices.
     """
     from scipy.sparse import coo_array
 
@@ -127,7 +128,7 @@ def _normal_derivatives(mesh, p, outward, length, partner):
     rows, columns, values = [], [], []
 
     def add(triangles, vertices, points):
-        """The derivatives of some triangles by the values at vertices (t, J) at points (t, J, 2), NaN where there is none."""
+        """Adds entries of some triangles (t,), fitted to vertices (t, J) at points (t, J, 2), NaN for unused entries."""
         of_corners, bubbles = _bubbles(points, p[triangles, 0], slope[triangles])
         fit = bubble[triangles] @ np.linalg.pinv(bubbles, rcond=1e-8)  # (t, 3, J)
         sides = (3 * triangles[:, None] + np.arange(3))[..., None]
@@ -159,7 +160,7 @@ def _normal_derivatives(mesh, p, outward, length, partner):
 
 
 def _unfolded(mesh, p, t, partner, slope):
-    """The vertices around triangle t in its plane, {vertex: (2,)}: rings of triangles until they fix a quadratic function."""
+    """Unfolds rings of triangles around t into its plane until they determine a quadratic function: {vertex: (2,)}."""
     triangles, x = mesh.triangles, mesh.points
     own = triangles[t].tolist()
     found = dict(zip(own, p, strict=True))

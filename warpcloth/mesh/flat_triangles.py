@@ -1,18 +1,18 @@
-"""Triangles without area, turned into others so that a surface stays whole."""
+"""Removes triangles without area from a surface, and keeps closed surfaces closed."""
 
 import numpy as np
 
 from .mesh import FLATTEST
 
-_FLIPS = 20  # rounds in which flat triangles are turned into others
-_FLAT = 1e-4  # height over the longest side at which they are: float32 leaves them no normal
+_FLIPS = 20  # rounds of edge flips
+_FLAT = 1e-4  # ratio of height to longest side below which a triangle is flipped, because float32 gives it no normal
 
 
 def without_slivers(points, triangles):
-    """The triangles of a surface as ones with an area, which a `Mesh` must have.
+    """Returns triangles (T, 3) with area for the same surface.
 
-    Those with two corners at one position are left out. One whose corners are on a line, as fans of polygons with such corners
-    have, changes its longest side for the other diagonal with the triangle beyond, so that a closed surface stays closed.
+    A triangle with two corners at one position is removed. A triangle with its corners on a line, as in the fan of a polygon
+    with a straight corner, flips its longest side with the triangle across it.
 
     Raises:
         ValueError: None has an area.
@@ -31,14 +31,14 @@ def without_slivers(points, triangles):
 
 
 def _flat(corners, least):
-    """Which triangles (T, 3, 3) are no higher than a part of their longest side."""
+    """Returns which triangles (T, 3, 3) have a height of at most ``least`` times their longest side, (T,)."""
     sides = corners - np.roll(corners, 1, axis=1)
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     return ~(doubled > least * np.einsum("tki,tki->tk", sides, sides).max(axis=1))
 
 
 def _flipped(points, triangles, index, flat):
-    """The triangles, some flat ones of which share another diagonal with the triangle beyond their longest side."""
+    """Flips the longest side of flat triangles, those whose neighbour is not flipped in this round."""
     triangles = triangles.copy()
     beyond = {}
     for t, corners in enumerate(index[triangles].tolist()):

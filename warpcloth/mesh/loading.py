@@ -8,8 +8,7 @@ import numpy as np
 
 from .mesh import READERS, Mesh
 
-# What is read, and how: trimesh would split vertices at texture seams and make a mesh of every material; an OBJ's objects
-# stay apart.
+# Options of trimesh by file ending. By default it splits vertices at texture seams and makes a mesh of each material.
 ENDINGS = {
     ".obj": {"split_objects": True, "group_material": False, "skip_materials": True},
     ".ply": {"fix_texture": False, "skip_materials": True},
@@ -18,38 +17,38 @@ ENDINGS = {
     ".glb": {},
     ".gltf": {},
 }
-# trimesh logs the tracebacks of its errors, which Python prints unless a log is configured.
+# trimesh logs the tracebacks of its errors, which Python prints unless a handler is set.
 _QUIET = logging.NullHandler()
-# STL has no shared vertices at all; glTF stores a vertex once for every normal and texture coordinate that it has.
+# STL shares no vertices. glTF stores a vertex once for every normal and texture coordinate.
 WELDED = (".stl", ".glb", ".gltf")
 
 
 def read_file(path, name=None, kind=Mesh):
-    """The triangle mesh in a file.
+    """Reads the triangle mesh in a file.
 
     Vertices keep the order of the file. STL and glTF repeat a vertex wherever triangles differ in normal or texture,
     which would cut the cloth: there, vertices with exactly equal points are welded into the first of them. glTF node
     transforms are applied; lengths are taken for metres. Polygons are cut into fans of triangles (x₀, xₖ, xₖ₊₁), which
     come after the file's own triangles.
 
-    Texture coordinates are read where there is one pair for each vertex: from PLY (where faces have their own, the last
-    counts), and from glTF unless welding joins vertices with different ones. OBJ has them for each corner of each face,
-    so they are not read.
+    Texture coordinates are read if there is one pair for each vertex: from PLY (if faces have their own, the last counts), and
+    from glTF unless welding joins vertices with different ones. They are not read from OBJ, which has them for each corner of
+    each face.
 
     Args:
         path: An .obj, .ply, .stl, .off, .glb or .gltf file.
-        name: Of the geometry (OBJ: object; glTF: node; STL: solid), if the file has several. Vertices of the others are
+        name: Name of the geometry (OBJ: object; glTF: node; STL: solid), if the file has several. Vertices of the others are
             left out.
         kind: `Mesh` or `Surface`.
 
     Returns:
-        Mesh: float64 points, as exact as the file's numbers.
+        Mesh: With float64 points.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The ending is none of those above; the file is empty, cannot be read, has no triangles or (OBJ) has
-            relative indices; an ASCII .ply or an .off file has not the rows that its header says; it has several geometries
-            and `name` is none of them; or Mesh refuses it. The message begins with the path.
+            relative indices; an ASCII .ply or an .off file does not have the rows that its header announces; it has several
+            geometries and `name` is none of them; or `kind` refuses the mesh. The message begins with the path.
     """
     points, triangles, st = read_arrays(path, name)
     try:
@@ -83,7 +82,7 @@ def read_arrays(path, name=None):
         raise ValueError(f"{path}: the ending must be one of {' '.join(ENDINGS)}")
     if path.stat().st_size == 0:
         raise ValueError(f"{path}: the file is empty")
-    # trimesh counts relative indices from the end of the file instead of from their line: other triangles, silently.
+    # trimesh counts relative indices from the end of the file instead of from their line, and reads wrong triangles.
     if ending == ".obj" and re.search(rb"^f\s[^\n#]*-\d", path.read_bytes(), re.MULTILINE):
         raise ValueError(f"{path}: its faces have relative (negative) indices, which are not supported")
     if ending in _COUNTED:
@@ -93,9 +92,9 @@ def read_arrays(path, name=None):
     logging.getLogger("trimesh").addHandler(_QUIET)
     try:
         scene = trimesh.load_scene(path, process=False, maintain_order=True, **ENDINGS[ending])
-    except ModuleNotFoundError:  # the module that would guess the encoding of a text
+    except ModuleNotFoundError:  # chardet, which guesses the encoding of text that is not UTF-8
         raise ValueError(f"{path}: cannot be read as {ending}, it is not UTF-8") from None
-    except Exception as error:  # the readers raise whatever a broken file makes them stumble over
+    except Exception as error:  # a broken file makes trimesh raise errors of many types
         raise ValueError(f"{path}: cannot be read as {ending}, {type(error).__name__}: {error}") from error
     found = {node: scene.graph[node] for node in scene.graph.nodes_geometry}
     found = {node: at for node, at in found.items() if len(getattr(scene.geometry[at[1]], "faces", ()))}
@@ -111,7 +110,7 @@ def read_arrays(path, name=None):
 
 
 def _check_ply(path, data):
-    """Refuses an ASCII .ply file whose lines do not match its header, because trimesh would read a different mesh."""
+    """Raises ValueError if the lines of an ASCII .ply file do not match its header; trimesh would read a wrong mesh."""
     head, end, body = data.partition(b"end_header")
     words = [line.split() for line in head.decode("latin-1").splitlines()]
     if ["format", "ascii"] not in [line[:2] for line in words]:
@@ -149,7 +148,7 @@ def _check_ply(path, data):
 
 
 def _check_off(path, data):
-    """Refuses an .off file whose lines do not match its header, because trimesh would read a different mesh."""
+    """Raises ValueError if the lines of an .off file do not match its header; trimesh would read a wrong mesh."""
     lines = enumerate(data.decode("latin-1").splitlines(), start=1)
     lines = [(number, words) for number, line in lines if (words := line.partition("#")[0].split())]
     if lines and lines[0][1][0].endswith("OFF"):
@@ -181,7 +180,7 @@ def _check_off(path, data):
 
 
 def _refuse_more(path, line):
-    """Refuses a file with a line, None for no such, after all that its header counts."""
+    """Raises ValueError if ``line``, the first line after all that the header counts, is not None."""
     if line is not None:
         raise ValueError(f"{path}, line {line}: the file goes on after all vertices and faces that its header says")
 
@@ -191,22 +190,25 @@ _PLURAL = {"vertex": "vertices", "face": "faces"}
 
 
 def _refuse_open_end(where, data, line, most):
-    """Refuses a file that ends in a number without a line break, if more digits could make an index below ``most``."""
+    """Raises ValueError if the last number has no line break after it and may be cut, as more digits would still be valid.
+
+    The last number is an index below ``most``, which is infinite if it is no index.
+    """
     last = line.split()[-1:] or [""]
     if data[-1:] not in b"\r\n" and not (last[0].isdecimal() and (int(last[0]) == 0 or 10 * int(last[0]) >= most)):
         raise ValueError(f"{where}: ends in {last[0]} without a line break, so the file may be cut; end the line with one")
 
 
 def _arrays(path, geometry, transform, drop_unused):
-    """Points, triangles and texture coordinates of a trimesh.Trimesh, as read_file describes them."""
+    """Returns points, triangles and texture coordinates of a trimesh.Trimesh, as for `read_file`."""
     ending = path.suffix.lower()
     points = np.asarray(geometry.vertices, dtype=np.float64)
     triangles = np.asarray(geometry.faces, dtype=np.int64)
     if not np.array_equal(transform, np.eye(4)):
         points = points @ transform[:3, :3].T + transform[:3, 3]
-        if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # a mirror turns the front of a triangle to the back
+        if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # a reflection reverses the orientation of triangles
             triangles = triangles[:, ::-1]
-    # Of an OBJ trimesh takes the mean of the *indices* that a vertex has at a seam: unrelated coordinates.
+    # For an OBJ, trimesh averages the *indices* of texture coordinates at a seam, which gives unrelated coordinates.
     st = None if ending == ".obj" else getattr(geometry.visual, "uv", None)
     st = None if st is None or len(st) != len(points) else np.asarray(st, dtype=np.float64)
     if triangles.min() < 0 or triangles.max() >= len(points):
@@ -225,7 +227,7 @@ def _arrays(path, geometry, transform, drop_unused):
 
 
 def _first_of_equals(points):
-    """The first row of each set of equal rows, in order, and for every row the index of its set in that order."""
+    """Returns the first row of each set of equal rows, in order, and for each row the index of its set."""
     order = np.lexsort(points.T)  # stable: equal rows stay in order
     new = np.concatenate([[True], (points[order][1:] != points[order][:-1]).any(axis=1)])
     first = order[new]

@@ -17,14 +17,13 @@ from ..kernels.deformation import FLATTEST
 from .parts import Part, checked_parts, joined
 from .selection import select
 
-# By the ending of a file, what reads a mesh from it: (path, name of the geometry, class) → mesh. Modules that read files enter
-# theirs: `loading`, and `usd` for stages.
+# Readers by file ending: (path, name of the geometry, class) → mesh. `loading` and, for stages, `usd` register theirs.
 READERS: dict[str, Callable[[FilePath, str | None, Any], Any]] = {}
 UP_AXES = ("Y", "Z")
 Own = TypeVar("Own", bound="Mesh")
 Pattern = Literal["diagonal", "alternating", "equilateral"]
 _MOST_VERTICES = 2**31 - 1  # indices are int32
-# Least memory to build a grid: float64 positions and texture coordinates, int64 corners of two triangles.
+# Memory that a grid needs at least: float64 positions and texture coordinates, int64 corners of two triangles.
 _BYTES_OF_A_VERTEX = 24 + 16 + 48
 
 
@@ -47,9 +46,9 @@ class Mesh:
             None.
 
     Raises:
-        ValueError: An array has the wrong shape or type or is empty. Or an element, which the message names by its index, is
-            not finite, refers to a vertex that does not exist, repeats a vertex, has no area or length, or is an edge that
-            occurs twice. Or the up axis is neither "Y" nor "Z".
+        ValueError: An array has the wrong shape or type, or is empty. An element, which the message names by its index, is not
+            finite, refers to a vertex that does not exist, repeats a vertex, has no area or length, or is an edge that occurs
+            twice. The up axis is neither "Y" nor "Z".
 
     Examples:
         >>> import warpcloth as wc
@@ -111,15 +110,15 @@ class Mesh:
 
     @classmethod
     def grid(cls: type[Own], nx: int, ny: int, size: float | tuple[float, float] = 1.0, pattern: Pattern = "diagonal") -> Own:
-        """A flat grid in the plane y = 0, its first corner at the origin, triangle normals along +y.
+        """Builds a flat grid in the plane y = 0, its first corner at the origin, triangle normals along +y.
 
         Vertex i + nx·j stands in column i along +x and row j along +z. Patterns:
 
         - "diagonal": rectangular cells, all diagonals from (i, j) to (i+1, j+1).
         - "alternating": rectangular cells, the diagonals of neighbouring cells mirrored, like a checkerboard.
         - "equilateral": rows along x with edges of length a = size/(nx−1), spaced a·√3/2 along z, odd rows shifted by a/2 along
-          +x. So the boundary at the ends of the rows zigzags by a/2, and there are no half triangles. The grid has no
-          four-sided cells, and therefore no `grid_shape`. Hinge energies are isotropic on this pattern only.
+          +x, so that the boundary zigzags by a/2 at the ends of the rows. The grid has no four-sided cells, and therefore no
+          `grid_shape`. Hinge energies are isotropic on this pattern only.
 
         Args:
             nx: Number of vertices of a row, at least 2.
@@ -162,9 +161,9 @@ class Mesh:
 
     @classmethod
     def join(cls: type[Own], meshes: Mapping[str, "Mesh"]) -> Own:
-        """One mesh of several, such as pieces of a garment: the vertices of the first part, then those of the next.
+        """Joins several meshes, such as the pieces of a garment: the vertices of the first part, then those of the next.
 
-        The selection ``part(name)`` has the vertices of one part. A term with ``part=name`` acts on that part alone. A
+        The selection ``part(name)`` gives the vertices of one part. A term with ``part=name`` acts on that part alone. A
         :class:`warpcloth.Spring` with given pairs can join two parts. Texture coordinates are kept if all parts have them.
 
         Args:
@@ -177,7 +176,7 @@ class Mesh:
         return cls(**joined(meshes))
 
     def part(self, name: str) -> "Mesh":
-        """Returns the mesh of a part, as it was before it was joined.
+        """Returns the mesh of one part, as it was before :meth:`join`.
 
         Raises:
             ValueError: The mesh has no part of that name.
@@ -203,12 +202,12 @@ class Mesh:
         )
 
     def _of_parts(self, indices: Callable[["Mesh"], np.ndarray]) -> np.ndarray:
-        """Joins the vertices that a function finds of each part, as vertices of the whole."""
+        """Applies a function that returns vertex indices to each part, and joins the results as indices of this mesh."""
         return np.concatenate([indices(self.part(name)) + part.first for name, part in (self.parts or {}).items()])
 
     @classmethod
     def chain(cls: type[Own], n: int, length: float = 1.0, direction: ArrayLike = (0, -1, 0)) -> Own:
-        """A straight chain: n vertices evenly spaced from the origin, n−1 edges from each to the next.
+        """Builds a straight chain: n vertices evenly spaced from the origin, n−1 edges from each to the next.
 
         Args:
             n: Number of vertices, at least 2.
@@ -231,7 +230,7 @@ class Mesh:
 
     @classmethod
     def load(cls: type[Own], path: FilePath, prim: str | None = None) -> Own:
-        """Reads the mesh in a file: see `loading.read_file`, and for USD stages `usd.read_mesh`, which say what is raised.
+        """Reads the mesh in a file, see `loading.read_file`, or `usd.read_mesh` for USD stages, also for what is raised.
 
         Args:
             path: An .obj, .ply, .stl, .off, .glb or .gltf file, or a .usd, .usda, .usdc or .usdz stage.
@@ -239,6 +238,9 @@ class Mesh:
 
         Returns:
             Mesh: An instance of the class on which it was called, with vertices in the order of the file.
+
+        Raises:
+            ValueError: The ending is none of those above.
         """
         read = READERS.get(Path(path).suffix.lower())
         if read is None:
@@ -246,10 +248,10 @@ class Mesh:
         return read(path, prim, cls)
 
     def select(self, text: str) -> np.ndarray:
-        """Returns the vertices of a selection such as "z == 0 and not corners", see `selection.select`.
+        """Returns the vertices of a selection such as "z == 0 and not corners".
 
         Args:
-            text: The description.
+            text: The selection; `selection.select` has the grammar.
 
         Returns:
             np.ndarray: Vertex indices, sorted, each once, int32.
@@ -260,12 +262,12 @@ class Mesh:
         return select(self, text)
 
     def corners(self) -> np.ndarray:
-        """Vertices at the corners.
+        """Returns the vertices at the corners.
 
-        For a grid, the four corners (0, 0), (nx−1, 0), (0, ny−1), (nx−1, ny−1), also with equilateral cells. For other triangle
-        meshes, the boundary vertices nearest to the four corners of the boundary's bounding box, measured in the plane of its
-        two largest extents, in the same order; a vertex nearest to two corners occurs once. For edge meshes, the ends: vertices
-        of exactly one edge.
+        With a ``grid_shape`` these are the four corners (0, 0), (nx−1, 0), (0, ny−1), (nx−1, ny−1). For other triangle meshes
+        they are the boundary vertices nearest to the corners of the boundary's bounding box in the plane of its two largest
+        extents, in the same order; a vertex nearest to two corners occurs once. For edge meshes they are the ends, vertices of
+        exactly one edge. A mesh with parts has the corners of each part.
 
         Returns:
             np.ndarray: Vertex indices, int32.
@@ -290,7 +292,7 @@ class Mesh:
         return self.boundary[list(dict.fromkeys(nearest.tolist()))]
 
     def springs(self, kind: str) -> np.ndarray:
-        """Vertex pairs that springs of one kind connect (Provot 1995, "Deformation constraints in a mass-spring model").
+        """Returns the vertex pairs of one kind of springs (Provot 1995, "Deformation constraints in a mass-spring model").
 
         | kind | a grid with `grid_shape` | other triangle meshes | edge meshes |
         |---|---|---|---|
@@ -303,8 +305,8 @@ class Mesh:
             kind: One of the four.
 
         Returns:
-            np.ndarray: Pairs (E, 2), int32: the smaller index first, each pair once. If the pairs are all edges, row e is edge
-                e of the mesh; otherwise they are in lexicographic order.
+            np.ndarray: Pairs (E, 2), int32: the smaller index first, each pair once. If the table says "every edge", row e is
+                edge e of the mesh; otherwise the pairs are in lexicographic order.
 
         Raises:
             ValueError: The kind is unknown, is "shear" on a mesh without cells, or "bending" on a mesh that refuses hinges.
@@ -342,9 +344,8 @@ class Mesh:
     def hinges(self) -> np.ndarray:
         """The four vertices of every pair of triangles that share an edge (H, 4), int32, in the order of the edges.
 
-        [x₀, x₁, x₂, x₃]: the first triangle, that of the lower index, runs along the shared edge from x₀ to x₁, so its
-        normal is (x₁−x₀)×(x₂−x₀) with x₂ its third vertex. x₃ is the third vertex of the second triangle; if both
-        triangles have the same orientation, the second runs from x₁ to x₀. If not, the pair is a hinge too.
+        In a row [x₀, x₁, x₂, x₃], the triangle of the lower index has the corners x₀, x₁, x₂ in this cyclic order, so its
+        normal is along (x₁−x₀)×(x₂−x₀). x₃ is the third vertex of the other triangle, whichever orientation that has.
 
         Raises:
             ValueError: More than two triangles share an edge, or two triangles have the same three vertices.
@@ -369,19 +370,19 @@ class Mesh:
 
     @cached_property
     def boundary_edges(self) -> np.ndarray:
-        """Edges of exactly one triangle (B, 2), int32, rows of `edges`; of an edge mesh none."""
+        """Edges of exactly one triangle (B, 2), int32, rows of `edges`; (0, 2) for an edge mesh."""
         return _read_only(self.edges[self._sides[2] == 1] if len(self.triangles) else self.edges[:0])
 
     @cached_property
     def boundary(self) -> np.ndarray:
-        """Sorted vertices of the boundary edges, int32; of an edge mesh the ends, vertices of exactly one edge."""
+        """Sorted vertices of the boundary edges, int32; for an edge mesh the ends, vertices of exactly one edge."""
         if len(self.triangles):
             return _read_only(np.unique(self.boundary_edges))
         return _read_only(np.flatnonzero(np.bincount(self.edges.ravel()) == 1).astype(np.int32))
 
     @cached_property
     def isolated(self) -> np.ndarray:
-        """Sorted vertices that no triangle (of an edge mesh: no edge) uses, int32; they have no area and no length."""
+        """Sorted vertices that belong to no edge, int32; they have no area and no length."""
         used = np.bincount(self.edges.ravel(), minlength=len(self.points))
         return _read_only(np.flatnonzero(used == 0).astype(np.int32))
 
@@ -398,22 +399,22 @@ class Mesh:
 
     @cached_property
     def vertex_areas(self) -> np.ndarray:
-        """Lumped areas (n,) [m²]: a third of each finite area of an adjacent triangle; 0 without any."""
+        """Lumped areas (n,) [m²]: a third of the area of each adjacent triangle; areas that are not finite count as 0."""
         third = np.repeat(np.where(np.isfinite(self.triangle_areas), self.triangle_areas, 0.0) / 3, 3)
         return _read_only(np.bincount(self.triangles.ravel(), weights=third, minlength=len(self.points)))
 
     @cached_property
     def vertex_lengths(self) -> np.ndarray:
-        """Lumped lengths (n,) [m]: half of the adjacent edges' lengths."""
+        """Lumped lengths (n,) [m]: half the length of each adjacent edge."""
         half = np.repeat(self.edge_lengths / 2, 2)
         return _read_only(np.bincount(self.edges.ravel(), weights=half, minlength=len(self.points)))
 
     @cached_property
     def _sides(self):
-        """The 3T triangle sides, sorted so that those of one edge are neighbours, lower triangles first.
+        """The 3T triangle sides, sorted by edge and then by triangle.
 
         Returns:
-            Side indices in that order (3T,), the index of each edge's first side in it (E,), sides of each edge (E,).
+            Sides in that order (3T,), the first position of each edge in it (E,), and the number of sides of each edge (E,).
         """
         keys = self._keys(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
         order = np.argsort(keys, kind="stable")
@@ -422,19 +423,19 @@ class Mesh:
         return order, first, np.diff(first, append=len(keys))
 
     def _keys(self, pairs):
-        """Packs pairs (E, 2), smaller index first, in one int64 each: these sort much faster than rows do."""
+        """Packs each pair of (E, 2), smaller index first, into one int64, because these sort much faster than rows."""
         return pairs.min(axis=1).astype(np.int64) * len(self.points) + pairs.max(axis=1)
 
     def _unique(self, pairs):
-        """Pairs (E, 2) with the smaller index first, in lexicographic order, each once, int32."""
+        """Returns the distinct pairs of (E, 2), int32, the smaller index first, in lexicographic order."""
         return np.stack(np.divmod(np.unique(self._keys(pairs)), len(self.points)), axis=1).astype(np.int32)
 
     def _flat(self):
-        """Whether a triangle has no area to speak of (T,), or none that can be told."""
+        """Whether the height of each triangle is at most FLATTEST times its longest side, or is not finite, (T,)."""
         with np.errstate(invalid="ignore", over="ignore"):
             sides = self.points[self.triangles] - self.points[np.roll(self.triangles, 1, axis=1)]
             longest_squared = np.einsum("tki,tki->tk", sides, sides).max(axis=1)
-            # 2·area/longest² is the height over the longest side, by that side.
+            # 2·area/longest² is the height over the longest side, divided by that side.
             return ~(2 * self.triangle_areas > FLATTEST * longest_squared)
 
     def _refuse_degenerate(self):
@@ -452,10 +453,10 @@ class Mesh:
 
 
 class Surface(Mesh):
-    """A mesh that is only measured: a triangle may be flat or name a vertex twice, and a point need not be finite.
+    """A mesh that is only measured: triangles may be degenerate and points may be infinite or NaN.
 
-    So a garment is not refused for one bad triangle; measures leave out triangles that are `degenerate`, and report them. Edges
-    and topology include such triangles, so that an edge may join a vertex with itself.
+    Measures skip `degenerate` triangles and report them. Edges and topology include them, so an edge may join a vertex with
+    itself.
     """
 
     @cached_property
@@ -464,11 +465,11 @@ class Surface(Mesh):
         return _read_only(np.flatnonzero(self._flat()).astype(np.int32))
 
     def _refuse_degenerate(self):
-        """Refuses nothing."""
+        """Does nothing."""
 
 
 def areas_of(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Areas of triangles (T,) [m²] between points x (n, 3) [m]."""
+    """Returns the areas (T,) [m²] of triangles (T, 3) with corners among the points x (n, 3) [m]."""
     a, b, c = (x[corner] for corner in triangles.T)
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
@@ -491,7 +492,7 @@ def _refuse(name, rows, bad, rule):
 
 
 def _rows(name, value, width, kinds):
-    """The value as an array (count, width), count at least 1, of one of NumPy's kinds of types."""
+    """Returns the value as an array (count, width), count at least 1, whose type is one of NumPy's ``kinds``."""
     try:
         array = np.asarray(value)
     except ValueError as error:
@@ -520,7 +521,7 @@ def _indices(name, value, width, n):
 
 
 def _repeated(rows):
-    """Whether a row (count, width) has a number twice."""
+    """Returns which rows of (count, width) have a number twice, (count,)."""
     ordered = np.sort(rows, axis=1)
     return (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
 

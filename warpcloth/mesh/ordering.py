@@ -1,4 +1,4 @@
-"""Numbering vertices so that neighbours lie near one another in memory."""
+"""Vertex orders that keep neighbours near one another in memory."""
 
 from typing import Any
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from .mesh import Mesh
 
-# Fewer stay in caches whatever their order is, and gain less in a second of motion than loading SciPy takes.
+# Smaller meshes fit in caches in any order, and gain less in a second of motion than the import of SciPy costs.
 LEAST = 4096
 
 
 def near_order(mesh: Mesh) -> np.ndarray:
-    """The vertices of a mesh in an order that keeps neighbours near: reverse Cuthill–McKee of its edges.
+    """Returns the vertices in reverse Cuthill–McKee order of the graph of edges, which keeps neighbours near.
 
     (Cuthill and McKee 1969, *Reducing the bandwidth of sparse symmetric matrices*; George 1971.)
 
@@ -31,13 +31,13 @@ def near_order(mesh: Mesh) -> np.ndarray:
 
 
 def spread(mesh: Mesh, order: np.ndarray | None = None) -> float:
-    """The mean of |i − j| over the edges of a mesh, as its vertices are numbered or in an ``order`` of them (n,)."""
+    """Returns the mean of |i − j| over the edges (i, j) of a mesh, as it is numbered or in another ``order`` (n,)."""
     ranks = np.arange(len(mesh.points)) if order is None else np.argsort(order)
     return float(np.abs(np.diff(ranks[mesh.edges], axis=1)).mean())
 
 
 def worthwhile_order(mesh: Mesh) -> np.ndarray | None:
-    """`near_order` of a mesh of :data:`LEAST` vertices or more where edges then span less than half as much, else None."""
+    """Returns `near_order` if the mesh has :data:`LEAST` vertices or more and the `spread` falls below half, else None."""
     if len(mesh.points) < LEAST:
         return None
     order = near_order(mesh)
@@ -45,10 +45,9 @@ def worthwhile_order(mesh: Mesh) -> np.ndarray | None:
 
 
 def order_of_run(scene: Any, solver: Any) -> np.ndarray | None:
-    """The order of vertices that a run of a scene has, see `worthwhile_order`; None where it keeps that of the scene.
+    """Returns the vertex order of a run, see `worthwhile_order`, or None to keep that of the scene.
 
-    Methods whose result depends on the order of elements, Gauss–Seidel sweeps, keep it, for theirs would change by more than
-    rounding.
+    Gauss–Seidel sweeps keep it, because their result depends on the order of elements by more than rounding.
 
     Args:
         scene: The :class:`warpcloth.Scene`.

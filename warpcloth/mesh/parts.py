@@ -1,7 +1,6 @@
 """Parts: several meshes joined into one, such as the pieces of a garment or layers of cloth.
 
-The vertices of a part follow one another, and no triangle or edge joins two parts. Springs between parts, such as seams, are
-pairs of vertices of the whole.
+The vertices of a part are consecutive, and no triangle or edge joins two parts. Springs may join parts, such as seams.
 """
 
 import operator
@@ -14,27 +13,27 @@ from ..base.checks import shown
 
 
 class Part(NamedTuple):
-    """A part of a mesh: vertices ``first`` to ``first + count``.
+    """A part of a mesh.
 
     Attributes:
         first: Its first vertex.
-        count: How many vertices it has.
+        count: Number of its vertices, first to first + count − 1.
         grid_shape: (nx, ny) if it is a grid, or None.
     """
 
     first: int
-    count: int  # type: ignore[assignment]  # instead of the method of tuples
+    count: int  # type: ignore[assignment]  # hides tuple.count
     grid_shape: tuple[int, int] | None = None
 
 
 def joined(meshes):
-    """The fields of a mesh that meshes are the parts of.
+    """Returns the fields of a mesh with the given parts, by name.
 
     Args:
         meshes: A :class:`warpcloth.Mesh` for each name.
 
     Raises:
-        ValueError: If there are none, some have triangles and others edges alone, or the up axes differ.
+        ValueError: There are none, one has parts itself, some have triangles and others edges alone, or the up axes differ.
     """
     if not (isinstance(meshes, Mapping) and meshes and all(hasattr(mesh, "triangles") for mesh in meshes.values())):
         raise ValueError(f"parts is {shown(meshes)}; it must be a mapping of names to meshes, with one part or more")
@@ -68,7 +67,7 @@ def joined(meshes):
 
 
 def checked_parts(parts, count, elements):
-    """Parts as a dict of :class:`Part` by name.
+    """Returns parts as a dict of :class:`Part` by name.
 
     Args:
         parts: (first, count, grid_shape) by name.
@@ -76,7 +75,7 @@ def checked_parts(parts, count, elements):
         elements: Its triangles or edges, (m, K).
 
     Raises:
-        ValueError: If a name is no identifier, the parts are not all vertices, one part after another, or an element joins two.
+        ValueError: A name is not an identifier, the parts do not cover all vertices in order, or an element joins two parts.
     """
     try:
         rows = {name: (operator.index(first), operator.index(count), *grid) for name, (first, count, *grid) in parts.items()}

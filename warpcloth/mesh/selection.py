@@ -1,4 +1,4 @@
-"""A small language that names vertices of a mesh."""
+"""Selections: a small language that selects vertices of a mesh."""
 
 import re
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from ..base.checks import as_array, shown
 
-# Points often come from float32 files, and 0.1 from a text: nearer than this share of the mesh's size is equal.
+# Relative tolerance of comparisons, because points often come from float32 files and numbers such as 0.1 from text.
 _EQUAL = 1e-6
 
 _DEEPEST = 100  # nested brackets, each of which takes three Python calls
@@ -18,7 +18,7 @@ _TOKEN = re.compile(
 
 
 def select(mesh, text):
-    """Vertices that a text describes.
+    """Returns the vertices that a selection describes.
 
         selection = term {"or" term}
         term      = factor {"and" factor}
@@ -30,10 +30,9 @@ def select(mesh, text):
                   | "part" "(" name ")"
         range     = index | [start] ":" [stop] [":" step]
 
-    Comparisons are of rest points, with 1e-6 of the bounding box's diagonal as tolerance: within it a coordinate is
-    equal, and so neither less nor greater. `nearest` gives the vertex nearest to a point, or that many (of equally near
-    ones the lower indices). A range is Python's, without negative numbers: `10:20` is 10 to 19. `part` is one of a mesh that
-    was joined.
+    Comparisons are of rest points. Coordinates that differ by at most 1e-6 of the bounding box's diagonal are equal. `nearest`
+    gives the `count` vertices nearest to a point, 1 by default, the lower indices first among equally near ones. Ranges are
+    Python's, without negative numbers: `10:20` is 10 to 19. `part` gives the vertices of one part of a joined mesh.
 
     Args:
         mesh: A Mesh.
@@ -43,8 +42,8 @@ def select(mesh, text):
         np.ndarray: Vertex indices, sorted, each once, int32; empty if nothing fits.
 
     Raises:
-        ValueError: The text does not follow the grammar, an index is not of a vertex, or `corners` of a closed mesh:
-            the text, the column and what is allowed there.
+        ValueError: The text does not follow the grammar, an index has no vertex, or `corners` is asked of a closed mesh. The
+            message gives the text, the column and what is allowed there.
     """
     if not isinstance(text, str):
         raise ValueError(f"selection is {text!r}; it must be a text")
@@ -52,10 +51,10 @@ def select(mesh, text):
 
 
 def distinct_vertices(name, vertices, mesh):
-    """Vertices (p,) of a mesh, int32, each once, in the order given, from indices or a selection.
+    """Returns vertices (p,), int32, from a selection, sorted, or from indices, in the order given.
 
     Raises:
-        ValueError: What ``vertices`` are not, under their name.
+        ValueError: They are not whole numbers, not vertices of the mesh, or repeated. The message begins with ``name``.
     """
     if isinstance(vertices, str):
         return select(mesh, vertices)
@@ -74,7 +73,7 @@ def distinct_vertices(name, vertices, mesh):
 
 
 class _Reader:
-    """Recursive descent: each method reads one rule of the grammar and gives a mask of the vertices (n,)."""
+    """A recursive-descent parser: each method reads one rule of the grammar and returns a mask of the vertices (n,)."""
 
     def __init__(self, mesh, text):
         self.mesh, self.text, self.position, self.depth = mesh, text, 0, 0
@@ -99,7 +98,7 @@ class _Reader:
         self.fail(column, f"found {shown(word)}, expected {what}" if word else f"the text ends, expected {what}")
 
     def accept(self, *words):
-        """The next token if it is one of these words, else None."""
+        """Reads the next token and returns it if it is one of these words, else None."""
         word = self.tokens[self.position][1]
         if word not in words:
             return None
@@ -113,7 +112,7 @@ class _Reader:
         kind, word, column = self.tokens[self.position]
         if kind != "number":
             self.expected("a whole number" if whole else "a number")
-        # Python converts only a few thousand digits to a number, and no index needs more than a float represents exactly.
+        # float first, because Python converts only a few thousand digits to an int; indices are exact as floats.
         if whole and not (word.isdecimal() and least <= float(word) <= most):
             self.fail(column, f"found {shown(word)[1:-1]}, expected a whole number from {least} to {most}")
         if not whole and not np.isfinite(float(word)):

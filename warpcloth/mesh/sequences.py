@@ -1,14 +1,14 @@
-"""Frames of a mesh whose triangles stay the same, whatever they come from, read one at a time.
+"""Mesh sequences: frames of one mesh with constant triangles, read one at a time from files or arrays.
 
 `open_sequence` takes
 
-- a USD stage with a Mesh prim whose points are sampled: its time codes are the frames, its rates the times;
+- a USD stage with a Mesh prim whose points are sampled: each time code is a frame, and the stage's rates give the times;
 - a folder of .obj, .ply or .off files, or a pattern such as "frames/cloth_*.obj": the last number in a name is the frame, and a
   frame takes 1/fps s, so that file 12 is two frames after file 10;
-- an .npz file, as `np.savez` writes it: `points` (F, n, 3) [m], `triangles` (T, 3), and `times` (F,) [s] if not by fps;
+- an .npz file, as `np.savez` writes it: `points` (F, n, 3) [m], `triangles` (T, 3), and `times` (F,) [s] unless fps is given;
 - an .npy file, (F, n, 3) [m], with a mesh that has the triangles.
 
-`as_sequence` takes what Python holds. Lengths are metres where a file does not say.
+`as_sequence` takes arrays. Lengths are metres unless a file says otherwise.
 """
 
 import glob
@@ -35,14 +35,14 @@ from .loading import ENDINGS, WELDED, read_arrays
 from .mesh import Mesh, Surface
 from .stage_mesh import StageMesh
 
-# By the ending of a file, what opens the sequence in it: (path, prim, fps) → :class:`Sequence`; `usd` enters that of stages.
+# Functions that open a sequence, by file ending: (path, prim, fps) → :class:`Sequence`. `usd` registers that of stages.
 OPENERS: dict[str, Callable[[FilePath, str | None, float | None], Any]] = {}
 _MOST_MISSING = 1_000_000
 _FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
 
 
 class HasPoints(Protocol):
-    """A result that has its frames as ``points``: an `Animation`, a `Deformation`."""
+    """A result with its frames in ``points``, such as an `Animation` or a `Deformation`."""
 
     @property
     def points(self) -> Any:
@@ -51,21 +51,20 @@ class HasPoints(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """Frames of one mesh. A frame is read when it is indexed, and nothing is kept, so memory stays flat.
+    """Frames of one mesh. Indexing reads a frame and keeps nothing, so that memory stays constant.
 
-    `sequence[i]` is the points of a frame (n, 3) [m], float64, and a copy; where they are not finite they are as the input has
-    them. It raises a ValueError that names file and frame where the frame does not fit the mesh or cannot be read.
+    `sequence[i]` is a copy of the points of frame i, (n, 3) [m], float64, with infinities and NaN as the input has them. It
+    raises a ValueError that names file and frame if the frame does not fit the mesh or cannot be read.
 
     Attributes:
-        mesh: The rest shape, a `Surface` where it was read from a file.
-        labels: (F,) numbers of the frames as the input has them: time codes, or the numbers in file names; int64 where all are
-            whole, else float64.
-        times: (F,) [s], increasing; None where nobody says them.
-        read: Function that gives the points of a frame from its index, 0 to F − 1.
+        mesh: The rest shape; a `Surface` if it was read from a file.
+        labels: Frame numbers of the input (F,): time codes, or the numbers in file names; int64 if all are whole, else float64.
+        times: (F,) [s], increasing; None if the input gives none.
+        read: Function that returns the points of a frame from its index, 0 to F − 1.
         path: The file, folder or pattern, or None.
-        stage: `usd.StageMesh` of a stage, or None; where its space moves, as it is at the first frame.
-        precision: Type of the numbers that the input has, which says how coarsely they are rounded.
-        declared: Whether the input says the rest shape; else `mesh` has the points of the first frame.
+        stage: `usd.StageMesh` of a stage, or None. If the prim's space moves, it is that of the first frame.
+        precision: Floating-point type of the input, which determines its rounding.
+        declared: Whether the input has a rest shape; else `mesh` has the points of the first frame.
         files: Paths of the files that frames are read from.
         up_axis: "Y" or "Z"; None if the input does not say.
 
@@ -96,21 +95,25 @@ class Sequence:
         return np.array(self.read(range(len(self))[operator.index(frame)]), dtype=np.float64)
 
     def rounding(self, points: np.ndarray) -> float:
-        """Rounding of points (n, 3) [m] in the precision of the input, by the largest that is finite."""
+        """Returns the rounding [m] of points (n, 3) [m]: the machine epsilon of the input times the largest coordinate."""
         return np.finfo(self.precision).eps * np.abs(points).max(initial=0.0, where=np.isfinite(points))
 
     @cached_property
     def missing(self) -> list[float]:
-        """Labels that a gap in the numbering leaves out, a list.
+        """Labels that are missing from the sequence.
 
-        The spacing is the smallest interval; nothing is missing where some other is no multiple of it. Time codes that are not
-        whole may be exposures within a frame: of these no more than a third of the intervals, or one, can be gaps.
+        The spacing is the smallest interval between labels. If another interval is not a multiple of it, nothing counts as
+        missing. Fractional time codes may be shutter samples within a frame, so nothing counts as missing either if more than
+        a third of their intervals, and more than one, would be gaps.
+
+        Raises:
+            ValueError: More than a million labels are missing.
         """
         intervals = np.diff(self.labels)
         spacing = intervals.min() if len(intervals) else 1
         multiples = np.rint(intervals / spacing)
         gaps = np.flatnonzero(multiples > 1)
-        uneven = np.abs(intervals / spacing - multiples) > 1e-6  # a time code has fewer than ten digits, and float64 sixteen
+        uneven = np.abs(intervals / spacing - multiples) > 1e-6  # time codes have fewer than 10 digits, float64 has 16
         if uneven.any() or (self.labels.dtype.kind == "f" and 3 * len(gaps) > max(3, len(intervals))):
             return []
         if (multiples[gaps] - 1.0).sum() > _MOST_MISSING:
@@ -121,24 +124,24 @@ class Sequence:
 
 
 def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = None, mesh: Mesh | None = None) -> Sequence:
-    """Opens a mesh sequence; see the top of this module for what there is.
+    """Opens a mesh sequence from a file, a folder or a pattern. The docstring of this module lists the formats.
 
-    Polygons are cut into triangles as `usd.read_stage_mesh` and `loading.read_file` do. A prim in a space that moves is taken
-    to world space at each time code, and its rest shape with the first frame.
+    Polygons are cut into triangles as by `usd.read_stage_mesh` and `loading.read_file`. A prim in a moving space is transformed
+    to world space at each time code, and its rest shape as at the first.
 
     Args:
         path: A stage, a folder, a pattern, an .npz or an .npy file.
-        prim: Path or name of the prim, or name of the geometry in each of the files, where there are several.
-        fps: Frames a second: numbers in file names, or time codes, instead of what the stage says. Without it there are no
-            times where the input says none.
-        mesh: The `Mesh` of an .npy file, which has no triangles; others have their own, and do not look at it.
+        prim: Path or name of the prim, or name of the geometry in each file, if there are several.
+        fps: Frames per second: of numbers in file names, or of time codes in place of the stage's rate. Without it, ``times``
+            is None unless the input has times.
+        mesh: The `Mesh` of an .npy file, which has no triangles; ignored for other inputs.
 
     Returns:
-        Sequence: Nothing but its first frame is read yet.
+        Sequence: Only its first frame has been read.
 
     Raises:
         FileNotFoundError: There is no such file or folder.
-        ValueError: It is none of the above, holds no frames, or what there is does not fit together; the message
+        ValueError: The format is none of these, there are no frames, or the parts of the input do not fit together. The message
             begins with the path.
     """
     path = os.fspath(path)
@@ -165,20 +168,20 @@ def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = N
 
 
 def as_sequence(mesh: Mesh, frames: ArrayLike | HasPoints, dt: float | None = None, times: ArrayLike | None = None) -> Sequence:
-    """Makes a `Sequence` of frames that Python holds.
+    """Makes a `Sequence` of frames in memory.
 
     Args:
         mesh: The `Mesh`, its points the rest shape.
         frames: An array (F, n, 3) [m], a list of F arrays (n, 3), `usd.FrameSequence`, `Animation` or `Deformation`.
         dt: Time from each frame to the next [s].
-        times: (F,) [s], increasing. One of the two; without either those of the frames, if they have any.
+        times: (F,) [s], increasing. Give one of ``dt`` and ``times``, or neither to use the times of ``frames``, if any.
 
     Returns:
-        Sequence: It holds on to `frames`.
+        Sequence: It keeps a reference to `frames`.
 
     Raises:
-        ValueError: A frame, named by its index, does not fit the mesh; times do not increase; or `mesh`
-            is no mesh with triangles.
+        ValueError: A frame, named by its index, does not fit the mesh; times do not increase; both ``dt`` and ``times`` are
+            given; or `mesh` is no mesh with triangles.
     """
     if not isinstance(mesh, Mesh):
         raise ValueError(f"mesh is {checks.shown(mesh)}; it must be a Mesh")
@@ -233,7 +236,7 @@ def _open_files(path, found, prim, fps):
 
 
 def _read_file(paths, prim, expected, count, frame):
-    """Points (n, 3) of a file that has the triangles of the first."""
+    """Reads the points (n, 3) of a file, which must have the same triangles as the first file."""
     path = paths[frame]
     points, triangles, _ = read_arrays(path, prim)
     for name, here, there in (("vertices", len(points), count), ("triangles", len(triangles), len(expected))):
@@ -268,7 +271,7 @@ def _open_npz(path, fps):
 
 @contextmanager
 def _numpy_reads():
-    """Turns all errors of NumPy while it reads a file into one kind; a broken header or archive raises many."""
+    """Turns the many errors that NumPy raises for a broken file into ValueError."""
     try:
         yield
     except ValueError:
@@ -281,13 +284,13 @@ def _numpy_reads():
 
 
 def _mapped(path, member):
-    """An array of an .npz file that stays on disk, where `np.load` would read all of it."""
+    """Maps an array of an .npz file from disk, while `np.load` would read all of it."""
     with zipfile.ZipFile(path) as archive:
         info = archive.getinfo(member)
     if info.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{member} is compressed, so that no frame can be read by itself; write it by np.savez")
     with open(path, "rb") as file:
-        file.seek(info.header_offset + 26)  # past it the local header has the lengths of a name and of an extra field
+        file.seek(info.header_offset + 26)  # here the local header has the lengths of its name and of its extra field
         file.seek(sum(np.frombuffer(file.read(4), "<u2").tolist()), os.SEEK_CUR)
         version = np.lib.format.read_magic(file)
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -308,8 +311,7 @@ def _open_npy(path, fps, mesh):
 
 
 def _array(name, frames, mesh):
-    """The number of frames, what gives each from its index, and the type of the numbers, of an array, list or `FrameSequence`
-    that fits the mesh."""
+    """Returns the number of frames, a function that reads one, and the floating-point type, of frames that fit the mesh."""
     shape = mesh.points.shape
     if isinstance(frames, (list, tuple)):
         for index, frame in enumerate(frames):
@@ -332,7 +334,7 @@ def _array(name, frames, mesh):
 
 
 def _coarsest(frames):
-    """The type of the frame whose numbers are rounded most."""
+    """Returns the least precise floating-point type of some frames."""
     types = [np.asarray(frame).dtype for frame in frames]
     return max((kind for kind in types if kind.kind == "f"), key=lambda kind: np.finfo(kind).eps, default=np.dtype(np.float64))
 

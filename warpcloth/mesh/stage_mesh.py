@@ -1,4 +1,4 @@
-"""The record of a cloth that was read from a stage; reading itself is in :mod:`warpcloth.usd`."""
+"""The mesh of a cloth that :mod:`warpcloth.usd` reads from a stage."""
 
 from dataclasses import dataclass
 
@@ -10,25 +10,25 @@ from .mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class StageMesh:
-    """The mesh of one prim, with what its stage says about space and time.
+    """The mesh of one prim, with the space and time settings of its stage.
 
     Attributes:
         mesh: Rest shape in the stage's world space [m]; vertex i is point i of a Mesh prim.
         path: The file.
         prim: Path of the prim.
-        transform: (4, 4) float64; row vectors: x = [p, 1]·transform, from the prim's own space and units to world space [m],
-            at the first time code where it is animated.
-        meters_per_unit: Metres in one unit of the stage; USD says 0.01 where the stage does not.
+        transform: (4, 4) float64, for row vectors: x = [p, 1]·transform maps from the prim's own space and units to world space
+            [m]; at the first time code if it is animated.
+        meters_per_unit: Metres per unit of the stage; USD's default is 0.01.
         up_axis: "Y" or "Z".
-        fps: Frames per second, None where the stage does not say.
-        time_codes_per_second: Time codes in a second; USD says 24 where the stage does not.
-        start: First time code, None where the stage does not say.
+        fps: Frames per second, or None if the stage does not set it.
+        time_codes_per_second: Time codes per second; USD's default is 24.
+        start: First time code, or None if the stage does not set it.
         pins: Sorted vertex indices (p,) int32 by name, of every GeomSubset of points.
-        point_vertices: Curves: the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
-        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), where vertices on seams have several
-            and the mesh has none; else None.
-        cloths: Of several cloths, whose meshes ``mesh`` joins, the `StageMesh` of each; else none.
-        rest: Whether the stage says a rest shape, the default points; else the mesh is that of one time code.
+        point_vertices: For curves, the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
+        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), if vertices on seams have several,
+            so that ``mesh`` has none; else None.
+        cloths: The `StageMesh` of each cloth if ``mesh`` joins several; else empty.
+        rest: Whether the stage has a rest shape, the default points; else the mesh is that of one time code.
     """
 
     mesh: Mesh
