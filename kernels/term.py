@@ -1,4 +1,4 @@
-"""The record of an energy: what a file in ``kernels/terms`` fills in, and all that a factory or a solver may know of it."""
+"""The record of an energy, which a file in ``kernels/terms`` fills in. Kernels and solvers know an energy by this alone."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ from typing import Any
 
 
 class HessianPolicy(IntEnum):
-    """The ways in which ``hessian`` treats the negative curvature of an energy.
+    """How ``hessian`` treats the negative curvature of an energy.
 
-    ``RAW`` returns ∂²u/∂y² as it is. ``CLAMP`` drops the negative part, ``ABSOLUTE`` turns its sign; both are
-    semi-definite, and equal to ``RAW`` where that is. Closed forms, no numerical eigenvalues.
+    ``RAW`` returns ∂²u/∂y². ``CLAMP`` drops its negative part, ``ABSOLUTE`` flips the sign of that part. Both are positive
+    semi-definite, in closed form, and equal to ``RAW`` where that is semi-definite.
     """
 
     RAW = 0
@@ -20,19 +20,17 @@ class HessianPolicy(IntEnum):
 
 @dataclass(frozen=True)
 class Dissipation:
-    """The dissipation D = Σ (Aβ/2hₑ)‖s(y) − s̃‖² of a step as an energy whose rest state s̃ is set where the step begins.
+    """The dissipation D = Σ (Aβ/2hₑ)‖s(y) − s̃‖² of a step, as an energy whose rest state s̃ is set at the start of the step.
 
-    s is the term's own invariant and s̃ that of the last state but for a change that makes (s − s̃)/hₑ the rate of s as the
-    integrator has it, see :func:`warpcloth.kernels.damping.set_damped_rest`. Where u = ½‖s − s̄‖² with the same s, D merges with
-    it: of a stiffness k + β/hₑ the rest state is s̄ + share·(s̃ − s̄), share = (β/hₑ)/(k + β/hₑ); with share 1 it is that of D
-    alone.
+    s is an invariant of the term. s̃ is such that (s − s̃)/hₑ is the rate of s of the integrator, see
+    :func:`warpcloth.kernels.damping.set_damped_rest`. If the energy itself is u = ½‖s − s̄‖², D merges with it: the sum has the
+    stiffness k + β/hₑ and the rest state s̄ + share·(s̃ − s̄), with share = (β/hₑ)/(k + β/hₑ). With share 1 it is D alone.
 
     Attributes:
-        change: (y, another y, rest state of the term) → s of the other − s of y.
-        rest: (y, s̃ − s of y, rest state of the term, share) → rest state of ``term``.
-        merges: Whether D merges with the energy; else it is one beside it.
-        term: The :class:`Term` of the sum, or of D alone where it does not merge, with the same weights; None for the term
-            itself.
+        change: (y, other y, rest state of the term) → s(other y) − s(y).
+        rest: (y, s̃ − s(y), rest state of the term, share) → rest state of ``term``.
+        merges: Whether D merges with the energy; else it is a term of its own.
+        term: The :class:`Term` of the sum, or of D alone if it does not merge, with the same weights; None for the term itself.
     """
 
     change: Any
@@ -45,52 +43,52 @@ class Dissipation:
 class Term:
     """An energy U = Σₑ kₑ Aₑ u(yₑ) over stencils of ``vertices`` = K vertices.
 
-    The local coordinate y = Σᵢ wᵢ ⊗ xᵢ, a matrix of ``rows`` = M rows of 3, is linear in the vertices. The functions are
+    The local coordinate y = Σᵢ wᵢ ⊗ xᵢ, a matrix (M, 3) with ``rows`` = M, is linear in the vertices. The functions are
     ``@wp.func``, generic over float32 and float64; ``rest`` below is one element's vector of ``parameters`` = P numbers.
-    None of them knows the stiffness kₑ [the term's unit]: the factories multiply by kₑ Aₑ.
+    They do not know the stiffness kₑ [unit of the term]: kernels multiply by kₑ Aₑ.
 
     Attributes:
-        name: The name of the energy in reports and kernels.
-        vertices: K; 0 of a term whose elements have any number of vertices, see :mod:`warpcloth.terms.sparse`.
+        name: Name of the energy in reports and kernels.
+        vertices: K; 0 if elements have any number of vertices, see :mod:`warpcloth.terms.sparse`.
         rows: M.
         parameters: P.
-        rest_state: NumPy function (points (n, 3) [m], stencil (E, K), …) → (E, P), the rest state of every element; further
-            arguments, by keyword, are what the material has beside its stiffness.
+        rest_state: NumPy function (points (n, 3) [m], stencil (E, K), …) → (E, P), the rest state of every element; keyword
+            arguments are parameters of the material other than its stiffness.
         weight: (rest, i) → (M,), the weights of vertex i in y; also ∂y/∂xᵢ. None where K is 0.
         measure: (rest) → Aₑ.
         energy: (y, rest) → u.
         gradient: (y, rest) → ∂u/∂y (M, 3).
         hessian: (y, rest, policy) → ∂²u/∂y² (3M, 3M), y row by row, see :class:`HessianPolicy`.
-        dead_zone: Whether there is a range about the rest shape without energy; ``rest_state`` then takes the ratios
-            ``least`` and ``most`` of its ends.
+        dead_zone: Whether the energy is 0 in a range about the rest shape; ``rest_state`` then takes the ratios ``least`` and
+            ``most`` of its ends.
         max_lengths: NumPy function (points (n, 3) [m], stencil (E, K), rest (E, P)) → (pairs (E·m, 2), lengths (E·m,) [m],
-            factors (E·m,)), element by element: pairs that the energy keeps no farther apart than these lengths (infinite: it
-            does not), and how stiff a spring between them would be, kₑ = 1; or None.
-        cells: Whether elements of K = 1 are the vertices of cells of any size, see :class:`warpcloth.model.model.Cells`.
-        cell: Of the share that a vertex has of a cell the :class:`Term` of the cell, see :mod:`.sparse`; else None.
-        project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; or where there is a
-            ``prox`` too, any p with ∂u/∂y = y − p(y); or None.
-        prox: (v, rest, compliance) → argmin u(y) + ‖y − v‖²/(2·compliance) (M, 3), compliance 0 or more, in closed form, the
-            local step where u is not ½‖y − p(y)‖²; or None.
-        prox_from: (y, v, rest, compliance) → the same of u as it is about y, the position before the step, for an energy of
-            which v may be nearer to another branch, such as the far side of a ball; or None.
-        idle: (y, rest, margin) → 1 where there is surely no force within ``margin`` of y, which is quicker to tell than the
-            force, else 0; of terms with K = 1; or None.
-        clearance: (y, rest) → a distance within which of y there is surely no force, 0 or less where there may be one at y; of
-            terms with ``idle``; or None.
-        secant: (y, rest) → s, from 0 to 1: where p moves with y, y − p is s times the distance to a point that moves less, and
-            constraint rows, which hold p fixed in an iteration, take that point and s k instead; or None.
+            factors (E·m,)), element by element: pairs, the largest distance that the energy allows each (infinite: any), and
+            the stiffness of a spring between them for kₑ = 1; or None.
+        cells: Whether elements of K = 1 are the vertices of cells of any size, see :class:`warpcloth.model.csr_cells.Cells`.
+        cell: For the element of one vertex of a cell, the :class:`Term` of the cell, see :mod:`.sparse`; else None.
+        project: (y, rest) → p(y) (M, 3), the nearest point of the constraint set, with u = ½‖y − p(y)‖²; with a ``prox``, any p
+            with ∂u/∂y = y − p(y); or None.
+        prox: (v, rest, compliance) → argmin u(y) + ‖y − v‖²/(2·compliance) (M, 3), compliance 0 or more, in closed form: the
+            local step if u is not ½‖y − p(y)‖²; or None.
+        prox_from: (y, v, rest, compliance) → the same for the branch of u at y, the position before the step. It is for
+            energies with several branches, such as the two sides of a ball, where v may be nearer to the wrong one; or None.
+        idle: (y, rest, margin) → 1 if there is surely no force within ``margin`` of y, else 0, at less cost than the force;
+            for terms with K = 1; or None.
+        clearance: (y, rest) → a radius about y within which there is surely no force, 0 or less if there may be a force at y;
+            for terms with ``idle``; or None.
+        secant: (y, rest) → s, 0 to 1. If p moves with y, y − p is s times the distance to a point that moves less. Constraint
+            rows hold p fixed in an iteration, so they use that point and s k instead; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices.
         quadratic: Whether p is 0 and the weights of an element add up to 0: U is then quadratic in the differences of vertices.
-        constraint: (y, rest) → C, a scalar with u = ½C²; or None, and with it the next four.
+        constraint: (y, rest) → C, a scalar with u = ½C²; or None, like the next four fields.
         constraint_gradient: (y, rest) → ∂C/∂y (M, 3).
         constraint_hessian: (y, rest) → ∂²C/∂y² (3M, 3M).
         stiffening: (y, rest, tension) → B (N, 3M), with BᵀB the positive half of tension·∂²C/∂y².
         stiffening_rows: N.
-        dissipation: :class:`Dissipation`, or None for what cannot be damped.
-        bounded: The :class:`Term` on the same elements that explicit steps take instead, as the curvature of this one has no
-            bound: that of its energy is at most 1, and its ``hessian`` is one that is nowhere smaller than the curvature, by
-            which steps are limited; or None.
+        dissipation: :class:`Dissipation`, or None if it cannot be damped.
+        bounded: The :class:`Term` on the same elements that explicit steps use instead, if the curvature of this one has no
+            bound. The curvature of its energy is at most 1, and its ``hessian`` is an upper bound of the curvature, from which
+            the stability limit follows; or None.
     """
 
     name: str
@@ -125,12 +123,12 @@ class Term:
 
     @property
     def whole(self):
-        """The term of the cells that it is a share of, or itself."""
+        """The term of the cell, if this is the element of a vertex of a cell; else this term."""
         return self.cell or self
 
     @property
     def moves(self):
-        """Whether it has a local step: a projection, a scalar constraint, a prox; of cells with weights a quadratic energy."""
+        """Whether it has a local step: a projection, a scalar constraint or a prox; with sparse cells, a quadratic energy."""
         if self.vertices == 0:
             return self.quadratic
         return any(function is not None for function in (self.project, self.constraint, self.prox))

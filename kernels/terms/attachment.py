@@ -1,6 +1,6 @@
-"""Attachment: U = Σ ½k‖x − target‖², k in N/m: a spring of no length to a fixed position.
+"""Attachment: U = Σ ½k‖x − target‖², k in N/m: a spring of rest length 0 to a target.
 
-Stencil (x₀), y = x₀, rest state the target (3,) [m], measure 1. Not invariant to translation: it holds on to the world.
+Stencil (x₀), y = x₀, rest state the target (3,) [m], measure 1. The energy is not invariant to translation.
 """
 
 from typing import Any
@@ -48,7 +48,7 @@ def hessian(y: Any, rest: Any, policy: int):
 
 @wp.func
 def change(y: Any, other: Any, rest: Any):
-    """Of s = y itself: the position that it holds on to does not turn with it."""
+    """The invariant is s = y itself, because the target does not move with the cloth."""
     return other[0] - y[0]
 
 

@@ -1,10 +1,10 @@
 """Corotated membrane: U = Σ ½kA‖F − R‖², k = 2μ = Et in N/m, Poisson's ratio 0 (Sorkine and Alexa 2007; Chao et al. 2010, *A
 simple geometric model for elastic deformation*).
 
-F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, R the nearest matrix with RᵀR = I, its polar factor;
-A is the rest area. Per area that is μΣ(σᵢ − 1)². A term ½λ(tr(RᵀF) − 2)² would bring Poisson's effect, and take the projection.
+F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, R its polar factor, the nearest matrix with RᵀR = I,
+and A the rest area. The energy per area is μΣ(σᵢ − 1)². A term ½λ(tr(RᵀF) − 2)² would give Poisson's effect, but no projection.
 
-A collapsed triangle keeps a force: where R is not unique it is the least rotation, see :mod:`..rotation`.
+Where R is not unique, it is the smallest rotation, see :mod:`..rotation`, so that a collapsed triangle still has a force.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ def rest_state(points, stencil):
 
 
 def max_lengths(points, stencil, rest):
-    """The edges, no longer than at rest."""
+    """Returns the edges, no longer than at rest."""
     return edge_max_lengths(points, stencil, np.ones(len(stencil)))
 
 

@@ -3,20 +3,20 @@
 
 Stencil: a hinge (x₀, x₁ the edge, x₂ and x₃ the opposite vertices). y = (e, a, b) = (x₁, x₂, x₃) − x₀. θ is the signed angle
 about e from the normal e×a to the normal b×e, 0 when flat; θ̄, the edge |e| and the areas Aᵢ come from the rest shape.
-The textbook has a factor 3 where this has 1: with 1 an equilateral sheet that is rolled up has the energy ½Dκ² per area.
+The papers have a factor 3 where this has 1: with 1, an equilateral sheet rolled to curvature κ has the energy ½Dκ² per area.
 
-Derivatives in closed form (Tamstorf and Grinspun 2013, *Discrete bending forces and their Jacobians*), here arranged so that
-each part of ∂²θ is a product of two orthogonal covectors and so splits into its positive and negative half by itself.
-For the triangle with apex distance vector a = s e + h m (m ⟂ e the way to the apex, n its normal, t = e/|e|), a change
-(δe, δa) moves the apex against its foot by d = δa − s δe and turns the edge by ε = δe/|e|:
+Derivatives are in closed form (Tamstorf and Grinspun 2013, *Discrete bending forces and their Jacobians*), here as a sum of
+products of two orthogonal covectors, each of which has a positive and a negative half in closed form. Write the vector to the
+apex of a triangle as a = s e + h m, with m ⟂ e, normal n and t = e/|e|. A variation (δe, δa) moves the apex relative to its
+foot by d = δa − s δe and turns the edge by ε = δe/|e|:
 
-    δθ = −Σ n·d/h,        ½δ²θ = Σ (n·d/h)(m·d/h) + (n·ε)(t·d/h + ½m·ε)        over both triangles,
+    δθ = −Σ n·d/h,        ½δ²θ = Σ (n·d/h)(m·d/h) + (n·ε)(t·d/h + ½m·ε)        over both triangles.
 
-found by rotating both normals with the edge (parallel transport), where only their difference counts.
+This follows from parallel transport of both normals along the edge, as only their difference counts.
 ∂²u = ∂θ∂θᵀ + (θ − θ̄)∂²θ is semi-definite only for θ = θ̄.
 
-A triangle no higher than 1e-6 of its longest side has no normal: C = 0 and no force there.
-θ − θ̄ is wrapped into (−π, π]; it jumps when a hinge passes through folded flat.
+If the height of a triangle is at most 1e-6 of its longest side, C = 0 and there is no force.
+θ − θ̄ is wrapped into (−π, π]. It jumps when a hinge passes through the fully folded state.
 """
 
 from typing import Any
@@ -71,9 +71,9 @@ def has_no_angle(y: Any):
 
 @wp.func
 def wrap(angle: Any):
-    """Into (−π, π], from within (−3π, 3π)."""
+    """Wraps an angle in (−3π, 3π) into (−π, π]."""
     pi = type(angle)(wp.pi)
-    turn = pi + pi  # a product of literals would be one of float32
+    turn = pi + pi  # a product of literals would be float32
     if angle > pi:
         angle -= turn
     if angle <= -pi:
@@ -85,7 +85,7 @@ def wrap(angle: Any):
 def constraint(y: Any, rest: Any):
     c = wp.ddot(y, y * y.dtype(0.0))  # 0, and NaN where y is
     if not has_no_angle(y):
-        # Not wp.normalize, which makes 0 of NaN.
+        # Not wp.normalize, which turns NaN into 0.
         n1 = wp.cross(y[0], y[1])
         n2 = wp.cross(y[2], y[0])
         n1 /= wp.length(n1)
@@ -96,7 +96,7 @@ def constraint(y: Any, rest: Any):
 
 @wp.func
 def apex_covector(direction: Any, foot: Any, corner: int):
-    """direction·d with d = δy[corner] − foot·δe, as a matrix of the shape of y."""
+    """Returns direction·d, d = δy[corner] − foot·δe, as a covector of the shape of y."""
     g = wp.matrix(shape=(3, 3), dtype=direction.dtype)
     g[0] = -foot * direction
     g[corner] = direction
@@ -105,7 +105,7 @@ def apex_covector(direction: Any, foot: Any, corner: int):
 
 @wp.func
 def edge_covector(direction: Any):
-    """direction·δe, as a matrix of the shape of y."""
+    """Returns direction·δe as a covector of the shape of y."""
     g = wp.matrix(shape=(3, 3), dtype=direction.dtype)
     g[0] = direction
     return g
@@ -135,7 +135,7 @@ def flatten(g: Any):
 
 @wp.func
 def positive_half(g: Any, h: Any, ratio: Any, scale: Any):
-    """w with w wᵀ the positive half of scale·(g hᵀ + h gᵀ); ratio is |h|/|g|, and g ⟂ h."""
+    """Returns w, with w wᵀ the positive half of scale·(g hᵀ + h gᵀ); g ⟂ h, and ratio is |h|/|g|."""
     u = flatten(g) * wp.sqrt(ratio)
     v = flatten(h) / wp.sqrt(ratio)
     return wp.sqrt(wp.abs(scale) * scale.dtype(0.5)) * (u + wp.sign(scale) * v)
@@ -143,7 +143,7 @@ def positive_half(g: Any, h: Any, ratio: Any, scale: Any):
 
 @wp.func
 def product(g: Any, h: Any, ratio: Any, scale: Any, policy: int):
-    """scale·(g hᵀ + h gᵀ), or its positive half or absolute value; ratio is |h|/|g|, and g ⟂ h."""
+    """Returns scale·(g hᵀ + h gᵀ), or its positive half or absolute value; g ⟂ h, and ratio is |h|/|g|."""
     if policy == CLAMP:
         w = positive_half(g, h, ratio, scale)
         return wp.outer(w, w)
@@ -156,7 +156,7 @@ def product(g: Any, h: Any, ratio: Any, scale: Any, policy: int):
 
 @wp.func
 def factors(y: Any, corner: int):
-    """Of one triangle the covectors g, h and g', h', |h'|/|g'| of ∂²θ = Σ g hᵀ + h gᵀ + g'h'ᵀ + h'g'ᵀ."""
+    """Returns g, h, g', h' and |h'|/|g'| of one triangle: ∂²θ = Σ g hᵀ + h gᵀ + g'h'ᵀ + h'g'ᵀ over both triangles."""
     e = y[0]
     length = wp.length(e)
     t = e / length
@@ -168,7 +168,7 @@ def factors(y: Any, corner: int):
     foot = wp.dot(y[corner], e) / (length * length)
     n = normal / wp.length(normal)
     m = (y[corner] - foot * e) / height
-    # Lengths of the covectors over the four vertices, so that the split does not depend on which is x₀.
+    # Lengths of the covectors as functions of all four vertices, so that the split does not depend on which is x₀.
     apex = wp.sqrt(one + foot * foot + (one - foot) * (one - foot)) / height
     edge = wp.sqrt(y.dtype(2.0)) / length
     sigma = apex_covector(t / height, foot, corner) + edge_covector(m * (y.dtype(0.5) / length))
@@ -184,7 +184,7 @@ def factors(y: Any, corner: int):
 
 @wp.func
 def curvature(y: Any, scale: Any, policy: int):
-    """scale·∂²θ, or of each of its four products the part that ``policy`` asks for."""
+    """Returns scale·∂²θ, with ``policy`` applied to each of its four products."""
     h = wp.matrix(shape=(9, 9), dtype=y.dtype)
     if has_no_angle(y):
         return h

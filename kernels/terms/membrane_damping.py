@@ -1,6 +1,6 @@
-"""Damping of membranes: D = Σ (Aβ/2hₑ)‖E − Ẽ‖², E = ½(FᵀF − I) the Green strain, β in N·s/m; beside any of their energies.
+"""Damping of all membranes: D = Σ (Aβ/2hₑ)‖E − Ẽ‖², E = ½(FᵀF − I) the Green strain, β in N·s/m.
 
-F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area, Ẽ the strain where the step began.
+F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area, Ẽ the strain at the start of a step.
 The stress βĖ is that of a Kelvin–Voigt solid, zero in rigid motion (Baraff and Witkin 1998, *Large steps in cloth
 simulation*, damp their conditions in the same way).
 """
@@ -15,7 +15,7 @@ from ..term import Dissipation, Term
 
 
 def rest_state(points, stencil):
-    """Inverse rest edges [1/m] of the triangles ``stencil`` (E, 3) and Ẽ₀₀, Ẽ₁₁, Ẽ₀₁ [1], 0, as an array (E, 6)."""
+    """Returns inverse rest edges [1/m] of the triangles ``stencil`` (E, 3) and Ẽ₀₀ = Ẽ₁₁ = Ẽ₀₁ = 0, as an array (E, 6)."""
     return np.column_stack([inverse_edges(points, stencil), np.zeros((len(stencil), 3))])
 
 
@@ -53,7 +53,7 @@ def covector(a: Any, b: Any):
 
 @wp.func
 def hessian(y: Any, rest: Any, policy: int):
-    """∂E∂Eᵀ, and (E − Ẽ)∂²E, which alone can be negative."""
+    """Returns ∂E∂Eᵀ + (E − Ẽ)∂²E; only the second part can be negative."""
     zero = y[0] * y.dtype(0.0)
     a = covector(y[0], zero)
     b = covector(zero, y[1])
@@ -74,7 +74,7 @@ def strain_change(y: Any, other: Any, rest: Any):
 
 @wp.func
 def damped_rest(y: Any, change: Any, rest: Any, share: Any):
-    """Of any membrane, whose rest state begins with the inverse rest edges."""
+    """Takes the rest state of any membrane, which begins with the inverse rest edges."""
     E = green_strain(y) + change
     r = wp.vector(length=6, dtype=rest.dtype)
     for i in range(3):

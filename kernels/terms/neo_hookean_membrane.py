@@ -1,12 +1,12 @@
 """Stable Neo-Hookean membrane: U = Σ A(½μ(‖F‖² − 2) − μ(J − 1) + ½(λ + μ)(J − 1)²), J = ‖f₁×f₂‖ (Smith, De Goes and Kim 2018,
-*Stable Neo-Hookean flesh simulation*, here of two dimensions and without their logarithm).
+*Stable Neo-Hookean flesh simulation*, here in two dimensions and without the logarithm).
 
 F (3×2) = [f₁, f₂] is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area. The stiffness is k = Et in
-N/m, Young's modulus times thickness, and with Poisson's ratio ν: μ = k/(2(1 + ν)), λ = kν/(1 − ν²), its moduli at small strain.
-Evaluated as ½μ(σ₁ − σ₂)² + ½(λ + μ)(J − 1)², which does not cancel near rest.
+N/m, Young's modulus times thickness. μ = k/(2(1 + ν)) and λ = kν/(1 − ν²) are the moduli at small strain, ν Poisson's ratio.
+The energy is computed as ½μ(σ₁ − σ₂)² + ½(λ + μ)(J − 1)², which has no cancellation near rest.
 
-The rest shape is its only minimum, up to motion in space. A triangle crushed to a line, f₁×f₂ = 0, is pushed apart all around:
-no direction is preferred, and ∂J := 0. That is, J ≤ 4ε‖F‖² in the precision.
+The rest shape is its only minimum, up to rigid motion. A triangle crushed to a line, f₁×f₂ = 0, has no unique ∂J, which is set
+to 0. It counts as crushed if J ≤ 4ε‖F‖², with ε of the precision.
 """
 
 from typing import Any
@@ -26,7 +26,7 @@ def crushed(y: Any, J: Any):
 
 @wp.func
 def slope(J: Any, rest: Any):
-    """∂ψ/∂J of −μ(J − 1) + ½(λ + μ)(J − 1)²."""
+    """Returns the derivative of −μ(J − 1) + ½(λ + μ)(J − 1)² with respect to J."""
     return (rest[3] + rest[4]) * (J - rest.dtype(1.0)) - rest[3]
 
 

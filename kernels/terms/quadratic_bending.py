@@ -3,11 +3,10 @@ bending model for inextensible surfaces*).
 
 Stencil: a hinge (x₀, x₁ the edge, x₂ and x₃ the opposite vertices). y = Σ cᵢxᵢ [m] with cotangent weights taken from the
 rest shape, so that ‖y‖ = |e|·θ for a small angle θ; Aᵢ are the rest areas of the two triangles. The Hessian is constant.
-The paper's factor is 3 where this has 1: with 1 an equilateral sheet that is rolled up has the energy ½Dκ² per area, with 3
-three times that.
+The paper has a factor 3 where this has 1: with 1, an equilateral sheet rolled to curvature κ has the energy ½Dκ² per area.
 
-The rest shape counts as flat: of a curved one only the lengths are used. Exact for isometric motion of a flat sheet; a sheet
-stretched in its plane by x → x + εx² costs ½D(2ε)² per area here and nothing with dihedral angles.
+The sheet is flat at rest: of a curved rest shape, only the edge lengths are used. The energy is exact for isometric motion.
+Stretch in the plane by x → x + εx² costs ½D(2ε)² per area here, and nothing with dihedral angles.
 """
 
 from typing import Any
@@ -20,7 +19,7 @@ from . import spring
 
 
 def rest_state(points, stencil):
-    """Cotangent weights (4) [1] and the measure 1/(A₁ + A₂) [1/m²] of the hinges ``stencil`` (E, 4), as an array (E, 5)."""
+    """Returns 4 cotangent weights [1] and the measure 1/(A₁ + A₂) [1/m²] of the hinges ``stencil`` (E, 4), (E, 5)."""
     x0, x1, x2, x3 = (points[stencil[:, i]] for i in range(4))
 
     def cotangent(apex, b, c):
@@ -65,7 +64,7 @@ def project(y: Any, rest: Any):
     return y * y.dtype(0.0)
 
 
-# Damped, with s = ‖y‖: the energy ½(‖y‖ − s̄)² of a spring of length s̄, the last number of the rest state.
+# With damping, s = ‖y‖: the energy ½(‖y‖ − s̄)² of a spring of rest length s̄, the last number of the rest state.
 
 spring_energy, spring_gradient, spring_hessian, spring_project = spring.energy, spring.gradient, spring.hessian, spring.project
 damped_length = spring.damped_length
@@ -73,7 +72,7 @@ damped_length = spring.damped_length
 
 @wp.func
 def length_of(rest: Any):
-    """s̄ as the rest state of a spring."""
+    """Returns s̄ as the rest state of a spring."""
     return wp.vector(rest[5], length=1)
 
 
@@ -107,7 +106,7 @@ def damped_rest(y: Any, change: Any, rest: Any, share: Any):
 
 
 def damped_rest_state(points, stencil):
-    """:func:`rest_state` and s̄ [m], 0 (E, 6)."""
+    """Returns :func:`rest_state` and s̄ = 0 [m], (E, 6)."""
     return np.column_stack([rest_state(points, stencil), np.zeros(len(stencil))])
 
 

@@ -1,13 +1,13 @@
 """Rigid cluster: U = Σ_cells (κ/2) Σᵢ mᵢ‖xᵢ − (c + R qᵢ)‖², κ in 1/s² (Müller et al. 2005, *Meshless deformations based on
 shape matching*; Chao et al. 2010 for the energy).
 
-The only term of cells of variable size: c is the centre of mass of a cell's vertices and R the rotation nearest to
-Σ mᵢ(xᵢ − c)qᵢᵀ (Kabsch 1976), qᵢ the rest positions about their own centre of mass. As c and R are the best there are,
-∂U/∂xᵢ = κmᵢ(xᵢ − c − R qᵢ), as if they stood still. So each vertex of each cell is an element of its own, (x₀), y = x₀, whose
-rest state is where it is to go, t = c + R q − x₀ [m], and mᵢ [kg]; the measure is mᵢ. t is set by :mod:`..clusters` wherever a
-gradient, an energy or a projection is asked for, and only good there.
+A cell is a rigid body of any number of vertices. c is the centre of mass of its vertices, and R the rotation nearest to
+Σ mᵢ(xᵢ − c)qᵢᵀ (Kabsch 1976), qᵢ the rest positions about their centre of mass. c and R minimise U, so their derivatives drop
+out: ∂U/∂xᵢ = κmᵢ(xᵢ − c − R qᵢ). So each vertex of each cell is an element of its own, (x₀), y = x₀. Its rest state is the
+displacement to its target, t = c + R q − x₀ [m], and mᵢ [kg]; the measure is mᵢ. :mod:`..clusters` sets t before each
+evaluation of a gradient, an energy or a projection, and it holds for that evaluation only.
 
-Its Hessian is at most κM, which is the one given here; what that counts too much is the motion of the cell as a whole.
+The Hessian is at most κM, which is used here. It overestimates the resistance to rigid motion of a cell.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ from .attachment import hessian, weight
 
 
 def rest_state(points, stencil, masses=1.0):
-    """t = 0 [m] and the masses (one or E) [kg] of the vertices ``stencil`` (E, 1), as an array (E, 4)."""
+    """Returns t = 0 [m] and the masses (one or E) [kg] of the vertices ``stencil`` (E, 1), as an array (E, 4)."""
     return np.column_stack([np.zeros((len(stencil), 3)), np.broadcast_to(masses, len(stencil))])
 
 
@@ -31,7 +31,7 @@ def measure(rest: Any):
 
 @wp.func
 def target(rest: Any):
-    """t as a matrix of the shape of y."""
+    """Returns t as a matrix of the shape of y."""
     return wp.matrix_from_rows(wp.vector(rest[0], rest[1], rest[2]))
 
 

@@ -1,9 +1,9 @@
 """Spring: U = Σ ½k(‖x₁ − x₀‖ − L)², k in N/m (Provot 1995, *Deformation constraints in a mass-spring model*).
 
-Stencil (x₀, x₁), y = x₁ − x₀, rest state L [m], measure 1. The Hessian k[ŷŷᵀ + (1 − L/l)(I − ŷŷᵀ)] has the eigenvalue
-k(1 − L/l) < 0 in compression (Choi and Ko 2002, *Stable but responsive cloth*); clamping that is dropping it.
+Stencil (x₀, x₁), y = x₁ − x₀, l = ‖y‖, rest state L [m], measure 1. The Hessian k[ŷŷᵀ + (1 − L/l)(I − ŷŷᵀ)] has the eigenvalue
+k(1 − L/l) < 0 in compression (Choi and Ko 2002, *Stable but responsive cloth*), which clamping sets to 0.
 
-A collapsed spring, l ≤ 1e-12 L, has no direction: its gradient is 0, its Hessian I, and projection leaves it.
+A collapsed spring, l ≤ 1e-12 L, has no direction: its gradient is 0, its Hessian I, and its projection y.
 """
 
 from typing import Any
@@ -23,13 +23,13 @@ def rest_state(points, stencil):
 
 
 def max_lengths(points, stencil, rest):
-    """The pairs themselves, no longer than L."""
+    """Returns the pairs, no longer than L."""
     return stencil, rest[:, -1], np.ones(len(stencil))
 
 
 @wp.func
 def weight(rest: Any, i: int):
-    # Made in one call, the vector changes the order of instructions: an explicit step takes 1.05 times as long (H200).
+    # Built in one call, the vector changes the order of instructions, and an explicit step takes 1.05 times as long (H200).
     w = wp.vector(length=1, dtype=rest.dtype)
     w[0] = rest.dtype(2 * i - 1)
     return w
@@ -51,8 +51,8 @@ def energy(y: Any, rest: Any):
     return y.dtype(0.5) * c * c
 
 
-# 1 of a collapsed spring, so that it pulls with 0. Kernels that take approximate roots have the root of a reciprocal in one
-# instruction; with √s, L/√s and a comparison of lengths springs take 1.07 times as long (H200, 512² vertices).
+# L/l, but 1 for a collapsed spring, so that its force is 0. In kernels with fast math a reciprocal square root is one
+# instruction; a square root, a division and a comparison take 1.07 times as long (H200, 512² vertices).
 _QUOTIENT = """
 #if defined(__USE_FAST_MATH__)
 {0} quotient = length * rsqrt{1}(square);
@@ -137,7 +137,7 @@ def change(y: Any, other: Any, rest: Any):
 
 @wp.func
 def damped_length(y: Any, change: Any, rest_length: Any, share: Any):
-    """L + share·(s̃ − L) of :class:`..term.Dissipation` for s = l; no less than 0, which is of no length."""
+    """Returns L + share·(s̃ − L), see :class:`..term.Dissipation`, for s = l, and at least 0."""
     s = wp.length(y[0]) + change
     return wp.max(rest_length + share * (s - rest_length), y.dtype(0.0))
 

@@ -1,8 +1,8 @@
 """Spring limit: U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L], k in N/m (Provot 1995, *Deformation constraints in a
 mass-spring model*).
 
-Stencil (x₀, x₁), y = x₁ − x₀, l = ‖y‖, measure 1. Within the limits there is neither energy nor force; beyond them it is the
-spring whose length is the limit, see :mod:`.spring`, collapsed ones too. An infinite k makes it a hard constraint.
+Stencil (x₀, x₁), y = x₁ − x₀, l = ‖y‖, measure 1. Within the limits there is neither energy nor force. Beyond them it is a
+spring whose rest length is the limit, see :mod:`.spring`. An infinite k makes it a hard constraint.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ spring_energy, spring_gradient, spring_hessian, spring_project = spring.energy, 
 
 
 def rest_state(points, stencil, least=-np.inf, most=np.inf):
-    """Least and most lengths [m] of the pairs ``stencil`` (E, 2), from σ_min and σ_max (one or E each), as an array (E, 2)."""
+    """Returns σ_min L and σ_max L [m] of the pairs ``stencil`` (E, 2), from σ_min and σ_max (one or E each), (E, 2)."""
     lengths = spring.rest_state(points, stencil)[:, 0]
     ratios = np.stack([np.broadcast_to(least, len(lengths)), np.broadcast_to(most, len(lengths))], axis=1).astype(np.float64)
     return np.multiply(ratios, lengths[:, None], out=ratios, where=np.isfinite(ratios))
@@ -25,7 +25,7 @@ def rest_state(points, stencil, least=-np.inf, most=np.inf):
 
 @wp.func
 def nearest_length(y: Any, rest: Any):
-    """c, as the rest state of a spring."""
+    """Returns c as the rest state of a spring."""
     return wp.vector(wp.min(wp.max(wp.length(y[0]), rest[0]), rest[1]), length=1)
 
 
@@ -42,7 +42,7 @@ def gradient(y: Any, rest: Any):
 
 @wp.func
 def hessian(y: Any, rest: Any, policy: int):
-    """On a limit that of outside."""
+    """Exactly on a limit, this is the Hessian beyond it."""
     h = spring_hessian(y, nearest_length(y, rest), policy)
     length = wp.length(y[0])
     if length > rest[0] and length < rest[1]:

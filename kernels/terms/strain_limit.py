@@ -1,9 +1,9 @@
 """Strain limit of triangles: U = Σ ½kA‖F − p(F)‖², k in N/m, p(F) the nearest F with σ_min ≤ σᵢ ≤ σ_max (Thomaszewski,
 Pabst and Straßer 2009, *Continuum-based strain limiting*).
 
-F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, with singular values σᵢ; p clamps them. Of the
-set of F below σ_max, which is convex, p is the only nearest point; above σ_min a collapsed F has several, and takes the least
-rotation. Inside the range there is neither energy nor force. An infinite k makes it a hard constraint.
+F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, with singular values σᵢ, which p clamps. The set with
+σᵢ ≤ σ_max is convex, so its nearest point is unique. That with σᵢ ≥ σ_min is not: a collapsed F takes the smallest rotation.
+Inside the range there is neither energy nor force. An infinite k makes it a hard constraint.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ def rest_state(points, stencil, least=-np.inf, most=np.inf):
 
 
 def max_lengths(points, stencil, rest):
-    """The edges, no longer than σ_max times their length at rest."""
+    """Returns the edges, no longer than σ_max times their length at rest."""
     return edge_max_lengths(points, stencil, rest[:, 4])
 
 

@@ -3,8 +3,8 @@
 F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area. The stiffness is k = Et in N/m,
 Young's modulus times thickness, and with Poisson's ratio ν: μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
 
-A polynomial: it is singular nowhere, but gives way when it is crushed. Under pressure the force has its maximum at
-σ = 1/√3 and vanishes at σ = 0, where the triangle passes through.
+The energy is a polynomial, without singularities, but does not resist collapse: in compression the force has its maximum at
+σ = 1/√3 and vanishes at σ = 0, where the triangle inverts.
 """
 
 from typing import Any
@@ -43,7 +43,7 @@ def hessian(y: Any, rest: Any, policy: int):
     b = S[1] * S[1]
     ab = S[0] * S[1]
     level = y.dtype(0.5) * lam * (a + b - y.dtype(2.0)) - mu
-    # The second Piola–Kirchhoff stresses are level + μσᵢ²; ψᵢ is σᵢ times that, so all quotients divide out.
+    # The second Piola–Kirchhoff stresses are level + μσᵢ², and ψᵢ is σᵢ times that, so that all quotients cancel.
     s1 = level + mu * a
     s2 = level + mu * b
     stretch = wp.matrix(shape=(2, 2), dtype=y.dtype)

@@ -1,1 +1,1 @@
-"""Models: scenes built on a device."""
+"""Models: scenes on a device, with all arrays of terms, loads and colliders."""

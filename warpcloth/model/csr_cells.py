@@ -1,4 +1,4 @@
-"""Elements of any number of vertices: cells in compressed rows."""
+"""Cells, which have any number of vertices, in compressed rows (CSR)."""
 
 from dataclasses import dataclass, replace
 
@@ -8,16 +8,16 @@ import warp as wp
 from ..kernels.term import Term
 from .host_values import host_values, keep, part, reordered
 
-_PINNED = 1e3  # what a pinned vertex of a cell counts, in masses of the rest of the cell: it does not move, so the cell must
+_PINNED = 1e3  # mass of a pinned vertex in the fit, relative to the rest of its cell, so that the cell moves to the vertex
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of elements: those from offsets[c] to offsets[c+1] are the vertices of cell c.
+    """Cells of rigid clusters: elements offsets[c] to offsets[c+1] − 1 are the vertices of cell c.
 
     Attributes:
         offsets: (B·C + 1,) int32.
-        per_copy: Cells of one copy, C.
+        per_copy: Number of cells of one copy, C.
         shape: Rest position of each element about the centre of mass of its cell, (B·E,) vectors [m].
     """
 
@@ -54,12 +54,12 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class SparseCells:
-    """Cells of a term whose elements have any number of vertices, each an element by itself, see :mod:`..kernels.sparse`.
+    """Cells of a sparse energy, each vertex of a cell an element by itself, see :mod:`..kernels.sparse`.
 
     Attributes:
         term: The energy of a cell.
         offsets: (B·C + 1,) int32.
-        per_copy: Cells of one copy, C.
+        per_copy: Number of cells of one copy, C.
         weights: (B·E,) vectors of M.
         rest: Rest state of each cell, (B·C,) vectors of P.
     """
@@ -98,20 +98,20 @@ class SparseCells:
         return np.diff(host_values(self.offsets))
 
     def blocks(self):
-        """Where the n² blocks of each cell of n vertices begin, (B·C,) int32 on the device, and the end of the last."""
+        """Returns the first of the n² blocks of each cell of n vertices, (B·C,) int32 on the device, and their total number."""
         ends = np.cumsum(self.sizes.astype(np.int64) ** 2)
         starts = np.append(0, ends[:-1]).astype(np.int32)
         return wp.array(starts, dtype=wp.int32, device=self.offsets.device), int(ends[-1])
 
     def pairs(self, elements):
-        """The row and the column of each of these blocks; ``elements`` are those of the cells."""
+        """Returns the row and the column of each of these blocks; ``elements`` are those of the cells."""
         vertices = np.split(host_values(elements.stencil)[:, 0].astype(np.int64), host_values(self.offsets)[1:-1])
         rows = [np.repeat(cell, len(cell)) for cell in vertices]
         return np.concatenate(rows), np.concatenate([np.tile(cell, len(cell)) for cell in vertices])
 
 
 def _reordered(cells, order):
-    """Offsets of cells with those of index ``order`` in that order, and the indices of their elements."""
+    """Returns the offsets of cells in another ``order``, and the order of their elements."""
     firsts, sizes = host_values(cells.offsets)[order], cells.sizes[order]
     ends = np.cumsum(sizes)
     of_elements = np.arange(ends[-1]) + np.repeat(firsts - (ends - sizes), sizes)
@@ -119,7 +119,7 @@ def _reordered(cells, order):
 
 
 def rigid_cells(model, elements):
-    """:class:`Cells` of :class:`warpcloth.terms.declared.Elements`, and their rest state with the masses, (B, E, P)."""
+    """Returns :class:`Cells` of :class:`warpcloth.terms.declared.Elements`, and rest states with the masses, (B, E, P)."""
     vertices, firsts = elements.stencil[:, 0], elements.cells[:-1]
     sizes = np.diff(elements.cells)
     shape = (model.copies, model.per_copy)
@@ -143,7 +143,7 @@ def rigid_cells(model, elements):
 
 
 def sparse_cells(model, elements, rest):
-    """:class:`SparseCells` of elements with rest states (B, C, P), and the rest states of their shares, (B, E, 4)."""
+    """Returns :class:`SparseCells` with rest states (B, C, P), and zero rest states of their elements, (B, E, 4)."""
     (E, M), P = elements.weights.shape[-2:], elements.term.parameters
     weights = np.broadcast_to(elements.weights, (model.copies, E, M))
     cells = SparseCells(
@@ -157,7 +157,7 @@ def sparse_cells(model, elements, rest):
 
 
 def _offsets(model, elements):
-    """Where the cells of all copies begin and the last ends, int32."""
+    """Returns the offsets of the cells of all copies, (B·C + 1,) int32."""
     E = elements.cells[-1]
     offsets = np.append((elements.cells[:-1] + np.arange(model.copies)[:, None] * E).ravel(), model.copies * E)
     return keep(offsets.astype(np.int32), wp.int32, model.device)

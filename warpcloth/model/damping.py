@@ -1,4 +1,4 @@
-"""Damping: within a step an energy whose rest state is set where the step begins."""
+"""Damping, as an energy whose rest state is set at the start of each step."""
 
 from dataclasses import replace
 from functools import partial
@@ -12,7 +12,7 @@ from .host_values import host_values
 
 
 def damped_terms(model, he):
-    """The elements of a step of hₑ [s]: the model's, those with damping merged with it or followed by it."""
+    """Returns the elements of a model for a step hₑ [s], with damping merged into them or, where that cannot be, added."""
     terms = []
     for elements in model.terms:
         if elements.damping is None:
@@ -25,12 +25,12 @@ def damped_terms(model, he):
 
 
 def dissipations(model, he):
-    """The elements of the dissipation alone."""
+    """Returns the elements of the dissipation alone, for a step hₑ [s]."""
     return [_dissipation(model, elements, he, 0.0) for elements in model.terms if elements.damping is not None]
 
 
 def _dissipation(model, elements, he, stiffness):
-    """The elements of D, or with their ``stiffness`` those of both."""
+    """Returns the elements of the dissipation, merged with an energy of a given stiffness, or alone if that is 0."""
     dissipation, count = elements.term.dissipation, elements.count
     viscous = host_values(elements.damping).astype(np.float64) / he
     both = stiffness + viscous
@@ -44,12 +44,12 @@ def _dissipation(model, elements, he, stiffness):
         damping=None,
         refresh=Refresh(STEP, partial(_set_rest, elements.term), (elements.rest, model.per_element(share))),
     )
-    model.refresh(STEP, Moment(model.positions), [damped])  # for those who ask for weights and measures before the first step
+    model.refresh(STEP, Moment(model.positions), [damped])  # some solvers read weights and measures before the first step
     return damped
 
 
 def _set_rest(damped, model, elements, moment):
-    """Sets the rest state of elements where a step begins, from that of the term that is ``damped`` and from its share."""
+    """Sets the rest states of dissipation at the start of a step, from those of the term that is ``damped``."""
     rule = moment.integrator
     kernel = model.kernel(kernels.set_damped_rest, damped, model.dtype, rule == "bdf2", rule == "midpoint")
     rest, share = elements.refresh.arrays

@@ -14,14 +14,14 @@ class DeviceColliders(NamedTuple):
     """The C colliders of a scene, which all copies share.
 
     Attributes:
-        keyframes: Poses of all colliders, one after another, seven numbers each.
+        keyframes: Poses of all colliders, one collider after another: position [m] and quaternion (x, y, z, w).
         firsts: Index of the first pose of each, (C + 1,) int32.
-        core, radius: Their shapes, (C,) vectors and (C,) numbers [m].
+        core, radius: Shapes, (C,) vectors and (C,) numbers [m], see :mod:`warpcloth.kernels.terms.contact`.
         distance: Contact distance [m].
         friction: μ of each, (C,) on the host.
         moves, half_space: Whether each has more than one pose, and whether it is a half-space, lists of C.
-        facets: How many half-spaces stand for each in a step, 0 where its shape does, a list of C.
-        meshes: Those that are triangle meshes, or None.
+        facets: Number of half-spaces that approximate each near a vertex in a step, 0 for other shapes, a list of C.
+        meshes: The triangle meshes among them, or None.
     """
 
     keyframes: wp.array
@@ -42,7 +42,7 @@ class DeviceColliders(NamedTuple):
 
 
 def colliders_on(model, scene):
-    """The colliders of a scene on the device of a model, or None if there are none."""
+    """Returns the colliders of a scene on the device of a model, or None if there are none."""
     if not scene.colliders:
         return None
     centred = [collider.centred() for collider in scene.colliders]

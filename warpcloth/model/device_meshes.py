@@ -7,7 +7,7 @@ import warp as wp
 
 from ..kernels import mesh_colliders as kernels
 
-# Of the farthest coordinate: what float32 may be off.
+# Rounding of bounds in float32, relative to the largest coordinate.
 _ROUNDING = 1e-6
 
 
@@ -16,8 +16,8 @@ class DeviceMeshes(NamedTuple):
 
     Attributes:
         geometry: The struct :func:`warpcloth.kernels.mesh_colliders.meshes`.
-        trees: A `wp.Bvh` of each collider at its start, or None where it is no mesh.
-        deform: Indices of the colliders whose points move.
+        trees: A `wp.Bvh` of each collider at its start, or None if it is not a mesh.
+        deform: Indices of the colliders that deform.
     """
 
     geometry: object
@@ -25,11 +25,11 @@ class DeviceMeshes(NamedTuple):
     deform: list
 
     def own(self, model):
-        """These, with trees of their own of what deforms."""
+        """Returns a copy that has its own trees of the meshes that deform."""
         trees = list(self.trees)
         for c in self.deform:
             trees[c] = wp.Bvh(wp.clone(trees[c].lowers), wp.clone(trees[c].uppers))
-        geometry = kernels.meshes(model.dtype)()  # as copies of a struct share its memory
+        geometry = kernels.meshes(model.dtype)()  # copy.copy of a struct would share its memory
         geometry.assign(self.geometry)
         geometry.bvh = _ids(trees, model.device)
         return self._replace(geometry=geometry, trees=trees)
@@ -41,7 +41,7 @@ class DeviceMeshes(NamedTuple):
 
 
 def meshes_on(model, colliders):
-    """The meshes among colliders on the device of a model, or None if there are none."""
+    """Returns the meshes among colliders on the device of a model, or None if there are none."""
     meshes = [collider if collider.facets else None for collider in colliders]
     if not any(meshes):
         return None

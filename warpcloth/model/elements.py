@@ -19,18 +19,18 @@ class DeviceElements:
 
     Attributes:
         label, term: As in :class:`warpcloth.terms.declared.Elements`.
-        per_copy: Elements of one copy, E.
+        per_copy: Number of elements of one copy, E.
         stencil: (B·E, K) int32.
-        stiffness: (B·E,); of stride 0 where all elements share one value.
+        stiffness: (B·E,), with stride 0 if all elements share one value [unit of the term].
         rest: (B·E,) vectors of P.
         hard: Whether any stiffness is infinite.
-        damping: β (B·E,), of stride 0 where all elements share one value; None where it is 0.
-        refresh: :class:`warpcloth.terms.refresh.Refresh` of what changes during a run, or None.
-        cells: :class:`Cells` or :class:`SparseCells` that the elements are the vertices of, or None.
-        collider: Index of the collider of the scene that they are the contact with or the friction on, or None.
-        facet: Of contact with a mesh which of its facets they are with.
-        clear: How far each vertex may move from x̃ in a step before there is a force, see
-            :mod:`warpcloth.kernels.clear_elements`, (B·E,) [m]; None for those that always look.
+        damping: β (B·E,), with stride 0 if all elements share one value; None if all are 0.
+        refresh: :class:`warpcloth.terms.refresh.Refresh` of a rest state that changes during a run, or None.
+        cells: :class:`Cells` or :class:`SparseCells` whose vertices the elements are, or None.
+        collider: For contact and friction, index of the collider in the scene; else None.
+        facet: For contact with a mesh, index of the half-space.
+        clear: How far each vertex may move from x̃ in a step before there is a force, (B·E,) [m], see
+            :mod:`warpcloth.kernels.clear_elements`; None for elements that are always evaluated.
     """
 
     label: str
@@ -49,7 +49,7 @@ class DeviceElements:
 
     @property
     def arguments(self):
-        """The arguments that every kernel over elements starts with."""
+        """The first arguments of every kernel over elements."""
         return [self.stencil, self.stiffness, self.rest]
 
     @property
@@ -65,13 +65,13 @@ class DeviceElements:
 
     def stiffness_of_copies(self, model):
         """Returns the stiffness (B,) that all elements of each copy share, or None if the elements of a copy differ."""
-        # Colours put elements of all copies in one order; all vertices of an element are in one copy.
+        # Coloured elements of all copies are mixed. All vertices of an element are in one copy.
         by_copy = np.argsort(host_values(self.stencil)[:, 0] // model.per_copy, kind="stable")
         values = host_values(self.stiffness)[by_copy].reshape(model.copies, -1)
         return values[:, 0] if values.size and (values == values[:, :1]).all() else None
 
     def with_unit_stiffness(self):
-        """Returns these elements with a stiffness of 1, or 0 where it is 0; of contact with 1/A."""
+        """Returns these elements with a stiffness of 1, of 1/A for contact, and of 0 where it is 0."""
         stiffness = host_values(self.stiffness)
         ones = (stiffness > 0.0) / (1.0 if self.collider is None else host_values(self.rest)[:, -1])  # A is last
         ones = keep(ones.astype(stiffness.dtype), self.stiffness.dtype, self.stiffness.device)
@@ -85,31 +85,31 @@ class DeviceElements:
 
     @property
     def constraints(self):
-        """Vertices (B·C, K) of each constraint, or of cells a list of arrays: elements, and cells as a whole."""
+        """Vertices of each constraint: of elements (B·E, K), of cells a list of B·C arrays."""
         stencil = host_values(self.stencil)
         return stencil if self.cells is None else np.split(stencil[:, 0], host_values(self.cells.offsets)[1:-1])
 
     def reordered(self, order):
-        """The elements, or cells, with those of index ``order`` in that order."""
+        """Returns the elements, or cells, in another ``order``."""
         cells = self.cells
         if cells:
             cells, order = cells.reordered(order)
         return self._changed(lambda array: reordered(array, order), cells)
 
     def by_lowest(self):
-        """The elements in the order of their lowest vertices; themselves where that is theirs."""
+        """Returns the elements in the order of their lowest vertices."""
         lowest = host_values(self.stencil).min(axis=1)
         return self.reordered(np.argsort(lowest, kind="stable")) if (np.diff(lowest) < 0).any() else self
 
     def part(self, first, count):
-        """Those of ``count`` of the copies from ``first`` on, as a model of these alone has them."""
+        """Returns the elements of copies ``first`` to ``first + count − 1``, for a model of these copies alone."""
         E = self.per_copy
         chosen = slice(first * E, (first + count) * E)
         found = self._changed(lambda array: part(array, chosen), self.cells and self.cells.part(first, count, chosen))
-        return replace(found, stencil=part(self.stencil, slice(count * E)))  # whose first vertex is 0
+        return replace(found, stencil=part(self.stencil, slice(count * E)))  # vertices count from 0 in each model
 
     def _changed(self, change, cells):
-        """The elements with every array of them as the function ``change`` makes it, and other cells."""
+        """Returns the elements with ``change`` applied to every array, and with other cells."""
         changed = {name: change(getattr(self, name)) for name in ("stencil", "stiffness", "rest")}
         if self.damping is not None:
             changed["damping"] = change(self.damping)
@@ -118,8 +118,10 @@ class DeviceElements:
         return replace(self, **changed, refresh=self.refresh and self.refresh.with_arrays(change), cells=cells)
 
     def at_limit(self, points):
-        """Of a limit the elements with no range at all about the rest shape ``points`` of one copy, of contact those with the
-        largest Hessian that explicit steps may meet; else these."""
+        """Returns the elements with the largest Hessian that explicit steps may meet, from which the stability limit follows.
+
+        A limit has an empty range about the rest shape ``points`` (n, 3) [m]. Contact has its ``bounded`` term.
+        """
         if self.term.bounded is not None:
             found = replace(self, term=self.term.bounded)
             return found.weighed(np.zeros(self.count)) if self.facet else found  # facets share the stiffness of one
@@ -130,40 +132,40 @@ class DeviceElements:
 
     @cached_property
     def incidences(self):
-        """(offsets (N+1,), codes (B·E·K,)), see :func:`incidences_of`, on the device. Built when first asked for."""
+        """(offsets (N+1,), codes (B·E·K,)) on the device, see :func:`incidences_of`. Built on first use."""
         stencil, device = host_values(self.stencil).ravel(), self.stencil.device
         found = incidences_of(stencil, int(stencil.max()) + 1)
         return tuple(wp.array(each.astype(np.int32), dtype=wp.int32, device=device) for each in found)
 
 
 def incidences_of(vertices, count):
-    """The elements of each vertex, one vertex after another.
+    """Lists the elements of each vertex, one vertex after another.
 
     Args:
-        vertices: (E·K,) the corners of elements, one element after another.
-        count: Vertices, N.
+        vertices: The stencils of all elements in one row, (E·K,).
+        count: Number of vertices, N.
 
     Returns:
-        (offsets (N+1,), codes (E·K,)): vertex i has the codes from offsets[i] to offsets[i+1], K·element + corner, in order.
+        (offsets (N+1,), codes (E·K,)): vertex i has codes offsets[i] to offsets[i+1] − 1, each K·element + corner, ascending.
     """
     codes = np.argsort(vertices, kind="stable")
     return np.searchsorted(vertices[codes], np.arange(count + 1)), codes
 
 
 def elements_on(model, term, positions, vary):
-    """The elements of a term on a model.
+    """Returns the :class:`DeviceElements` of a term on a model.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`, all but its terms.
+        model: The :class:`warpcloth.model.model.Model`, complete but for its terms.
         term: A :class:`warpcloth.terms.declared.Declared`.
-        positions: Where the vertices of each copy start, (B, n, 3) [m].
+        positions: Initial positions of each copy, (B, n, 3) [m].
         vary: :class:`warpcloth.model.vary.Vary`.
     """
     one, rest, stiffness, damping = vary.elements(term, model.scene.mesh, positions)
     E = len(one.stencil)
     vertices = model.in_model(one.stencil)
     if model.order is not None and vertices.shape[1] == 2:
-        vertices = np.sort(vertices, axis=1)  # a pair has no direction, and those of one are faster
+        vertices = np.sort(vertices, axis=1)  # a pair has no direction, and sorted pairs are faster
     stencil = vertices[None] + (np.arange(model.copies) * model.per_copy)[:, None, None]
     cells, declared = None, one.term
     if one.cells is not None:
@@ -174,7 +176,7 @@ def elements_on(model, term, positions, vary):
         if stiffness.shape[1] > 1:
             stiffness = np.repeat(stiffness, np.diff(one.cells), axis=1)
     rest_type = wp.types.vector(declared.parameters, model.dtype)
-    rest = model.keep(f"{one.label}: rest state", "", rest, rest_type, infinite=True)  # a limit may be none
+    rest = model.keep(f"{one.label}: rest state", "", rest, rest_type, infinite=True)  # an absent limit is infinite
     if one.refresh:
         release(rest)
     found = DeviceElements(
@@ -195,7 +197,7 @@ def elements_on(model, term, positions, vary):
 
 
 def _numbers(model, name, values, E):
-    """(B, 1) or (B, E) values as an array (B·E,), of stride 0 where all are one value."""
+    """Returns values (B, 1) or (B, E) as an array (B·E,), with stride 0 if all are equal."""
     each = "element" if values.shape[1] > 1 else None
     if (values != values[0, 0]).any() or len(values) * values.shape[1] == model.copies * E:
         return model.keep(name, "", np.broadcast_to(values, (model.copies, E)), model.dtype, each, infinite=True)

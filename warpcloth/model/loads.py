@@ -1,4 +1,4 @@
-"""The loads of a scene on a device: forces on vertices, which become accelerations beside gravity."""
+"""The loads of a scene on a device: forces on vertices, which are added to gravity as accelerations."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,12 @@ class DeviceLoads:
     """All loads of a scene.
 
     Attributes:
-        dead: Forces that keep their direction, and the loaded vertices, see :func:`warpcloth.kernels.loads.dead_forces`.
+        dead: Dead loads, whose direction is fixed, and the loaded vertices, see :func:`warpcloth.kernels.loads.dead_forces`.
         pressed: Pressures, see :func:`warpcloth.kernels.loads.pressures`.
-        constant: The dead forces of each vertex, (B, n, 3) [N] in the order of the model; None if loads change.
+        constant: Dead loads of each vertex, (B, n, 3) [N] in the order of the model; None if loads change.
         timed: Whether values follow keyframes.
-        force: Forces on vertices as they were set last, (N,) vectors [N].
-        acceleration: Gravity and the forces over the masses, (N,) vectors [m/s²].
+        force: Latest forces on vertices, (N,) vectors [N].
+        acceleration: Gravity plus forces over masses, (N,) vectors [m/s²].
     """
 
     dead: object
@@ -31,7 +31,7 @@ class DeviceLoads:
 
     @property
     def follows(self):
-        """Whether a pressure follows the cloth."""
+        """Whether there is a pressure, whose direction follows the cloth."""
         return self.pressed.triangles is not None
 
     @property
@@ -41,7 +41,7 @@ class DeviceLoads:
         return found + [self.pressed.triangles, self.pressed.keyframes, self.pressed.offsets, self.pressed.codes] * self.follows
 
     def launch(self, model, moment):
-        """Launches the forces at a :class:`warpcloth.terms.refresh.Moment`; nothing where they never change."""
+        """Launches the forces at a :class:`warpcloth.terms.refresh.Moment`, unless they never change."""
         if self.constant is None:
             self.set(model, moment)
 
@@ -56,7 +56,7 @@ class DeviceLoads:
         model.lock(self.acceleration)
 
     def part(self, model, first, count):
-        """The loads of ``count`` of the copies from ``first`` on."""
+        """Returns the loads of copies ``first`` to ``first + count − 1``."""
         n, copies = model.per_copy, slice(first, first + count)
         dead, pressed = kernels.dead_forces(model.dtype)(), kernels.pressures(model.dtype)()
         dead.per_copy, dead.vertices, dead.keyframes = n, self.dead.vertices, self.dead.keyframes[:, copies]
@@ -69,13 +69,13 @@ class DeviceLoads:
 
 
 def loads_on(model, loads, vary, acceleration):
-    """The loads of a scene on a model.
+    """Returns the :class:`DeviceLoads` of a model.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`, all but its terms.
-        loads: Those of the scene.
+        model: The :class:`warpcloth.model.model.Model`, complete but for its loads and terms.
+        loads: Loads of the scene.
         vary: :class:`warpcloth.model.vary.Vary`.
-        acceleration: Gravity of each vertex, along free axes (N,), which the loads add to.
+        acceleration: Gravity of each vertex along its free axes, (N,) vectors [m/s²], to which the loads are added.
     """
     mesh, B, n = model.scene.mesh, model.copies, model.per_copy
     dead, pressed, triangles = [], [], [np.empty((0, 3), dtype=np.int32)]
@@ -112,7 +112,7 @@ def loads_on(model, loads, vary, acceleration):
 
 
 def _on_vertices(load, mesh, elements, values, n):
-    """The forces on the vertices of a dead load, (F, B, n, 3) [N]."""
+    """Returns the forces of a dead load on all vertices, (F, B, n, 3) [N]."""
     found = np.zeros((*values.shape[:2], n, 3))
     if isinstance(load, Traction):
         lengths = np.linalg.norm(mesh.points[elements[:, 1]] - mesh.points[elements[:, 0]], axis=1)
@@ -124,7 +124,7 @@ def _on_vertices(load, mesh, elements, values, n):
 
 
 def _held(values, frames):
-    """Keyframes (F, …) with the last one repeated up to a number of frames."""
+    """Repeats the last of some keyframes (F, …) up to a number of frames."""
     return values[np.minimum(np.arange(frames), len(values) - 1)]
 
 

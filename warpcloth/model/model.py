@@ -1,4 +1,4 @@
-"""A scene on a device: arrays of one or more copies laid out one after another, and nothing undeclared."""
+"""A scene on a device, as one copy or more laid out one after another. Only declared terms have arrays."""
 
 import inspect
 from copy import copy as shallow_copy
@@ -32,24 +32,22 @@ class Model:
         device: A Warp device, ``"cpu"`` or ``"cuda:0"``.
         dtype: ``"float32"`` or ``"float64"``.
         copies: B.
-        vary: What differs between the copies, by name, each with B entries: ``"gravity"`` (B, 3), ``"density"`` (B,),
-            ``"masses"`` (B, n), ``"positions"`` and ``"velocities"`` (B, n, 3), and any numeric field of a term, by its name or
-            class, such as ``"Spring.stiffness"`` and ``"Spring.rest_lengths"``, (B,) or (B, E), or of a load, such as
-            ``"Force.force"``, (B, 3) or (B, p, 3).
-        order: The scene's vertices in the order that the model has them in, (n,), such as
-            :func:`warpcloth.mesh.ordering.near_order` gives; elements are then in the order of their lowest vertices there. All
-            arguments here, and what is said of them, have the scene's own order, and all attributes and what solvers make of
-            them have this one; :meth:`in_scene_order` leads back. None keeps the scene's, of vertices and elements.
+        vary: Values that differ between copies, by name: ``"gravity"`` (B, 3), ``"density"`` (B,), ``"masses"`` (B, n),
+            ``"positions"`` and ``"velocities"`` (B, n, 3); any numeric field of a term, by its name or class, such as
+            ``"Spring.stiffness"``, (B,) or (B, E); and values of a load, such as ``"Force.force"``, (B, 3) or (B, p, 3).
+        order: Vertices of the scene in the order of the model, (n,), such as :func:`warpcloth.mesh.ordering.near_order` gives;
+            elements are then sorted by their lowest vertices. Arguments and messages use the order of the scene, attributes
+            and solvers that of the model, and :meth:`in_scene_order` converts. None keeps the order of vertices and elements.
         threads: Threads of the CPU that share the steps, see :class:`warpcloth.core.thread_pool.ThreadPool`.
 
     Attributes:
-        positions, velocities: Where the copies start, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
-        mass, inverse_mass: (B·n,) [kg], [1/kg]; the inverse of a pinned vertex is 0.
-        mobility: Inverse masses along each axis, 0 where it is locked, (B·n,) vectors [1/kg]; None where no coordinate of a
-            vertex that moves is locked.
+        positions, velocities: Initial state, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
+        mass, inverse_mass: (B·n,) [kg], [1/kg]; the inverse mass of a pinned vertex is 0.
+        mobility: Inverse masses along each axis, 0 along locked axes, (B·n,) vectors [1/kg]; None if no coordinate of a moving
+            vertex is locked.
         gravity: (B,) vectors [m/s²].
         pins, keyframes: Moved pins (p,) and their positions (F, p) [m], or None.
-        pin_axes: 1 along axes that each moved pin holds and 0 along others, (p,) vectors; None where all hold all axes.
+        pin_axes: 1 along axes that each moved pin holds and 0 along others, (p,) vectors; None if all hold all axes.
         loads: The :class:`warpcloth.model.loads.DeviceLoads`, or None.
         terms: One :class:`warpcloth.model.elements.DeviceElements` for each declared term, then for contact with each collider
             and friction on it.
@@ -57,15 +55,15 @@ class Model:
         rest_points: Rest shape of one copy, (n, 3) [m].
         order: As given, int32, or None.
         indices: Index in a copy of each vertex of the scene, (n,) int32; None without an order.
-        kernels: Names of the kernels that solvers asked for.
-        launches: How many launches there have been, a list of one that models of other terms share.
+        kernels: Names of the kernels that solvers use.
+        launches: Number of launches so far, in a list of one that models made from this one share.
         threads: As given.
 
     Raises:
-        ValueError: If an argument is not allowed, or a value or the cloth itself is lost in the precision of the model.
+        ValueError: An argument is not allowed, or the precision cannot represent a value or resolve the cloth.
 
     Warns:
-        UserWarning: If there are more threads than cores.
+        UserWarning: There are more threads than cores.
     """
 
     @in_turn
@@ -88,7 +86,7 @@ class Model:
         vary = Vary({} if vary is None else vary, copies)
 
         masses = vary.masses(scene)
-        with np.errstate(over="ignore"):  # an inverse that no precision holds is refused below
+        with np.errstate(over="ignore"):  # an infinite inverse is refused below
             inverse = 1.0 / np.where(masses > 0.0, masses, np.inf)
         inverse[:, scene.fixed] = 0.0
         positions = vary.take("positions", scene.positions)
@@ -141,60 +139,60 @@ class Model:
         self.rest_points = self.scene.mesh.points[self.order]
 
     def in_model(self, vertices):
-        """The indices in a copy of vertices of the scene."""
+        """Returns the indices, in a copy, of vertices of the scene."""
         return vertices if self.indices is None else self.indices[vertices]
 
     def in_scene_order(self, values):
-        """NumPy ``values`` of all vertices (B·n, …) in the order of the scene; the same array where that is the model's."""
+        """Returns NumPy ``values`` of all vertices (B·n, …) in the order of the scene."""
         if self.indices is None:
             return values
         return values.reshape(self.copies, self.per_copy, *values.shape[1:])[:, self.indices].reshape(values.shape)
 
     @property
     def free_gravity(self):
-        """Gravity and loads along free axes, (G,) vectors [m/s²], and how many vertices in a row share an entry."""
+        """Acceleration by gravity and loads along free axes, (G,) vectors [m/s²], and how many vertices share an entry."""
         return (self.gravity, self.per_copy) if self.uniform else (self._vertex_gravity, 1)
 
     @property
     def uniform(self):
-        """Whether gravity acts on all vertices of a copy alike, and along every axis: no load, no locked coordinate."""
+        """Whether gravity is the same for all vertices of a copy: there is no load and no locked coordinate."""
         return self._vertex_gravity is None
 
     @property
     def local_mobility(self):
-        """Inverse masses as local steps take them, (B·n,) numbers, or vectors where coordinates are locked."""
+        """Inverse masses for local steps, (B·n,) numbers, or vectors if coordinates are locked [1/kg]."""
         return self.inverse_mass if self.mobility is None else self.mobility
 
     def lock(self, values):
-        """Launches values = 0 at coordinates that do not move, of vectors (N,); nothing where none is locked."""
+        """Sets vectors (N,) to 0 at coordinates that do not move, if a coordinate is locked."""
         if self.mobility is not None:
             self.launch(self.kernel(lock, self.dtype), self.count, [self.mobility], [values])
 
     def coordinate_mobility(self):
-        """The inverse mass of each coordinate on the host, 0 where it does not move, (3 B·n,) [1/kg] in double precision."""
+        """Returns the inverse mass of each coordinate, 0 if it does not move, (3 B·n,) [1/kg] float64 on the host."""
         if self.mobility is None:
             return np.repeat(self.inverse_mass.numpy().astype(np.float64), 3)
         return self.mobility.numpy().astype(np.float64).ravel()
 
     def with_terms(self, terms):
-        """This model with other :class:`warpcloth.model.elements.DeviceElements`, all else shared."""
+        """Returns a model with other :class:`warpcloth.model.elements.DeviceElements` that shares all else."""
         other = shallow_copy(self)
         other.terms = tuple(terms)
         return other
 
     def without_colliders(self):
-        """This model without colliders and contact, all else shared."""
+        """Returns a model without colliders and contact that shares all else."""
         other = self.with_terms(elements for elements in self.terms if elements.collider is None)
         other.colliders = None
         return other
 
     def refresh(self, when, moment, terms=None):
-        """Launches what its loads and terms, or only the ``terms`` given, have set anew.
+        """Updates loads and the rest states of terms, or those of ``terms`` alone, see :mod:`warpcloth.terms.refresh`.
 
         Args:
             when: :data:`warpcloth.terms.refresh.STEP` or :data:`warpcloth.terms.refresh.EVALUATION`.
             moment: The :class:`warpcloth.terms.refresh.Moment`.
-            terms: :class:`warpcloth.model.elements.DeviceElements`.
+            terms: The :class:`warpcloth.model.elements.DeviceElements` to update, without loads; None for all and the loads.
         """
         if self.loads is not None and terms is None and when == STEP:
             self.loads.launch(self, moment)
@@ -203,11 +201,11 @@ class Model:
                 elements.refresh.launch(self, elements, moment)
 
     def alone(self, copy):
-        """A model of one copy, whose arrays are parts of those of this one."""
+        """Returns a model of one copy, whose arrays are views of those of this one."""
         return self if self.copies == 1 else self.part(copy, 1)
 
     def part(self, first, count):
-        """A model of ``count`` of the copies from ``first`` on, for one thread, whose arrays are parts of those of this one."""
+        """Returns a model of copies ``first`` to ``first + count − 1``, for one thread, whose arrays are views."""
         n = self.per_copy
         other, of_copies, of_vertices = shallow_copy(self), slice(first, first + count), slice(first * n, (first + count) * n)
         other.copies, other.count, other.threads = count, count * n, 1
@@ -222,18 +220,18 @@ class Model:
 
     @in_turn
     def array(self, values, dtype):
-        """``values`` on the model's device, in its precision."""
+        """Returns ``values`` as an array on the model's device, in its precision."""
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy_dtype), dtype=dtype, device=self.device)
 
     def _put(self, name, unit, values, dtype, each="vertex"):
-        """Values (B, count, …) on the device, one row after another, as :func:`warpcloth.model.precision.cast` lets them be."""
+        """Returns values (B, count, …) on the device, one copy after another, see :func:`warpcloth.model.precision.cast`."""
         held = self._cast(name, unit, values, each)
         if each == "vertex" and self.order is not None:
             held = held[:, self.order]
         return self.array(held.reshape(-1, *held.shape[2:]), dtype)
 
     def keep(self, name, unit, values, dtype, each="element", infinite=False):
-        """Values (B, count, …) of elements likewise, which the host keeps."""
+        """Returns values (B, count, …) of elements on the device, and keeps them on the host too, see `host_values.keep`."""
         held = self._cast(name, unit, values, each, infinite)
         return keep(held.reshape(-1, *held.shape[2:]), dtype, self.device)
 
@@ -241,22 +239,22 @@ class Model:
         return cast(name, unit, values, self.numpy_dtype, lambda copy, i: self._label(each, copy, i), infinite)
 
     def _label(self, each, copy, i):
-        """The words for one of what ``each`` names, or for a whole copy."""
+        """Returns words for error messages, such as "vertex 3 of copy 0"."""
         words = [] if each is None else [f"{each} {i}"]
         return " of ".join(words + ([f"copy {copy}"] if self.copies > 1 else []))
 
     @in_turn
     def vectors(self):
-        """A new array of one zero vector for each vertex of all copies."""
+        """Returns a new array of a zero vector for each vertex of all copies."""
         return wp.zeros(self.count, dtype=self.vec3, device=self.device)
 
     def scalars(self, dtype=wp.float64):
-        """A new array of one zero for each copy."""
+        """Returns a new array of a zero for each copy."""
         return wp.zeros(self.copies, dtype=dtype, device=self.device)
 
     @in_turn
     def kernel(self, factory, *key):
-        """The kernel that ``factory(*key)`` makes, noted for :meth:`report` as factory(variant).Term."""
+        """Returns the kernel of ``factory(*key)``, and notes its name for :meth:`report`, as factory(variant).Term."""
         kernel = factory(*key)
         terms = [part.name for part in key if isinstance(part, Term)]
         terms += [part.term.name for parts in key if isinstance(parts, tuple) for part in parts]
@@ -271,19 +269,19 @@ class Model:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
     def launcher(self, *made):
-        """Finds the kernels of each (factories, *key), and returns the function (factory, dim, inputs, outputs) to launch them.
+        """Makes the kernels of each (factories, *key), and returns a function (factory, dim, inputs, outputs) to launch them.
 
-        All are found before the first is launched, so that those that share a module are compiled at once.
+        All are made before the first launch, so that those of one module are compiled together.
         """
         kernels = {factory: self.kernel(factory, *key) for factories, *key in made for factory in factories}
         return lambda factory, dim, inputs, outputs: self.launch(kernels[factory], dim, inputs, outputs)
 
     def constant(self, value, count):
-        """An array (count,) of one value, of stride 0."""
+        """Returns an array (count,) of one value, with stride 0."""
         return repeat(keep(np.array([value], dtype=self.numpy_dtype), self.dtype, self.device), count)
 
     def per_element(self, values):
-        """Numbers (E,) in an array, of stride 0 where they are all one value."""
+        """Returns numbers (E,) as an array, with stride 0 if all are equal."""
         if len(values) and (values == values[0]).all():
             return self.constant(values[0], len(values))
         return keep(np.array(values, dtype=self.numpy_dtype), self.dtype, self.device)

@@ -1,4 +1,4 @@
-"""Limits of a model's precision: values that it would turn into 0 or infinity, and positions where it loses the cloth."""
+"""Checks that the precision of a model represents all values, and resolves the cloth and the surface of colliders."""
 
 import numpy as np
 import warp as wp
@@ -7,21 +7,21 @@ DTYPES = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float6
 
 
 def cast(name, unit, values, dtype, label, infinite=False):
-    """``values`` in the precision of a model, each finite there, and single numbers 0 only where they were.
+    """Casts ``values`` to the precision of a model, and checks that none overflows and that no number underflows.
 
     Args:
-        name: What they are, for the error.
-        unit: Their unit, likewise.
+        name: What the values are, for the error message.
+        unit: Their unit, for the error message.
         values: (B, count) numbers, or (B, count, …) components of vectors, in double precision.
         dtype: ``np.float32`` or ``np.float64``.
-        label: Function (copy, index) → the words that name a value, which may be none.
-        infinite: Whether a value may be infinite if it was so.
+        label: Function (copy, index) → words that name a value, or "".
+        infinite: Whether values may be infinite.
 
     Returns:
         np.ndarray: Of the same shape.
 
     Raises:
-        ValueError: Naming the first value that is lost and its index.
+        ValueError: A value overflows or underflows. The message names it and its index.
     """
     limits = np.finfo(dtype)
     with np.errstate(over="ignore", under="ignore"):
@@ -29,7 +29,7 @@ def cast(name, unit, values, dtype, label, infinite=False):
     lost = ~np.isfinite(held)
     if infinite:
         lost &= ~np.isinf(values)
-    if np.ndim(values) == 2:  # of a vector, a component that is next to nothing may be lost
+    if np.ndim(values) == 2:  # a component of a vector may underflow
         lost |= (np.abs(held) < limits.tiny) & (values != 0.0)
     for index in np.argwhere(lost)[:1]:
         words = [name, label(*index[:2])] if label(*index[:2]) else [name]
@@ -42,18 +42,16 @@ def cast(name, unit, values, dtype, label, infinite=False):
 
 
 def refuse_coarse(mesh, positions, dtype, label):
-    """Refuses positions so far from the origin, or a mesh so large or small, that a precision loses the cloth.
-
-    ε·|x| may be 1 % of the median edge of the rest shape, and the square of every edge must be a normal number.
+    """Checks that a precision resolves the cloth: ε·|x| is at most 1 % of the median rest edge, and edges can be squared.
 
     Args:
         mesh: The :class:`warpcloth.Mesh`.
         positions: (B, n, 3) [m].
         dtype: ``np.float32`` or ``np.float64``.
-        label: Function (b, i) → the words that name a position.
+        label: Function (b, i) → words that name a position.
 
     Raises:
-        ValueError: Naming the edge, or the largest coordinate.
+        ValueError: It does not. The message names the edge or the largest coordinate.
     """
     limits = np.finfo(dtype)
     edges = np.linalg.norm(np.diff(mesh.points[mesh.edges], axis=1)[:, 0], axis=1)
@@ -77,13 +75,13 @@ def refuse_coarse(mesh, positions, dtype, label):
 
 
 def refuse_large(scene, dtype):
-    """Refuses colliders so large that a precision loses their surface.
+    """Checks that a precision resolves the surface of colliders.
 
-    ε·size may be a fifth of the contact distance, or 1e-4 of the median edge, which is what the cloth has anyway; the size is
-    the radius, or the shortest half of a box.
+    ε·size is at most a fifth of the contact distance, or 1e-4 of the median edge. The size is the radius plus the shortest half
+    size of a box.
 
     Raises:
-        ValueError: Naming the collider.
+        ValueError: It does not. The message names the collider.
     """
     mesh, limits = scene.mesh, np.finfo(dtype)
     edge = np.median(np.linalg.norm(np.diff(mesh.points[mesh.edges], axis=1), axis=2))

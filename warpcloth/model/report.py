@@ -1,11 +1,11 @@
-"""The report of what a model was built of."""
+"""The report of what a model consists of."""
 
 import numpy as np
 import warp as wp
 
 
 def report(model):
-    """Reports what was built: a dict of vertices, copies, dtype, device, bytes, terms (elements and bytes of each), kernels.
+    """Describes a model: a dict of scene, vertices, copies, dtype, device, bytes, terms (elements and bytes) and kernels.
 
     Terms of one label are numbered from the second on: Spring, Spring 2. Kernels are factory(variant).Term.
     """

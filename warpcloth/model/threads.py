@@ -1,4 +1,4 @@
-"""How many threads of the CPU share the steps of a model."""
+"""The number of CPU threads that share the steps of a model."""
 
 import os
 import warnings
@@ -9,14 +9,21 @@ from ..base.checks import whole
 
 
 def cores(device):
-    """The number of cores of the CPU that this process may use; 1 for another device."""
+    """Returns the number of CPU cores that this process may use; 1 for another device."""
     if not device.is_cpu:
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def threads_on(device, threads):
-    """The number of threads, refused where one device or mode cannot have it."""
+    """Checks a number of threads and returns it.
+
+    Raises:
+        ValueError: It is not 1 or more, or the device or Warp's mode allows no more than 1.
+
+    Warns:
+        UserWarning: There are more threads than cores.
+    """
     whole("threads", threads, 1)
     if threads > 1 and not device.is_cpu:
         raise ValueError(f"threads is {threads} on {device}, which has its own; more than 1 is for device='cpu'")

@@ -1,4 +1,4 @@
-"""Values that differ between the copies of a model: any number that a scene or one of its terms holds."""
+"""Values that differ between the copies of a model: numeric fields of the scene, its terms and its loads."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,14 +9,14 @@ from ..base.checks import array, numeric, shown
 
 
 class Vary:
-    """The values of ``vary``, taken by name; what nobody takes is refused.
+    """The values of ``vary``, which are taken by name. :meth:`refuse_rest` checks that all were taken.
 
     Args:
-        values: Arrays by name, the first axis of each the copies, see :class:`warpcloth.model.model.Model`.
+        values: Arrays by name, with B entries each, see :class:`warpcloth.model.model.Model`.
         copies: B.
 
     Raises:
-        ValueError: If it is no mapping.
+        ValueError: ``values`` is not a mapping.
     """
 
     def __init__(self, values, copies):
@@ -29,14 +29,14 @@ class Vary:
         return name in self.values
 
     def take(self, name, default):
-        """``values[name]`` as (B, *shape of default), or the default B times."""
+        """Returns ``values[name]``, (B, *shape of default), or the default B times."""
         if name not in self.values:
             return np.repeat(np.asarray(default, dtype=np.float64)[None], self.copies, axis=0)
         self.taken.add(name)
         return array(f"vary[{name!r}]", self.values[name], (self.copies, *np.shape(default))).copy()
 
     def masses(self, scene):
-        """Masses of all copies (B, n) [kg]."""
+        """Returns the masses of all copies, (B, n) [kg], and checks them."""
         if self.has("density") and self.has("masses"):
             raise ValueError("vary has density and masses; at most one of the two may be given")
         if self.has("density") and scene.density is None:
@@ -57,16 +57,16 @@ class Vary:
         return masses
 
     def elements(self, term, mesh, positions):
-        """The elements of a term, and what differs between their copies.
+        """Returns the elements of a term, and their values in each copy.
 
         Args:
             term: A :class:`warpcloth.terms.declared.Declared`.
             mesh: The :class:`warpcloth.Mesh`.
-            positions: Where the vertices of each copy start, (B, n, 3) [m].
+            positions: Initial positions of each copy, (B, n, 3) [m].
 
         Returns:
             (elements, rest, stiffness, damping): :class:`warpcloth.terms.declared.Elements` of the first copy, with weights
-            (B, E, M) where they may differ, rest states (B, E, P), stiffness and damping (B, 1) or (B, E), of cells (B, C).
+            (B, E, M) if they vary; rest states (B, E, P); stiffness and damping (B, 1), (B, E), or for cells (B, C).
         """
         one = term.elements(mesh, positions[0])
         count = len(one.stencil) if one.cells is None else len(one.cells) - 1
@@ -79,7 +79,7 @@ class Vary:
         )
         if damping.any() and one.term.dissipation is None:
             raise ValueError(f"{one.label} cannot be damped; leave its damping out")
-        if damping.any() and one.refresh:  # damping sets rest states too
+        if damping.any() and one.refresh:  # damping would overwrite the rest states
             raise ValueError(f"{one.label} changes during a run and cannot be damped; leave its damping out")
         if not (given or self.has("positions")):
             return one, np.repeat(one.rest[None], self.copies, axis=0), stiffness, damping
@@ -95,7 +95,7 @@ class Vary:
         return one, np.stack([each.rest for each in found]), stiffness, damping
 
     def _of_term(self, term, field, count):
-        """A field of a term, (B, *shape) or (B, count, *shape), or None where it does not vary."""
+        """Returns a field of a term, (B, *shape) or (B, count, *shape), or None if it does not vary."""
         quantity = term.quantities()[field]
         self.fields.append(f"{type(term).__name__}.{field}")
         for name in (f"{term.label}.{field}", f"{type(term).__name__}.{field}"):
@@ -112,7 +112,7 @@ class Vary:
         return None
 
     def load(self, load):
-        """A load as each copy has it, B records."""
+        """Returns the load of each copy, a list of B records."""
         found = [load] * self.copies
         for field in (load.quantity, "keyframes"):
             self.fields.append(f"{type(load).__name__}.{field}")
@@ -130,7 +130,11 @@ class Vary:
         return found
 
     def refuse_rest(self):
-        """Refuses names that nobody took."""
+        """Checks that every name was taken.
+
+        Raises:
+            ValueError: A name is nothing that can vary in this scene.
+        """
         rest = sorted(set(self.values) - self.taken, key=str)
         shared = [name for name in rest if name in ("duration", "fps", "pins.keyframes")]
         if shared:

@@ -1,1 +1,1 @@
-"""The records that a scene is made of."""
+"""Scenes, colliders and contact: the records that a user declares."""

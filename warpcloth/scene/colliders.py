@@ -1,4 +1,4 @@
-"""Colliders: what cloth touches, standing or moved as rigid bodies, and how it touches them."""
+"""Colliders: static or moving rigid shapes, and the contact of cloth with them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ import numpy as np
 from ..base.checks import array, as_array, number, shown
 from ..base.types import Converted, default
 
-# The part of the contact distance by which the weight of the cloth presses it in, with the default stiffness.
+# With the default stiffness, the weight of one layer compresses the contact distance by this fraction.
 _SAG = 0.1
 
 
@@ -40,17 +40,17 @@ class Contact:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Collider:
-    """The base of colliders.
+    """The base class of colliders.
 
     Attributes:
-        position: Position of its centre, (3,) [m], or its positions at the frames 0 … F−1 of the scene, (F, 3).
-        rotation: Quaternion (x, y, z, w) by which it is rotated, (4,), or the quaternions at these frames, (F, 4). Between
-            frames it moves linearly and rotates at constant speed, by the smaller angle; after the last it stands still.
+        position: Position of its centre, (3,) [m], or positions at frames 0 … F−1 of the scene, (F, 3).
+        rotation: Rotation as a unit quaternion (x, y, z, w), (4,), or at these frames, (F, 4). Between frames it moves linearly
+            and rotates at constant speed, by the smaller angle; after the last it stands still.
         friction: Coefficient μ of friction.
-        name: Its name in messages and files; by default that of the class.
+        name: Name in messages and files; by default that of the class.
 
     Raises:
-        ValueError: If a value is not allowed.
+        ValueError: A value is not allowed.
     """
 
     position: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 0.0, 0.0))
@@ -79,38 +79,38 @@ class Collider:
 
     @property
     def label(self) -> str:
-        """The name, or else that of the class."""
+        """The name, or the name of the class."""
         return self.name or type(self).__name__
 
     @property
     def core(self) -> tuple[np.ndarray, float]:
-        """Half sizes (3,) of the core box and the radius about it [m], see :mod:`warpcloth.kernels.terms.contact`."""
+        """Half sizes of a box (3,), and the radius by which it is inflated [m], see :mod:`warpcloth.kernels.terms.contact`."""
         raise NotImplementedError  # each shape has its own
 
     @property
     def bounds(self) -> tuple[np.ndarray, float]:
-        """Half sizes and radius, as of :attr:`core`, of a shape that holds all of it at all frames."""
+        """Half sizes and radius, as for :attr:`core`, of a shape that contains it at all frames."""
         return self.core
 
     @property
     def extent(self) -> float:
-        """The farthest of its surface from ``position`` [m]."""
+        """Largest distance of its surface from ``position`` [m]."""
         half, radius = self.core
         return float(np.linalg.norm(half)) + radius
 
     @property
     def deforms(self) -> np.ndarray:
-        """By how much any of it moves in its own frame from one keyframe to the next, (F − 1,) [m]."""
+        """Largest displacement of a point in its own frame from each keyframe to the next, (F − 1,) [m]; empty if rigid."""
         return np.zeros(0)
 
     @property
     def facets(self) -> int:
-        """How many half-spaces stand for it in a step, 0 if its shape is one of :attr:`core`."""
+        """Number of half-spaces that approximate it near a vertex in a step; 0 if :attr:`core` is its shape."""
         return 0
 
     @property
     def up(self) -> np.ndarray:
-        """The direction in the frame of ``rotation`` of the y axis in which :attr:`core` is, (3,)."""
+        """The y axis of the frame of :attr:`core`, as a direction in the frame of ``rotation``, (3,)."""
         return np.array([0.0, 1.0, 0.0])
 
     @property
@@ -119,29 +119,29 @@ class Collider:
         return len(self.poses) > 1
 
     def at_last(self) -> "Collider":
-        """This collider where its last keyframe has it, standing."""
+        """Returns a static collider at the last keyframe of this one."""
         position, rotation = np.atleast_2d(self.position)[-1], np.atleast_2d(self.rotation)[-1]
         return replace(self, position=position, rotation=rotation)
 
     def centred(self) -> "Collider":
-        """This collider in a frame about which its shape lies, for float32."""
+        """Returns this collider with its frame moved to the centre of its shape, which float32 needs."""
         return self
 
     @property
     def most_move(self) -> float:
-        """By how much a point of :attr:`bounds` moves in a frame, at most [m]; infinite for a plane that turns."""
+        """Upper bound of how far a point of :attr:`bounds` moves in a frame [m]; infinite for a plane that turns."""
         poses = self.poses
         turns = 2.0 * np.arccos(np.clip(np.einsum("fi,fi->f", poses[1:, 3:], poses[:-1, 3:]), -1.0, 1.0))
-        turned = np.zeros_like(turns)  # rounding turns by 1e-8, and planes have no end
+        turned = np.zeros_like(turns)  # turns of 1e-8 are rounding, and would be infinite moves of planes
         turned[turns > 1e-7] = turns[turns > 1e-7] * (np.linalg.norm(self.bounds[0]) + self.bounds[1])
         return float((np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + turned).max(initial=0.0))
 
     @property
     def poses(self) -> np.ndarray:
-        """Position and quaternion (x, y, z, w) of the frame in which :attr:`core` is, (F, 7), F = 1 if it stands."""
+        """Position and quaternion (x, y, z, w) of the frame of :attr:`core` at each frame, (F, 7); F = 1 if it is static."""
         rotations = _product(np.atleast_2d(self.rotation), from_y(self.up))
         lengths = np.linalg.norm(rotations, axis=1)
-        lengths[np.abs(lengths - 1.0) < 1e-15] = 1.0  # so that the poses of a pose are those
+        lengths[np.abs(lengths - 1.0) < 1e-15] = 1.0  # so that normalising twice changes no bit
         rotations = rotations / lengths[:, None]
         signs = np.sign(np.einsum("fi,fi->f", rotations[1:], rotations[:-1]))
         rotations[1:] *= np.cumprod(np.where(signs < 0.0, -1.0, 1.0))[:, None]  # the shorter way
@@ -150,7 +150,7 @@ class Collider:
         return np.column_stack([np.broadcast_to(positions, (frames, 3)), np.broadcast_to(rotations, (frames, 4))])
 
     def distances(self, points: np.ndarray, frame: int = 0) -> np.ndarray:
-        """Signed distances (…,) [m] of points (…, 3) [m] to the surface at a frame, below 0 inside."""
+        """Returns signed distances (…,) [m] of points (…, 3) [m] to the surface at a frame, negative inside."""
         pose, (half, radius) = self.poses[min(frame, len(self.poses) - 1)], self.core
         local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
         if np.isinf(half[0]):
@@ -254,7 +254,7 @@ class Box(Collider):
 
 
 def _direction(name, given):
-    """A vector of length 1."""
+    """Returns a vector of length 1 along the given one."""
     values = array(name, given, (3,))
     length = np.linalg.norm(values)
     if not length > 0.0:
@@ -263,7 +263,7 @@ def _direction(name, given):
 
 
 def from_y(directions):
-    """The quaternions (…, 4), (x, y, z, w), that turn the y axis to directions (…, 3) by the shortest way."""
+    """Returns the quaternions (…, 4), (x, y, z, w), of the smallest rotations of the y axis to directions (…, 3)."""
     x, y, z = np.moveaxis(directions, -1, 0)
     found = np.stack([z, np.zeros_like(x), -x, 1.0 + y], axis=-1)
     found[y < -1.0 + 1e-12] = [1.0, 0.0, 0.0, 0.0]
@@ -271,28 +271,28 @@ def from_y(directions):
 
 
 def _product(p, q):
-    """Products of quaternions (F, 4) and (4,)."""
+    """Returns products of quaternions (F, 4) and (4,)."""
     u, v = p[:, :3], q[:3]
     vector = p[:, 3:] * v + q[3] * u + np.cross(u, v)
     return np.column_stack([vector, p[:, 3] * q[3] - u @ v])
 
 
 def turned(q, vectors):
-    """Vectors (…, 3) turned by a quaternion."""
+    """Returns vectors (…, 3) rotated by a quaternion."""
     t = 2.0 * np.cross(q[:3], vectors)
     return vectors + q[3] * t + np.cross(q[:3], t)
 
 
 def default_stiffness(weight: float, distance: float) -> float:
-    """The stiffness k [Pa/m] that a weight per area [Pa] presses in by a tenth of the contact distance [m]."""
+    """Returns the stiffness k [Pa/m] at which a weight per area [Pa] compresses a tenth of the contact distance [m]."""
     return weight / (_SAG * distance)
 
 
 def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:
-    """The colliders that are given.
+    """Returns the given colliders as a tuple.
 
     Raises:
-        ValueError: If they are no list of colliders.
+        ValueError: They are not a list of colliders.
     """
     if isinstance(given, Collider) or not isinstance(given, Iterable):
         raise ValueError(f"colliders is {shown(given)}; it must be a list of colliders, such as [Plane()]")
@@ -304,16 +304,16 @@ def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:
 
 
 def refuse_inside(colliders: Sequence[Collider], positions: np.ndarray, free: np.ndarray, copy: str = "") -> None:
-    """Refuses free vertices that start inside a collider.
+    """Checks that no free vertex starts inside a collider.
 
     Args:
         colliders: The colliders.
-        positions: Where the vertices start, (n, 3) [m].
-        free: Which of them move, (n,).
-        copy: Words that follow, of a copy.
+        positions: Initial positions, (n, 3) [m].
+        free: Which vertices move, (n,).
+        copy: Words for the error message that name the copy, or "".
 
     Raises:
-        ValueError: Naming the first one.
+        ValueError: One does. The message names the first vertex and the collider.
     """
     for collider in colliders:
         found = collider.distances(positions)

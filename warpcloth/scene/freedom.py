@@ -13,12 +13,12 @@ import numpy as np
 
 from ..terms.bending import Bending
 
-# Most free vertices for which the rank is computed, in a few seconds; time and memory grow faster than their number.
+# Largest number of free vertices for which the rank is computed, in a few seconds; time and memory grow faster than linearly.
 MOST = 20_000
 # Radius, in edges, of the fold whose cost decides whether an edge is stiff.
 FOLD = 4.0
-# Squares of singular values below this are 0, for rows of unit length. Nets of up to MOST vertices have nonzero ones of 1e-9
-# and more, and zeros that round to some 1e-13.
+# Squared singular values below this count as 0, for rows of unit length. In nets of up to MOST vertices, nonzero ones are 1e-9
+# or more, and zeros round to some 1e-13.
 _ZERO = 1e-11
 
 
@@ -27,7 +27,7 @@ class Freedom:
     """Degrees of freedom that edges of fixed length leave, in general position.
 
     Attributes:
-        edges: Number of edges that hold their length. Each pair of vertices counts once, pairs of pinned vertices do not count.
+        edges: Number of edges of fixed length. Each pair of vertices counts once; pairs of pinned vertices do not count.
         hard: Whether some of them are hard.
         coordinates: Number of coordinates of the vertices that are neither pinned nor locked.
         rank: Rank of the Jacobian of the lengths with respect to these coordinates.
@@ -126,7 +126,8 @@ def _rigid(mesh, pairs, free):
     joined = np.concatenate([mesh.edges, pairs])
     _, piece = connected_components(coo_array((np.ones(len(joined)), tuple(joined.T)), shape=(n, n)), directed=False)
     moves = np.array([0, 3, 5, 6])[np.minimum(np.bincount(piece), 3)]
-    # What these moves do to each coordinate that is not free, in general position; of each piece its Gram matrix has the rank.
+    # Motion of each locked coordinate by the six rigid motions of its piece, in general position. The rank of a piece's Gram
+    # matrix is the number of rigid motions that it loses.
     vertices, axes = np.nonzero(~free)
     units = np.eye(3)[axes]
     rows = np.hstack([units, np.cross(np.random.default_rng(0).normal(size=(n, 3))[vertices], units)])

@@ -9,21 +9,22 @@ from ..base.checks import shown
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 
-# Fields of the whole: cloths may leave them alone, or have one value in common.
+# Fields of the whole scene, which default to the value of the cloths if all have the same.
 _COMMON = ("gravity", "duration", "fps")
-# Fields of the whole that no cloth has by itself.
+# Fields of the whole scene that cloths must not set.
 _WHOLE = ("colliders", "contact", "self_contact")
 
 
 def fields_of_cloths(cloths, whole):
-    """The fields of a scene of several cloths.
+    """Returns the fields of a scene of several cloths, all but its pins.
 
     Args:
         cloths: A :class:`warpcloth.Scene` for each name.
         whole: Fields of the whole scene by name.
 
     Raises:
-        ValueError: If there are none, a name or a mesh is refused, or cloths have fields of the whole that differ.
+        ValueError: There is no cloth, a name or a mesh is refused, a field may not be set there, or cloths differ in a field of
+            the whole scene that is not given.
     """
     if not (isinstance(cloths, Mapping) and cloths and all(hasattr(cloth, "mesh") for cloth in cloths.values())):
         raise ValueError(f"cloths is {shown(cloths)}; it must be a mapping of names to scenes, with one cloth or more")
@@ -56,7 +57,7 @@ def fields_of_cloths(cloths, whole):
 
 
 def pins_of_cloths(cloths):
-    """Vertices (p,), keyframes (F, p, 3) or None, and axes of the pins of all cloths, vertices counted from the first cloth."""
+    """Returns the pins of all cloths: vertices of the joined mesh (p,), keyframes (F, p, 3) [m] or None, and axes."""
     firsts = np.cumsum([0, *(len(cloth.mesh.points) for cloth in cloths)])
     vertices = np.concatenate([cloth.pins.vertices + first for cloth, first in zip(cloths, firsts[:-1], strict=True)])
     axes = ["".join(axis for axis, holds in zip("xyz", held, strict=True) if holds) for c in cloths for held in c.pins.held]
@@ -84,7 +85,7 @@ def _free(cloth):
 
 
 def _common(cloths, whole):
-    """Gravity, duration and rate: those of the whole, or else those that all cloths agree on."""
+    """Returns gravity, duration and fps of the whole scene: those given, or those that all cloths have."""
     found = {}
     for field in _COMMON:
         if field in whole:

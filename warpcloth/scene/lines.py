@@ -1,4 +1,4 @@
-"""Finds the lines to draw for strings and bars: pairs of vertices that a term joins and that are not edges of a triangle."""
+"""Finds the lines to draw for strings and bars: pairs of vertices that a term joins outside the triangles."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ _SPRING, _BODY = 0.05, 0.15
 def lines_of(scene):
     """Finds the pairs of vertices that a term joins, at least one of them without a triangle.
 
-    A spring has its own pairs. A rigid body has the shortest tree over its vertices without a triangle. A mesh of edges alone
-    shows all of its vertices already.
+    Springs give their own pairs, and rigid bodies the minimum spanning tree of their vertices without a triangle. A mesh of
+    edges alone gives none, because its edges are drawn anyway.
 
     Args:
         scene: The :class:`warpcloth.Scene`.

@@ -19,14 +19,14 @@ from .colliders import Collider, from_y, turned
 
 @dataclass(frozen=True, eq=False)
 class MeshCollider(Collider):
-    """A triangle mesh.
+    """A triangle mesh, rigid or deforming.
 
-    If its surface is closed, it is a solid behind the fronts of its triangles. Otherwise it is a sheet without thickness, which
-    collides on both sides. Vertices with the same position at all frames are merged, so that a seam does not make the surface
-    open. At frames where all of its vertices are at one position it is absent.
+    A closed surface is a solid, behind the fronts of its triangles. Any other surface is a sheet without thickness, which
+    collides on both sides. Vertices with the same position at all frames are merged, so that seams do not open a surface. At
+    frames where all of its vertices are at one position, the collider is absent.
 
     Attributes:
-        points: Its vertices, (n, 3) [m], or the vertices at the frames 0 … F−1 of the scene, (F, n, 3), in the frame of
+        points: Positions of its vertices, (n, 3) [m], or at frames 0 … F−1 of the scene, (F, n, 3), in the frame of
             ``position`` and ``rotation``. Between frames they move linearly; after the last they stand still.
         triangles: Vertices of each triangle (T, 3), counter-clockwise from the front.
 
@@ -62,7 +62,7 @@ class MeshCollider(Collider):
         self._refuse_turned_over()
 
     def _refuse_turned_over(self):
-        """Refuses keyframes at which the inside of a closed one is outside, for cloth cannot get there."""
+        """Raises ValueError if a closed surface is inside out at a keyframe, because cloth cannot get there."""
         if len(self.frames) == 1 or not self.closed:
             return
         found = np.array([self._filling(vertices) for vertices in self.frames])
@@ -74,14 +74,14 @@ class MeshCollider(Collider):
             )
 
     def _filling(self, vertices):
-        """The volume within it over that of a cube as long as it; below 0 if its fronts look inwards."""
+        """Returns its volume relative to the cube of its size; negative if its fronts face inwards."""
         a, b, c = (vertices - vertices.mean(axis=0))[self.triangles].transpose(1, 0, 2)
         size = np.ptp(vertices, axis=0).max()
         return np.einsum("ti,ti", a, np.cross(b, c)) / (6.0 * size**3) if size else 0.0
 
     @property
     def frames(self) -> np.ndarray:
-        """Its vertices at each keyframe that deforms it, (F, n, 3), F = 1 if nothing does."""
+        """Its vertices at each keyframe, (F, n, 3) [m]; F = 1 if it is rigid."""
         return self.points.reshape(-1, *self.points.shape[-2:])
 
     @property
@@ -102,11 +102,11 @@ class MeshCollider(Collider):
 
     @cached_property
     def facets(self) -> int:
-        """One if it is convex at all frames, or as many as a corner has."""
+        """1 if it is convex at all frames, else the number of half-spaces that a corner may need."""
         return 1 if self.closed and all(map(self._bulges, self.frames)) else FACETS
 
     def _bulges(self, vertices):
-        """Whether it is nowhere concave by more than 1e-4 [rad]."""
+        """Returns whether no edge is concave by more than 1e-4 [rad]."""
         corners = vertices[self.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]

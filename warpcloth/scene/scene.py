@@ -1,4 +1,4 @@
-"""Scenes: a scene is data without a solver. Any solver that supports its terms runs it unchanged."""
+"""Scenes. A scene is data without a solver, and any solver that supports its terms runs it unchanged."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
@@ -24,7 +24,7 @@ from .self_contact import SelfContact
 
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
-_MOST_FRAMES = 2**31 - 1  # what counts them on the device is int32
+_MOST_FRAMES = 2**31 - 1  # frames are counted in int32 on the device
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Pins:
 
     @cached_property
     def held(self) -> np.ndarray:
-        """The axes that each pin of a scene holds, (p, 3) truth values."""
+        """The axes that each pin of a scene holds, (p, 3) booleans."""
         each = [self.axes] * len(self.vertices) if isinstance(self.axes, str) else self.axes
         return np.array([[axis in axes for axis in "xyz"] for axes in each], dtype=bool).reshape(-1, 3)
 
@@ -70,15 +70,15 @@ class Pins:
         return self.keyframes is not None and bool((self.keyframes != self.keyframes[:1])[:, self.held].any())
 
     def refuse_far(self, positions: np.ndarray, copy: str = "") -> None:
-        """Refuses pins whose first keyframe is not where their vertices start, at ``positions`` (n, 3) [m].
+        """Checks that pins start at their first keyframe; ``positions`` (n, 3) [m] are those at the start.
 
         Raises:
-            ValueError: Saying how far apart they are.
+            ValueError: They do not. The message says how far apart they are.
         """
         if self.keyframes is None:
             return
         gap = np.abs(self.keyframes[0] - positions[self.vertices])[self.held].max(initial=0.0)
-        # Either may have been float32 once, whose rounding grows with the distance from the origin.
+        # Either may come from float32, whose rounding grows with the distance from the origin.
         near = 1e-6 * np.ptp(positions, axis=0).max() + 2.0 * np.finfo(np.float32).eps * np.abs(positions).max()
         if gap > near:
             raise ValueError(f"pins.keyframes[0] is {gap:.3g} m from where the pinned vertices start{copy}; it must be there")
@@ -117,7 +117,7 @@ class Scene:
             prim of its own.
 
     Raises:
-        ValueError: If a value is not allowed; the message names it.
+        ValueError: A value is not allowed. The message names it.
 
     Examples:
         >>> import warpcloth as wc
@@ -148,20 +148,19 @@ class Scene:
 
     @classmethod
     def join(cls, cloths: Mapping[str, "Scene"], **whole: Any) -> "Scene":
-        """One scene of several cloths, such as layers or the pieces of a garment, each of its own mesh and material.
+        """Joins several cloths, such as layers or the pieces of a garment, into one scene.
 
         The mesh is that of :meth:`warpcloth.Mesh.join`. Each cloth keeps its masses, terms, pins, loads, positions and
-        velocities; a term is called by its cloth, as skirt_Spring is. ``Animation.cloth(name)`` has the motion of one cloth,
-        and files have a prim for each.
+        velocities. The names of terms begin with that of their cloth, such as skirt_Spring. ``Animation.cloth(name)`` has the
+        motion of one cloth, and files have a prim for each.
 
         Args:
-            cloths: A scene for each name, which must be an identifier. Cloths have no colliders and no contact of their own.
-            **whole: Fields of the whole scene: gravity, duration and fps, which may be left out if cloths agree on them;
+            cloths: A scene for each name, which must be an identifier. Cloths must not have colliders or contact.
+            **whole: Fields of the whole scene: gravity, duration and fps, by default those of the cloths if all have the same;
                 colliders, contact, self_contact and name; and further terms, such as seams, on the vertices of all cloths.
 
         Raises:
-            ValueError: There is no cloth, a name is no identifier, meshes cannot be joined, cloths differ in a field of the
-                whole, or a field is not one of the whole.
+            ValueError: There is no cloth, a name is not an identifier, meshes cannot be joined, or a field is not allowed.
 
         Examples:
             >>> import warpcloth as wc
@@ -175,7 +174,7 @@ class Scene:
 
     @property
     def declared(self) -> tuple[object, ...]:
-        """Everything that it declares besides the cloth itself. Any of this may add energy to the cloth."""
+        """Pins, terms, loads and colliders, all of which may do work on the cloth."""
         return (self.pins, *self.terms, self.loads, *self.colliders)
 
     def __post_init__(self) -> None:
@@ -265,7 +264,7 @@ class Scene:
 
     @property
     def _touching_areas(self):
-        """Areas of the vertices [m²]; of a mesh of edges their lengths times twice the contact distance."""
+        """Areas of the vertices (n,) [m²]; for a mesh of edges, their lengths times twice the contact distance."""
         mesh = self.mesh
         if len(mesh.triangles):
             return mesh.vertex_areas
@@ -274,18 +273,17 @@ class Scene:
 
     @property
     def _areal_mass(self):
-        """Mass over area [kg/m²] of the vertices that have an area."""
+        """Mass per area [kg/m²] of the vertices that have an area."""
         areas = self._touching_areas
         return float(self.vertex_masses[areas > 0.0].sum() / areas.sum())
 
     @property
     def contact_terms(self) -> tuple[VertexContact, ...]:
-        """The terms of its colliders: contact of the free vertices with each collider, and friction on colliders that have
-        it."""
+        """The terms of its colliders: contact of the free vertices with each collider, and friction if it has any."""
         if not self.colliders or self.contact is None or self.contact.stiffness is None:
             return ()
         areas, mass = self._touching_areas, self._areal_mass
-        areas = np.where(areas > 0.0, areas, self.vertex_masses / mass)  # of a vertex without a triangle, by its mass
+        areas = np.where(areas > 0.0, areas, self.vertex_masses / mass)  # a vertex without a triangle has an area by its mass
         free = np.delete(np.arange(len(areas), dtype=np.int32), self.fixed)
         if not len(free):
             raise ValueError("pins hold every vertex; colliders need one that is free")
@@ -297,7 +295,7 @@ class Scene:
             given |= {"collider": c, "pose": collider.poses[0], "core": core, "radius": radius}
             for facet in range(max(collider.facets, 1)):
                 shape = {}
-                if isinstance(collider, MeshCollider) and facet == 0:  # the others are set by steps
+                if isinstance(collider, MeshCollider) and facet == 0:  # steps set the other facets
                     shape = {"pose": collider.planes(self.positions[free]), "core": np.full(3, np.inf), "radius": 0.0}
                 found.append(VertexContact(name=f"contact with {collider.label}", facet=facet, **{**given, **shape}))
             if collider.friction:
@@ -310,10 +308,10 @@ class Scene:
         return [c for c, collider in enumerate(self.colliders) if collider.friction]
 
     def refuse_inside(self, positions: np.ndarray, copy: str = "") -> None:
-        """Refuses free vertices that start inside a collider, at ``positions`` (n, 3) [m].
+        """Checks that no free vertex is inside a collider at ``positions`` (n, 3) [m].
 
         Raises:
-            ValueError: Naming the vertex and the collider.
+            ValueError: One is. The message names the vertex and the collider.
         """
         free = np.ones(len(positions), dtype=bool)
         free[self.fixed] = False
@@ -332,7 +330,7 @@ class Scene:
 
     @cached_property
     def vertex_masses(self) -> np.ndarray:
-        """Mass of each vertex, given or lumped from the density, (n,) [kg]."""
+        """Mass of each vertex (n,) [kg], given or lumped from the density."""
         if self.masses is not None:
             return self.masses
         with np.errstate(over="ignore"):
@@ -342,13 +340,13 @@ class Scene:
 
     @cached_property
     def fixed(self) -> np.ndarray:
-        """Vertices that obey no forces, those that pins hold along every axis and those without a free one, (f,) int32."""
+        """Vertices that do not respond to forces: those that pins hold along every axis, or without a free axis, (f,) int32."""
         axes = self._unlocked
         return self.pins.vertices if axes is None else np.flatnonzero(~axes.any(axis=1)).astype(np.int32)
 
     @cached_property
     def _unlocked(self) -> np.ndarray | None:
-        """The axes along which vertices move, (n, 3) truth values; None where that is all axes of all but pins."""
+        """The axes along which each vertex moves, (n, 3) booleans; None if all but pins move along all axes."""
         if self.free_axes is None and self.pins.held.all():
             return None
         found = np.ones((len(self.mesh.points), 3), dtype=bool) if self.free_axes is None else self.free_axes.copy()
@@ -357,7 +355,7 @@ class Scene:
 
     @property
     def locked(self) -> np.ndarray | None:
-        """The locked coordinates of vertices that move along other axes, (n, 3) booleans; None if there are none."""
+        """The locked coordinates of vertices that can move along another axis, (n, 3) booleans; None if there are none."""
         if self._unlocked is None:
             return None
         found = ~self._unlocked
@@ -366,7 +364,7 @@ class Scene:
 
     @property
     def frames(self) -> int:
-        """Number of frames after the first."""
+        """Number of frames, without frame 0, the start."""
         return round(self.duration * self.fps)
 
     @property
@@ -385,7 +383,7 @@ class Scene:
         order: ArrayLike | None = None,
         threads: int = 1,
     ) -> Model:
-        """The scene on a device, see :class:`warpcloth.model.model.Model`."""
+        """Builds the :class:`warpcloth.model.model.Model` of this scene on a device."""
         return Model(self, device=device, dtype=dtype, copies=copies, vary=vary, order=order, threads=threads)
 
     def __str__(self) -> str:
@@ -413,7 +411,7 @@ class Scene:
 
 
 def _checked_axes(free_axes, n):
-    """Truth values (n, 3), or None."""
+    """Returns booleans (n, 3), or None."""
     if free_axes is None:
         return None
     found = as_array(free_axes).copy()
@@ -428,8 +426,8 @@ def checked_pins(pins: Any, mesh: Mesh) -> Pins:
     """Returns `Pins` with indices of a mesh, int32, from anything that a scene takes as pins.
 
     Raises:
-        ValueError: A vertex is not in the mesh or occurs twice, keyframes have a wrong shape or are not finite, or axes are
-            none.
+        ValueError: A vertex is not in the mesh or occurs twice, keyframes have a wrong shape or are not finite, or axes are not
+            among x, y and z.
     """
     pins = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins)
     vertices = distinct_vertices("pins.vertices", pins.vertices, mesh)
@@ -443,7 +441,7 @@ def checked_pins(pins: Any, mesh: Mesh) -> Pins:
 
 
 def _checked_pin_axes(axes, count):
-    """One text, or a tuple of them if pins differ."""
+    """Returns the axes as one string, or as a tuple of strings if pins differ."""
     rule = "it must be some of the letters x, y and z, each once, such as 'xz'"
     each = [axes] if isinstance(axes, str) else list(axes) if isinstance(axes, Iterable) else [axes]
     for k, one in enumerate(each):
@@ -456,7 +454,7 @@ def _checked_pin_axes(axes, count):
 
 
 def _described(term):
-    """A term in one line: Spring(pairs='structural', stiffness=1000.0)."""
+    """Returns a term in one line: Spring(pairs='structural', stiffness=1000.0)."""
     parts = []
     for field in fields(term):
         value = getattr(term, field.name)

@@ -12,22 +12,22 @@ STARTS = ("refuse", "run")
 class SelfContact:
     """Contact of cloth with itself and with other pieces of cloth, with the φ of :class:`warpcloth.Contact`.
 
-    The energy is U = Σ kA φ(d), over pairs of a vertex and a triangle and over pairs of two edges; d is the distance of a pair.
-    See :mod:`warpcloth.kernels.self_contact`. Pairs that share a vertex do not collide. Within a connected piece, the contact
-    distance of a pair is at most half its distance at rest, so neighbours do not push one another. At the end of each step a
-    filter cuts short the moves that would cross: no step ends with cloth that went through cloth.
+    The energy is U = Σ kA φ(d) over vertex–triangle pairs and edge–edge pairs at distance d, see
+    :mod:`warpcloth.kernels.self_contact`. Pairs that share a vertex do not collide. Within a connected piece, the contact
+    distance of a pair is at most half its distance at rest, so that neighbours do not push one another. At the end of each step
+    a filter shortens moves that would cross, so that cloth never passes through cloth.
 
     Attributes:
         distance: Contact distance r [m].
         stiffness: k [Pa/m]. By default 10 w/r, where w is the weight of the cloth per area, so that one layer rests at a gap of
             0.9 r.
         friction: Coefficient μ of friction.
-        crossing_start: What to do if cloth crosses or touches cloth at the start: ``"refuse"`` it, or ``"run"`` all the same.
-            Triangles that cross or touch at the start then pass through one another, until they are free; from then on they
-            cannot cross again. No other triangles come to cross. ``Animation.crossings`` is the number of pairs that are left.
+        crossing_start: What to do if cloth crosses or touches cloth at the start: ``"refuse"`` the scene, or ``"run"`` it.
+            Triangles that cross or touch at the start then pass through one another until they are apart, and cannot cross
+            again after that. No other triangles can cross. ``Animation.crossings`` is the number of crossing pairs left.
 
     Raises:
-        ValueError: If a value is not allowed.
+        ValueError: A value is not allowed.
     """
 
     distance: float = 1e-3

@@ -1,6 +1,6 @@
-"""The catalogue of the energies that a scene declares: one file, one record and two lines here for each.
+"""The catalogue of energies: each has a file of its own, with its record, and two lines here.
 
-Stages and others that name an energy look it up in :data:`TERMS`; :func:`register` adds one from outside the package.
+USD stages, the command line and charts look up an energy by name in :data:`TERMS`. :func:`register` adds one from outside.
 """
 
 from ..base.extensions import note
@@ -37,16 +37,16 @@ TERMS = {name: globals()[name] for name in __all__}
 def register(energy):
     """Adds the record of an energy to :data:`TERMS`, so that stages, charts and tests know it by its name.
 
-    It replaces one of the same name from outside the package, such as the same file loaded before.
+    It replaces a record of the same name that was registered before.
 
     Args:
         energy: A frozen dataclass that derives from :class:`warpcloth.terms.declared.Declared`.
 
     Returns:
-        The same class, so that this is a decorator too.
+        The same class, so that this can be used as a decorator.
 
     Raises:
-        ValueError: If it is not such a class, or has the name of an energy of the package.
+        ValueError: It is not such a class, or it has the name of an energy of the package.
     """
     if not (isinstance(energy, type) and issubclass(energy, Declared) and hasattr(energy, "term")):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Contact and friction of vertices with one collider, which a scene declares by its colliders."""
+"""Contact and friction of vertices with one collider. A scene makes these terms from its colliders."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -21,9 +21,9 @@ class VertexContact(Declared):
         stiffness: k [Pa/m].
         areas: A (E,) [m²].
         distance: r [m].
-        pose, core, radius: The collider at the start.
-        collider: Its index among those of the scene.
-        facet: Of a mesh which of the half-spaces that stand for it.
+        pose, core, radius: Pose and shape of the collider at the start, see :mod:`warpcloth.kernels.terms.contact`.
+        collider: Index of the collider in the scene.
+        facet: For a mesh, index of the half-space, of those that approximate it near a vertex.
     """
 
     term: ClassVar[Term] = CONTACT

@@ -1,4 +1,4 @@
-"""The base of the records of energies: metadata and checks of their fields, and their elements on a mesh."""
+"""The base classes of the records of energies: metadata and checks of fields, and the elements on a mesh."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -20,10 +20,10 @@ class Elements:
         label: Name of the term within its scene.
         term: The energy.
         stencil: Vertices of each element, (E, K) int32.
-        stiffness: One value or (E,); of cells one value or (C,) [unit of the term].
-        rest: Rest states (E, P); of sparse cells (C, P).
+        stiffness: One value or (E,); with cells one value or (C,) [unit of the term].
+        rest: Rest states (E, P); with sparse cells (C, P).
         damping: One value or (E,) [unit of the term, times s].
-        cells: Offsets (C+1,) of cells: elements from cells[c] to cells[c+1] are the vertices of cell c. None without cells.
+        cells: Offsets (C+1,) of cells: elements cells[c] to cells[c+1] − 1 are the vertices of cell c. None without cells.
         weights: Weights (E, M) of the vertices of sparse cells, see :mod:`.sparse`; else None.
         refresh: The :class:`warpcloth.terms.refresh.Refresh` of a rest state that changes during a run, or None.
     """
@@ -41,13 +41,13 @@ class Elements:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Metadata of a numeric field: one value for all elements or one for each, in SI.
+    """Metadata of a numeric field: one value for all elements or one for each, in SI units.
 
-    Checks, ``vary`` of batches and USD attributes follow from it.
+    The checks of the field, ``vary`` of batches and USD attributes are derived from it.
 
     Attributes:
-        rule: The rule for values, as in an error, such as "must be above 0".
-        holds: (array of values) → which of them follow the rule.
+        rule: The rule for values, as part of an error message, such as "must be above 0".
+        holds: (array of values) → which of them obey the rule.
         shape: Shape of one value, () or (3,).
     """
 
@@ -58,10 +58,10 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Indices:
-    """Metadata of a field that names vertices by their indices.
+    """Metadata of a field of vertex indices.
 
     Attributes:
-        each: Number of vertices of an element.
+        each: Number of vertices per element.
         text: The meaning of a string: "selection" of vertices, or a "word" that the energy defines; "" if none is allowed.
     """
 
@@ -70,12 +70,12 @@ class Indices:
 
 
 def quantity(rule, holds, shape=()):
-    """The ``metadata`` of a field that is a :class:`Quantity`."""
+    """Returns the ``metadata`` of a field that is a :class:`Quantity`."""
     return {"quantity": Quantity(rule, holds, shape)}
 
 
 def indices(each=1, text=""):
-    """The ``metadata`` of a field that is :class:`Indices`."""
+    """Returns the ``metadata`` of a field that is :class:`Indices`."""
     return {"indices": Indices(each, text)}
 
 
@@ -86,19 +86,19 @@ FINITE_FROM_0 = quantity("must be finite, 0 or more", lambda values: (values >= 
 
 @dataclass(frozen=True, kw_only=True)
 class Declared:
-    """The base of all terms: a stiffness, and a name to tell two terms of one kind apart.
+    """The base class of all terms: a stiffness, a name and the part of the mesh.
 
-    A subclass sets ``term`` and defines ``stencil``; its numeric fields have the metadata of :func:`quantity`.
+    A subclass sets ``term`` and defines ``stencil``. Its numeric fields have the metadata of :func:`quantity`.
 
     Attributes:
         term: The :class:`warpcloth.kernels.term.Term` with the functions of the energy.
         stiffness: One or (E,) [unit of the term].
         name: To tell two terms of one kind apart.
-        part: The part of the mesh that it acts on, see :meth:`warpcloth.Mesh.join`, or None for the whole mesh. With a part,
-            selections, indices and arrays are relative to that part.
+        part: Name of the part of the mesh that it acts on, see :meth:`warpcloth.Mesh.join`, or None for the whole mesh.
+            Selections, indices and arrays then refer to that part.
 
     Raises:
-        ValueError: If a value is not allowed. The lengths of arrays are checked when the scene is built.
+        ValueError: A value is not allowed. The lengths of arrays are checked when the scene is built.
     """
 
     term: ClassVar[Term]
@@ -119,22 +119,22 @@ class Declared:
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
-        """:class:`Quantity` of each numeric field by its name."""
+        """Returns the :class:`Quantity` of each numeric field by name."""
         return {field.name: field.metadata["quantity"] for field in fields(cls) if "quantity" in field.metadata}
 
     @property
     def label(self) -> str:
-        """The name, or else that of the class."""
+        """The name, or the name of the class."""
         return self.name or type(self).__name__
 
     def _numeric(self, field):
         return numeric(f"{self.label}.{field}", getattr(self, field), "be a number or an array of numbers")
 
     def of_elements(self, field: str, count: int) -> np.ndarray:
-        """A numeric field as one value or one for each element (count, …).
+        """Returns a numeric field as one value or one for each element, (…) or (count, …).
 
         Raises:
-            ValueError: If its shape is neither.
+            ValueError: It has another shape.
         """
         values, shape = self._numeric(field), self.quantities()[field].shape
         if values.shape not in (shape, (count, *shape)):
@@ -148,21 +148,18 @@ class Declared:
         return self.of_elements("stiffness", count)
 
     def stencil(self, mesh: Mesh) -> np.ndarray:
-        """Vertices of each element on ``mesh``, (E, K) int32."""
+        """Returns the vertices of each element on ``mesh``, (E, K) int32."""
         raise NotImplementedError  # every energy has its own
 
     def elements(self, mesh: Mesh, positions: np.ndarray) -> Elements:
-        """The elements of this term on a mesh.
+        """Returns the :class:`Elements` of this term on a mesh.
 
         Args:
             mesh: The :class:`warpcloth.Mesh`; its points are the rest shape.
-            positions: Where the vertices start, (n, 3) [m].
-
-        Returns:
-            :class:`Elements`.
+            positions: Initial positions, (n, 3) [m].
 
         Raises:
-            ValueError: If the mesh has none, has no such part, or an array has another length than the elements.
+            ValueError: The mesh has no elements or no such part, or the length of an array is not that of the elements.
         """
         if self.part is None:
             return self.elements_on(mesh, positions)
@@ -172,7 +169,7 @@ class Declared:
         return replace(found, stencil=found.stencil + np.int32(first))
 
     def elements_on(self, mesh: Mesh, positions: np.ndarray) -> Elements:
-        """The elements on a mesh, which :meth:`elements` calls with the mesh of the part, if there is one."""
+        """Returns the elements on a mesh; :meth:`elements` passes the mesh of the part."""
         stencil = self.stencil(mesh)
         if len(stencil) == 0:
             raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
@@ -191,24 +188,28 @@ class Declared:
         return Elements(self.label, self.term, stencil, stiffness, rest, damping)
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
-        """Rest state (E, P) of the elements, from the rest shape of the mesh."""
+        """Returns the rest states (E, P) of the elements, by default from the rest shape of the mesh."""
         return self.term.rest_state(mesh.points, stencil)
 
     def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The pairs of vertices whose distance the term holds, and how stiffly, on a mesh as in :meth:`elements`.
+        """Returns the pairs of vertices whose distance the term keeps, and the stiffness; none by default.
+
+        Args:
+            mesh: As for :meth:`elements`.
+            positions: As for :meth:`elements`.
 
         Returns:
-            (pairs (m, 2), K (m,) [N/m]): K is the stiffness of the sheet, force per width and strain. Empty by default.
+            (pairs (m, 2), K (m,) [N/m]): K is the stiffness of a sheet, force per width and strain.
         """
         return np.empty((0, 2), dtype=np.int32), np.empty(0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Damped(Declared):
-    """The base of terms with damping β: each step adds the dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖², s an invariant
-    such as the length of a spring.
+    """The base class of terms with damping β, which adds the dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖² to each step.
 
-    ``term.dissipation`` defines s, see :class:`warpcloth.kernels.term.Dissipation`.
+    s is an invariant such as the length of a spring; ``term.dissipation`` defines it, see
+    :class:`warpcloth.kernels.term.Dissipation`.
 
     Attributes:
         damping: β, one or (E,) [unit of the term, per unit of s², times s].
@@ -218,10 +219,10 @@ class Damped(Declared):
 
 
 def own_indices(name, given):
-    """Returns given indices as (E,) int32.
+    """Returns indices as (E,) int32.
 
     Raises:
-        ValueError: If they are not a list of whole numbers.
+        ValueError: They are not a list of whole numbers below 2³¹.
     """
     found = as_array(given)
     found = found.astype(np.int32) if found.size == 0 else found
@@ -234,10 +235,10 @@ def own_indices(name, given):
 
 
 def own_stencil(label, parameter, given, vertices, count):
-    """Returns given indices, (E, ``vertices``) or if ``vertices`` is 1 (E,), as (E, ``vertices``) int32.
+    """Returns indices (E, ``vertices``), or (E,) if ``vertices`` is 1, as (E, ``vertices``) int32.
 
     Raises:
-        ValueError: If the shape is another, or an element names a vertex twice or one outside [0, ``count``).
+        ValueError: The shape is another, an index is outside [0, ``count``), or a pair names one vertex twice.
     """
     stencil = as_array(given)
     if vertices == 1 and stencil.ndim == 1:

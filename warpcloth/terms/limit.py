@@ -1,4 +1,4 @@
-"""The base of limits, whose energy is 0 in a range about the rest shape."""
+"""The base class of limits, whose energy is 0 in a range about the rest shape."""
 
 import math
 from collections.abc import Sequence
@@ -18,8 +18,8 @@ class Limit(Declared):
     """An energy that is 0 in a range about the rest shape; beyond it the stiffness is infinite by default.
 
     Attributes:
-        least, most: The ends of the range, σ_min and σ_max, ratios to the rest shape, each one or (E,); at least
-            one is required.
+        least, most: Ends of the range, σ_min and σ_max, as ratios to the rest shape, each one or (E,). At least one is
+            required.
         stiffness: k beyond the range, one or (E,).
     """
 

@@ -1,4 +1,4 @@
-"""Loads: forces on vertices, tractions on edges and pressures on triangles, constant or led by keyframes."""
+"""Loads: forces on vertices, tractions on edges and pressures on triangles, constant or with keyframes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ from ..mesh.selection import distinct_vertices
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Load:
-    """The base of all loads. Give its value, which stays, or keyframes of it.
+    """The base class of all loads, which have a constant value or keyframes.
 
     Attributes:
-        quantity: Name of the field of the value.
+        quantity: Name of the field with the constant value.
         shape: Shape of one value.
-        acts_on: Its elements, in words.
-        vertices: Indices (p,), or a selection of the mesh such as ``"x == 1"``, as of pins.
-        keyframes: The value at frames 0 … F−1 of the scene, (F, …); linear between them, and constant after the last.
+        acts_on: Its elements, in the words of error messages.
+        vertices: Indices (p,), or a selection of the mesh such as ``"x == 1"``.
+        keyframes: Values at frames 0 … F−1 of the scene, (F, …): linear in between, constant after the last.
         name: To tell two loads of one kind apart.
 
     Raises:
-        ValueError: If a value is not allowed; a scene checks vertices and the lengths of arrays.
+        ValueError: A value is not allowed. The scene checks vertices and the lengths of arrays.
     """
 
     quantity: ClassVar[str]
@@ -48,17 +48,17 @@ class Load:
         return self.name or type(self).__name__
 
     def elements(self, mesh: Mesh) -> np.ndarray:
-        """Indices of what it acts on, which has one value each: vertices (p,), edges (E, 2) or triangles (T, 3)."""
+        """Returns the elements that it acts on: vertices (p,), edges (E, 2) or triangles (T, 3)."""
         raise NotImplementedError  # every load has its own
 
     def of_elements(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-        """Finds the elements and the keyframes of each of them.
+        """Returns the elements and the keyframes of each.
 
         Returns:
-            (elements, values): As of :meth:`elements`, and (F, count, …), with F = 1 of a constant load.
+            (elements, values): Those of :meth:`elements`, and (F, count, …), with F = 1 for a constant load.
 
         Raises:
-            ValueError: If it acts on nothing, or has another number of values.
+            ValueError: There are no elements, or there is another number of values.
         """
         found, values = self.elements(mesh), self._values()
         if not len(found):
@@ -87,7 +87,7 @@ class Load:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Force(Load):
-    """Forces on vertices, which keep their direction.
+    """Forces on vertices, of fixed direction.
 
     Attributes:
         force: [N] on each vertex, (3,), or (p, 3).
@@ -114,11 +114,10 @@ class Force(Load):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Traction(Load):
-    """Tractions on the edges between vertices, which keep their direction. Half of t L acts at each end of an edge of rest
-    length L.
+    """Tractions on edges, of fixed direction. A force ½tL acts at each end of an edge of rest length L.
 
     Attributes:
-        vertices: An edge of the mesh is pulled if both of its ends are among these.
+        vertices: An edge of the mesh is loaded if both of its ends are among these.
         traction: t [N/m] of rest length, (3,), or (E, 3) in the order of ``mesh.edges``.
         keyframes: (F, 3) or (F, E, 3) [N/m].
     """
@@ -135,15 +134,14 @@ class Traction(Load):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pressure(Load):
-    """Pressure on triangles, along their normals: a force p A n/3 on each corner, with area A and normal n of the moving
-    triangle.
+    """Pressure on triangles along their normals: a force pAn/3 on each corner, with the current area A and normal n.
 
     The corners turn counter-clockwise about the normal. On cloth with free edges, pressure does not derive from an energy, so
-    its force is computed before a step: at x for explicit steps and implicit Euler, at x + ½h v for midpoint, and at 2xₙ − xₙ₋₁
-    for BDF2. Each integrator keeps its order.
+    its force is evaluated once per step: at x for explicit steps and implicit Euler, at x + ½h v for midpoint, and at
+    2xₙ − xₙ₋₁ for BDF2. Each integrator keeps its order.
 
     Attributes:
-        vertices: A triangle is pressed if all of its corners are among these.
+        vertices: A triangle is loaded if all of its corners are among these.
         pressure: p [Pa], a number, or (T,) in the order of ``mesh.triangles``.
         keyframes: (F,) or (F, T) [Pa].
     """
@@ -166,10 +164,10 @@ LOADS = {kind.__name__: kind for kind in (Force, Traction, Pressure)}
 
 
 def checked_loads(loads: Any, mesh: Mesh) -> Loads:
-    """Returns the loads of a scene on a mesh.
+    """Returns one load or several as :class:`Loads`.
 
     Raises:
-        ValueError: One is no load, or does not fit the mesh.
+        ValueError: One is not a load, or does not fit the mesh.
     """
     if not isinstance(loads, Iterable):
         loads = (loads,)
@@ -182,7 +180,7 @@ def checked_loads(loads: Any, mesh: Mesh) -> Loads:
 
 
 def _within(load, mesh, elements):
-    """Which edges or triangles have all of their vertices among those of a load, (count,) truth values."""
+    """Returns which edges or triangles have all of their vertices among those of a load, (count,) booleans."""
     chosen = np.zeros(len(mesh.points), dtype=bool)
     chosen[distinct_vertices(f"{load.label}.vertices", load.vertices, mesh)] = True
     return chosen[elements].all(axis=1)

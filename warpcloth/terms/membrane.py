@@ -1,4 +1,4 @@
-"""The base of membranes: energies of the deformation gradient F (3×2) of each triangle."""
+"""The base classes of membranes: energies of the deformation gradient F (3×2) of each triangle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,10 +15,10 @@ Own = TypeVar("Own", bound="IsotropicMembrane")
 
 @dataclass(frozen=True, kw_only=True)
 class Membrane(Damped):
-    """A membrane of triangles. :func:`warpcloth.analyze` can measure the energy and stress of its material too.
+    """The base class of membranes, whose energy and stress :func:`warpcloth.analyze` can measure.
 
     Attributes:
-        material: Its name on the command line.
+        material: Name of the material on the command line.
         stiffness: k = Et [N/m], Young's modulus times thickness. One or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
     """
@@ -29,7 +29,7 @@ class Membrane(Damped):
         return mesh.triangles
 
     def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The edges of the triangles, K = Et."""
+        """Returns the edges of the triangles, and K = Et."""
         found = self.elements(mesh, positions)
         pairs = found.stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         return pairs, np.repeat(np.broadcast_to(found.stiffness, len(found.stencil)), 3)
@@ -39,7 +39,7 @@ class Membrane(Damped):
 class IsotropicMembrane(Membrane):
     """An isotropic membrane in plane stress: k = Et, and Poisson's ratio ν.
 
-    Its Lamé parameters are μ = k/(2(1 + ν)) and λ = kν/(1 − ν²). If the stiffness varies in a batch, ν does not.
+    Its Lamé parameters are μ = k/(2(1 + ν)) and λ = kν/(1 − ν²). A varied stiffness leaves ν as it is.
     """
 
     poisson_ratio: float | Sequence[float] | np.ndarray = field(
@@ -65,7 +65,7 @@ class IsotropicMembrane(Membrane):
 
 
 def membrane_stiffness(cls, youngs_modulus, thickness):
-    """Et [N/m]."""
+    """Returns Et [N/m], and checks both."""
     given = {"youngs_modulus": youngs_modulus, "thickness": thickness}
     modulus, t = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in given.items())
     refuse(f"{cls.__name__}.youngs_modulus", modulus, ~(modulus >= 0.0), "must be 0 or more")

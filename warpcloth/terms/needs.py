@@ -1,8 +1,4 @@
-"""The properties that a solver may need of every term, and the refusal of a term that lacks one.
-
-The :class:`..kernels.term.Term` says whether it has a projection, a scalar constraint or a prox, whether it has cells, and
-whether its damping merges with it; its elements say whether a stiffness is infinite and whether they are damped.
-"""
+"""The properties that a solver may need of every term, and the error for a term that lacks one."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,10 +11,11 @@ class Need:
     """A property that a solver needs of every term.
 
     Attributes:
-        met: (elements) → whether a term has it; ``elements`` is a :class:`warpcloth.model.elements.DeviceElements`, or anything
-            else with ``term``, ``hard`` and ``damping`` (None without damping).
-        lack: Description of a term that lacks the property, with {label} in it, for the sentence of the error.
-        remedy: A change to the term that a user can make instead of taking another solver, or "".
+        met: (elements) → whether a term has the property; ``elements`` is a
+            :class:`warpcloth.model.elements.DeviceElements`, or another object with ``term``, ``hard`` and ``damping`` (None
+            without damping).
+        lack: Words for a term that lacks the property, with {label} in them, for the error message.
+        remedy: A change with which the solver takes the term, or "".
     """
 
     met: Callable
@@ -34,7 +31,7 @@ ELEMENTS = Need(
 PROJECTION = Need(
     lambda elements: elements.term.whole.project is not None, "{label}, whose energy is no squared distance to a set"
 )
-# A projection, or contact, whose Hessian is added to that of projections.
+# A projection, or contact: its Hessian is added to the matrix of the projections.
 PROJECTION_OR_CONTACT = Need(
     lambda elements: elements.term.whole.project is not None or elements.term.bounded is not None, PROJECTION.lack
 )
@@ -49,7 +46,7 @@ ROWS = Need(
     lambda elements: elements.term.vertices > 0 and (elements.term.project is not None or elements.term.constraint is not None),
     "{label}, whose energy is no square of a constraint",
 )
-# Where the projection changes from iteration to iteration, λ would keep parts of earlier directions.
+# With a projection that changes between iterations, λ would keep components along earlier directions.
 STEADY_ROWS = Need(
     lambda elements: not elements.hard or elements.term.constraint is not None or elements.term.linear or elements.term.cells,
     "{label} with infinite stiffness, as it has no scalar constraint",
@@ -63,7 +60,7 @@ MERGED_DAMPING = Need(
 
 
 def lacks(elements, needs):
-    """The first of some needs that a term does not meet, or None."""
+    """Returns the first need that a term does not meet, or None."""
     return next((need for need in needs if not need.met(elements)), None)
 
 
@@ -73,22 +70,22 @@ def listed(names):
 
 
 def refuse_unmet(terms, solver, needs, others):
-    """Refuses the first term that lacks something that a solver needs.
+    """Checks that every term meets the needs of a solver.
 
     Args:
         terms: Elements of each term, see :class:`Need`.
-        solver: Name of the solver, for the sentence.
-        needs: Its needs; the first that is not met is named.
-        others: The needs of each solver that could be used instead, by name.
+        solver: Name of the solver, for the error message.
+        needs: Its needs.
+        others: The needs of all solvers that could be used instead, by name.
 
     Raises:
-        ValueError: Naming the term, the solver and what would work.
+        ValueError: A term does not. The message names the term, the solver, the first need that is not met and what would work.
     """
     for elements in terms:
         need = lacks(elements, needs)
         if need is not None:
             able = [name for name, theirs in others.items() if lacks(elements, theirs) is None]
-            # Of several needs that are not met, a remedy for one would not do where another solver takes the term as it is.
+            # If another solver takes the term as it is, name the remedy only if it is enough: no other need is unmet.
             suffices = need.remedy and (not able or sum(not each.met(elements) for each in needs) == 1)
             instead = [f"{listed(able)} can"] * bool(able) + [need.remedy] * bool(suffices)
             raise ValueError(

@@ -12,7 +12,8 @@ from .membrane import IsotropicMembrane
 class NeoHookeanMembrane(IsotropicMembrane):
     """A stable Neo-Hookean membrane, U = Σ A(½μ(‖F‖² − 2) − μ(J − 1) + ½(λ + μ)(J − 1)²) (Smith, De Goes and Kim 2018).
 
-    F (3×2) is the deformation gradient, J = ‖f₁×f₂‖, and A the rest area of a triangle. It recovers from any deformation.
+    F (3×2) = [f₁, f₂] is the deformation gradient, J = ‖f₁×f₂‖, and A the rest area of a triangle. A triangle recovers from any
+    deformation.
 
     Attributes:
         stiffness: k = Et [N/m], Young's modulus times thickness: the force per width and strain of a strip that is pulled a

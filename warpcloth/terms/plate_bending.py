@@ -1,4 +1,4 @@
-"""Bending of a plate, isotropic or along warp and weft, that does not depend on the pattern of the mesh."""
+"""Bending of an isotropic or orthotropic plate, independent of the pattern of the mesh."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,10 +22,9 @@ Own = TypeVar("Own", bound="PlateBending")
 class PlateBending(Sparse):
     """Plate bending, U = Σ ½AκᵀCκ.
 
-    κᵀCκ is D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂². κ holds the second derivatives of the positions along warp and weft, for
-    each triangle. It is exact for surfaces of constant curvature on any mesh. The error of deflections falls with the square of
-    the edge length. Forces are linear in x. The plate is flat at rest: of a mesh that is curved at rest only the lengths of
-    edges count.
+    κᵀCκ is D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂². κ holds the second derivatives of the positions of each triangle along warp
+    and weft. They are exact for surfaces of constant curvature on any mesh. The error of deflections falls with the square of
+    the edge length. Forces are linear in x. The plate is flat at rest: of a curved rest shape, only the edge lengths are used.
 
     The stiffness is given by D₁, Poisson's ratio ν = D₁₂/√(D₁D₂), and two ratios: D₂/D₁ and D₆₆/D₁. An isotropic plate has
     D₂ = D₁ = D and D₆₆ = ½(1 − ν)D.
@@ -35,8 +34,8 @@ class PlateBending(Sparse):
         poisson_ratio: ν, above −1 and below 1, one or (T,).
         weft_ratio: D₂/D₁, one or (T,).
         twist_ratio: D₆₆/D₁, one or (T,); ½(1 − ν)√(D₂/D₁) if None.
-        warp: Vector along the warp, (3,) or (T,3); each triangle takes the part in its plane. By default the direction in which
-            the texture coordinate s grows and t does not. Isotropic plates need neither.
+        warp: Vector along the warp, (3,) or (T,3), of which each triangle takes the component in its plane. By default the
+            direction in which the texture coordinate s grows and t is constant. Isotropic plates need neither.
         name: To tell two terms of one kind apart.
 
     Examples:
@@ -86,7 +85,7 @@ class PlateBending(Sparse):
         root = np.zeros((T, 3, 3))  # of C/D₁
         root[:, 0, 0], root[:, 0, 1] = 1.0, ratio * np.sqrt(weft)
         root[:, 1, 1], root[:, 2, 2] = np.sqrt(weft * (1.0 - ratio**2)), 2.0 * np.sqrt(twist)
-        c, s = self._warp(mesh).T  # κ along warp and weft from that along the axes of each triangle
+        c, s = self._warp(mesh).T  # rotates κ from the axes of each triangle to warp and weft
         turn = np.stack([c * c, s * s, 2.0 * c * s, s * s, c * c, -2.0 * c * s, -c * s, c * s, c * c - s * s], axis=1)
         columns = np.broadcast_to(3 * np.arange(T)[:, None, None] + np.arange(3), root.shape)
         entries = (root @ turn.reshape(-1, 3, 3)).ravel(), columns.ravel(), np.arange(0, 9 * T + 1, 3)
@@ -96,7 +95,7 @@ class PlateBending(Sparse):
         return mesh.triangle_areas[:, None]
 
     def _warp(self, mesh):
-        """The unit vector along the warp by the two axes of each triangle, (T, 2)."""
+        """Returns the unit vector along the warp in the axes of each triangle, (T, 2)."""
         axes, T = side_axes(mesh), len(mesh.triangles)
         if self.warp is not None:
             warp = np.broadcast_to(self.of_elements("warp", T), (T, 3))

@@ -14,9 +14,9 @@ class QuadraticBending(Bending):
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh, which has a Poisson's ratio
-            of −1/3. Other meshes are not isotropic plates. A grid with one diagonal per cell has a stiffness of 3 D if it
-            curves along its diagonals, of D if it folds about them or curves along its rows, and of 0.75 D if it curves in
-            directions 15° off the rows, away from the diagonals. A grid with alternating diagonals has 1 to 1.5 D.
+            of −1/3. Other meshes are not isotropic. A grid with one diagonal per cell has the stiffness 3 D when it curves
+            along its diagonals, D when it folds about them or curves along its rows, and 0.75 D when it curves along directions
+            15° off the rows, away from the diagonals. A grid with alternating diagonals has 1 to 1.5 D.
         damping: β [N·m·s]. It damps the rate of ‖y‖, where ‖y‖ is |e|·|θ| for a small angle θ.
         name: To tell two terms of one kind apart.
 

@@ -1,8 +1,7 @@
-"""Rest states that change during a run: a term says when they are updated, and by which launch.
+"""Updates of rest states during a run: a term says when, and by which launch.
 
-Damping, rigid clusters and sparse energies use it. A solver calls
-:meth:`warpcloth.model.model.Model.refresh` where a step begins, and each evaluation of an energy, a force or a projection calls
-it with the positions that it is about to use. Neither knows a term by name.
+Damping, rigid clusters, sparse energies and colliders use it. A solver calls :meth:`warpcloth.model.model.Model.refresh` at the
+start of each step. Every evaluation of an energy, a force or a projection calls it with the positions that it will use.
 """
 
 from collections.abc import Callable
@@ -11,7 +10,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-# When: once a step, before the prediction; or before each evaluation, of which a step has many.
+# Once per step, before the prediction; or before each evaluation, of which a step has many.
 STEP, EVALUATION = "step", "evaluation"
 
 
@@ -20,14 +19,13 @@ class Moment(NamedTuple):
 
     Attributes:
         x: Positions (N,) vectors [m].
-        correction: d (N,) [m] of an evaluation at x + d, or None of one at x.
-        integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, whose step begins.
-        move: Array (N,) whose ``scale``-fold is, where a step begins, the last move of BDF2 or hₑ v of midpoint [m]; None for
-            Euler.
-        scale: 1 if ``move`` is in metres, or the time [s] by which velocities are multiplied.
-        steps: Number of steps of keyframes that each copy has made, (B,) int32, or None where nothing follows keyframes.
-        per_frame: Number of these steps in a frame.
-        ahead: Number of these steps from where a step begins to where it takes forces.
+        correction: d (N,) [m] for an evaluation at x + d; None for one at x.
+        integrator: Integrator of the step that begins: ``"euler"``, ``"midpoint"`` or ``"bdf2"``.
+        move: Array (N,) such that scale·move is the last displacement of BDF2, or hₑ v of midpoint [m]; None for Euler.
+        scale: 1 if ``move`` is in metres, or a time [s] if it is a velocity.
+        steps: Number of keyframe steps that each copy has made, (B,) int32; None if nothing follows keyframes.
+        per_frame: Keyframe steps per frame.
+        ahead: Keyframe steps from the start of the step to the time at which it takes forces.
     """
 
     x: wp.array
@@ -44,16 +42,16 @@ class Moment(NamedTuple):
 class Refresh:
     """The update of a term's elements during a run.
 
-    It writes rest states. If it writes stencils, the term has arrays for the most elements that it can have, and the launch
-    sets the stiffness of those not in use to 0. Stencils are read once when a solver is bound, for incidences on CUDA, the
-    pattern of the Hessian, colours and constant matrices, which then do not follow.
+    It writes rest states. It may also write stencils: then the arrays are as long as the largest number of elements, and the
+    launch sets the stiffness of unused ones to 0. But a solver reads stencils once, when it is bound, for incidences on CUDA,
+    the pattern of the Hessian, colours and constant matrices, which do not follow later changes.
 
     Attributes:
         when: :data:`STEP` or :data:`EVALUATION`.
-        launch: Function of (model, elements, moment) whose launches write the arrays of ``elements``, the
-            :class:`warpcloth.model.elements.DeviceElements`, at a :class:`Moment`. It is recorded once and replayed, so it
+        launch: Function (model, elements, moment) that launches kernels which write the arrays of ``elements``, the
+            :class:`warpcloth.model.elements.DeviceElements`, at a :class:`Moment`. It is captured once and replayed, so it
             must neither read on the host nor allocate.
-        arrays: Arrays that it reads, with one entry per element, (B·E,); they are reordered with the elements.
+        arrays: Arrays that it reads, (B·E,), which are reordered with the elements.
     """
 
     when: str

@@ -22,11 +22,10 @@ class RigidCluster(Declared):
     """Rigid bodies by shape matching, U = Σ (κ/2)Σ mᵢ‖xᵢ − (c + R qᵢ)‖², c and R the best fit of the rest shape (Müller et al.
     2005).
 
-    Bodies that share a vertex are joined there. A vertex of several bodies has its whole mass in each of them. In the fit, a
-    pinned vertex weighs a thousand times as much as all others of its body, so that the body turns about it. A body whose
-    vertices lie on a line has no orientation about that line. Newton's method uses κM as the Hessian, which also resists rigid
-    motion: steps with κh² near 1 or above take more iterations, and ``equilibrium`` may use up its iterations if bodies move
-    far.
+    Bodies that share a vertex are joined there; the vertex has its whole mass in each of them. In the fit, a pinned vertex has
+    a thousand times the mass of the rest of its body, so that the body turns about it. A body with all vertices on a line has
+    no orientation about that line. Newton's method uses κM as the Hessian, which also resists rigid motion: steps with κh² near
+    1 or above take more iterations, and ``equilibrium`` may use up its iterations if bodies move far.
 
     Attributes:
         vertices: Vertex indices of the bodies, one body after the other, (E,); or a list with one array per body; or a
@@ -62,7 +61,7 @@ class RigidCluster(Declared):
 
     @property
     def _selections(self):
-        """The selection of each body, or () where bodies are given by indices."""
+        """The selection of each body, or () if bodies are given by indices."""
         vertices = (self.vertices,) if isinstance(self.vertices, str) else self.vertices
         texts = [isinstance(body, str) for body in vertices]
         if any(texts) and not all(texts):
@@ -72,7 +71,7 @@ class RigidCluster(Declared):
         return tuple(vertices) if any(texts) else ()
 
     def _bodies(self, mesh):
-        """Vertices of each body, a list of index arrays."""
+        """Returns the vertices of each body, a list of index arrays."""
         if texts := self._selections:
             bodies = [mesh.select(text) for text in texts]
             for text in [text for text, body in zip(texts, bodies, strict=True) if not len(body)][:1]:
@@ -105,7 +104,7 @@ class RigidCluster(Declared):
 
 
 def _fit(model, elements, moment):
-    """Fits the clusters at x, or at x + d, and sets their targets."""
+    """Fits the rigid bodies at x, or at x + d, and sets the targets of their vertices."""
     cells, d = elements.cells, moment.correction
     kernel = model.kernel(fit_targets, model.dtype, d is not None)
     given = [cells.offsets, elements.stencil, cells.shape, moment.x, d]

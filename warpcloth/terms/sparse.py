@@ -1,4 +1,4 @@
-"""Energies whose elements have any number of vertices: y = Dx by a sparse matrix."""
+"""Energies of cells with any number of vertices, y = Dx with a sparse matrix D."""
 
 from dataclasses import dataclass
 
@@ -14,16 +14,16 @@ class Sparse(Declared):
     """An energy U = Σ_c k A u(y_c) of cells with any number of vertices, y = Dx linear in all of them.
 
     A subclass defines ``operator`` and ``rest``, and no ``stencil``. Its ``term`` has ``vertices`` 0 and ``weight`` None.
-    Explicit and Newton take it; of a quadratic energy, whose ``term`` has ``cells``, ``project``, ``linear`` and ``quadratic``,
-    all solvers but ConstrainedDynamics do.
+    Explicit and Newton take it. All solvers but ConstrainedDynamics take a quadratic energy, whose ``term`` sets ``cells``,
+    ``project``, ``linear`` and ``quadratic``.
     """
 
     def operator(self, mesh):
-        """D as a scipy sparse matrix (C·M, n), whose rows from cM to cM + M give y of cell c from the vertices of ``mesh``."""
+        """Returns D, a scipy sparse matrix (C·M, n) whose rows cM to cM + M − 1 give y of cell c."""
         raise NotImplementedError  # every energy has its own
 
     def rest(self, mesh, positions, stencil):
-        """Rest state (C, P) of the cells, from the rest shape of the mesh."""
+        """Returns the rest states (C, P) of the cells."""
         raise NotImplementedError
 
     def elements_on(self, mesh, positions):
@@ -34,7 +34,7 @@ class Sparse(Declared):
             raise ValueError(
                 f"{self.label}: the operator has shape {D.shape}; it must be {M} rows for each cell and {n} columns"
             )
-        # Each vertex of a cell once, with the weights of all rows.
+        # One element for each vertex of a cell, with its weights in all rows.
         keys, where = np.unique(D.row.astype(np.int64) // M * n + D.col, return_inverse=True)
         weights = np.zeros((len(keys), M))
         np.add.at(weights, (where, D.row % M), D.data)
@@ -58,7 +58,7 @@ class Sparse(Declared):
 
 
 def _evaluate(model, elements, moment):
-    """Evaluates the cells at x, or at x + d, and sets the part of each vertex."""
+    """Evaluates the cells at x, or at x + d, and sets the rest state of each vertex of a cell."""
     cells, d = elements.cells, moment.correction
     kernel = model.kernel(kernels.evaluate, cells.term, model.dtype, d is not None)
     given = [cells.offsets, elements.stencil, cells.weights, cells.rest, moment.x, d]

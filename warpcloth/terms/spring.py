@@ -51,13 +51,13 @@ class Spring(Damped):
         return np.broadcast_to(lengths, len(stencil))[:, None].copy()
 
     def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the pairs themselves; a net of them is as stiff as a sheet of K = 2k/√3."""
+        """Returns the pairs, and K = 2k/√3, the stiffness of a sheet of equilateral triangles of springs."""
         found = self.elements(mesh, positions)
         return found.stencil, 2.0 / np.sqrt(3.0) * np.broadcast_to(found.stiffness, len(found.stencil))
 
 
 def pairs_on(mesh, label, pairs):
-    """The pairs of :class:`Spring` on a mesh, (E, 2) int32."""
+    """Returns the pairs of :class:`Spring` on a mesh, (E, 2) int32."""
     kinds = (pairs,) if isinstance(pairs, str) else pairs
     if isinstance(kinds, (tuple, list)) and kinds and all(isinstance(kind, str) for kind in kinds):
         found = [mesh.springs(kind) for kind in kinds]

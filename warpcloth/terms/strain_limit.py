@@ -19,8 +19,8 @@ class StrainLimit(Limit):
     Attributes:
         least, most: Bounds σ_min, σ_max of the singular values σᵢ of the deformation gradient F, each one or (T,); at least
             one of the two is required.
-        stiffness: k [N/m], one or (T,): beyond its limits a triangle is as stiff as a :class:`warpcloth.CorotatedMembrane` of
-            this stiffness. Infinite for solvers that take hard constraints, such as PBD; finite for solvers that need forces.
+        stiffness: k [N/m], one or (T,), that of a :class:`warpcloth.CorotatedMembrane` beyond the limits. Infinite for solvers
+            that take hard constraints, such as PBD; finite for solvers that need forces.
         name: To tell two terms of one kind apart.
     """
 
