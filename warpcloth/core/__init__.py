@@ -1,1 +1,1 @@
-"""Operators, state and capture that all solvers share."""
+"""Energy, gradient, Hessian, state and graph capture, which all solvers share."""

@@ -1,4 +1,4 @@
-"""Graph capture, on the CPU too: a segment of launches is recorded once and replayed."""
+"""Graph capture, on the CPU and on CUDA: a segment of launches is captured once and replayed."""
 
 import warp as wp
 
@@ -7,20 +7,19 @@ from ..base.turns import TURN
 
 
 def on_host(device, what):
-    """Refuses a call on the host while ``device`` is recording, when arrays do not yet have the values of the recorded
-    launches.
+    """Checks that no graph is being captured, because captured launches have not run, so the host would read old values.
 
     Raises:
-        RuntimeError: If a graph is being captured on the device.
+        RuntimeError: A graph is being captured on the device.
     """
     if device.is_capturing:
         raise RuntimeError(f"{what} runs on the host and cannot be part of a captured segment")
 
 
 class Mirror:
-    """A device array and its counterpart on the host, by which the host reads and writes between segments.
+    """A device array with a pinned host array, through which the host reads and writes it between segments.
 
-    Both are allocated when it is built, so reading and writing allocate nothing; on the CPU they are one array.
+    Reading and writing allocate nothing. On the CPU both are one array.
 
     Args:
         array: The device array.
@@ -31,10 +30,10 @@ class Mirror:
         self.host = array if array.device.is_cpu else wp.empty_like(array, device="cpu", pinned=True)
 
     def read(self):
-        """The values as NumPy, valid until the next call or launch.
+        """Returns the values as a NumPy array, valid until the next call or launch.
 
         Raises:
-            RuntimeError: If a graph is being captured on the device.
+            RuntimeError: A graph is being captured on the device.
         """
         on_host(self.array.device, "reading an array")
         if self.host is not self.array:
@@ -43,30 +42,30 @@ class Mirror:
         return self.host.numpy()
 
     def write(self, values):
-        """Sets the values from NumPy.
+        """Sets the values from a NumPy array.
 
         Raises:
-            RuntimeError: If a graph is being captured on the device.
+            RuntimeError: A graph is being captured on the device.
         """
         on_host(self.array.device, "writing an array")
         self.host.numpy()[...] = values
         if self.host is not self.array:
             wp.copy(self.array, self.host)
-            wp.synchronize_stream(self.array.device)  # or the next write would change what is still being copied
+            wp.synchronize_stream(self.array.device)  # before the next write changes the host array
 
 
 class Segment:
-    """Launches that always run together: recorded when it is built, replayed when it is called, on the CPU and on CUDA.
+    """Launches that always run together: captured on construction, replayed on each call, on the CPU and on CUDA.
 
     Args:
         device: The Warp device.
-        record: Function that does the launches.
+        record: Function that launches.
     """
 
     def __init__(self, device, record):
         self.device = device
-        self.record = record  # the graph has only addresses of the arrays that the function refers to, which must not be freed
-        # Memory that the collector frees on CUDA, such as the factors of cholespy, would break a capture.
+        self.record = record  # keeps the arrays of the function alive, of which the graph has only addresses
+        # If the collector freed CUDA memory, such as factors of cholespy, the capture would fail.
         with TURN, uncollected(), wp.ScopedCapture(device=device) as capture:
             record()
         self.graph = capture.graph

@@ -8,7 +8,7 @@ from ..model.host_values import host_values
 
 
 def constant_blocks(model, elements):
-    """k A GᵀG of each element, y = Gx, (E, K, K) [N/m]."""
+    """Returns k A GᵀG of each element, y = Gx, (E, K, K) [N/m]."""
     K = elements.term.vertices
     blocks = wp.zeros((elements.count, K * K), dtype=wp.float64, device=model.device)
     kernel = model.kernel(assemble.constant_blocks, elements.term, model.dtype)
@@ -17,7 +17,7 @@ def constant_blocks(model, elements):
 
 
 def constant_entries(model, elements):
-    """The rows and columns of the entries of k A GᵀG of all elements of one copy, and their numbers (B, m) [N/m]."""
+    """Returns the rows and columns (m,) of the entries of Σ k A GᵀG of one copy, and the values of all copies (B, m) [N/m]."""
     if elements.term.cell is None:
         stencil = host_values(elements.stencil)[: elements.per_copy]
         K = stencil.shape[1]
@@ -34,7 +34,7 @@ def constant_entries(model, elements):
 
 
 def constant_matrices(model, s):
-    """s·M + Σ k A GᵀG of each copy, y = Gx, as scipy matrices (n, n) [N/m]; rows of pins are those of the identity."""
+    """Returns s·M + Σ k A GᵀG of each copy, y = Gx, as scipy matrices (n, n) [N/m]. Rows of pins are the identity."""
     from scipy.sparse import coo_matrix
 
     n, B = model.per_copy, model.copies
@@ -46,6 +46,6 @@ def constant_matrices(model, s):
         for found, more in zip((rows, columns, values), constant_entries(model, elements), strict=True):
             found.append(more)
     rows, columns, values = np.concatenate(rows), np.concatenate(columns), np.concatenate(values, axis=1)
-    free = free[:n]  # pins are those of the scene, in every copy
+    free = free[:n]  # all copies have the same pins
     keep = (free[rows] & free[columns]) | (np.arange(len(rows)) < n)
     return [coo_matrix((each[keep], (rows[keep], columns[keep])), shape=(n, n)).tocsc() for each in values]

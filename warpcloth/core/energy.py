@@ -9,7 +9,7 @@ from ..terms.refresh import EVALUATION, Moment
 
 
 class Energy:
-    """U of all terms of each copy [J], or of the ``terms`` given."""
+    """The energy U [J] of each copy, of all terms or of the ``terms`` given."""
 
     @in_turn
     def __init__(self, model, sums, corrected=False, terms=None):
@@ -24,7 +24,7 @@ class Energy:
             self.of_elements.append(wp.zeros(elements.count, dtype=wp.float64, device=model.device))
 
     def add(self, x, out, correction=None):
-        """out (B,) += U(x), or U(x + correction)."""
+        """Launches out (B,) += U(x), or U(x + correction)."""
         self.model.refresh(EVALUATION, Moment(x, correction), self.terms)
         for elements, kernel, values in zip(self.terms, self.kernels, self.of_elements, strict=True):
             if values is None:

@@ -1,4 +1,4 @@
-"""The explicit step in plain form: the gradient, then v += h(g − M⁻¹∇U), x += h v. Tests compare faster backends with it."""
+"""The plain explicit step: the gradient, then v += h(g − M⁻¹∇U) and x += h v. Tests compare faster backends with it."""
 
 from typing import NamedTuple
 
@@ -14,11 +14,11 @@ class StepRecord(NamedTuple):
     Attributes:
         backend: ``"core"``, ``"blocks"`` or ``"gather"``.
         threads: Threads of the CPU that share the steps of one cloth.
-        lanes: Threads of a GPU that take one vertex.
-        block: Threads of the block that takes a copy through several steps in one launch, or 0.
-        pairs: Labels of the quadratic terms that are taken by the entries of their matrix.
-        compensated: Whether x is moved on by compensated summation.
-        packed: Whether its residual is packed into four bytes.
+        lanes: GPU threads per vertex.
+        block: Threads of a block that takes several steps of one copy in one launch, or 0.
+        pairs: Labels of the quadratic terms whose forces are computed from the entries of their matrix.
+        compensated: Whether x is updated by compensated summation.
+        packed: Whether the position residual is packed into four bytes.
     """
 
     backend: str
@@ -31,10 +31,10 @@ class StepRecord(NamedTuple):
 
 
 class ExplicitStep:
-    """Steps of several launches, on any device.
+    """Explicit steps of several launches, on any device.
 
-    The gradient of the dissipation D about the state x is taken at x + h v, see :class:`warpcloth.kernels.term.Dissipation`;
-    with compensated positions forces are taken at x + residual.
+    The gradient of the dissipation is evaluated at x + h v, see :class:`warpcloth.kernels.term.Dissipation`. With compensated
+    positions, forces are evaluated at x + residual.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -45,7 +45,7 @@ class ExplicitStep:
         compensated: Whether x is updated by compensated summation.
 
     Attributes:
-        gradient: ∂U/∂x (N,) [N] of what is not of the terms, to which steps add; 0 after each.
+        gradient: ∂U/∂x (N,) [N]. Callers may add other forces before a step; it is 0 after each step.
         residual: Position residual of compensated summation (N,) [m], or None.
         record: :class:`StepRecord`.
     """
@@ -64,7 +64,7 @@ class ExplicitStep:
         self._per_frame = round(1.0 / (model.scene.fps * h))
 
     def launch(self, steps, move_pins):
-        """Launches this number of steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        """Launches this number of steps, and calls ``move_pins(pins, keyframes, count, x, v)`` after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
             model.refresh(STEP, Moment(x, steps=self._pins[-1], per_frame=self._per_frame))

@@ -8,7 +8,7 @@ from .transpose import Transpose
 
 
 class Gradient:
-    """∂U/∂x of all terms [N], or of the ``terms`` given: Dᵀ(kA∂u/∂y), one launch for each term."""
+    """The gradient ∂U/∂x = Dᵀ(kA ∂u/∂y) [N] of all terms or of the ``terms`` given, one launch for each."""
 
     @in_turn
     def __init__(self, model, corrected=False, terms=None):
@@ -24,7 +24,7 @@ class Gradient:
             self._sums.append((Transpose(model, elements, *factories, elements.term, model.dtype, corrected), data))
 
     def add(self, x, out, correction=None):
-        """out += ∂U/∂x at x, or at x + correction if it was built ``corrected``."""
+        """Launches out += ∂U/∂x at x, or at x + correction if built with ``corrected``."""
         self.model.refresh(EVALUATION, Moment(x, correction), self.terms)
         for transpose, data in self._sums:
             data.x = x

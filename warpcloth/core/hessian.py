@@ -13,7 +13,7 @@ def _is_sparse(elements):
 
 
 class _Blocks:
-    """The blocks of the elements of one term, (B·E, K²)."""
+    """The Hessian blocks of the elements of one term, (B·E, K²)."""
 
     def __init__(self, model, elements, corrected):
         self.model, self.elements, K = model, elements, elements.term.vertices
@@ -37,7 +37,7 @@ class _Blocks:
 
 
 class _SparseBlocks:
-    """The blocks of the cells of one term, cell by cell, see :mod:`warpcloth.kernels.sparse`."""
+    """The Hessian blocks of the cells of one term, cell by cell, see :mod:`warpcloth.kernels.sparse`."""
 
     def __init__(self, model, elements, corrected):
         self.model, self.elements, cells = model, elements, elements.cells
@@ -61,13 +61,13 @@ class _SparseBlocks:
 
 
 class Hessian:
-    """∂²U/∂x² + scale·M of all terms, or of the ``terms`` given, in block compressed rows; rows of pins are the identity.
+    """∂²U/∂x² + scale·M of all terms, or of the ``terms`` given, in block compressed rows (BSR). Rows of pins are the identity.
 
-    A locked coordinate keeps its entry of the diagonal, or 1 where that is not above 0, and nothing else of its row and column
-    (Baraff and Witkin 1998), so that it stays and the rest do not notice.
+    The row and column of a locked coordinate are 0 but for the diagonal, which keeps its value, or is 1 if that is not above 0
+    (Baraff and Witkin 1998). So the coordinate does not move, and does not affect the others.
 
-    The blocks of ``pairs``, a :class:`warpcloth.contact.self_steps.SelfSteps`, are in ``values`` on the diagonal alone;
-    :meth:`multiply` has them all.
+    ``values`` has only the diagonal blocks of ``pairs``, a :class:`warpcloth.contact.self_steps.SelfSteps`; :meth:`multiply`
+    uses all of their blocks.
 
     Attributes:
         offsets, columns: Block rows (N+1,) and the column of each block.
@@ -75,7 +75,7 @@ class Hessian:
         values: The blocks [N/m].
         policy: (B,) int32, a :class:`HessianPolicy` for each copy.
         count, per_copy: Vertices of all copies, and of one copy.
-        vector, block: Types of an unknown and of a block.
+        vector, block: Warp types of an unknown and of a block.
     """
 
     @in_turn
@@ -121,7 +121,7 @@ class Hessian:
             start += len(source)
 
     def assemble(self, x, scale, correction=None):
-        """Fills ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal."""
+        """Launches the assembly of ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal."""
         model = self.model
         self.values.zero_()
         model.launch(self._set_inertia, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values])
@@ -136,34 +136,34 @@ class Hessian:
             model.launch(lock, len(self.values), [self._rows, self.columns, model.mobility], [self.values])
 
     def norms(self):
-        """Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ of every vertex i, summed over elements, (N,) [N/m], with √(‖·‖₁‖·‖∞) as bound of each norm."""
+        """Returns Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ of each vertex i, summed over elements, (N,) [N/m], each norm bounded by √(‖·‖₁‖·‖∞)."""
         rows = np.zeros(self.model.count)
         for of_term in self._of_terms:
             sizes = np.abs(of_term.blocks.numpy().astype(np.float64))
-            # No less than the spectral norm, equal to it along the axes and diagonals of a grid, and cheap.
+            # A cheap upper bound of the spectral norm, equal to it along the axes and diagonals of a grid.
             of_term.add_norms(np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)), rows)
         return rows
 
     def prepare(self):
-        """Finds the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""
+        """Makes the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""
         self._multiply = self.model.kernel(linear.multiply, self.model.dtype)
         self._invert_diagonal = self.model.kernel(linear.invert_diagonal, self.model.dtype)
         contact = self.pairs is not None or any(elements.collider is not None for elements in self.terms)
         self._lost = 16.0 * float(np.finfo(self.model.numpy_dtype).eps) * contact
 
     def multiply(self, p, q, active):
-        """q = A p for the copies that are ``active`` (B,)."""
+        """Launches q = A p for the copies that are ``active`` (B,)."""
         given = [self.offsets, self.columns, self.values, p, active, self.per_copy]
         self.model.launch(self._multiply, self.count, given, [q])
         if self.pairs is not None:
             self.pairs.forces.add_products(p, q, active)
 
     def invert_diagonal(self, out):
-        """out = the inverse diagonal blocks."""
+        """Launches out (N,) = the inverse diagonal blocks."""
         self.model.launch(self._invert_diagonal, self.count, [self.diagonal, self.values, self._lost], [out])
 
     def matrices(self):
-        """The present values on the host: for each copy a scipy matrix (3n, 3n) in block compressed rows, in float64."""
+        """Returns the present values of each copy as a scipy BSR matrix (3n, 3n) in float64."""
         from scipy.sparse import bsr_matrix
 
         n = self.model.per_copy
@@ -177,7 +177,7 @@ class Hessian:
         return found
 
     def coupling(self):
-        """The blocks of pairs off the diagonal at the last :meth:`assemble`, scipy (3N, 3N); None without pairs."""
+        """Returns the off-diagonal blocks of pairs at the last :meth:`assemble`, scipy (3N, 3N); None without pairs."""
         if self.pairs is None:
             return None
         J, D = self.pairs.forces.rows()
@@ -187,7 +187,7 @@ class Hessian:
         return whole.tocsc()
 
     def matrix(self):
-        """All copies in one scipy matrix (3N, 3N)."""
+        """Returns all copies in one scipy matrix (3N, 3N)."""
         from scipy.sparse import block_diag
 
         return block_diag(self.matrices(), format="csr")

@@ -1,4 +1,4 @@
-"""Jacobi sweeps in plain form: local steps of the elements, the transpose, a move. Tests compare faster backends with them."""
+"""Plain Jacobi sweeps: local steps of the elements, the transpose, a move. Tests compare faster backends with them."""
 
 import warp as wp
 
@@ -9,18 +9,18 @@ from .transpose import Transpose
 
 
 class JacobiSweeps:
-    """Sweeps of several launches, on any device.
+    """Jacobi sweeps of several launches, on any device.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         x: x̃, (N,) vectors [m]; read only.
         h: Step [s].
         correction: d (N,) [m], which the sweeps update.
-        multipliers: λ of each term, an array (B·E,) of numbers or M × 3 matrices, or None.
-        keys: For each term (term, dtype, whether its scalar constraint is used).
+        multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, or None.
+        keys: For each term (term, dtype, whether to use its scalar constraint).
         factors: Factors of Δλ for each term, (B·E,).
-        scale: Factors of the moves of the vertices, (N,).
-        spread: The number of sweeps that together make the correction of finite stiffness, or None.
+        scale: Factors of the moves of vertices, (N,).
+        spread: Number of sweeps over which the correction of finite stiffness is spread, or None.
     """
 
     def __init__(self, model, x, h, correction, multipliers, keys, factors, scale, spread):
@@ -56,5 +56,5 @@ class JacobiSweeps:
             model.launch(self._move, model.count, [model.inverse_mass, self._scale], [self._total, d])
 
     def parts(self, sweeps):
-        """Returns pairs of a function that launches and of how many times it runs, for this number of sweeps."""
+        """Returns pairs (function that launches, number of calls) for this number of sweeps."""
         return [(self.launch, sweeps)]

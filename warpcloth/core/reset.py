@@ -1,4 +1,4 @@
-"""The reset of copies to their start, between steps."""
+"""Resets copies to their start, between steps."""
 
 import numpy as np
 import warp as wp
@@ -20,10 +20,10 @@ class Reset:
     def __init__(self, stepper):
         self.stepper, self.model = stepper, stepper.model
         self._kernel = None
-        self._buffers = {}  # for values from the host, made when first needed
+        self._buffers = {}  # for values from the host, allocated on first use
 
     def _prepare(self):
-        """Finds the kernel, and the arrays beside x and v with their starts, by address and size."""
+        """Makes the kernel, and the addresses and sizes of the arrays of the state other than x and v, and of their starts."""
         model, state = self.model, self.stepper.state
         names = [name for name in state.arrays if name not in ("x", "v")]
         carried, starts = ([arrays.get(name) for name in names] for arrays in (state.arrays, state.starts))
@@ -62,10 +62,10 @@ class Reset:
             ]
 
     def on_device(self, mask, positions, velocities):
-        """The mask (B,), and positions and velocities (B·n,) vectors or None, as Warp arrays.
+        """Returns the mask (B,), and positions and velocities, (B·n,) vectors or None, as Warp arrays.
 
         Raises:
-            ValueError: If one of them is not allowed.
+            ValueError: An argument is not allowed.
         """
         mask = self._mask(mask)
         x = None if positions is None else self._vectors("positions", "m", positions)
@@ -75,14 +75,14 @@ class Reset:
         return mask, x, v
 
     def _refuse_inside(self, mask, x):
-        """Refuses positions (B·n, 3) at which a free vertex of a copy in ``mask`` (B,) is inside a collider, as at a start."""
+        """Raises ValueError if a free vertex of a copy in ``mask`` (B,) is inside a collider at positions x (B·n, 3) [m]."""
         model = self.model
         points = model.in_scene_order(x.astype(np.float64)).reshape(model.copies, -1, 3)
         for copy in np.flatnonzero(mask):
             model.scene.refuse_inside(points[copy], f" in copy {copy}" if model.copies > 1 else "")
 
     def _mask(self, mask):
-        """The mask on the device, (B,)."""
+        """Returns the mask on the device, (B,)."""
         B = self.model.copies
         if self._on_device(mask):
             if mask.dtype is not wp.bool or mask.shape != (B,) or not mask.is_contiguous:
@@ -94,11 +94,11 @@ class Reset:
         return self._buffered("mask", wp.bool, B, values)
 
     def _vectors(self, name, unit, values):
-        """Positions or velocities on the device, (B·n,) vectors."""
+        """Returns positions or velocities on the device, (B·n,) vectors."""
         model = self.model
         shape = (model.copies, model.per_copy, 3)
         if self._on_device(values):
-            vectors = wp.types.types_equal(values.dtype, model.vec3)  # as wp.vec3 is, which is another class
+            vectors = wp.types.types_equal(values.dtype, model.vec3)  # wp.vec3 is equal to it, but another class
             whole = (*values.shape, 3) if vectors else values.shape if values.dtype is model.dtype else ()
             if whole not in (shape, (model.count, 3)) or not values.is_contiguous:
                 raise ValueError(
@@ -113,7 +113,7 @@ class Reset:
         return isinstance(values, wp.array) and values.device == self.model.device
 
     def _buffered(self, name, dtype, count, values):
-        """The values in an array on the device that is used again in later calls."""
+        """Returns the values in a device array, which later calls use again."""
         if name not in self._buffers:
             self._buffers[name] = Mirror(wp.empty(count, dtype=dtype, device=self.model.device))
         self._buffers[name].write(values)
@@ -125,5 +125,5 @@ def _host(values):
 
 
 def _kind(values):
-    """Describes a Warp array, for the sentence of an error."""
+    """Describes a Warp array, for error messages."""
     return f"an array {values.shape} of {values.dtype.__name__}"

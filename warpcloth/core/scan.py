@@ -1,4 +1,4 @@
-"""Sums from the first element on, of counts, in launches that a branch of a graph can hold, as it cannot those of Warp."""
+"""Exclusive prefix sums, by kernels that a conditional branch of a graph may contain; Warp's own scan may not be in one."""
 
 import math
 
@@ -8,11 +8,11 @@ from ..kernels import scan
 
 
 class Scan:
-    """Exclusive sums of integers.
+    """Exclusive prefix sums of integers.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        count: How many, n.
+        count: Number of integers, n.
     """
 
     def __init__(self, model, count):
@@ -21,7 +21,7 @@ class Scan:
         self._launch = model.launcher(((scan.sum_chunks, scan.add_chunks, scan.write_sums),))
 
     def launch(self, values, out):
-        """out (n+1,) = the sum of the values (n,) before each, and of all."""
+        """Launches out (n+1,) = the sum of the values (n,) before each, and the sum of all."""
         chunks = len(self._sums)
         self._launch(scan.sum_chunks, chunks, [values, self._size], [self._sums])
         self._launch(scan.add_chunks, 1, [], [self._sums])

@@ -9,23 +9,23 @@ from .status import Result
 class State:
     """Every array that one step passes to the next, and the results of the steps so far.
 
-    A stepper registers its own arrays besides x and v with :meth:`add`, such as the position residual of compensated summation,
-    the move of the last step, or the number of steps that keyframes have made. Code that copies, compares, resets or stores a
-    state does not know which these are. Arrays that a step writes before it reads them do not belong to the state.
+    A stepper registers further arrays with :meth:`add`, such as the position residual of compensated summation or the move of
+    the last step. Code that copies, compares, resets or stores a state does not know them by name. Arrays that a step writes
+    before it reads them do not belong to the state.
 
     Args:
         x: Positions (N,) vectors [m].
         v: Velocities (N,) vectors [m/s].
-        batch_size: Copies of the scene, B.
-        shares: States of the threads' shares of the batch, whose x and v are views of those of this state.
+        batch_size: Number of copies of the scene, B.
+        shares: States of the parts of the batch that threads have, whose x and v are views of those of this state.
 
     Attributes:
         arrays: All arrays on the device by name, with N or B rows, ``"x"`` and ``"v"`` among them.
-        parts: Values of other sizes by name, which copy, assign and store themselves; a reset leaves them as they are.
-        starts: Values at the start, for those arrays that neither start at 0 nor have their start in the model.
+        parts: Objects with values of other sizes by name, see :meth:`add_part`; a reset does not change them.
+        starts: Initial values by name, for arrays that start neither at 0 nor from the model.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).
-        lent: Arrays by name that another state lends, which it has in place of those that are added.
+        lent: Arrays of another state by name, which :meth:`add` uses in place of the given ones.
     """
 
     def __init__(self, x, v, batch_size, shares=()):
@@ -35,7 +35,7 @@ class State:
 
     @property
     def results(self):
-        """The worst result of each copy so far, those of the shares where there are any."""
+        """The worst result of each copy so far."""
         return [result for share in self.shares for result in share.results] if self.shares else self._results
 
     @results.setter
@@ -44,7 +44,7 @@ class State:
 
     @property
     def residual(self):
-        """The largest residual of each copy so far, likewise."""
+        """The largest residual of each copy so far, (B,)."""
         return np.concatenate([share.residual for share in self.shares]) if self.shares else self._residual
 
     @residual.setter
@@ -66,7 +66,7 @@ class State:
         return iter((self.x, self.v))
 
     def add(self, name, array):
-        """Registers an array that is 0 at the start, or None, and returns it, or the one that is lent in its place."""
+        """Registers an array that is 0 at the start, and returns it, or the array that is lent in its place; ignores None."""
         if array is not None:
             array = self.arrays[name] = self.lent.get(name, array)
         return array
@@ -77,7 +77,7 @@ class State:
         return part
 
     def start_here(self, *names):
-        """Takes the present values of the arrays of these names as those at the start."""
+        """Makes the present values of these arrays their initial values."""
         self.starts |= {name: wp.clone(self.arrays[name]) for name in names}
 
     def copy(self):
@@ -99,7 +99,7 @@ class State:
         self.results, self.residual = list(other.results), other.residual.copy()
 
     def __eq__(self, other):
-        """Whether every bit is the same, so that a NaN equals itself."""
+        """Returns whether all bits are equal, so that NaN equals NaN."""
         if not isinstance(other, State):
             return NotImplemented
         mine, of_other = self.to_host(), other.to_host()
@@ -111,7 +111,7 @@ class State:
     __hash__ = None
 
     def to_host(self):
-        """Returns everything as copies in NumPy arrays, by name."""
+        """Returns copies of everything as NumPy arrays by name."""
         found = {name: np.array(array.numpy()) for name, array in self.arrays.items()}
         found |= {"results": np.array([result.name for result in self.results]), "residual": np.array(self.residual)}
         for name, part in self.parts.items():
@@ -124,7 +124,7 @@ class State:
         """Sets everything to the values that :meth:`to_host` returned for an equal scene and solver.
 
         Raises:
-            ValueError: If they are of another scene or solver.
+            ValueError: They are of another scene or solver.
         """
         now = self.to_host()
         sized = [name for name in now if not any(name.startswith(f"{part} ") for part in self.parts)]

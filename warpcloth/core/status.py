@@ -1,4 +1,4 @@
-"""Results of steps and runs, and the sentence that says how a run ended."""
+"""Results of steps and runs, and the message about how a run ended."""
 
 from enum import Enum
 from typing import NamedTuple
@@ -20,7 +20,7 @@ class Result(Enum):
     STOPPED = "stopped"
 
     def worse(self, other):
-        """The worse of two results."""
+        """Returns the worse of two results."""
         order = list(Result)
         return max(self, other, key=order.index)
 
@@ -31,15 +31,15 @@ class Stopped(ValueError):
 
 UNBALANCED = "largest unbalanced acceleration of a vertex"
 
-# The use of a result that is neither clearly good nor clearly bad.
+# How a result can be used that is neither clearly good nor clearly bad.
 _NEAR = "usable if this is near enough to the solution"
 
 
 class Residual(NamedTuple):
-    """The quantity that a solver reports as its residual; each record of options names its own as ``residual``.
+    """The quantity that a solver reports as its residual.
 
     Attributes:
-        measure: Name of the quantity; a run reports its largest value in any step.
+        measure: Name of the quantity. A run reports the largest value of any step.
         weightless: Its unit in a scene without gravity.
         unit: Its unit in a scene with gravity.
     """
@@ -53,13 +53,13 @@ class Status(NamedTuple):
     """How a run ended.
 
     Attributes:
-        result: The worst of any step and copy.
+        result: The worst result of any step and copy.
         frame: The last frame in which a copy is good.
         residual: The largest residual of any step; with B > 1 copies one per copy, (B,). 0 for methods without a residual.
-        message: One sentence: how it ended, whether the result can be used, and the residual with its unit and tolerance.
+        message: How it ended, whether the result can be used, and the residual with its unit and tolerance.
         good: The last good frame of each copy, (B,).
         measure: The quantity that the residual measures, or None for methods without a residual.
-        unit: The unit of the residual, with several copies that of the worst one; or None.
+        unit: The unit of the residual, that of the worst copy if there are several; or None.
     """
 
     result: Result
@@ -72,12 +72,12 @@ class Status(NamedTuple):
 
     @property
     def ok(self):
-        """False if a copy diverged, or the run could not go on."""
+        """Whether no copy diverged and the run was not stopped."""
         return self.result not in (Result.DIVERGED, Result.STOPPED)
 
 
 def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None, use=None):
-    """Says how a run ended, whether its result can be used, and the residual with its unit and tolerance.
+    """Returns a message: how a run ended, whether its result can be used, and the residual with its unit and tolerance.
 
     Args:
         result: The worst :class:`Result` of any step.
@@ -87,7 +87,7 @@ def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=No
         unit: Its unit.
         tolerance: The tolerance it was compared with, or None for methods that do not check it.
         copy: The copy whose residual it is, or None if there is one copy.
-        use: How the result can be used, if not as a run over time can.
+        use: How the result can be used; None for what holds for a run over time.
     """
     use = use or {
         Result.COMPLETED: "usable" if measure is None else _NEAR,
@@ -104,5 +104,5 @@ def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=No
 
 
 def digits(value):
-    """Formats a number with two digits, without an exponent if that is short."""
+    """Formats a number with two significant digits, below a million without an exponent."""
     return f"{float(f'{value:.2g}'):.0f}" if 100.0 <= value < 1e6 else f"{value:.2g}"

@@ -1,18 +1,18 @@
-"""Sums and maxima of each copy, in two launches: over chunks, and then over the chunks' results."""
+"""Sums and maxima of each copy, in two launches: over chunks, then over the results of the chunks."""
 
 import warp as wp
 
 from ..base.turns import in_turn
 from ..kernels import reduce
 
-# Chunks of a sum per copy on a GPU, enough to keep it busy; the CPU, which would run them one after another, has one.
+# Chunks per copy on a GPU, enough to occupy it. The CPU has one.
 CHUNKS = 256
 
 
 class Sums:
     """Sums and maxima per copy in double precision and a fixed order."""
 
-    numbers = False  # in place of vectors
+    numbers = False  # whether arrays hold numbers, not vectors
 
     @in_turn
     def __init__(self, model, per_copy=None):
@@ -25,17 +25,17 @@ class Sums:
         self._largest = model.kernel(*largest)
 
     def dot(self, a, b, out, active=None):
-        """out (B,) = Σ a·b of each copy; undefined for copies not ``active`` (B,), if that is given."""
+        """Launches out (B,) = Σ a·b of each copy; undefined for copies that are not ``active`` (B,), if that is given."""
         self.model.launch(self._dot, self.partial.shape, [a, b, active, self.per_copy], [self.partial])
         self._add_chunks(0, out)
 
     def sum(self, values, per_copy, out, accumulate=0):
-        """out (B,) = Σ of the ``per_copy`` values of each copy, added to out if ``accumulate`` is 1."""
+        """Launches out (B,) = Σ of the ``per_copy`` values of each copy, or out += that if ``accumulate`` is 1."""
         self.model.launch(self._sum, self.partial.shape, [values, per_copy], [self.partial])
         self._add_chunks(accumulate, out)
 
     def largest(self, weights, a, out):
-        """out (B,) = max wᵢ‖aᵢ‖ over the vertices of each copy."""
+        """Launches out (B,) = max wᵢ‖aᵢ‖ over the vertices of each copy."""
         self._find_largest([weights, a], out)
 
     def _add_chunks(self, accumulate, out):
@@ -52,5 +52,5 @@ class RowSums(Sums):
     numbers = True
 
     def largest(self, values, out):
-        """out (B,) = max of each copy of ``values``, which are 0 or more and in double precision."""
+        """Launches out (B,) = the maximum of each copy of ``values``, float64, 0 or more."""
         self._find_largest([values], out)

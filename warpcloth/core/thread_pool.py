@@ -1,4 +1,4 @@
-"""Threads of this process that replay graphs in parallel on the CPU: Warp releases Python's lock meanwhile."""
+"""Threads of this process that replay graphs in parallel on the CPU; Warp releases Python's global lock in a replay."""
 
 import ctypes
 import os
@@ -13,13 +13,13 @@ from ..kernels import barrier as kernels
 
 
 def _leave():
-    """The address of the C function that yields the core to another thread."""
+    """Returns the address of the C function that yields the core to another thread."""
     function = ctypes.windll.kernel32.SwitchToThread if sys.platform == "win32" else ctypes.CDLL(None).sched_yield
     return ctypes.cast(function, ctypes.c_void_p).value
 
 
 class ThreadPool:
-    """Threads of the CPU that share the steps of one stepper: each replays graphs of its own, and they meet at a barrier.
+    """CPU threads that share the steps of one stepper. Each replays its own graphs, and they synchronise at barriers.
 
     Args:
         threads: Number of threads. With 1 no thread is started, and there is no barrier.
@@ -39,12 +39,12 @@ class ThreadPool:
 
     @property
     def thread(self):
-        """Number of the thread, from 0, for which this thread launches or records."""
+        """Index of the thread of the pool for which the current thread launches or records."""
         return getattr(self._here, "thread", 0)
 
     @property
     def leads(self):
-        """Whether :attr:`thread` is the first, which does the work that is not shared."""
+        """Whether :attr:`thread` is 0, which does the work that is not shared."""
         return self.thread == 0
 
     def as_thread(self, thread, launch):
@@ -65,7 +65,7 @@ class ThreadPool:
         return first, count * (self.thread + 1) // self.threads - first
 
     def launch_barrier(self, model):
-        """Launches a barrier: a thread continues when all have arrived. With one thread it launches nothing."""
+        """Launches a barrier, at which threads wait until all have arrived; nothing with one thread."""
         if self.threads > 1:
             model.launch(model.kernel(kernels.wait_at_barrier), 1, [self.threads, self._leave], [self._barrier])
 
@@ -77,12 +77,15 @@ class ThreadPool:
         self.launch_barrier(model)
 
     def run(self, functions):
-        """Calls each function in a thread of its own, and returns when all have ended; there are at most as many as threads.
+        """Calls each function in a thread of its own, and returns when all have ended.
 
-        Calls from several threads run one after another.
+        Calls of `run` from several threads run one after another.
+
+        Args:
+            functions: At most as many as there are threads.
 
         Raises:
-            Exception: The first one that a function raises. Threads that wait for that function at the barrier are released.
+            Exception: The first that a function raises. Threads that wait at the barrier are released.
         """
         if self.threads == 1:
             for function in functions:
@@ -92,13 +95,13 @@ class ThreadPool:
             self._start()
         with self._busy:
             if self._running is not None:
-                self._running.exception()  # has ended, but where a second interrupt left it behind
-            # By a thread of the pool: an interrupt, which comes in the main thread alone, finds all of them started or none.
+                self._running.exception()  # waits, if a second interrupt left a run behind
+            # A thread of the pool starts the others, because interrupts come in the main thread only: so all start, or none.
             self._running = self._pool.submit(self._run, functions)
             try:
                 self._running.result()
             except KeyboardInterrupt:
-                self._running.exception()  # the state is whole again when all have ended
+                self._running.exception()  # waits until all have ended, so that the state is consistent
                 raise
 
     def _run(self, functions):
@@ -112,7 +115,7 @@ class ThreadPool:
     def _guard(self, function):
         """Calls the function; returns the exception that it raises, or None."""
         try:
-            with TURN.shared():  # the turn of the thread that called run
+            with TURN.shared():  # the lock of the thread that called run
                 function()
         except BaseException as error:
             self._barrier.numpy()[kernels.ABANDONED] = 1

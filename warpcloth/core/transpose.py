@@ -2,7 +2,7 @@
 
 
 class Transpose:
-    """Adds Dᵀz to arrays of vertices: on the CPU element by element, on CUDA vertex by vertex, always in the same order.
+    """Adds Dᵀz to arrays of vertices: scatters from elements on the CPU, gathers by vertex on CUDA, in a fixed order.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -15,11 +15,11 @@ class Transpose:
         self.model, cuda = model, model.device.is_cuda
         self._kernel = model.kernel(gather if cuda else scatter, *key)
         if cuda:
-            offsets, codes = elements.incidences  # now: made during a capture they would only be recorded
+            offsets, codes = elements.incidences  # built now, because during a capture it would only be recorded
             self._dim, self._given = len(offsets) - 1, [offsets, codes, elements.rest]
         else:
             self._dim, self._given = elements.count, [elements.stencil, elements.rest]
 
     def add(self, data, *out):
-        """out += Dᵀz of what the struct ``data`` holds."""
+        """Launches out += Dᵀz, z from the struct ``data``."""
         self.model.launch(self._kernel, self._dim, [*self._given, data], out)

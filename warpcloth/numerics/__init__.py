@@ -1,1 +1,1 @@
-"""Minimisers, linear systems, sweeps and integrators that solvers are made of."""
+"""Minimisers, linear systems, sweeps and integrators, of which solvers are built."""

@@ -1,4 +1,4 @@
-"""The step of an accelerated iteration d ← d − A⁻¹∇φ(d), taken where it lowers φ more than the plain one."""
+"""The step of an accelerated iteration d ← d − A⁻¹∇φ(d), taken if φ falls more than with the plain step."""
 
 import numpy as np
 import warp as wp
@@ -14,8 +14,8 @@ class AcceleratedStep:
 
     Args:
         stepper: The :class:`warpcloth.solvers.projective_dynamics.ProjectiveDynamicsStepper`.
-        method: What proposes, of :mod:`warpcloth.numerics.acceleration`.
-        falls: Whether an iterate stays where it is if φ rises in both steps; else the plain one never lets φ rise.
+        method: The acceleration, of :mod:`warpcloth.numerics.acceleration`.
+        falls: Whether an iterate stays if φ rises with both steps; not needed if φ never rises with the plain step.
     """
 
     def __init__(self, stepper, method, falls=False):
@@ -31,7 +31,7 @@ class AcceleratedStep:
         self.plain_energy, self.energy = (Mirror(model.scalars()) for _ in range(2))
         self._lowest = model.scalars() if falls else None
         self._stayed = Mirror(model.scalars(wp.int32)) if falls else None
-        # A rise of φ, relative, that is taken for rounding, as in a line search.
+        # Relative rise of φ that counts as rounding, as in a line search.
         self._noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
         self.energy_of = Energy(model, stepper.sums, corrected=True)
         of_vertices = kernels.note_change, kernels.partial_products, kernels.combine, kernels.accept
@@ -40,12 +40,12 @@ class AcceleratedStep:
         self._note = Segment(device, self._launch_note)
 
     def start(self):
-        """Before the first iteration of a step."""
+        """Clears the history, before the first iteration of a step."""
         self.method.start()
         self._iteration = 0
 
     def propose(self, active):
-        """Sets the coefficients of the accelerated step of the copies that still iterate."""
+        """Sets the coefficients of the accelerated step of the ``active`` copies (B,)."""
         self._note()
         accepted = self.energy.read() <= self.plain_energy.read() if self._iteration else np.ones(len(active), dtype=bool)
         products = self.products.read().reshape(len(active), 4, -1)
@@ -54,11 +54,11 @@ class AcceleratedStep:
         self._iteration += 1
 
     def stayed(self):
-        """Which copies stayed where they were in the last iteration, (B,) truth values."""
+        """Returns which copies did not move in the last iteration, (B,) booleans."""
         return self._stayed.read() == 1
 
     def launch_start(self):
-        """The first pair goes to the first slot, and d = 0 is the lowest point so far."""
+        """Launches the start of a history: an empty first slot, and d = 0 as the lowest point."""
         self.slot.zero_()
         if self._lowest is not None:
             self._stayed.array.zero_()
@@ -73,7 +73,7 @@ class AcceleratedStep:
         self._launch(kernels.finish_products, self.products.array.shape, [self.partial], [self.products.array])
 
     def launch_move(self):
-        """d = the better of the plain and the accelerated step."""
+        """Launches d = the better of the plain and the accelerated step."""
         stepper, model = self.stepper, self.stepper.model
         N, n, d = model.count, model.per_copy, stepper.correction
         stepper.launch_plain_step(self.plain)
@@ -89,7 +89,7 @@ class AcceleratedStep:
         self._launch(kernels.accept, N, given, [d, self.s])
 
     def _launch_energy(self, d, out):
-        """out (B,) = φ(d)."""
+        """Launches out (B,) = φ(d) [J]."""
         stepper, model = self.stepper, self.stepper.model
         stepper.inertia.add(d, self.unused)
         stepper.sums.sum(stepper.inertia.work, model.per_copy, out)

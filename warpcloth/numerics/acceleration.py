@@ -1,7 +1,7 @@
-"""Accelerations of d ← d − A⁻¹∇φ(d), as coefficients of the steps taken before.
+"""Accelerations of the iteration d ← d − A⁻¹∇φ(d): Chebyshev, Anderson and L-BFGS.
 
-Each proposes d − c₀w + Σⱼ aⱼsⱼ + bⱼzⱼ, w = A⁻¹∇φ, from the products of a history of m pairs: steps sⱼ, changes yⱼ of ∇φ and
-zⱼ = A⁻¹yⱼ. All numbers here are on the host, in double precision, with a row for each copy.
+Each proposes d − c₀w + Σⱼ(aⱼsⱼ + bⱼzⱼ) with w = A⁻¹∇φ. The coefficients follow from dot products of the last m steps sⱼ,
+changes yⱼ of ∇φ and zⱼ = A⁻¹yⱼ. All arrays here are on the host, in double precision, with a row for each copy.
 """
 
 import numpy as np
@@ -10,12 +10,12 @@ import numpy as np
 class Chebyshev:
     """The Chebyshev semi-iterative method (Wang 2015): d ← ω(d − w − d₋₁) + d₋₁ with ω → 2/(1 + √(1 − ρ²)).
 
-    ω is 1 in the first ten iterations, then 2/(2 − ρ²), then 4/(4 − ρ²ω), and the same anew in a copy whose proposal was turned
-    down, but for the ten.
+    ω is 1 in the first ten iterations, then 2/(2 − ρ²), then 4/(4 − ρ²ω). If a proposal is rejected, ω of that copy starts
+    again from 1, without the ten iterations.
 
     Args:
         copies: B.
-        rho: ρ in [0, 1), the assumed factor of the error in a plain iteration, one or (B,).
+        rho: ρ in [0, 1), the assumed factor by which a plain iteration multiplies the error, one or (B,).
     """
 
     DELAY = 10
@@ -29,12 +29,12 @@ class Chebyshev:
         self.omega[:], self.count[:] = 1.0, 0
 
     def propose(self, iteration, products, accepted):
-        """Coefficients (B, 1 + 2m) of (c₀, a, b).
+        """Returns the coefficients (c₀, a, b), (B, 1 + 2m).
 
         Args:
-            iteration: From 0.
-            products: sⱼ·∇φ, zⱼ·∇φ, sⱼ·y, zⱼ·y, y the newest, (B, 4, m).
-            accepted: Which copies took the proposal before, (B,).
+            iteration: Index of the iteration in the step, from 0.
+            products: sⱼ·∇φ, zⱼ·∇φ, sⱼ·y and zⱼ·y with the latest y, (B, 4, m).
+            accepted: Which copies accepted the last proposal, (B,).
         """
         self.count = np.where(accepted, self.count + 1, self.DELAY)
         later = np.where(self.omega > 1.0, 4.0 / (4.0 - self.rho2 * self.omega), 2.0 / (2.0 - self.rho2))
@@ -43,7 +43,7 @@ class Chebyshev:
 
 
 def _dot(a, b):
-    """Σⱼ aⱼbⱼ of each copy, (B, m) both; added in order, so that a copy has the same bits however many there are."""
+    """Returns Σⱼ aⱼbⱼ of each copy, from (B, m) both, added in a fixed order, so that the result does not depend on B."""
     total = np.zeros(len(a))
     for j in range(a.shape[1]):
         total = total + a[:, j] * b[:, j]
@@ -51,17 +51,17 @@ def _dot(a, b):
 
 
 def _times(A, b):
-    """A b of each copy, (B, m, m) and (B, m), as :func:`_dot`."""
+    """Returns A b of each copy, from (B, m, m) and (B, m), as :func:`_dot`."""
     return np.stack([_dot(row, b) for row in A.transpose(1, 0, 2)], axis=1)
 
 
 class _History:
-    """The products of the last m pairs: sᵢ·yⱼ for j no older than i, and zᵢ·yⱼ = yᵢᵀA⁻¹yⱼ for all.
+    """The dot products of the last m steps: sᵢ·yⱼ for j no older than i, and zᵢ·yⱼ = yᵢᵀA⁻¹yⱼ for all.
 
     Args:
         copies: B.
         window: m.
-        epsilon: Rounding of the products, relative.
+        epsilon: Relative rounding of the products.
     """
 
     def __init__(self, copies, window, epsilon):
@@ -82,7 +82,7 @@ class _History:
         self.sy[:, :, newest] = products[:, 2]
         self.zy[:, :, newest] = self.zy[:, newest] = products[:, 3]
         slots = [(newest - age) % m for age in range(min(iteration, m))]
-        with np.errstate(all="ignore"):  # of a copy that is not finite
+        with np.errstate(all="ignore"):  # a copy may be NaN or infinite
             a, b = self._coefficients(slots, products[:, 0, slots], products[:, 1, slots])
         good = (np.isfinite(a) & np.isfinite(b)).all(axis=1)[:, None]
         proposal[:, [1 + j for j in slots]] = np.where(good, a, 0.0)
@@ -90,14 +90,14 @@ class _History:
         return proposal
 
     def _coefficients(self, slots, s, z):
-        """a and b (B, pairs) of the pairs in ``slots``, the newest first, from their products s and z with ∇φ."""
+        """Returns a and b (B, pairs) of the pairs in ``slots``, newest first, from their products s and z with ∇φ."""
         raise NotImplementedError  # every method has its own
 
 
 class Anderson(_History):
     """Anderson acceleration (Peng et al. 2018): d − w − Σθⱼ(sⱼ − zⱼ) with the θ that minimises ‖w − Σθⱼzⱼ‖ in the norm of A.
 
-    In that norm zᵢᵀAzⱼ = zᵢ·yⱼ and zᵢᵀAw = zᵢ·∇φ. Directions that are linear combinations of others are left out.
+    In that norm zᵢᵀAzⱼ = zᵢ·yⱼ and zᵢᵀAw = zᵢ·∇φ. Linearly dependent directions are left out.
     """
 
     def _coefficients(self, slots, s, z):
@@ -114,7 +114,7 @@ class Anderson(_History):
 
 
 class LBFGS(_History):
-    """L-BFGS with A for the first Hessian (Liu et al. 2017), both loops on products alone; pairs with sᵀy ≤ 0 are left out."""
+    """L-BFGS with A as initial Hessian (Liu et al. 2017), computed from dot products alone. Pairs with sᵀy ≤ 0 are left out."""
 
     def _coefficients(self, slots, s, z):
         sy, zy = self.sy[:, slots][:, :, slots], self.zy[:, slots][:, :, slots]
@@ -133,12 +133,12 @@ class LBFGS(_History):
 
 
 def accelerated(name, model, window, slowest):
-    """The acceleration of that name, with the ``window`` given; None for ``"none"``.
+    """Returns the acceleration of a name; None for ``"none"``.
 
     Args:
         name: ``"none"``, ``"chebyshev"``, ``"anderson"`` or ``"l-bfgs"``.
         model: The :class:`warpcloth.model.model.Model`.
-        window: Steps that Anderson and L-BFGS remember.
+        window: Number of steps that Anderson and L-BFGS remember.
         slowest: Function that returns ρ of Chebyshev, (B,).
     """
     if name == "none":

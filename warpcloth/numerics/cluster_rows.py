@@ -1,4 +1,4 @@
-"""The constraint rows of rigid clusters, beside those of terms in :mod:`warpcloth.numerics.constraints`."""
+"""The constraint rows of rigid clusters, for :mod:`warpcloth.numerics.constraints`."""
 
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ class ClusterRows:
         elements: The :class:`warpcloth.model.elements.DeviceElements`, of cells.
 
     Attributes:
-        count: Rows of one copy.
+        count: Number of rows of one copy.
     """
 
     def __init__(self, model, elements):
@@ -35,12 +35,12 @@ class ClusterRows:
         self._rotations = wp.zeros(self.cells.count, dtype=model.mat33, device=model.device)
         self._turned = Mirror(self._rotations)
         self._gather_pulls = model.kernel(kernels.gather_pulls, elements.term, model.dtype)
-        self._incidences = elements.incidences  # now: made during a capture they would only be recorded
+        self._incidences = elements.incidences  # built now, because during a capture it would only be recorded
         self._pulls = stored(elements.term, model.dtype).data()
         self._pulls.z = wp.zeros(elements.count, dtype=wp.types.matrix((1, 3), model.dtype), device=model.device)
 
     def _inertias(self):
-        """Σ m(q²I − qqᵀ) of each cell at rest, (C, 3, 3) [kg m²]."""
+        """Returns the inertia tensor Σ m(q²I − qqᵀ) of each cell at rest, (C, 3, 3) [kg·m²]."""
         mass, q = self._mass, self._rest
         each = mass[:, None, None] * ((q**2).sum(axis=1)[:, None, None] * np.eye(3) - q[:, :, None] * q[:, None, :])
         return np.add.reduceat(each, self._offsets[:-1], axis=0)
@@ -56,19 +56,19 @@ class ClusterRows:
         self._launch(kernels.linearise_clusters, cells.count, given, [self._rotations, values])
 
     def launch_apply(self, v, out, active=None):
-        """out += J v, of all copies."""
+        """Launches out += J v, of all copies."""
         given = [*self._shape(), self.elements.stencil, self.elements.rest, v, self.layout]
         self._launch(kernels.apply_cluster_rows, self.cells.count, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
-        """out += Jᵀ rows, of all copies."""
+        """Launches out += Jᵀ rows, of all copies."""
         given = [*self._shape(), self.elements.rest, rows, self.layout]
         self._launch(kernels.pull_clusters, self.cells.count, given, [self._pulls.z])
         given = [*self._incidences, self.elements.rest, self._pulls]
         self.model.launch(self._gather_pulls, len(self._incidences[0]) - 1, given, [out])
 
     def entries(self):
-        """J on the host: values, rows and columns."""
+        """Returns J on the host: values, rows and columns."""
         mass, q, R, found = self._mass, self._rest, self._turned.read().astype(np.float64), []
         for cell, (start, stop) in enumerate(pairwise(self._offsets)):
             if not R[cell].any():

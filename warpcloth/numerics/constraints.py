@@ -1,6 +1,6 @@
-"""The rows of all constraints of a model and their Schur complement J W Jᵀ + α̃: what constrained dynamics solves for λ.
+"""The constraint rows of a model and their Schur complement J W Jᵀ + α̃, the matrix of constrained dynamics.
 
-The rows of a term are an object that knows its part of J; anything with the same methods can stand beside it.
+Each term has an object for its rows of J. Self-contact and rigid clusters have objects with the same methods.
 """
 
 from functools import cached_property
@@ -25,10 +25,10 @@ class TermRows:
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         elements: The :class:`warpcloth.model.elements.DeviceElements`.
-        curved: Whether tension stiffens.
+        curved: Whether to add geometric stiffness.
 
     Attributes:
-        count: Rows of one copy.
+        count: Number of rows of one copy.
     """
 
     def __init__(self, model, elements, curved):
@@ -47,18 +47,26 @@ class TermRows:
         self.layout = layout
 
     def launch_linearise(self, x, d, h, least, values):
-        """Of x + d its part of what :func:`warpcloth.kernels.constraint_rows.linearise` makes, in the struct ``values``."""
+        """Launches the linearisation of its rows at x + d, see :func:`warpcloth.kernels.constraint_rows.linearise`.
+
+        Args:
+            x: Positions (N,) [m].
+            d: Correction (N,) [m].
+            h: Step [s].
+            least: Smallest compliance, relative to the diagonal of J W Jᵀ.
+            values: The struct of the rows, which is written.
+        """
         model = self.model
         given = [*self.elements.arguments, model.inverse_mass, x, d, h, least, self.layout]
         model.launch(self._linearise, self.elements.count, given, [self._slopes, values])
 
     def launch_apply(self, v, out, active=None):
-        """out += J v, of the copies that are ``active`` (B,), all of them where it is None."""
+        """Launches out += J v, for the copies that are ``active`` (B,), or for all if it is None."""
         given = [self.elements.stencil, self.elements.rest, self._slopes, v, self.layout, active]
         self.model.launch(self._apply, self.elements.count, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
-        """out += Jᵀ rows, of the copies that are ``active`` (B,), all of them where it is None."""
+        """Launches out += Jᵀ rows, for the copies that are ``active`` (B,), or for all if it is None."""
         held = jacobian.held_rows(*self._key)()
         held.slopes, held.multipliers, held.layout = self._slopes, rows, self.layout
         if active is not None:
@@ -67,7 +75,7 @@ class TermRows:
 
     @cached_property
     def _in_full(self):
-        """Scratch, kernel and pattern of :meth:`entries`: rows and columns of every entry in one matrix of all copies."""
+        """Scratch, kernel, rows and columns of :meth:`entries`, for one matrix of all copies."""
         elements, Q = self.elements, self.rows
         stencil = host_values(elements.stencil).astype(np.int64)
         E, K = stencil.shape
@@ -79,25 +87,25 @@ class TermRows:
         return blocks, self.model.kernel(jacobian.rows_in_full, *self._key), rows.ravel(), columns.ravel()
 
     def entries(self):
-        """J on the host: values, rows and columns."""
+        """Returns J on the host: values, rows and columns."""
         blocks, kernel, rows, columns = self._in_full
         self.model.launch(kernel, self.elements.count, [self.elements.rest, self._slopes], [blocks.array])
         return blocks.read().ravel(), rows, columns
 
 
 class Constraints:
-    """All rows of a model; as a matrix their Schur complement A = J W Jᵀ + α̃, W the inverse masses.
+    """All constraint rows of a model, with the matrix A = J W Jᵀ + α̃, W the inverse masses.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         h: Step [s].
-        curved: Whether tension stiffens.
+        curved: Whether to add geometric stiffness.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None.
 
     Attributes:
-        parts: :class:`TermRows` of each term, and then of pairs.
-        count, per_copy: Rows of all copies and of one.
-        multipliers: λ (count,) [kg m over the unit of the constraint].
+        parts: The rows of each term, and then of pairs.
+        count, per_copy: Number of rows of all copies and of one.
+        multipliers: λ (count,) [J·s² over the unit of the constraint].
         gap: C + α̃λ (count,).
         residual, rounding, carried: (count,) [m], see :func:`warpcloth.kernels.constraint_rows.linearise`.
     """
@@ -113,7 +121,7 @@ class Constraints:
             if pairs.friction is not None:
                 self.parts.append(FrictionRows(model, pairs.friction))
             sizes += [part.per_copy for part in self.parts[len(sizes) :]]
-        self._fresh = [elements for elements in model.terms if not elements.cells]  # whose rows fit themselves
+        self._fresh = [elements for elements in model.terms if not elements.cells]  # rows of cells update themselves
         self.per_copy = sum(part.count for part in self.parts)
         self.count = self.per_copy * model.copies
         first = 0
@@ -135,50 +143,50 @@ class Constraints:
         self._vectors = model.vectors()
         self._weigh, self._scale = (model.kernel(scale, model.dtype, numbers) for numbers in (False, True))
         self.vector = self.block = model.dtype
-        # Of redundant hard rows A would be singular, and what they share of λ undetermined.
+        # Without compliance, redundant hard rows would make A singular and λ undetermined.
         self.least = float(np.finfo(model.numpy_dtype).eps) ** 0.7
 
     def launch_linearise(self, x, d):
-        """All rows at x + d, with λ as it is."""
+        """Launches the linearisation of all rows at x + d, with the present λ."""
         self.model.refresh(EVALUATION, Moment(x, d), self._fresh)
         for part in self.parts:
             part.launch_linearise(x, d, self.h, self.least, self._values)
 
     def launch_apply(self, v, out, active=None):
-        """out += J v; of copies that are not ``active`` (B,), if that is given, less or nothing."""
+        """Launches out += J v; undefined for copies that are not ``active`` (B,), if that is given."""
         for part in self.parts:
             part.launch_apply(v, out, active)
 
     def launch_moves(self, rows, out, active=None):
-        """out = W Jᵀ rows, (N,) vectors [m] for λ, likewise."""
+        """Launches out = W Jᵀ rows, (N,) vectors, [m] for λ; undefined for copies that are not ``active`` (B,)."""
         out.zero_()
         for part in self.parts:
             part.launch_transpose(rows, out, active)
         self.model.launch(self._weigh, self.model.count, [self.model.inverse_mass, out], [out])
         self.model.lock(out)
 
-    # As a matrix, see ConjugateGradients.
+    # The matrix A, for ConjugateGradients.
 
     def prepare(self):
-        """Nothing is left to find."""
+        """Does nothing."""
 
     def multiply(self, p, q, active):
-        """q = A p, of the copies that are ``active`` (B,)."""
+        """Launches q = A p, for the copies that are ``active`` (B,)."""
         self.launch_moves(p, self._vectors, active)
         self.model.launch(self._scale, self.count, [self._compliance, p], [q])
         self.launch_apply(self._vectors, q, active)
 
     def invert_diagonal(self, out):
-        """out = the inverse diagonal, 0 where that is 0."""
+        """Launches out = the inverse of the diagonal of A, 0 where that is 0."""
         wp.copy(out, self._inverse)
 
     @cached_property
     def _on_host(self):
-        """The inverse masses of coordinates, and the mirror of the compliances."""
+        """Inverse masses of coordinates, and the mirror of the compliances."""
         return self.model.coordinate_mobility(), Mirror(self._compliance)
 
     def matrices(self):
-        """A of each copy on the host, scipy matrices in double precision."""
+        """Returns A of each copy as scipy matrices in double precision."""
         from scipy.sparse import csr_matrix, diags
 
         n, R, copies = 3 * self.model.per_copy, self.per_copy, self.model.copies

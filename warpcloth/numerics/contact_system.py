@@ -7,22 +7,23 @@ from ..core.capture import Mirror, Segment
 from ..kernels.clear_elements import add_hessian
 from .search import HALVINGS, Search
 
-# Of ‖b‖ in the norm of A⁻¹, to which systems are solved closely.
+# An accurate solve ends at this residual, relative to b, in the norm of A⁻¹.
 TOLERANCE = 1e-3
-# Roughly: until the quadratic model of φ has fallen by this share of a bound of its whole fall, or falls in an iteration by no
-# more than that part of its fall so far. The projections of the next iteration change more than what is left.
+# A rough solve ends when the quadratic model of φ has fallen by the fraction SHARE of a bound of its total decrease, or when an
+# iteration lowers it by at most the fraction LAST of its decrease so far. The projections of the next iteration change more.
 SHARE, LAST = 0.7, 0.1
-# Of the largest ‖∇φ‖ of a step in the norm of A⁻¹, below which systems are solved closely, as Anderson acceleration needs.
+# Solves are accurate once ‖∇φ‖ is below this fraction of its largest value in a step, in the norm of A⁻¹, as Anderson
+# acceleration needs.
 NEAR = 1e-6
 ITERATIONS = 200
-# A change of ψ, relative to its parts, that is taken for rounding.
+# Change of ψ, relative to its summands, that counts as rounding.
 NOISE = 1e-10
 
 
 class CorrectedSystem:
-    """Solves (A + D) w = b, D semi-definite and of contact, with A⁻¹ as preconditioner of conjugate gradients.
+    """Solves (A + D) w = b, D the semi-definite matrix of contact, by conjugate gradients with A⁻¹ as preconditioner.
 
-    A p follows from the residuals: an iteration is a solve with A and a product with D.
+    A p follows from the residuals, so that an iteration costs a solve with A and a product with D.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -42,7 +43,15 @@ class CorrectedSystem:
         return np.einsum("bi,bi->b", one.reshape(B, -1), other.reshape(B, -1))
 
     def _solve(self, add_product, b, z, going, closely):
-        """w = (A + D)⁻¹ b of the copies that are ``going``, from z = A⁻¹ b, and A w; ``add_product(p, q)``: q += D p."""
+        """Returns w = (A + D)⁻¹ b and A w of the copies that are ``going`` (B,).
+
+        Args:
+            add_product: Function (p, q) that does q += D p.
+            b: Right-hand side.
+            z: A⁻¹ b.
+            going: Which copies to solve for, (B,).
+            closely: Which copies to solve accurately, (B,).
+        """
         B = self.model.copies
 
         def over(one, other):
@@ -74,11 +83,12 @@ class CorrectedSystem:
 
 
 class ContactSystem(CorrectedSystem):
-    """Solves (A + D) w = ∇φ, D the semi-definite Hessian of contact: closely where φ rose or is nearly least, else roughly.
+    """Solves (A + D) w = ∇φ, D the semi-definite Hessian of contact: accurately if φ rose or is near its minimum, else roughly.
 
-    The curvature of contact has no bound, so that no constant matrix is above it. D is the sum of the blocks of vertices near
-    colliders and of the matrix of the pairs of self-contact. Copies whose φ rose are ``careful`` in the next 4 iterations,
-    after the second time in 16, and so on: w is then also shortened until φ falls. Without :meth:`start` all always are.
+    The curvature of contact has no bound, so no constant matrix is an upper bound of the Hessian. D is the sum of the blocks of
+    vertices near colliders and of the matrix of pairs of self-contact. A copy whose φ rose is ``careful`` in the next 4
+    iterations, after a second rise in 16, and so on: w is then also shortened until φ falls. Without :meth:`start`, all copies
+    always are.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -89,7 +99,7 @@ class ContactSystem(CorrectedSystem):
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None.
 
     Attributes:
-        careful: Which copies are, (B,) truth values.
+        careful: Which copies are careful, (B,) booleans.
     """
 
     def __init__(self, model, x, linear, sums, s, pairs=None):
@@ -113,7 +123,7 @@ class ContactSystem(CorrectedSystem):
         self._start = np.zeros(model.copies)
 
     def record(self):
-        """Records what an iteration launches."""
+        """Captures the launches of an iteration."""
         device, search = self.model.device, self._search
         self._assemble = Segment(device, self._launch_assemble)
         self._begin = Segment(device, search.launch_again)
@@ -128,22 +138,22 @@ class ContactSystem(CorrectedSystem):
             self._pairs.forces.launch_forces(self.x, self._search.correction)
 
     def start(self):
-        """Before the first iteration of a step whose iterates stay where they are if φ would rise: no copy is careful."""
+        """Makes no copy careful, before the first iteration of a step whose iterates stay if φ would rise."""
         self.careful[:], self._left[:], self._more[:], self._start[:] = False, 0, 1, 0.0
 
     def note(self, rose):
-        """Notes where φ rose in the last iteration, (B,) truth values."""
+        """Notes in which copies φ rose in the last iteration, (B,) booleans."""
         self._more = np.where(rose, 4 * self._more, self._more)
         self._left = np.where(rose, self._more, self._left - 1)
         self.careful = self._left > 0
 
     def correct(self, d, gradient, w, active):
-        """w = (A + D)⁻¹ ∇φ at d, of careful copies t times that, from the A⁻¹ ∇φ that it is."""
+        """Replaces w = A⁻¹ ∇φ by (A + D)⁻¹ ∇φ at d, for careful copies times a step length."""
         wp.copy(self._search.correction, d)
         self._assemble()
         blocks = self._blocks.read()
         blocks[self._held] = np.where(self._moves, blocks[self._held], 0.0)
-        touching = np.flatnonzero(blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2])  # semi-definite, with 0 trace is 0
+        touching = np.flatnonzero(blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2])  # trace 0 of a semi-definite block
         J, D = (None, None) if self._pairs is None else self._pairs.forces.rows()
         pressing = len(touching) or (J is not None and J.shape[0])
         if not (pressing or self.careful.any()):
@@ -189,11 +199,11 @@ class PairSystem(CorrectedSystem):
         self.record()
 
     def record(self):
-        """Records what an iteration launches."""
+        """Captures the launches of an iteration."""
         self._press = Segment(self.model.device, self._launch_press)
 
     def _launch_press(self):
-        """U and ∂U/∂x at the trial."""
+        """Launches U and ∂U/∂x at the trial."""
         pairs = self._pairs
         pairs.forces.launch_forces(self._x, self._trial.array)
         self._energy.array.zero_()
@@ -208,7 +218,7 @@ class PairSystem(CorrectedSystem):
         return self._energy.read().copy(), self._pull.read().astype(np.float64)
 
     def correct(self, d, gradient, w, active):
-        """w = t (A + JᵀDJ)⁻¹ ∇ψ at d, 0 < t ≤ 1, from the A⁻¹ ∇ψ that it is."""
+        """Replaces w = A⁻¹ ∇ψ by t (A + JᵀDJ)⁻¹ ∇ψ at d, 0 < t ≤ 1."""
         d, b, found = (array.numpy().astype(np.float64) for array in (d, gradient, w))
         energy, pull = self._pressed(d)
         J, D = self._pairs.forces.rows()

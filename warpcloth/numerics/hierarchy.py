@@ -1,9 +1,9 @@
-"""Coarser and coarser levels of a cloth, for solvers that carry information over many vertices at once (Müller 2008).
+"""A hierarchy of coarser levels of a cloth, whose constraints span many vertices (Müller 2008).
 
-The levels are made of bounds: pairs of vertices that the terms of a model keep no farther apart than a length, see
-``max_lengths`` of :class:`warpcloth.kernels.term.Term`. A level keeps some vertices of the finer one, no two of them linked
-there, so that every dropped vertex is linked to at least one kept one; pins are all kept. A bound between kept vertices is the
-shortest way over up to two dropped ones, with its length: what meets all finer bounds meets it, on any mesh, however folded.
+A bound is a pair of vertices with a largest distance, see ``max_lengths`` of :class:`warpcloth.kernels.term.Term`. A level
+keeps an independent set of vertices of the finer level, so that every dropped vertex is linked to a kept one; all pins are
+kept. A bound between kept vertices is the length of the shortest path over up to two dropped ones. So a cloth that meets all
+finer bounds meets it too, on any mesh and in any shape.
 """
 
 from dataclasses import dataclass, replace
@@ -15,17 +15,17 @@ from ..kernels.terms import SPRING_LIMIT
 from ..model.elements import DeviceElements
 from ..model.host_values import host_values
 
-_HUB = 8  # kept neighbours of a dropped vertex, above which they are linked to the nearest of them alone, not each to each
+_HUB = 8  # a dropped vertex with more kept neighbours links them to the nearest of them, not each to each
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Pairs of vertices and how far apart they may be.
+    """Pairs of vertices with the largest distance allowed.
 
     Attributes:
         pairs: (E, 2), each pair once.
         lengths: (E,) [m].
-        compliance: 1/k of each copy, (E, B), or (E, 1) where copies do not differ [m/N].
+        compliance: 1/k of each copy, (E, B), or (E, 1) if copies do not differ [m/N].
     """
 
     pairs: np.ndarray
@@ -39,7 +39,7 @@ class Bounds:
         return Bounds(self.pairs[which], self.lengths[which], self.compliance[which])
 
     def shortest(self, n):
-        """The shortest of the bounds of each pair, of equal ones the first; in lexicographic order, smaller index first."""
+        """Returns the shortest bound of each pair, the first of equal ones, in lexicographic order, smaller index first."""
         keys = self.pairs.min(axis=1).astype(np.int64) * n + self.pairs.max(axis=1)
         order = np.lexsort((self.lengths, keys))
         unique, first = np.unique(keys[order], return_index=True)
@@ -49,14 +49,14 @@ class Bounds:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A level of the vertices of one copy, and the way from it to the next finer one.
+    """A level of the vertices of one copy, and the interpolation from it to the next finer one.
 
     Attributes:
-        bounds: The :class:`Bounds` between kept vertices, as tuples (soft, hard).
-        inverse_mass: (B, n) [1/kg]: of a kept vertex that of itself and its parts of the dropped ones, so that a move of the
-            level has the momentum of the move of all that follow it. 0 of pins.
-        dropped: The vertices (D,) that the finer level has and this one has not.
-        offsets, parents, weights: Of each of these the kept vertices that it follows, with weights of sum 1, as CSR.
+        bounds: The :class:`Bounds` between kept vertices, a tuple (soft, hard).
+        inverse_mass: (B, n) [1/kg]. The mass of a kept vertex includes its weights of the dropped ones that follow it, so that
+            a move of the level has the momentum of the move of all of them. 0 for pins.
+        dropped: The vertices (D,) of the finer level that this one drops.
+        offsets, parents, weights: For each dropped vertex, the kept vertices that it follows, and weights with sum 1, as CSR.
     """
 
     bounds: tuple
@@ -68,14 +68,14 @@ class Level:
 
 
 def levels(model, most=None):
-    """The levels above the finest, finer ones first: as many as have bounds, or ``most`` of them.
+    """Returns the levels above the finest, finer ones first: as many as have bounds, or ``most`` of them.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         most: Number of levels, or None.
 
     Returns:
-        A list of :class:`Level`; without bounds between vertices of which one moves it is empty.
+        A list of :class:`Level`, empty without bounds on vertices that move.
     """
     n, inverse = model.per_copy, model.inverse_mass.numpy().reshape(model.copies, -1).astype(np.float64)
     free = inverse[0] > 0.0
@@ -89,7 +89,7 @@ def levels(model, most=None):
         ).shortest(n)
         kept = _independent(links.pairs, free)
         dropped, offsets, parents, weights = _followers(links, kept)
-        for copy_mass in mass:  # of the dropped vertices nothing is left behind
+        for copy_mass in mass:  # the kept vertices take over all mass of the dropped ones
             np.add.at(copy_mass, parents, weights * np.repeat(copy_mass[dropped], np.diff(offsets)))
             copy_mass[dropped] = 0.0
         groups = tuple(_scaled(_coarser(each, kept, free), each, free) for each in groups)
@@ -101,7 +101,7 @@ def levels(model, most=None):
 
 
 def _finest(model, free):
-    """The bounds of a model's terms, (soft, hard): a hard bound must not be merged with a soft one of another length."""
+    """Returns the bounds of a model's terms, (soft, hard), apart because a hard bound must not merge with a soft one."""
     n, soft, hard = model.per_copy, [], []
     points = model.rest_points
     for elements in model.terms:
@@ -111,7 +111,7 @@ def _finest(model, free):
         stiffness = host_values(elements.stiffness).reshape(model.copies, E).astype(np.float64).T
         if (stiffness == stiffness[:, :1]).all():
             stiffness = stiffness[:, :1]
-        # What bounds all copies is the longest of their lengths; the last sweeps have each its own.
+        # All copies share the longest of their bounds; the last sweeps use the lengths of each copy.
         stencil, rest = host_values(elements.stencil)[:E], host_values(elements.rest).reshape(model.copies, E, -1)
         found = [elements.term.max_lengths(points, stencil, each) for each in (rest if (rest != rest[:1]).any() else rest[:1])]
         pairs, _, factors = found[0]
@@ -139,7 +139,7 @@ def _joined(bounds, copies):
 
 
 def _parallel(bounds, n, copies):
-    """Soft bounds of one pair as one: of the sum of their stiffness, and as long as where their forces cancel in copy 0."""
+    """Merges soft bounds of one pair: their stiffnesses add up, and at its length their forces cancel in copy 0."""
     bounds = _joined(bounds, copies)
     stiffness = 1.0 / bounds.compliance
     keys = bounds.pairs.min(axis=1).astype(np.int64) * n + bounds.pairs.max(axis=1)
@@ -152,7 +152,7 @@ def _parallel(bounds, n, copies):
 
 
 def _independent(pairs, free):
-    """Which vertices are kept, (n,): linked ones, pins first, then each in its order that is linked to none that is kept."""
+    """Returns which vertices are kept, (n,): linked pins, then in order each linked vertex without a kept neighbour."""
     n = len(free)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     both = both[np.argsort(both[:, 0], kind="stable")]
@@ -172,9 +172,9 @@ def _independent(pairs, free):
 
 
 def _followers(links, kept):
-    """The dropped vertices and what each follows: linked kept ones, and where that is one only those of dropped neighbours.
+    """Returns the dropped vertices and the kept ones that each follows: its neighbours, and if that is one, those at two links.
 
-    Weights are one over the length of the way, 1/L over Σ 1/L.
+    The weights are 1/L over Σ 1/L, with L the length of the path.
     """
     n = len(kept)
     dropped, near = _nearest(links, kept)
@@ -207,7 +207,7 @@ def _followers(links, kept):
 
 
 def _nearest(bounds, kept):
-    """Bounds from a dropped to a kept vertex, pairs (dropped, kept) by the dropped one and then by length; and the former."""
+    """Returns the dropped vertices and the bounds from dropped to kept vertices, sorted by dropped vertex and length."""
     inside = kept[bounds.pairs]
     one = inside[:, 0] != inside[:, 1]
     some, inside = bounds.take(one), inside[one]
@@ -218,20 +218,20 @@ def _nearest(bounds, kept):
 
 
 def _spread(first, count):
-    """(rows, entries): entries first[i] … first[i] + count[i] − 1 of each row i, one after another."""
+    """Returns (rows, entries): entries first[i] … first[i] + count[i] − 1 of each row i, one row after another."""
     rows = np.repeat(np.arange(len(first)), count)
     return rows, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
 
 
 def _coarser(bounds, kept, free):
-    """Bounds between kept vertices: their own, over one dropped vertex, and over two, each by its nearest kept one."""
+    """Returns bounds between kept vertices: direct, over one dropped vertex, and over two by the nearest kept one of each."""
     n = len(kept)
     inside = kept[bounds.pairs]
     own = bounds.take(inside.all(axis=1))
     dropped, near = _nearest(bounds, kept)
     first = np.searchsorted(dropped, np.arange(n))
     count = np.bincount(dropped, minlength=n)
-    # Each way to a kept vertex goes on to those before it, from a hub to the nearest alone.
+    # Each path to a kept vertex continues to those before it in the list, or at a hub to the nearest one.
     before = np.arange(len(dropped)) - first[dropped]
     back, other = _spread(first[dropped], np.where(count[dropped] > _HUB, np.minimum(before, 1), before))
     over_one = Bounds(
@@ -252,9 +252,9 @@ def _coarser(bounds, kept, free):
 
 
 def _scaled(coarse, fine, free):
-    """``coarse`` with a stiffness that keeps Σ kL², twice the energy of a uniform stretch, of each connected part of cloth.
+    """Scales the stiffness of ``coarse`` so that Σ kL², twice the energy of a unit stretch, of each connected piece is kept.
 
-    In a chain the way in series has that already; a sheet has as many ways side by side as a level drops.
+    In a chain, the stiffness of paths in series already keeps it. In a sheet, a level also drops parallel paths.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -279,7 +279,7 @@ def _scaled(coarse, fine, free):
 
 
 def on_device(model, level):
-    """The model of a level: the same vertices and kernels, with its masses, and its bounds as the one term."""
+    """Returns the model of a level: the same vertices and kernels, with the masses and the bounds of the level."""
     bounds = _joined(level.bounds, model.copies)
     E, B = len(bounds), model.copies
     with np.errstate(divide="ignore"):

@@ -6,15 +6,15 @@ from ..kernels.minimise import add_inertia
 
 
 class Inertia:
-    """Adds inertia, and gravity where that is a force, to the objective and to its gradient.
+    """Adds inertia, and gravity if it acts as a force, to the objective and to its gradient.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         s: Weight of the inertia, 1/h² [1/s²].
 
     Attributes:
-        s, load: s as given; the part of gravity that acts as a force, 0 until it is set.
-        work: The sum by vertices, (N,) [J].
+        s, load: s as given; the fraction of gravity that acts as a force, 0 by default.
+        work: The summand of each vertex, (N,) [J].
     """
 
     def __init__(self, model, s):
@@ -23,7 +23,7 @@ class Inertia:
         self._kernel = model.kernel(add_inertia, model.dtype)
 
     def add(self, d, gradient):
-        """gradient (N,) += s M d − load·M g, g with loads, and 0 for what does not move; sets ``work``."""
+        """Launches gradient (N,) += s M d − load·M g, g with loads, 0 for fixed coordinates; and sets ``work``."""
         model = self.model
         gravity, each = model.free_gravity
         given = [model.mass, model.inverse_mass, gravity, d, each, self.s, self.load]

@@ -1,10 +1,10 @@
 """Implicit Euler, midpoint and BDF2, which share one minimisation.
 
-Each step of each of them minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x); they differ in the effective step hₑ, in x̃ and in how the new
-state follows from the minimiser (Hairer and Wanner 1996, *Solving ordinary differential equations II*). As solvers minimise
-over the correction d = x − x̃, velocities follow from d/hₑ = hₑ a with a = −∇U/m at the minimiser.
+Each of their steps minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x). They differ in the effective step hₑ, in x̃ and in how the new state
+follows from the minimiser (Hairer and Wanner 1996, *Solving ordinary differential equations II*). Solvers minimise over the
+correction d = x − x̃, so velocities follow from d/hₑ = hₑ a, with a = −∇U/m at the minimiser.
 
-A class also says what solvers and step limits ask of its integrator, so that these need not know it by name.
+A class also has the properties that solvers and step limits need, so that they do not know integrators by name.
 """
 
 from typing import ClassVar
@@ -25,12 +25,12 @@ class Euler:
     Attributes:
         he: hₑ [s].
         part: hₑ/h.
-        pin_parts: In which the pins make the way of a step.
+        pin_parts: Number of parts in which pins move during a step.
         hard: Whether it takes constraints of infinite stiffness.
-        damps: Whether it damps what its steps do not resolve.
-        to_and_fro: Whether Gauss–Seidel sweeps must change their direction, because it does not damp what one order adds.
-        least_weight: Number of iterations times the least automatic weight of ADMM. A small weight needs many iterations, and
-            what a step leaves unfinished becomes a velocity in the next one, which midpoint keeps and Euler damps.
+        damps: Whether it damps frequencies that its steps do not resolve.
+        to_and_fro: Whether Gauss–Seidel sweeps must alternate in direction, because the error of one order is not damped.
+        least_weight: Number of iterations times the smallest automatic weight of ADMM. A small weight needs many iterations.
+            The remaining error of a step becomes a velocity in the next one, which midpoint keeps and Euler damps.
         least_factor: The smallest real q for which no |z| of `growth` is above 1.
     """
 
@@ -44,7 +44,7 @@ class Euler:
 
     @staticmethod
     def growth(q):
-        """The factors z of a step, complex, where iterations multiply x̃ by q (n,): z² − 2qz + q = 0."""
+        """Returns the complex amplification factors z of a step whose iterations give x = q x̃, q (n,): z² − 2qz + q = 0."""
         return _roots(q, q)
 
     def __init__(self, stepper):
@@ -55,20 +55,20 @@ class Euler:
 
     @property
     def moment(self):
-        """The :class:`warpcloth.terms.refresh.Moment` where a step begins, by which (s − s̃)/hₑ is the rate of a damped s."""
+        """The :class:`warpcloth.terms.refresh.Moment` at the start of a step; (s − s̃)/hₑ is then the rate of a damped s."""
         return Moment(self.stepper.state.x, **self._time(parts=1))
 
     def _time(self, parts):
-        """When loads are taken that follow keyframes: one step of these ahead, of which a step of h has ``parts``."""
+        """Fields of a Moment for loads with keyframes: one keyframe step ahead, of which a step has ``parts``."""
         return {"steps": self.stepper.count, "per_frame": parts * self.stepper.steps_per_frame, "ahead": 1}
 
     def launch_prediction(self):
-        """Sets x = x̃ and v = (x̃ − x₀)/hₑ, and moves the pins to the end of the step."""
+        """Launches x = x̃, v = (x̃ − x₀)/hₑ, and the move of pins by a part of the step."""
         self._launch(kernels.predict, [*self.stepper.model.free_gravity, self.he], list(self.stepper.state))
         self.stepper.launch_pins(self.pin_parts)
 
     def launch_finish(self, correction):
-        """Sets the state at the end of the step."""
+        """Launches the state at the end of the step, from the ``correction`` d of the minimiser (N,) [m]."""
         self._launch(kernels.finish, [correction, self.he], list(self.stepper.state))
 
     def _launch(self, factory, inputs, outputs):
@@ -77,13 +77,13 @@ class Euler:
 
 
 class Midpoint(Euler):
-    """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Second order. At xₘ pins are where they are at t + h/2."""
+    """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Second order. xₘ has the pins at t + h/2."""
 
     part, pin_parts, hard, damps, to_and_fro, least_weight, least_factor = 0.5, 2, False, False, True, 20.0, 0.0
 
     @staticmethod
     def growth(q):
-        """As of Euler, z² − 2(2q − 1)z + 1 = 0."""
+        """See :meth:`Euler.growth`: z² − 2(2q − 1)z + 1 = 0."""
         return _roots(2.0 * q - 1.0, 1.0)
 
     @property
@@ -101,14 +101,14 @@ class Midpoint(Euler):
 class BDF2(Euler):
     """hₑ = 2h/3, x̃ = (4x₀ − x₋₁)/3 + hₑ(4v₀ − v₋₁)/3 + hₑ² g; the minimiser is x₁, v₁ = (4v₀ − v₋₁)/3 + hₑ(a₁ + g).
 
-    Second order. Two steps of Euler of hₑ from x₀, with velocities v₁ and v₂ after them, give the past state:
+    Second order. Two Euler steps of hₑ from x₀, with velocities v₁ and v₂ after them, give the past state:
 
         v₋₁ = v₀ − h a₀, a₀ = (v₁ − v₀)/hₑ;  x₋₁ = x₀ − h v̄ + ½h²(v₂ − v₁)/hₑ, v̄ = 2v₁ − v₂
 
-    v̄ is v₀ up to O(h²), except for modes so stiff or damped that the first step stops them, which must not move in x₋₁ either.
-    Errors of O(h) in accelerations do not change the order, steps of hₑ have the matrix of all other steps, and linear motion
-    gains energy from no start. Pins stand still before the start. Where the velocity of pins jumps, the past state is from
-    before the jump: the damping force is then too large by half of the jump, which is exactly what (v₀ − v₋₁)/3 lacks.
+    v̄ is v₀ up to O(h²), except for modes so stiff or damped that the first step stops them; these do not move in x₋₁ either.
+    Errors of O(h) in accelerations do not change the order, steps of hₑ have the matrix of all other steps, and no start gives
+    energy to linear motion. Pins are at rest before the start. If the velocity of pins jumps, the past state is that before the
+    jump: the damping force is then too large by half of the jump, which is exactly what (v₀ − v₋₁)/3 lacks.
 
     Attributes:
         move: x₀ − x₋₁ (N,) [m].
@@ -119,7 +119,7 @@ class BDF2(Euler):
 
     @staticmethod
     def growth(q):
-        """As of Euler, z² = r(4z − 1)/3 with r = q ± √(q² − q)."""
+        """See :meth:`Euler.growth`: z² = r(4z − 1)/3 with r = q ± √(q² − q)."""
         return np.concatenate([_roots(2.0 * r / 3.0, r / 3.0) for r in _roots(q, q)])
 
     def __init__(self, stepper):
@@ -128,8 +128,7 @@ class BDF2(Euler):
         self.v_before = stepper.state.add("v before", stepper.model.vectors())
 
     def start(self):
-        """Finds the past state, by two steps with x₋₁ = x₀ and v₋₁ = v₀, which are steps of Euler of hₑ, and restores the
-        state.
+        """Computes the past state by two Euler steps of hₑ, which are steps with x₋₁ = x₀ and v₋₁ = v₀, and restores x and v.
 
         The results of these steps count like those of other steps. A twin shares the past state of its lead.
         """
@@ -140,9 +139,9 @@ class BDF2(Euler):
             self.move.zero_()
             wp.copy(self.v_before, v)
             if stepper.count is not None:
-                stepper.count.fill_(-1)  # pins are led to their first keyframe, which is where they are
+                stepper.count.fill_(-1)  # pins then move to their first keyframe, where they are
             if stepper.colliders is not None:
-                stepper.colliders.steps.fill_(-1)  # likewise
+                stepper.colliders.steps.fill_(-1)  # as for pins
             stepper.step()
         self._launch(kernels.start_bdf2, [model.velocities, v, stepper.h], [self.move, self.v_before])
         stepper.state.start_here("move before", "v before")
@@ -170,7 +169,7 @@ class BDF2(Euler):
 
 
 def _roots(half, product):
-    """Solves z² − 2·half·z + product = 0 for both z, complex."""
+    """Returns both complex roots z of z² − 2·half·z + product = 0."""
     root = np.sqrt(half * half - product + 0j)
     return np.stack([half + root, half - root])
 

@@ -1,4 +1,4 @@
-"""The loop of the methods that iterate towards a minimiser, and the scale of their residuals."""
+"""The loop of iterative methods that minimise, and the scale of their residuals."""
 
 from typing import NamedTuple
 
@@ -28,12 +28,12 @@ def iterate(method, tolerance, iterations):
         method: An object with the ``model`` and three functions:
 
             - ``start()`` sets the first iterate.
-            - ``measure()`` returns the residual (B,) of the iterate, which is not finite in a copy that diverged, and a dict
-              from any other :class:`Result` to the truth values (B,) that say which copies end with it.
-            - ``iterate(active)`` does one iteration of the active copies, (B,) truth values.
+            - ``measure()`` returns the residual (B,) of the iterate, not finite in a copy that diverged, and a dict from other
+              :class:`Result` values to booleans (B,), which copies end with them.
+            - ``iterate(active)`` does one iteration of the active copies, (B,) booleans.
 
         tolerance: The residual at which a copy has converged.
-        iterations: The most iterations.
+        iterations: Maximum number of iterations.
 
     Returns:
         :class:`Ended`. A copy that has ended keeps its residual and its result.
@@ -58,7 +58,7 @@ def iterate(method, tolerance, iterations):
 
 
 class GravityScale:
-    """The acceleration to which the residuals of each copy are relative: that of gravity, if there is any.
+    """The acceleration by which the residuals of each copy are divided: gravity, if there is any.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.

@@ -1,4 +1,4 @@
-"""The only thing that solves a sparse system: conjugate gradients on the device, or a factorisation."""
+"""Solvers of sparse linear systems: conjugate gradients on the device, and factorisations."""
 
 import importlib.util
 import time
@@ -12,22 +12,22 @@ from ..kernels import linear
 from ..kernels.elementwise import scale
 from ..kernels.loop import count_pass, limit_passes
 
-# Most unknowns for which all eigenvalues are computed at once.
+# Largest number of unknowns for which all eigenvalues are computed.
 SMALL = 100
 
 
 class ConjugateGradients:
     """Solves A x = b for each copy by conjugate gradients with the inverse diagonal blocks as preconditioner.
 
-    Runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) fell to its tolerance times the first, or at
-    a direction without positive curvature: then x is a descent direction of ½xᵀAx − bᵀx all the same and ``negative`` is 1
-    (Steihaug 1983).
+    It runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) has fallen to its tolerance times the first
+    value, or at a direction of negative curvature. In that case x is still a descent direction of ½xᵀAx − bᵀx, and ``negative``
+    is 1 (Steihaug 1983).
 
     Args:
-        matrix: A, such as :class:`warpcloth.core.hessian.Hessian`: what it has of ``count``, ``per_copy``, ``vector`` and
-            ``block``, ``prepare``, ``multiply`` and ``invert_diagonal``.
+        matrix: A, an object with ``count``, ``per_copy``, ``vector``, ``block``, ``prepare``, ``multiply`` and
+            ``invert_diagonal``, such as :class:`warpcloth.core.hessian.Hessian`.
         sums: :class:`warpcloth.core.sums.Sums` over its unknowns.
-        iterations: The most iterations of one solve.
+        iterations: Maximum number of iterations of one solve.
     """
 
     capturable = True
@@ -55,7 +55,7 @@ class ConjugateGradients:
         )
 
     def solve(self, b, x, wanted):
-        """x = A⁻¹ b to the relative ``tolerance`` (B,) of each copy that is wanted, 0 for the rest."""
+        """Solves for x = A⁻¹ b to the relative ``tolerance`` (B,), for the copies that are ``wanted`` (B,); others get 0."""
         N, B = self.matrix.count, self.model.copies
         self.matrix.invert_diagonal(self.preconditioner)
         self._launch(linear.start_iteration, N, [self.preconditioner, b], [x, self.r, self.z, self.p])
@@ -80,10 +80,10 @@ class ConjugateGradients:
 
 
 class Factorised:
-    """Solves A x = b by a sparse factorisation on the host (scipy's SuperLU in symmetric mode), exact and for any stiffness.
+    """Solves A x = b by a sparse factorisation on the host (scipy's SuperLU in symmetric mode), for any stiffness.
 
-    Pivots are taken from the diagonal, so that their signs are those of the eigenvalues (Sylvester): ``negative`` is 1 for a
-    copy with a negative one. Of two pivots of about 0 in an indefinite matrix no promise is made.
+    Pivots are taken from the diagonal, so that their signs are those of the eigenvalues (Sylvester's law of inertia):
+    ``negative`` is 1 for a copy with a negative one. This may fail if an indefinite matrix has two pivots near 0.
 
     Args:
         hessian: The :class:`warpcloth.core.hessian.Hessian`.
@@ -101,7 +101,7 @@ class Factorised:
         self._mirrors = {}
 
     def solve(self, b, x, wanted):
-        """x = A⁻¹ b, in double precision; 0 for a copy that is not wanted, or whose A is singular or not finite."""
+        """Solves for x = A⁻¹ b in float64; 0 for copies that are not ``wanted``, or whose A is singular or not finite."""
         right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
         sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
         solution, negative = np.zeros_like(sides), np.zeros(self.model.copies, dtype=bool)
@@ -115,20 +115,20 @@ class Factorised:
         self.negative.write(negative)
 
     def curves_down(self, unresolved=0.0):
-        """Whether some copy has an eigenvalue below −1000 ε times its largest diagonal entry − ``unresolved`` [N/m]."""
+        """Returns whether a copy has an eigenvalue below −(1000 ε times its largest diagonal entry + ``unresolved`` [N/m])."""
         shift = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
         given = self.values.read(), self.hessian.coupling(), shift, unresolved
         factors = (self._factor(copy, *given) for copy in range(self.model.copies))
         return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
     def lowest_eigenvalue(self, copy=0):
-        """Finds the lowest eigenvalue of a copy's matrix over coordinates that move [N/m], see :func:`lowest_eigenvalue`."""
+        """Returns the lowest eigenvalue of a copy's matrix over free coordinates [N/m], see :func:`lowest_eigenvalue`."""
         columns, n = self._columns(copy, self.values.read(), self.hessian.coupling()), 3 * self.model.per_copy
         free = np.flatnonzero(self.model.coordinate_mobility()[copy * n : (copy + 1) * n])
         return lowest_eigenvalue(columns[free][:, free])
 
     def _columns(self, copy, values, coupling):
-        """A copy's matrix in compressed columns."""
+        """Returns a copy's matrix in compressed columns."""
         matrix = self.matrices[copy]
         matrix.data[:] = values[self.starts[copy] : self.starts[copy + 1]]
         if coupling is None:
@@ -137,13 +137,16 @@ class Factorised:
         return matrix.tocsc() + coupling[own, own]
 
     def _mirror(self, array):
-        """The mirror of an array, built when the array is first seen."""
+        """Returns the mirror of an array, built on first use."""
         if array.ptr not in self._mirrors:
             self._mirrors[array.ptr] = Mirror(array)
         return self._mirrors[array.ptr]
 
     def _factor(self, copy, values, coupling, shift=0.0, unresolved=0.0):
-        """The factors of a copy's matrix, or None; with ``shift`` times its largest entry + ``unresolved`` on the diagonal."""
+        """Returns the factors of a copy's matrix, or None if it is singular or not finite.
+
+        ``shift`` times its largest diagonal entry, plus ``unresolved`` [N/m], is added to the diagonal.
+        """
         from scipy.sparse import identity
 
         columns = self._columns(copy, values, coupling)
@@ -159,10 +162,10 @@ class Factorised:
 
 
 def symmetric_factors(columns):
-    """The factors of a symmetric matrix in compressed columns by scipy's SuperLU, without pivots.
+    """Factorises a symmetric matrix in compressed columns by scipy's SuperLU, with pivots on the diagonal.
 
     Raises:
-        RuntimeError: If the matrix is exactly singular.
+        RuntimeError: The matrix is exactly singular.
     """
     from scipy.sparse.linalg import splu
 
@@ -170,17 +173,17 @@ def symmetric_factors(columns):
 
 
 def lowest_eigenvalue(matrix):
-    """Finds the lowest eigenvalue of a sparse symmetric matrix, by Lanczos iterations with the inverse of A + σ.
+    """Returns the lowest eigenvalue of a sparse symmetric matrix, by Lanczos iterations with (A + σI)⁻¹.
 
-    σ starts at 1000 ε times the largest entry of the diagonal and grows tenfold until A + σ has no negative pivot. Then no
-    eigenvalue lies below −σ, the lowest is the nearest to −σ, and few iterations find it (Ericsson and Ruhe 1980).
+    σ starts at 1000 ε times the largest diagonal entry and grows tenfold until A + σI has no negative pivot. Then no eigenvalue
+    is below −σ, so that the lowest is the one nearest to −σ, and few iterations find it (Ericsson and Ruhe 1980).
 
     Args:
         matrix: A, scipy (n, n).
 
     Returns:
-        float: Accurate to about 1e-10 (λ + σ), where σ is at most 10 |λ| or 1000 ε times the largest entry. Infinite if n is 0,
-            NaN if an entry is not finite.
+        float: Accurate to about 1e-10 (λ + σ), where σ is at most 10 |λ| or 1000 ε times the largest diagonal entry. Infinite
+            if n is 0, NaN if an entry is not finite.
     """
     from scipy.sparse import identity
     from scipy.sparse.linalg import LinearOperator, eigsh
@@ -208,11 +211,11 @@ def lowest_eigenvalue(matrix):
 
 
 class FactorisedRows:
-    """Solves A x = b for A = J W Jᵀ + α̃ of constraint rows by a sparse factorisation on the host, scaled to a unit diagonal.
+    """Solves A x = b for A = J W Jᵀ + α̃ of constraint rows, scaled to a unit diagonal, by a sparse factorisation on the host.
 
     Args:
         matrix: The :class:`warpcloth.numerics.constraints.Constraints`.
-        arrays: b, x and wanted, as they will be given to :meth:`solve`, which then allocates nothing.
+        arrays: The arguments b, x and wanted of :meth:`solve`, which then allocates nothing.
     """
 
     capturable = False
@@ -221,10 +224,10 @@ class FactorisedRows:
         self.matrix, self.model = matrix, matrix.model
         self._mirrors = {array.ptr: Mirror(array) for array in arrays}
         if matrix.count:
-            matrix.matrices()  # allocates what it needs
+            matrix.matrices()  # so that it allocates now
 
     def solve(self, b, x, wanted):
-        """x = A⁻¹ b of each copy that is wanted, NaN where A or b is not finite, 0 for the rest."""
+        """Solves for x = A⁻¹ b of each copy that is ``wanted``, NaN if A or b is not finite; others get 0."""
         from scipy.sparse import diags
 
         right, left, wanted = (self._mirrors[array.ptr] for array in (b, x, wanted))
@@ -240,15 +243,15 @@ class FactorisedRows:
             A, side = diags(scale) @ A @ diags(scale) + diags((scale == 0.0).astype(float)), scale * side
             factor = symmetric_factors(A.tocsc())
             found = factor.solve(side)
-            found += factor.solve(side - A @ found)  # redundant rows leave A hardly definite
+            found += factor.solve(side - A @ found)  # refined, because redundant rows make A nearly singular
             solution[copy] = scale * found
         left.write(solution.ravel())
 
 
 def constant_factor(matrix, device, dtype):
-    """The factors of a constant matrix: :class:`CholeskyFactor` where cholespy is installed, else :class:`LUFactor`.
+    """Factorises a constant matrix: :class:`CholeskyFactor` if cholespy is installed, else :class:`LUFactor`.
 
-    Of several CUDA devices cholespy knows the first alone.
+    cholespy supports only the first of several CUDA devices.
     """
     if importlib.util.find_spec("cholespy") and not (device.is_cuda and device.ordinal):
         return CholeskyFactor(matrix, device, dtype)
@@ -258,7 +261,7 @@ def constant_factor(matrix, device, dtype):
 class CholeskyFactor:
     """Solves A x = b for a constant symmetric positive definite A by cholespy: CHOLMOD on the CPU, its own kernels on CUDA.
 
-    A is factorised once, in double precision, and solved on its device without copies of vectors.
+    A is factorised once, in double precision. Solves run on the device, without copies of vectors.
 
     Args:
         matrix: A, a scipy sparse matrix (n, n), n at least 1.
@@ -266,10 +269,10 @@ class CholeskyFactor:
         dtype: Their scalar type, ``wp.float32`` or ``wp.float64``.
 
     Attributes:
-        seconds: What factorising took [s].
+        seconds: Time of the factorisation [s].
 
     Raises:
-        ValueError: If A is not finite or not positive definite.
+        ValueError: A is not finite or not positive definite.
     """
 
     def __init__(self, matrix, device, dtype):
@@ -292,7 +295,7 @@ class CholeskyFactor:
         """x = A⁻¹ b; both (n,) vectors or (n, k) numbers. NaN in b is NaN in x."""
         on_host(self.device, "a sparse factorisation")
         wp.synchronize_device(self.device)  # on CUDA cholespy has a stream of its own
-        with deferred():  # while it looks at arrays, cholespy makes a TypeError of an interrupt
+        with deferred():  # cholespy turns an interrupt during its checks of arrays into a TypeError
             self.solver.solve(b, x)
         wp.synchronize_device(self.device)
 
@@ -321,17 +324,17 @@ class LUFactor:
 
 
 class CopyFactors:
-    """Solves A x = b for each copy with a constant scalar matrix, factorised once for all copies that have the same.
+    """Solves A x = b for each copy with a constant scalar matrix; copies with equal matrices share one factorisation.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         matrices: A of each copy, scipy matrices (n, n) of one pattern.
 
     Attributes:
-        seconds: What factorising took [s].
+        seconds: Time of the factorisations [s].
 
     Raises:
-        ValueError: If a matrix is not finite or not positive definite.
+        ValueError: A matrix is not finite or not positive definite.
     """
 
     def __init__(self, model, matrices):
@@ -346,12 +349,12 @@ class CopyFactors:
         self._parts = {}
 
     def solve(self, b, x):
-        """x = A⁻¹ b, both (N,) vectors; a call of the host. NaN in b is NaN in x of that copy."""
+        """Solves for x = A⁻¹ b, both (N,) vectors, from the host. NaN in b gives NaN in x of that copy."""
         for factor, right, left in zip(self.factors, self._of_copies(b), self._of_copies(x), strict=True):
             factor.solve(right, left)
 
     def _of_copies(self, array):
-        """The parts of an array that belong to the copies, made when the array is first seen."""
+        """Returns the parts of an array that belong to each copy, built on first use."""
         if array.ptr not in self._parts:
             n = self.per_copy
             self._parts[array.ptr] = [array[first : first + n] for first in range(0, len(array), n)]
@@ -359,7 +362,7 @@ class CopyFactors:
 
 
 class AxisFactors:
-    """Solves A x = b as :class:`CopyFactors` does where coordinates are locked: for each axis over the vertices free along it.
+    """Solves A x = b as :class:`CopyFactors` with locked coordinates: for each axis, over the vertices free along it.
 
     Arguments and attributes are those of :class:`CopyFactors`.
     """
@@ -377,19 +380,19 @@ class AxisFactors:
         self.seconds = sum(factors.seconds for factors, _ in self._parts)
 
     def solve(self, b, x):
-        """x = A⁻¹ b of free coordinates, both (N,) vectors, and b of the others; a call of the host."""
+        """Solves for x = A⁻¹ b of free coordinates, both (N,) vectors, from the host; x = b for the others."""
         for factors, taken in self._parts:
             factors.solve(b, self._found)
             self.model.launch(self._take, self.model.count, [self._found, taken], [x])
 
 
 def factorise_copies(model, matrices):
-    """Factorises a constant scalar matrix of each copy: :class:`CopyFactors`, or :class:`AxisFactors` of locked coordinates."""
+    """Factorises a constant scalar matrix of each copy, as :class:`CopyFactors`, or with locks as :class:`AxisFactors`."""
     return (CopyFactors if model.mobility is None else AxisFactors)(model, matrices)
 
 
 class DiagonalScaling:
-    """x = D⁻¹ b, the step of a Jacobi iteration; runs on the device and may be captured.
+    """Computes x = D⁻¹ b, the step of a Jacobi iteration, on the device; it may be captured.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -403,7 +406,7 @@ class DiagonalScaling:
         self._scale = model.kernel(scale, model.dtype)
 
     def solve(self, b, x):
-        """x = D⁻¹ b, both (N,) vectors."""
+        """Launches x = D⁻¹ b, both (N,) vectors."""
         self.model.launch(self._scale, self.model.count, [self._inverse, b], [x])
 
 
@@ -411,7 +414,7 @@ _INDEFINITE = "the matrix is not positive definite, so it has no Cholesky factor
 
 
 def _finite_columns(matrix):
-    """A sparse matrix in sorted compressed columns of double precision."""
+    """Returns a sparse matrix in sorted compressed columns of double precision, and checks that it is finite."""
     columns = matrix.tocsc().astype(np.float64)
     columns.sort_indices()
     if not np.isfinite(columns.data).all():

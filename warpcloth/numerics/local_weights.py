@@ -1,4 +1,4 @@
-"""Weights of the local problems of ADMM, r = W²/(s k A) of each element."""
+"""The weights of ADMM, r = W²/(s k A) of each element."""
 
 import numpy as np
 import warp as wp
@@ -9,13 +9,13 @@ from ..model.host_values import host_values
 
 
 def best_weights(model, elements, he, curvature=None):
-    """Computes r = 1/(2hₑω) of each element (E,), ω² its largest eigenvalue of M⁻¹ s k A DᵀD by itself; 1 if it cannot move.
+    """Returns r = 1/(2hₑω) of each element (E,), ω² the largest eigenvalue of M⁻¹ s k A DᵀD of that element; 1 if it is fixed.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         elements: One of its terms.
         he: Effective step hₑ [s].
-        curvature: s of each element (E,), see :func:`curvatures`, if that is known.
+        curvature: s of each element (E,); None to compute it by :func:`curvatures`.
     """
     blocks = constant_blocks(model, elements.weighed(curvatures(model, elements) if curvature is None else curvature))
     root = np.sqrt(model.inverse_mass.numpy().astype(np.float64))[host_values(elements.stencil)]
@@ -24,7 +24,7 @@ def best_weights(model, elements, he, curvature=None):
 
 
 def curvatures(model, elements):
-    """Computes the unit s of r for each element (E,): 1 for a squared distance and for contact, else the curvature at rest."""
+    """Returns s of each element (E,): 1 for a squared distance and for contact, else the curvature at rest."""
     if elements.term.project is not None or elements.term.bounded is not None:
         return np.ones(elements.count, dtype=model.numpy_dtype)
     scale = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
@@ -32,5 +32,5 @@ def curvatures(model, elements):
     kernel = model.kernel(stiffness_scale, elements.term, model.dtype)
     model.launch(kernel, elements.count, [*elements.arguments, rest_shape], [scale])
     found = scale.numpy()
-    # A hinge without a normal at rest has no curvature there, and its weight would be 0.
+    # A hinge without a normal at rest has no curvature, so its weight would be 0.
     return np.where(found > 0.0, found, found.max() or 1.0)

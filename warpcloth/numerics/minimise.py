@@ -14,9 +14,9 @@ from .iterate import GravityScale, iterate
 from .linear import ConjugateGradients, Factorised
 from .search import Search
 
-# Roundings that a force takes: of the lengths, of the strain, of the products and of the sum over a vertex's elements.
+# Number of roundings in a force: of lengths, strain, products, and the sum over the elements of a vertex.
 ROUNDINGS = 4.0
-# Of the energy that roundings lose at worst what they lose as a rule, adding up like a random walk.
+# Typical rounding of the energy relative to its worst case, because roundings add up like a random walk.
 TYPICAL = 0.1
 
 POLICIES = {
@@ -28,23 +28,23 @@ POLICIES = {
 
 
 class Minimiser:
-    """Finds the d that minimises φ for each copy, from d = 0 (for the equation see the module).
+    """Minimises φ(d) of each copy from d = 0; the docstring of the module has the equation.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        base: The positions of d = 0, (N,) vectors [m]; the caller's array, read only.
-        hessian: ``"adaptive"`` (raw; clamped in an iteration whose matrix shows a negative curvature), ``"raw"``,
-            ``"clamp"`` or ``"absolute"``.
+        base: The positions at d = 0, (N,) vectors [m]; the caller's array, read only.
+        hessian: ``"adaptive"`` (raw, but clamped in iterations whose matrix has a negative curvature), ``"raw"``, ``"clamp"``
+            or ``"absolute"``.
         linear: ``"cg"`` or ``"factorised"``.
         s: Weight of the inertia, 1/h² [1/s²].
-        linear_iterations: The most iterations of a conjugate gradient solve.
+        linear_iterations: Maximum number of iterations of a conjugate gradient solve.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
 
     Attributes:
         correction: d (N,) [m].
-        residual: The largest unbalanced acceleration of each copy over ``scale``, (B,), after :meth:`minimise`.
-        scale: The acceleration of each copy that its residual is relative to [m/s²], (B,), after :meth:`minimise`.
-        iterations: Newton iterations of the last :meth:`minimise`.
+        residual: The largest unbalanced acceleration of each copy divided by ``scale``, (B,), after :meth:`minimise`.
+        scale: The acceleration by which the residual of each copy is divided, (B,) [m/s²], after :meth:`minimise`.
+        iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
 
     def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None):
@@ -87,17 +87,17 @@ class Minimiser:
         self._step_on = Segment(device, self._launch_search)
 
     def set_objective(self, s, load):
-        """Another s and load; what was recorded holds the old ones and is recorded again."""
+        """Sets s and load, and captures again the launches that have the old values."""
         self.search.inertia.s, self.search.inertia.load = s, load
         self.record()
 
     def minimise(self, tolerance, iterations, scale=None):
-        """Iterates until every vertex is in balance, or nothing is left to gain in the model's precision.
+        """Iterates until every copy has converged, or rounding allows no further progress.
 
-        In balance is a copy with max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a. The acceleration a is ``scale`` (B,) [m/s²], by default
-        gravity's, without any the largest at d = 0. Nothing is left to gain when ‖∇φ‖ is no more than rounding may make of it,
-        4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) a vertex, and an iteration has not lowered φ by more than rounding: the
-        norm alone would let the noise of stiff directions hide what soft ones still lack.
+        A copy has converged if max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a. The acceleration a is ``scale`` (B,) [m/s²], by default gravity,
+        or without gravity the largest acceleration at d = 0. Rounding allows no progress if ‖∇φ‖ is within its rounding,
+        4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) per vertex, and an iteration lowered φ by no more than rounding. The norm
+        alone would not do, because the noise of stiff directions may hide the error of soft ones.
 
         Returns:
             A :class:`Result` for each copy.
@@ -110,22 +110,22 @@ class Minimiser:
     # The loop of `iterate`.
 
     def start(self):
-        """Goes to d = 0."""
+        """Starts from d = 0."""
         self.clear()
         acceleration = self._acceleration.read()
         self.scale = self.gravity_scale.or_else(acceleration) if self._given_scale is None else self._given_scale
-        # Linear systems are solved no better than the residual has fallen (Eisenstat and Walker 1996).
+        # Linear systems are solved more accurately as the residual falls (Eisenstat and Walker 1996).
         self._first = np.maximum(acceleration / self.scale, 1.0)
         self._before = self._energy.read().copy()
         self._ended = {}
 
     def measure(self):
-        """The residual of each copy, and which copies can come no nearer."""
+        """Returns the residual of each copy (B,), and which copies end for another reason."""
         self.residual = self._acceleration.read() / self.scale
         return self.residual, self._ended
 
     def iterate(self, active):
-        """A step along the direction of Newton's method."""
+        """Takes a line-searched step along the Newton direction."""
         self._active.write(active)
         if self.linear.capturable:
             self.linear.tolerance.write(np.clip(self.residual / self._first, 1e-12, 0.1))
@@ -133,9 +133,9 @@ class Minimiser:
         self._step_on()
         noisy = self._square.read() <= ROUNDINGS**2 * self._rounding.read()
         before, self._before = self._before, self._energy.read().copy()
-        with np.errstate(invalid="ignore"):  # of a copy that is not finite
+        with np.errstate(invalid="ignore"):  # a copy may be NaN or infinite
             level = before - self._before <= self.resolution * np.abs(before) + TYPICAL * self._lost.read()
-        # A copy is stuck where no step was found, or there was none to look for.
+        # A copy is stuck if the search found no step, or the direction does not descend.
         stuck = (self._step.read() == 0.0) | ~(self._slope.read() < 0.0)
         self._ended = {Result.ROUNDED: noisy & (stuck | level), Result.STALLED: stuck & ~noisy}
 
@@ -150,10 +150,10 @@ class Minimiser:
             self._solve()
 
     def curves_down(self, tolerance):
-        """Whether the unchanged Hessian at d = 0 of some copy has a negative eigenvalue that ``tolerance`` does not explain.
+        """Returns whether the raw Hessian at d = 0 of a copy has a negative eigenvalue that ``tolerance`` does not explain.
 
-        Balance to ``tolerance`` may leave a force of ``tolerance`` times the scale and the mass of the cloth. That force can
-        compress an edge, which adds the force divided by the edge length [N/m] to the Hessian. A sheet without bending
+        An equilibrium to ``tolerance`` may have an unbalanced force of ``tolerance`` times the scale and the mass of the cloth.
+        Such a force in an edge can lower an eigenvalue by the force over the edge length [N/m]. A sheet without bending
         stiffness has no other resistance to motion out of its plane.
         """
         self._assemble_raw()
@@ -161,12 +161,12 @@ class Minimiser:
         return Factorised(self.hessian).curves_down(unresolved / self.edge)
 
     def lowest_eigenvalue(self):
-        """Finds the lowest eigenvalue of the unchanged Hessian at d = 0 over the free vertices of the first copy [N/m]."""
+        """Returns the lowest eigenvalue of the raw Hessian at d = 0 over the free vertices of the first copy [N/m]."""
         self._assemble_raw()
         return Factorised(self.hessian).lowest_eigenvalue()
 
     def unbalanced(self):
-        """Σ‖∇φᵢ‖ at d of each copy, (B,) [N]."""
+        """Returns Σ‖∇φᵢ‖ at d of each copy, (B,) [N]."""
         gradient = self.search.gradient.numpy().astype(np.float64).reshape(self.model.copies, -1, 3)
         return np.linalg.norm(gradient, axis=2).sum(axis=1)
 
@@ -212,7 +212,7 @@ class Minimiser:
         self._launch_norms()
 
     def _launch_norms(self):
-        """‖∇φ‖² and the largest unbalanced acceleration at d."""
+        """Launches ‖∇φ‖² and the largest unbalanced acceleration at d."""
         gradient = self.search.gradient
         self.sums.dot(gradient, gradient, self.square)
         self.sums.largest(self.model.inverse_mass, gradient, self.acceleration)

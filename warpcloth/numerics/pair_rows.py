@@ -7,17 +7,17 @@ from ..kernels import pair_rows as kernels
 
 
 class PairRows:
-    """The rows of pairs, see :mod:`warpcloth.kernels.pair_rows`; methods are those of the rows of a term.
+    """The rows of pairs, see :mod:`warpcloth.kernels.pair_rows`, with the methods of :class:`.constraints.TermRows`.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`.
-        curved: Whether tension stiffens.
+        curved: Whether to add geometric stiffness.
 
     Attributes:
-        elements: None, for they are of no term.
-        per_copy: Pairs that have rows in each copy: all there is room for.
-        count: Rows of one copy.
+        elements: None, because the rows belong to no term.
+        per_copy: Number of pairs with rows in each copy, the capacity.
+        count: Number of rows of one copy.
     """
 
     elements = None
@@ -47,17 +47,17 @@ class PairRows:
         model.launch(self._linearise, (model.copies, self.per_copy), given, [self._slopes, values])
 
     def launch_apply(self, v, out, active=None):
-        """out += J v, of all copies."""
+        """Launches out += J v, of all copies."""
         given = [self._pairs.pairs, self._slopes, v, self.model.per_copy, self._layout]
         self.model.launch(self._apply, self.per_copy, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
-        """out += Jᵀ rows, of all copies."""
+        """Launches out += Jᵀ rows, of all copies."""
         given = [self._pairs.pairs, self._slopes, rows, self.model.per_copy, self._layout]
         self.model.launch(self._gather, self.model.count, given, [out])
 
     def entries(self):
-        """J on the host: values, rows and columns."""
+        """Returns J on the host: values, rows and columns."""
         count = min(int(self._pairs.pairs.counts.numpy().sum()), self.per_copy)
         binds = np.flatnonzero(self._slopes.first.numpy()[:count].any(axis=1))
         names = ("first", "second")[: self._rows]

@@ -1,4 +1,4 @@
-"""Singular values, polar decomposition and best rotations of arrays of small matrices and points, on the CPU and on CUDA."""
+"""Singular value and polar decompositions of arrays of small matrices, and best-fit rotations, on the CPU and on CUDA."""
 
 from collections.abc import Sequence
 from typing import Literal, TypeVar
@@ -24,23 +24,23 @@ _POLAR = {(3, 3): rotation.polar3, (3, 2): rotation.polar3x2, (2, 2): rotation.p
 
 @in_turn
 def svd(A: Array, convention: Literal["plain", "rotation"] = "plain") -> tuple[Array, Array, Array]:
-    """Singular value decompositions A = U diag(S) Vᵀ of many small matrices, S descending.
+    """Computes singular value decompositions A = U diag(S) Vᵀ of many small matrices, S descending.
 
-    The error is a few ε of the largest singular value, whatever the size or the rank of A, in float32 as in float64.
-    See :mod:`warpcloth.kernels.rotation` for the method, its sources, and what holds where UVᵀ is not unique. A NaN or an
-    infinity in a matrix makes all of its results NaN.
+    The error is a few ε of the largest singular value, for any size and rank of A, in float32 and float64.
+    See :mod:`warpcloth.kernels.rotation` for the method, its sources, and the choice where UVᵀ is not unique. If an entry is
+    NaN or infinite, all results of its matrix are NaN.
 
     Args:
-        A: (..., 3, 3), (..., 3, 2) or (..., 2, 2), a NumPy array (decomposed on the CPU) or a Warp array, of numbers or of
-            matrices (decomposed on its device); float32 or float64.
-        convention: "plain", S ≥ 0; or "rotation", det U = det V = 1, and the last S has the sign of det A. Of 3×2 matrices
-            both are one: S ≥ 0, det V = 1.
+        A: (..., 3, 3), (..., 3, 2) or (..., 2, 2), float32 or float64: a NumPy array, decomposed on the CPU, or a Warp array of
+            numbers or of matrices, decomposed on its device.
+        convention: "plain" for S ≥ 0, or "rotation" for det U = det V = 1, where the last S has the sign of det A. For 3×2
+            matrices both give S ≥ 0, det V = 1.
 
     Returns:
-        tuple: U like A, S (..., columns), V (..., columns, columns), of the kind of array that A is.
+        tuple: U like A, S (..., columns), V (..., columns, columns), arrays of the same kind as A.
 
     Raises:
-        ValueError: A is of another shape or type, or there is no such convention.
+        ValueError: A has another shape or type, or there is no such convention.
     """
     choice("convention", convention, tuple(_SVD))
     batch = _Batch("A", A, tuple(_POLAR))
@@ -50,17 +50,17 @@ def svd(A: Array, convention: Literal["plain", "rotation"] = "plain") -> tuple[A
 
 @in_turn
 def polar(A: Array) -> tuple[Array, Array]:
-    """Polar decompositions A = R P of many small matrices.
+    """Computes polar decompositions A = R P of many small matrices.
 
     Args:
-        A: As of :func:`svd`.
+        A: As for :func:`svd`.
 
     Returns:
-        tuple: R like A, the nearest rotation (det R = 1; of 3×2 the nearest matrix with RᵀR = I), and P (..., columns,
-        columns), symmetric; of square A its least eigenvalue has the sign of det A. Of the kind of array that A is.
+        tuple: R like A, the nearest rotation (det R = 1; for 3×2 the nearest matrix with RᵀR = I), and P (..., columns,
+        columns), symmetric, whose lowest eigenvalue has the sign of det A if A is square. Arrays of the same kind as A.
 
     Raises:
-        ValueError: A is of another shape or type.
+        ValueError: A has another shape or type.
     """
     batch = _Batch("A", A, tuple(_POLAR))
     n = batch.shape[1]
@@ -74,25 +74,25 @@ def kabsch(
     weights: ArrayLike | wp.array | None = None,
     neighbours: ArrayLike | Sequence[ArrayLike] | None = None,
 ) -> Array:
-    """The rotations R that turn points P to Q best, about their centroids: min Σ w ‖(q − q̄) − R(p − p̄)‖² (Kabsch 1976).
+    """Computes the best rotations R of points P to Q about their centroids: min Σ w ‖(q − q̄) − R(p − p̄)‖² (Kabsch 1976).
 
-    With p̄ = Σ w p / Σ w. Reflections are never taken; of points on a line R is the least of the best rotations, of one point
-    the identity. A point or a weight that is not finite makes R NaN. Far from the origin nothing is lost but what the
-    coordinates have lost.
+    p̄ = Σ w p / Σ w. R is never a reflection. For points on a line, R is the smallest of the best rotations, for one point the
+    identity. If a point or a weight is not finite, R is NaN. A large distance from the origin adds no error beyond the rounding
+    of the coordinates.
 
     Args:
-        P: (..., n, 3) [m], a NumPy array or a Warp array of numbers or of vectors, float32 or float64.
-        Q: The same, of the same kind and type; leading dimensions may differ as in NumPy's arithmetic.
-        weights: (n,) or with leading dimensions too, 0 or more; 1 where not given. Of a point in several sets it is the same.
-        neighbours: Sets of points, each of which has its own rotation: (C, k) indices of points, or C lists of any lengths,
-            as `scipy.spatial.cKDTree` gives them; of all points together where not given.
+        P: (..., n, 3) [m], float32 or float64: a NumPy array, or a Warp array of numbers or of vectors.
+        Q: (..., n, 3) [m], of the same kind and type; leading dimensions broadcast as in NumPy.
+        weights: (n,) or (..., n), 0 or more; 1 by default. A point has the same weight in all of its sets.
+        neighbours: Sets of points with a rotation each: (C, k) indices, or C lists of indices of any lengths, as
+            `scipy.spatial.cKDTree` returns them. By default one set of all points.
 
     Returns:
-        R (..., 3, 3), with neighbours (..., C, 3, 3), of the kind of array that P is.
+        R (..., 3, 3), with neighbours (..., C, 3, 3), an array of the same kind as P.
 
     Raises:
-        ValueError: An array has the wrong shape or type, a set is empty or has another index than 0 to n − 1, or a weight is
-            negative, or they are all 0.
+        ValueError: An array has the wrong shape or type, a set is empty or has an index outside 0 to n − 1, a weight is
+            negative, or all weights of a set are 0.
 
     Examples:
         >>> import warpcloth as wc
@@ -121,7 +121,7 @@ def kabsch(
     except ValueError:
         raise ValueError("P, Q and weights have leading dimensions {}, {} and {}; they must fit".format(*shapes)) from None
     count = int(np.prod(leading, dtype=np.int64))
-    # Every leading index has points, weights and sets of its own; sets are found once.
+    # Every leading index has its own points and weights. All share the sets.
     offsets = np.concatenate([[0], np.cumsum(np.tile(sizes, count))])
     members = (members + n * np.arange(count)[:, None]).ravel()
     device, vec3, mat33 = rest.device, wp.types.vector(3, rest.scalar), wp.types.matrix((3, 3), rest.scalar)
@@ -141,7 +141,7 @@ def kabsch(
 
 
 def point_sets(neighbours, n):
-    """Number of members of each set (C,), and all members one after another."""
+    """Returns the size of each set (C,), and the indices of all sets, one set after another."""
     if neighbours is None:
         return np.array([n]), np.arange(n)
     rule = f"it must be an array (C, k) of indices or C lists of them, of the {n} points, none of them empty"
@@ -166,7 +166,7 @@ def _on_host(array):
 
 
 def _decomposed(batch, factory, function, *shapes):
-    """The results of a device function of all matrices, each of a shape."""
+    """Launches a device function over all matrices, and returns its results, each with its shape."""
     kinds = [wp.types.vector(s[0], batch.scalar) if len(s) == 1 else wp.types.matrix(s, batch.scalar) for s in shapes]
     out = [wp.empty(len(batch.items), dtype=kind, device=batch.device) for kind in kinds]
     decompose.launch(factory, function, batch.items, out)
@@ -174,12 +174,12 @@ def _decomposed(batch, factory, function, *shapes):
 
 
 class _Batch:
-    """An array of vectors or small matrices as one row of Warp's, and results as the same kind of array.
+    """An array of vectors or small matrices as a flat Warp array, and the conversion of results to the kind of the input.
 
     Attributes:
-        batch, shape: Leading dimensions, and those of one item.
-        items: All items in a row.
-        words: What kind of array it is.
+        batch, shape: Leading dimensions, and the shape of one item.
+        items: All items in a flat Warp array.
+        words: Words for the kind of array, for error messages.
     """
 
     def __init__(self, name, A, shapes):
@@ -208,14 +208,14 @@ class _Batch:
             self.items = wp.array(A, dtype=self.kind, device="cpu", copy=False)
 
     def spread(self, batch):
-        """The items repeated to other leading dimensions, in a row."""
+        """Returns the items broadcast to other leading dimensions, as a flat array."""
         if batch == self.batch:
             return self.items
         rows = np.broadcast_to(np.arange(len(self.items)).reshape(self.batch), batch).ravel()
         return self.items[wp.array(rows.astype(np.int32), dtype=wp.int32, device=self.device)].contiguous()
 
     def like(self, array, batch, shape):
-        """A row of items as an array of leading dimensions and items of a shape, of the kind that this one is."""
+        """Returns a flat array of items with leading dimensions ``batch`` and items of a shape, of the kind of the input."""
         if not self.warp:
             return array.numpy().reshape(*batch, *shape)
         if self.typed and batch:

@@ -1,4 +1,4 @@
-"""The objective φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d, and steps along a direction that lower it, for each copy."""
+"""A line search on the objective φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d of each copy."""
 
 import numpy as np
 import warp as wp
@@ -9,26 +9,26 @@ from ..kernels import minimise as kernels
 from ..kernels.loop import count_pass, limit_passes
 from .inertia import Inertia
 
-# Halvings of a step before a copy counts as stuck: 2⁻³⁰ of a Newton step moves nothing.
+# Halvings of a step before a copy counts as stuck, because 2⁻³⁰ of a Newton step moves nothing.
 HALVINGS = 30
 
 
 class Search:
-    """A line search on φ by halving (Armijo, and Hager and Zhang 2005 where φ no longer resolves the decrease).
+    """A backtracking line search on φ (Armijo; the approximate Wolfe condition of Hager and Zhang 2005 if rounding hides the
+    decrease).
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        base: The positions of d = 0, (N,) vectors [m]; the caller's array, read only.
+        base: The positions at d = 0, (N,) vectors [m]; the caller's array, read only.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: See :class:`warpcloth.numerics.inertia.Inertia`.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
 
     Attributes:
         correction: d (N,) [m].
-        direction: What is searched along (N,) [m], set by the caller.
+        direction: Search direction p (N,) [m], set by the caller.
         gradient: ∇φ at d (N,) [N].
-        energy, slope, step: φ [J], its slope along the direction [J] and the step taken of each copy, (B,); 0 where none was
-            found.
+        energy, slope, step: φ [J], its slope along p [J], and the step of each copy, (B,); a step of 0 if none was found.
     """
 
     def __init__(self, model, base, sums, s, pairs=None):
@@ -45,12 +45,12 @@ class Search:
             ((kernels.begin_search, kernels.check_trial),),
             ((count_pass, limit_passes), kernels.MODULE),
         )
-        # Increase of φ, relative, that the approximate Wolfe condition takes for rounding. A spring of strain e resolves its
-        # energy to 2ε/e, so that √ε covers strains down to √ε.
+        # Relative increase of φ that the approximate Wolfe condition counts as rounding. The energy of a spring of strain e has
+        # a relative error of 2ε/e, so that √ε covers strains down to √ε.
         self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
 
     def launch_start(self):
-        """d = 0, with its φ and ∇φ."""
+        """Launches d = 0, φ and ∇φ."""
         if self.pairs is None:
             self.correction.zero_()
         else:
@@ -58,14 +58,14 @@ class Search:
         self.launch_again()
 
     def launch_again(self):
-        """φ and ∇φ at the d that is there."""
+        """Launches φ and ∇φ at the present d."""
         self.direction.zero_()
         self.step.zero_()
         self._launch_trial()
         wp.copy(self.energy, self.trial_energy)
 
     def launch(self, active):
-        """d += step·p, with the longest step of 1, ½, ¼ … that lowers φ, of the copies that are ``active`` (B,)."""
+        """Launches d += step·p with the longest step of 1, ½, ¼ … that lowers φ, for the copies that are ``active`` (B,)."""
         self.sums.dot(self.gradient, self.direction, self.slope)
         started = [self.step, self.searching, self.trials, self.proceed]
         self._launch(kernels.begin_search, self.model.copies, [active], started)
@@ -74,7 +74,7 @@ class Search:
         wp.copy(self.energy, self.trial_energy)
 
     def _launch_trial(self):
-        """trial = d + step·p with its φ, ∇φ and slope φ'."""
+        """Launches trial = d + step·p, with its φ, ∇φ and slope φ′."""
         model = self.model
         N, n = model.count, model.per_copy
         given = [self.correction, self.direction, self.step, n]

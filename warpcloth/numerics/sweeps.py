@@ -1,7 +1,7 @@
-"""Sweeps over the constraints of a model: Jacobi with three ways to keep it from overshooting, Gauss–Seidel by colour or not.
+"""Sweeps over the constraints of a model: Jacobi sweeps of three kinds, and Gauss–Seidel sweeps, coloured or sequential.
 
-Gauss–Seidel lets each constraint see the moves of those before it. Constraints of one colour share no vertex that moves, so
-their order does not matter and they run at once; between colours, and between terms, the order is fixed and changes the result.
+In Gauss–Seidel sweeps, each constraint sees the moves of those before it. Constraints of one colour share no free vertex, so
+they run in parallel. The order of colours and terms is fixed, and affects the result.
 """
 
 import numpy as np
@@ -15,29 +15,30 @@ from ..kernels.sparse import correct_cells
 from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 
-# By vertex: the average of where a vertex's n constraints want it, and α times where it is. By constraint: each correction over
-# the largest n of its vertices. Jacobi: the plain sum.
+# "vertex-averaged": a vertex moves to the average of the targets of its n constraints and of α times its position.
+# "constraint-averaged": each correction is divided by the largest n of its vertices. "jacobi": corrections add up.
 SWEEPS = ("vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential")
-# Gauss–Seidel: an element sees the moves of those before it.
+# Gauss–Seidel sweeps.
 IN_PLACE = ("coloured", "sequential")
 
 
 def colours(constraints, free):
-    """Colours of elements, so that no two of one colour share a free vertex: (E,) int, from 0 without gaps.
+    """Returns colours of elements such that no two of one colour share a free vertex: (E,) int, from 0 without gaps.
 
-    By Warp's maximum cardinality search: 8 colours for the structural and shear springs of a grid, which is the least, and 18
-    for the hinges of an alternating one.
+    Warp's maximum cardinality search finds 8 colours for the structural and shear springs of a grid, the optimum, and 18 for
+    the hinges of an alternating grid.
 
     Args:
-        constraints: Vertices of each, (E, K) or a list of E arrays.
-        free: Which vertices move, (n,); pinned ones may be shared (the hinges of ``bunny`` then need 17 colours, not 20).
+        constraints: Vertices of each element, (E, K) or a list of E arrays.
+        free: Which vertices are free, (n,). Elements of one colour may share pinned ones, so that the hinges of ``bunny`` need
+            17 colours instead of 20.
     """
     sizes = [len(vertices) for vertices in constraints]
     elements, vertices = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), np.concatenate(constraints)
     keep = free[vertices]
     order = np.argsort(vertices[keep], kind="stable")
     elements, vertices = elements[keep][order], vertices[keep][order]
-    # Each element at a vertex is a neighbour of those before it there.
+    # Elements at a vertex are neighbours in the graph.
     first = np.searchsorted(vertices, vertices)
     before = np.arange(len(vertices)) - first
     others = np.arange(before.sum()) - np.repeat(np.cumsum(before) - before - first, before)
@@ -49,20 +50,20 @@ def colours(constraints, free):
 
 
 class _Sweep:
-    """Sweeps over all constraints of a model, term by term as declared, which move the correction d from x̃ on.
+    """The base class of sweeps over all constraints of a model, term by term as declared, which update d = x − x̃.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         x: x̃, (N,) vectors [m]; read only.
         h: Step [s].
-        relaxation: ω, a factor of every Δλ.
-        scalar: Whether terms that have both are taken by their scalar constraint.
-        multipliers: Whether λ adds up over the sweeps of a step (XPBD).
-        correction: The d to move on, if not one of its own.
+        relaxation: ω, a factor on every Δλ.
+        scalar: Whether to use the scalar constraint of terms that have a projection too.
+        multipliers: Whether λ accumulates over the sweeps of a step (XPBD).
+        correction: The array of d, or None for a new one.
 
     Attributes:
         correction: d (N,) [m].
-        multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, in the order of ``elements``, or Nones.
+        multipliers: λ of each term, (B·E,) numbers or M × 3 matrices, in the order of ``elements``, or None.
         elements: :class:`warpcloth.model.elements.DeviceElements` of each term, in the order of the sweep.
     """
 
@@ -80,22 +81,22 @@ class _Sweep:
         ]
 
     def with_multipliers(self):
-        """Triples of the elements of each term, their multipliers, and the term, dtype and whether these are numbers."""
+        """Returns triples: the elements of each term, their multipliers, and (term, dtype, whether multipliers are numbers)."""
         return zip(self.elements, self.multipliers, self._keys, strict=True)
 
 
 class JacobiSweep(_Sweep):
-    """Jacobi sweeps, in which each constraint sees where its vertices were before.
+    """Jacobi sweeps, in which all constraints see the positions before the sweep.
 
     ``launch_start``, ``launch`` and ``parts`` are those of :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`.
 
     Args:
         model, x, h, relaxation, scalar, multipliers: See :class:`_Sweep`.
         kind: One of :data:`SWEEPS` that is not in :data:`IN_PLACE`.
-        alpha: α of the average by vertex.
-        spread: The number of sweeps that finite stiffness is spread over, or None.
+        alpha: α of ``"vertex-averaged"``.
+        spread: Number of sweeps over which the correction of finite stiffness is spread, or None.
         backend: See :func:`warpcloth.fast.plan.plan`.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs all move after the elements; or None.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs are swept after the elements; or None.
     """
 
     def __init__(
@@ -139,7 +140,7 @@ class JacobiSweep(_Sweep):
         return [(self._launch, sweeps)]
 
     def _weights(self, kind, alpha):
-        """Factors of elements and of vertices."""
+        """Returns the factors of elements and of vertices."""
         model, terms = self.model, self.model.terms
         even = [model.constant(self.relaxation, elements.count) for elements in terms]
         if kind == "jacobi":
@@ -159,7 +160,7 @@ class JacobiSweep(_Sweep):
 
 
 def _correction(elements, dtype, key):
-    """The factory of the kernel that sweeps over the elements, and the first of its arguments."""
+    """Returns the factory of the kernel that sweeps over the elements, and its first arguments."""
     if elements.term.cell:
         return correct_cells, elements.term.cell, dtype
     return (correct_clusters, dtype) if elements.cells else (kernels.correct_in_place, *key)
@@ -171,14 +172,14 @@ class GaussSeidelSweep(_Sweep):
     Args:
         model, x, h, relaxation, scalar, multipliers, correction: See :class:`_Sweep`.
         kind: One of :data:`IN_PLACE`.
-        spread: The number of sweeps that finite stiffness is spread over, or None.
-        pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares sweeps by colour; None for one thread.
-        before: Positions where the step began (N,), by which one thread of the CPU lists the elements that may have a force, of
-            terms with ``clear``; or None.
+        spread: Number of sweeps over which the correction of finite stiffness is spread, or None.
+        pool: The :class:`warpcloth.core.thread_pool.ThreadPool` whose threads share coloured sweeps; None for one thread.
+        before: Positions at the start of the step (N,) [m], from which one CPU thread lists the elements of terms with
+            ``clear`` that may have a force; or None.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs are swept last; or None.
 
     Attributes:
-        ranges: The (first, count) of the elements that each launch takes, of each term.
+        ranges: For each term, the ranges (first, count) of elements of its launches.
     """
 
     def __init__(
@@ -205,7 +206,7 @@ class GaussSeidelSweep(_Sweep):
         self.ranges = [[(0, (elements.cells or elements).count)] for elements in model.terms]
         if kind == "coloured" and model.terms:
             self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True)
-        # Cells fit themselves as they are swept.
+        # The sweep over cells updates them itself.
         refreshed = [elements for elements in self.elements if elements.refresh and not elements.cells]
         self._refreshed = [elements for elements in refreshed if elements.refresh.when == EVALUATION]
         more = multipliers, spread is not None, model.mobility is not None
@@ -217,7 +218,7 @@ class GaussSeidelSweep(_Sweep):
         ]
 
     def _list_of(self, elements, multipliers, key, before):
-        """(kernel, arguments, counter of sweeps, list) of a term with ``clear``; else None."""
+        """Returns (kernel, arguments, counter of sweeps, list) for a term with ``clear``, else None."""
         term, dtype, scalar = key
         if elements.clear is None or scalar:
             return None
@@ -228,7 +229,7 @@ class GaussSeidelSweep(_Sweep):
         return kernel, given, sweep, busy
 
     def _by_colour(self, elements):
-        """The elements of all copies by colour, and the range of each colour."""
+        """Returns the elements of all copies sorted by colour, and the range of each colour."""
         model = self.model
         free = model.inverse_mass.numpy()[: model.per_copy] > 0.0
         one = elements.constraints[: elements.cells.per_copy if elements.cells else elements.per_copy]
@@ -238,7 +239,7 @@ class GaussSeidelSweep(_Sweep):
         return elements.reordered(np.argsort(colour, kind="stable")), list(zip(firsts.tolist(), counts.tolist(), strict=True))
 
     def launch_start(self):
-        """Launches d = 0, λ = 0, once x̃ is there."""
+        """Launches d = 0, λ = 0; x must be x̃ already."""
         if self.pairs is not None:
             self.pairs.forces.launch_sweep_start(self.x)
         counters = [each[2] for each in self._lists if each]
@@ -247,11 +248,11 @@ class GaussSeidelSweep(_Sweep):
                 array.zero_()
 
     def parts(self, sweeps):
-        """Returns pairs of a function that launches and of how many times it runs, for so many sweeps."""
+        """Returns pairs (function that launches, number of calls) for this number of sweeps."""
         return [(self.launch, sweeps)]
 
     def launch(self, backward=False):
-        """Launches one sweep, or one backward, from the last term, colour and element to the first."""
+        """Launches one sweep, forward or backward through terms, colours and elements."""
         model, pool = self.model, self.pool
         if self._refreshed:
             pool.launch_alone(model, lambda: model.refresh(EVALUATION, Moment(self.x, self.correction), self._refreshed))
@@ -272,7 +273,7 @@ class GaussSeidelSweep(_Sweep):
                 model.launch(find, 1, listed, [sweep, busy])
             for first, count in self.ranges[i][::way]:
                 before, part = pool.part(count // each)
-                # A thread of the CPU takes all its elements in one loop, in half of the time that as many threads take.
+                # On the CPU, one thread loops over all elements, in half of the time of one launch thread per element.
                 threads, each_thread = (1, part * each) if model.device.is_cpu else (part, each)
                 turn = kernels.sweep_turn(model.dtype)()
                 turn.first, turn.each = first + before * each, way * each_thread

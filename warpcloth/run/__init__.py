@@ -1,1 +1,1 @@
-"""Runs of scenes: simulation, equilibrium, the watch over energy, and scene files."""
+"""Runs of scenes: simulation, equilibrium, detection of divergence, and scene files."""

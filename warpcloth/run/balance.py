@@ -1,15 +1,14 @@
-"""Compares the energy of a cloth with the energy that its sources can have put in.
+"""Compares the energy of a cloth with the energy that its sources can have added.
 
-A cloth is judged by its kinetic energy and its height, whose sum never exceeds its total energy. Elastic energy is left out,
-because sweeps that end too early store a huge ½kx² without exploding; strain is judged separately.
+A cloth is judged by its kinetic energy and its potential energy of gravity. Elastic energy is left out, because unconverged
+sweeps store a huge ½kx² without diverging; strain is judged separately. Negative elastic energy, such as that of an attraction,
+counts like that of gravity, because the cloth may fall into it.
 
-Symplectic Euler has its velocities half a step before its positions. For x″ = −ω²x it conserves v² + ω²x² − hω²xv, which near
-the limit ωh = 2 is far below v², by a factor of up to 200 at ωh = 1.995. With the velocity at the time of the position,
-u = v − ½hω²x, the conserved quantity is u² + ω²x²(1 − ω²h²/4). Below the limit u² never exceeds it, so u is judged and not v.
+In symplectic Euler, velocities are half a step behind positions. For x″ = −ω²x it conserves v² + ω²x² − hω²xv, which near the
+limit ωh = 2 is far below v², by a factor of up to 200 at ωh = 1.995. With the velocity at the time of the position,
+u = v − ½hω²x, the conserved quantity is u² + ω²x²(1 − ω²h²/4). Below the limit u² never exceeds it, so u is used instead of v.
 
-Where elastic energy is below 0, as that of an attraction may be, it is counted like height: the cloth may fall into it.
-
-What puts energy in are the sources of :mod:`warpcloth.run.sources`.
+:mod:`warpcloth.run.sources` has the sources of energy.
 """
 
 from functools import cached_property
@@ -22,17 +21,17 @@ from ..core.sums import Sums
 from ..fast.plan import plan
 from .sources import source_of
 
-# A run has diverged when it has this many times the energy that its sources can have put in. Stable runs reach up to 1.4 times
-# with unconverged or large steps and 1.3 times with sweeps averaged by vertex. Single hierarchical sweeps, 16 a frame, reach
-# 1.9 times on a hanging cloth and 2.9 times on a hard flag that is swung by 120°. Runs that explode pass every bound.
+# A run has diverged when it has this many times the energy that its sources can have added. Stable runs reach 1.4 times with
+# unconverged or large steps, and 1.3 times with vertex-averaged sweeps. Single hierarchical sweeps, 16 a frame, reach 1.9 times
+# on a hanging cloth and 2.9 times on a hard flag that is swung by 120°. Runs that diverge exceed every bound.
 GAIN = 3.0
-# A run has diverged when an edge has this strain and the run does not have the energy for it. The fewest sweeps that hold a
-# cloth give up to 6.4 (one a step of 1/60 s, averaged by vertex); a cloth that falls as if nothing held it soon passes 10.
+# A run has diverged when an edge has this strain and the energy of the run does not explain it. The fewest sweeps that hold a
+# cloth give up to 6.4 (one vertex-averaged sweep per step of 1/60 s); a cloth that falls as if nothing held it soon passes 10.
 STRETCHED = 10.0
 
 
 class Elastic:
-    """Evaluates U and ∂U/∂x of the soft terms of a model, and gaps; kernels and scratch are allocated on first use."""
+    """Evaluates U, ∂U/∂x and gaps of the soft terms of a model. Kernels and scratch are allocated on first use."""
 
     def __init__(self, model):
         self.model = model
@@ -52,11 +51,11 @@ class Elastic:
         return plan(self.model).gradient(terms=self.soft)
 
     def energy(self, x):
-        """U [J] of the soft terms of each copy at x, (B,)."""
+        """Returns U [J] of the soft terms of each copy at x, (B,)."""
         return sum(self._energies_at(x), np.zeros(self.model.copies))
 
     def below_0(self, x):
-        """The energy of those terms of which it is negative, (B,) [J]; what overflows to NaN counts as 0, as infinity does."""
+        """Returns the sum of the negative energies of terms, (B,) [J]; NaN, which comes from overflow, counts as 0."""
         return sum((np.fmin(energy, 0.0) for energy in self._energies_at(x)), np.zeros(self.model.copies))
 
     def _energies_at(self, x):
@@ -67,18 +66,18 @@ class Elastic:
         return [self._value(energy, self.model.positions) for energy in self._energies]
 
     def gaps(self, x, terms):
-        """Computes ½Σ gap² of the constraints of terms, which is their energy with a stiffness of 1, (B,)."""
+        """Returns ½Σ gap² of the constraints of terms, their energy with stiffness 1, (B,)."""
         unit = tuple(elements.with_unit_stiffness() for elements in terms)
         return self._value(Energy(self.model, self._sums, terms=unit), x) if unit else np.zeros(self.model.copies)
 
     def gradient(self, x):
-        """∂U/∂x [N] of the soft terms at x, (B·n, 3), in the order of the scene."""
+        """Returns ∂U/∂x [N] of the soft terms at x, (B·n, 3), in the order of the scene."""
         gradient = self.model.vectors()
         self._gradient.add(x, gradient)
         return self.model.in_scene_order(gradient.numpy()).astype(np.float64)
 
     def put(self, points):
-        """Puts points (B·n, 3) from the order of the scene into that of the model, on its device."""
+        """Returns points (B·n, 3) in the order of the scene as a device array in the order of the model."""
         model = self.model
         if model.order is not None:
             points = points.reshape(model.copies, -1, 3)[:, model.order]
@@ -91,11 +90,11 @@ class Elastic:
 
 
 class Balance:
-    """Compares the energy of each copy, frame by frame, with what the sources of the scene can have put in.
+    """Compares the energy of each copy, frame by frame, with the energy that the sources of the scene can have added.
 
-    Energies are counted from the lowest height that a copy has had, so falling is not a separate source. Elastic energy below 0
-    counts with the height; it is computed at the start and in frames that would be judged diverged without it. A cloth that no
-    pin and no attachment holds is judged by its motion relative to its centre of mass, to which gravity adds nothing.
+    Potential energy counts from the lowest value so far, so that falling is not a source. Negative elastic energy is included;
+    it is computed at the start, and in frames that would otherwise count as diverged. A cloth without pins and attachments is
+    judged by its motion relative to its centre of mass, to which gravity adds nothing.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -106,8 +105,8 @@ class Balance:
         free: Whether no pin, attachment or rail holds it.
         elastic: :class:`Elastic` of the model.
         sources: The sources of the scene.
-        points: Those of the frame that is checked (B·n, 3) [m].
-        has, given: Energy that each copy has, and that it can have been given, in the last frame that was checked, (B,) [J].
+        points: Positions of the frame that is checked, (B·n, 3) [m].
+        has, given: Energy of each copy, and the energy that its sources can have added, in the last checked frame, (B,) [J].
     """
 
     carried = ("_lowest", "_fastest", "_rounding", "_rounded_height")  # from frame to frame
@@ -120,7 +119,7 @@ class Balance:
         points, mass, inverse = (model.in_scene_order(array.numpy()).astype(np.float64) for array in arrays)
         self.mass = np.where(inverse > 0.0, mass, 0.0).reshape(model.copies, -1)
         self.total = self.mass.sum(axis=1)
-        # A term of one vertex that is in no cell holds it where it is in space.
+        # A term with stencils of one vertex, and without cells, holds vertices in space.
         held = any(elements.term.vertices == 1 and not elements.cells for elements in model.terms)
         self.free = not (held or len(model.scene.fixed) or model.mobility is not None)
         self._gravity = model.gravity.numpy().astype(np.float64)
@@ -131,20 +130,20 @@ class Balance:
         self._rounding = np.zeros(model.copies)
         self.elastic = Elastic(model)
         self._lowest = self.elastic.below_0(model.positions)
-        # Rounding of positions gives a velocity of at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
+        # Rounding of positions changes velocities by at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
         self._note_farthest(points)
         found = (source_of(part, self, stepper) for part in (stepper, *model.scene.declared))
         self.sources = [source for source in found if source is not None]
 
     def kinetic(self, velocities):
-        """½Σ m v² of each copy [J], of a free cloth relative to its centre of mass."""
+        """Returns ½Σ m v² of each copy (B,) [J]; for a free cloth, relative to its centre of mass."""
         velocities = velocities.reshape(*self.mass.shape, 3)
         if self.free:
             velocities = velocities - (self._moments(velocities) / self.total[:, None])[:, None]
         return 0.5 * (self.mass * np.einsum("bij,bij->bi", velocities, velocities)).sum(axis=1)
 
     def gains(self, frame, points, velocities):
-        """Divides the energy of each copy by what it can have been given, (B,).
+        """Returns the energy of each copy over the energy that its sources can have added, (B,).
 
         Args:
             frame: Number of the frame; they come in order from 1.
@@ -179,11 +178,11 @@ class Balance:
 
     @property
     def weighs(self):
-        """Whether each copy has gravity, (B,)."""
+        """Whether gravity acts on each copy, (B,)."""
         return self._gravity.any(axis=1)
 
     def sentence(self, copy):
-        """Says how much energy a copy has gained by the last frame."""
+        """Returns the part of a message that says how much energy a copy has gained by the last frame."""
         names = [source.name for source in self.sources] + ["falling"] * bool(self.weighs[copy] and not self.free)
         names = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
         return (
@@ -196,7 +195,7 @@ class Balance:
         )
 
     def suffices(self, copy, points, stretch):
-        """Whether the energy that a copy can have been given by the last frame allows an edge ``stretch`` m too long."""
+        """Returns whether the energy that a copy can have explains an edge that is ``stretch`` [m] too long."""
         with TURN:
             x = self.elastic.put(points)
             energy, gaps = self.elastic.energy(x)[copy], self.elastic.gaps(x, self.elastic.hard)[copy]
@@ -208,7 +207,7 @@ class Balance:
         return np.where(self.has > 0.0, self.has / self.given, np.where(self.has <= 0.0, 0.0, np.nan))
 
     def _note_farthest(self, points):
-        """Bounds the energy that rounding adds in a step, and the height that it changes, by the farthest of the points."""
+        """Updates the bounds of kinetic and potential energy that rounding adds, from the largest coordinate."""
         farthest = np.abs(points).reshape(self.model.copies, -1).max(axis=1)
         rounded = 4.0 * np.finfo(self.model.numpy_dtype).eps * farthest
         self._rounding = np.fmax(0.5 * self.total * (rounded / self._h) ** 2, self._rounding)
@@ -218,7 +217,7 @@ class Balance:
         return np.einsum("bi,bij->bj", self.mass, points.reshape(*self.mass.shape, 3))
 
     def _height(self, points):
-        """Potential energy of gravity and constant loads since the start [J], without which a free cloth is judged."""
+        """Returns the potential energy of gravity and constant loads since the start, (B,) [J]; 0 for a free cloth."""
         if self.free:
             return np.zeros(self.model.copies)
         height = -((self._moments(points) - self._moment) * self._gravity).sum(axis=1)
@@ -227,7 +226,7 @@ class Balance:
         return height
 
     def _at_positions(self, points, velocities):
-        """Velocities at the time of the positions, half a kick later."""
+        """Returns the velocities at the time of the positions, half a step later."""
         mass, shape = self.mass[..., None], (*self.mass.shape, 3)
         forces = mass * self._gravity[:, None] - self.elastic.gradient(self.elastic.put(points)).reshape(shape)
         if self.model.loads is not None:

@@ -1,7 +1,6 @@
-"""Checkpoints: all that an interrupted run needs to go on, to the bit of one that was not interrupted.
+"""Checkpoints, from which an interrupted run continues with the same bits as an uninterrupted one.
 
-A run that writes a file leaves one beside its frames with each finished chunk, instead of the one before, and none when it has
-ended.
+A run that writes a file replaces its checkpoint, beside the frames, after each chunk of frames, and deletes it at the end.
 """
 
 import json
@@ -17,7 +16,7 @@ from ..base.digest import digest_of, scene_digest, source_digest
 from ..base.interrupts import deferred
 
 NAME = "checkpoint.npz"
-# What two runs must have in common, and how a sentence calls it; of a digest without its value.
+# Facts that two runs must have in common, with words for the error message; {} stands for the value.
 _CALLED = {
     "code": "another version of warpcloth or of Warp",
     "scene": "another scene",
@@ -31,17 +30,17 @@ _CALLED = {
 
 
 def facts_of(scene, solver, device, dtype, vary, threads, record=()):
-    """All that the bits of a run depend on, by name.
+    """Returns everything that the bits of a run depend on, by name.
 
     Raises:
-        ValueError: If something in the scene is no data.
+        ValueError: The scene cannot be hashed, see :func:`warpcloth.base.digest.digest_of`.
     """
     device = wp.get_device(device)
     return {
         "code": f"{source_digest()} {wp.__version__}",
         "scene": digest_of([scene_digest(scene), float(scene.duration)]),
         "vary": digest_of([[name, np.asarray(values)] for name, values in sorted((vary or {}).items())]),
-        "solver": repr(solver.without_limits()),  # which its steps do not depend on
+        "solver": repr(solver.without_limits()),  # steps do not depend on the check of limits
         "device": device.name if device.is_cuda else "cpu",
         "dtype": dtype,
         "threads": int(threads),
@@ -51,14 +50,14 @@ def facts_of(scene, solver, device, dtype, vary, threads, record=()):
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A run after a frame that is the last of a chunk.
+    """The state of a run after the last frame of a chunk.
 
     Attributes:
         frame: Number of the frame.
-        facts: As :func:`facts_of` gives them.
-        chunks: Time code of the first frame and name of the file of each chunk until then.
+        facts: See :func:`facts_of`.
+        chunks: Time code of the first frame, and name of the file, of each chunk so far.
         span: Time codes of the first and of the last frame.
-        state, watch: What :class:`warpcloth.core.state.State` and :class:`warpcloth.run.watch.Watch` give for a file.
+        state, watch: Values of :class:`warpcloth.core.state.State` and :class:`warpcloth.run.watch.Watch` on the host.
     """
 
     frame: int
@@ -69,10 +68,10 @@ class Checkpoint:
     watch: dict
 
     def write(self, folder):
-        """Writes it into a folder, over one that is there.
+        """Writes it into a folder, in place of an older one.
 
         Raises:
-            OSError: If it cannot be written; the one that is there stays.
+            OSError: It cannot be written; the older one stays.
         """
         about = json.dumps({"frame": self.frame, "facts": self.facts, "chunks": self.chunks, "span": self.span})
         arrays = {f"state {name}": values for name, values in self.state.items()}
@@ -89,10 +88,10 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path):
-        """The checkpoint of a file.
+        """Reads the checkpoint in a file.
 
         Raises:
-            ValueError: If it is none.
+            ValueError: The file has none that can be read.
         """
         try:
             with np.load(path) as file:
@@ -106,10 +105,10 @@ class Checkpoint:
             raise ValueError(f"{path}: is no checkpoint that can be read; run without resume to begin anew") from None
 
     def refuse_other(self, output, facts):
-        """Refuses to go on with another run.
+        """Checks that it is of a run with the same facts.
 
         Raises:
-            ValueError: Naming the first thing that differs.
+            ValueError: A fact differs. The message names the first.
         """
         for name, called in _CALLED.items():
             if self.facts.get(name) != facts[name]:

@@ -1,4 +1,4 @@
-"""Static equilibria: where the energy of a scene and of its weight is least, without inertia."""
+"""Static equilibria: minima of the energy of a scene and its weight, without inertia."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ from .history import Evaluation, checked_record, collider_names
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
-# Part of the size of the cloth; a descent that rounding ended after less than this has nowhere left to go.
+# A descent that ended by rounding, and moved by less than this fraction of the size of the cloth, is not repeated.
 NEAR = 1e-5
 
 
@@ -34,14 +34,14 @@ class Equilibrium(NamedTuple):
         points: (n, 3) [m].
         status: How it ended, see :class:`warpcloth.core.status.Result`, with the residual: the sum Σ‖fᵢ‖ of the unbalanced
             forces of all free vertices, divided by the weight Σmᵢ‖g‖ (without gravity, by its value at the start).
-        iterations: Newton iterations in all, each round of proximal steps counting as one more.
-        lowest_eigenvalue: Lowest eigenvalue of the Hessian of the energy over the free vertices [N/m]; NaN if the descent did
-            not end in balance.
-        stable: Whether the descent ended in balance and no eigenvalue is more negative than rounding and the tolerance explain.
-            Then no small move lowers the energy to second order. Moves that change no energy, such as those of a body that
-            nothing holds, have the eigenvalue 0 and count as stable.
+        iterations: Total number of Newton iterations; each round of proximal steps counts as one more.
+        lowest_eigenvalue: Lowest eigenvalue of the Hessian of the energy over the free vertices [N/m]; NaN if forces do not
+            balance.
+        stable: Whether forces balance, and no eigenvalue is more negative than rounding and the tolerance explain. Then no
+            small move lowers the energy to second order. Moves that change no energy, such as those of a free body, have the
+            eigenvalue 0 and count as stable.
         energies: With ``record="energies"``, a dictionary [J]: each term, ``"self-contact"``, ``"gravity"`` since the start,
-            and the ``"work of loads"`` that are constant.
+            and ``"work of loads"`` that are constant.
         reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (p, 3) [N].
         collider_forces: With ``record="reactions"``, the force of the cloth on each collider by its name, (3,) [N].
     """
@@ -75,40 +75,40 @@ def equilibrium(
     came there, and free vertices must start outside them. With friction there are many rest shapes, and the motion decides
     among them, so colliders and self-contact with friction are refused: run such a scene with damping until it rests.
 
-    Of colliders that are meshes each vertex meets the half-spaces that touch them nearest to it, see
-    :mod:`warpcloth.kernels.mesh_colliders`. These are found again, and the cloth settles again, until they no longer change the
-    balance; no vertex crosses a triangle on its straight way from one of these rounds to the next.
+    A mesh collider is approximated near each vertex by half-spaces that touch it, see :mod:`warpcloth.kernels.mesh_colliders`.
+    They are updated after the cloth has settled, and it settles again, until they no longer change the balance. No vertex
+    crosses a triangle on the straight line between two of these rounds.
 
-    With self-contact all iterates stay apart, pins included: pins with keyframes move as far as cloth lets them, and if they do
-    not arrive, the iterations are used up. The areas of contact are held constant while the cloth settles, then computed again,
-    until forces balance. ``stable`` and ``lowest_eigenvalue`` leave out that pairs rotate. Layers without friction, which may
-    slide off one another, often have no equilibrium.
+    With self-contact, no iterate crosses itself, pins included: pins with keyframes move as far as cloth lets them, and if they
+    do not arrive, the iterations are used up. The areas of contact are held constant while the cloth settles, then computed
+    again, until forces balance. ``stable`` and ``lowest_eigenvalue`` neglect the rotation of pairs. Layers without friction may
+    slide off one another, so they often have no equilibrium.
 
-    The method is Newton's without inertia, with a line search; gravity is applied in equal load steps. If the Hessian is
-    singular, because, for example, a flat cloth without bending stiffness cannot carry its weight, the step is taken with
-    inertia, s/2‖x − x_now‖²_M, and s is lowered from there. This is a proximal point method, in which the energy never rises.
-    Cloth that nothing holds has no equilibrium and is reported as not converged. If the Hessian has a negative eigenvalue in
-    the end, the shape is in balance but not a minimum: it is perturbed a little and settles again.
+    The method is Newton's with a line search, without inertia; gravity is applied in equal load steps. If the Hessian is
+    singular, for example because a flat cloth without bending stiffness cannot carry its weight, a term s/2‖x − x_now‖²_M is
+    added, and s is lowered from there. This is a proximal point method, in which the energy never rises. Cloth that nothing
+    holds has no equilibrium and is reported as not converged. If the final Hessian has a negative eigenvalue, the shape is in
+    balance but not a minimum: it is perturbed a little and settles again.
 
     Args:
         scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
         tolerance: Tolerance of the residual, see :class:`Equilibrium`, and of the unbalanced acceleration of each vertex
             divided by gravity (without gravity, by the largest at the start). If rounding leaves more than this at a vertex,
             the descent ends when it cannot lower the energy any more, and the residual decides. With gravity, a shape with half
-            of the weight or more unbalanced does not count as a rest shape.
+            of the weight or more unbalanced is no equilibrium.
         load_steps: Number of steps in which gravity and loads grow and pins move along their keyframes. Pins that rotate far
             need several.
         iterations: Maximum number of Newton iterations in total.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
         linear: ``"factorised"``, which stiff and slender cloth needs, or ``"cg"``.
-        record: ``"energies"``, ``"reactions"`` or both, which the result then has.
+        record: ``"energies"``, ``"reactions"`` or both, to be included in the result.
 
     Returns:
         :class:`Equilibrium`.
 
     Raises:
-        ValueError: If an argument is not allowed, a stiffness is infinite, there is friction, a free vertex starts inside a
+        ValueError: An argument is not allowed, a stiffness is infinite, there is friction, a free vertex starts inside a
             collider at its last keyframe, or cloth crosses cloth at the start.
 
     Examples:
@@ -141,10 +141,10 @@ def equilibrium(
     descent = _Descent(minimiser, base, tolerance, iterations)
     for part in range(1, load_steps + 1):
         result = _settle_on_meshes(model, base, descent, part / load_steps, contact)
-    # In balance; but a straight chain that stands on its pin is too. Nudged, it leaves, and what is at rest comes back.
+    # Forces balance, but they do for a straight chain that stands on its pin too. A small perturbation tells them apart.
     if result in SETTLED and minimiser.curves_down(tolerance):
         base.assign(base.numpy() + _nudge(model))
-        # What is left unbalanced compresses the edges of a nearly straight chain by many times itself, and curves the energy.
+        # A small unbalanced force compresses the edges of a nearly straight chain by much more, and changes the eigenvalues.
         descent.tolerance *= 0.01
         if contact is not None:
             contact.launch_end(base, model.vectors())
@@ -157,7 +157,7 @@ def equilibrium(
     residual, began = descent.residual, result.value
     if result is Result.ROUNDED and residual <= tolerance:
         result = Result.CONVERGED
-    # A sheet that has not moved leaves its whole weight, up to an ulp. Without gravity a start at rest leaves its own rounding.
+    # A sheet that did not move has its whole weight unbalanced. Without gravity, a start at rest has only rounding unbalanced.
     elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity_scale.gravity[0] > 0.0:
         result, began = Result.STALLED, f"rounding hides the equilibrium in {dtype}"
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
@@ -184,7 +184,7 @@ def equilibrium(
 
 
 def _with_colliders_at_rest(scene):
-    """The scene with moving colliders where their last keyframe has them; refuses friction."""
+    """Returns the scene with static colliders at their last keyframes; raises ValueError if there is friction."""
     for collider in scene.colliders:
         if collider.friction:
             raise ValueError(
@@ -205,13 +205,13 @@ def _with_colliders_at_rest(scene):
 
 
 class _Descent:
-    """Minimises from where the cloth is and moves it there, again and again, with so many iterations in all."""
+    """Repeated minimisations from the present positions, with a limit on the total number of iterations."""
 
     def __init__(self, minimiser, base, tolerance, iterations):
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
         self.used, self.moved, self.pairs = 0, 0.0, minimiser.pairs
-        self._apart = wp.clone(base)  # the last positions of a descent, which base may have left without regard to pairs
-        self.scale = None  # from the first descent: without gravity a later one would be scaled by its own rounding
+        self._apart = wp.clone(base)  # the last positions without crossings
+        self.scale = None  # from the first descent, because without gravity a later one would be scaled by its own rounding
         model = minimiser.model
         self.load = float(
             minimiser.gravity_scale.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64)
@@ -219,11 +219,11 @@ class _Descent:
         self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
 
     def run(self, load, s):
-        """Settles without inertia, with proximal steps in between where that does not go on; the last result."""
+        """Settles without inertia, with proximal steps in between if it gets stuck; returns the last result."""
         while True:
             result = self._settle(0.0, load, self.iterations)
             least, found = (np.inf, np.inf), (self.moved, self.unbalanced)
-            # A long d rounds much; from here it is short, unless a move costs nothing and rounding makes one.
+            # A long d has a large rounding, so start again from here; it is short then, unless moves cost no energy.
             while result is Result.ROUNDED and self.moved > NEAR and self.used < self.iterations and _halved(found, least):
                 least = tuple(map(min, found, least))
                 result = self._settle(0.0, load, self.iterations)
@@ -233,10 +233,10 @@ class _Descent:
             for _ in range(8):
                 self._settle(s, load, 20)
             s /= 16.0
-            self.used += 1  # so that a round which finds no direction at all ends too
+            self.used += 1  # so that rounds without a direction end too
 
     def balanced(self, update):
-        """Whether new areas, and loads by ``update``, leave no more unbalanced than the tolerance, or than rounding does."""
+        """Returns whether forces balance to the tolerance or to rounding, with new areas and the loads of ``update``."""
         self.minimiser.clear()
         rounded = float(self.minimiser.unbalanced()[0])
         update()
@@ -289,16 +289,16 @@ class _Descent:
 
 
 def _settle_all(model, base, descent, part):
-    """Descends under the fraction ``part`` of loads and keyframes until what follows the cloth no longer changes it.
+    """Settles under the fraction ``part`` of loads and keyframes until loads and areas that follow the cloth are constant.
 
-    Loads may follow it, and the areas of pairs of self-contact do. Pins that cloth held back go on from there.
+    Pressures follow the cloth, and so do the areas of pairs of self-contact. Pins that cloth held back move on.
     """
     pins, loads = model.scene.pins, model.loads
     follows = descent.pairs is not None or (loads is not None and loads.follows)
 
     def set_loads():
         if loads is not None:
-            # Of keyframes the last, whatever their number.
+            # The last keyframe.
             loads.set(model, Moment(base, ahead=MOST_FRAMES))
 
     while True:
@@ -317,9 +317,9 @@ def _settle_all(model, base, descent, part):
 
 
 def _settle_on_meshes(model, base, descent, part, contact):
-    """Settles as :func:`_settle_all`; with meshes again, until the half-spaces that are nearest now leave it in balance.
+    """Settles by :func:`_settle_all`, and repeats that with new half-spaces of meshes until the cloth is in balance.
 
-    Only scenes with meshes have ``contact``, a :class:`warpcloth.contact.collider_steps.ColliderSteps`.
+    ``contact`` is the :class:`warpcloth.contact.collider_steps.ColliderSteps` of a scene with meshes, else None.
     """
     if contact is None:
         return _settle_all(model, base, descent, part)
@@ -327,7 +327,7 @@ def _settle_on_meshes(model, base, descent, part, contact):
     def find_facets():
         model.refresh(STEP, Moment(base))
 
-    velocity = model.vectors()  # which a round has not
+    velocity = model.vectors()  # 0
     while True:
         find_facets()
         result = _settle_all(model, base, descent, part)
@@ -341,12 +341,12 @@ def _settle_on_meshes(model, base, descent, part, contact):
 
 
 def _halved(found, least):
-    """Whether some number is at most half of the least that it was."""
+    """Returns whether a number is at most half of its earlier minimum."""
     return any(one <= 0.5 * before for one, before in zip(found, least, strict=True))
 
 
 def _with_pins(pins, points, part):
-    """The points (n, 3) [m] with pins that have keyframes after the fraction ``part`` of these."""
+    """Returns the points (n, 3) [m] with moved pins after the fraction ``part`` of their keyframes."""
     if pins.keyframes is None:
         return points
     at = part * (len(pins.keyframes) - 1)
@@ -358,14 +358,14 @@ def _with_pins(pins, points, part):
 
 
 def _nudge(model):
-    """A move of the free vertices by about 1e-4 of the size of the cloth, the same at every call (n, 3) [m]."""
+    """Returns displacements of the free vertices of about 1e-4 of the size of the cloth, (n, 3) [m], equal in every call."""
     size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
     noise = np.random.default_rng(0).normal(size=(model.count, 3))
     return 1e-4 * size * noise * (model.coordinate_mobility() > 0.0).reshape(-1, 3)
 
 
 def _frequency_scale(model):
-    """100 g over the size of the cloth [1/s²], 10 times the frequency at which it would swing by its end, squared; or 1."""
+    """Returns (10ω)² = 100 g over the size of the cloth [1/s²], ω that of a pendulum of this length; 1 without gravity."""
     size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
     gravity = float(np.linalg.norm(model.gravity.numpy()))
     return 100.0 * gravity / size if gravity > 0.0 else 1.0

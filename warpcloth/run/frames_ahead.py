@@ -1,4 +1,4 @@
-"""The frames of a run on the host, in the order of the scene, computed ahead of who watches and writes them."""
+"""The frames of a run on the host, in the order of the scene, computed while earlier ones are checked and written."""
 
 import itertools
 import time
@@ -16,15 +16,15 @@ from ..kernels.copy import take_vertices
 
 
 class Frame(NamedTuple):
-    """A frame, and what its stepper said of it.
+    """A frame, with the results of its stepper.
 
     Attributes:
-        points: (B·n, 3) [m], in the order of the scene; as the velocities an array of its own.
-        velocities: (B·n, 3) [m/s].
-        results: The worst :class:`warpcloth.core.status.Result` of each copy until then, a list of B.
-        residual: The largest residual of each copy until then, (B,).
-        seconds: What computing it took; on CUDA as its clock says.
-        state: The state of the stepper then, as :meth:`warpcloth.core.state.State.to_host` gives it, or None.
+        points: (B·n, 3) [m], in the order of the scene, not a view.
+        velocities: (B·n, 3) [m/s], not a view.
+        results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
+        residual: The largest residual of each copy so far, (B,).
+        seconds: Time of its computation [s]; on CUDA by events of the device.
+        state: The state of the stepper, see :meth:`warpcloth.core.state.State.to_host`, or None.
     """
 
     points: np.ndarray
@@ -36,16 +36,16 @@ class Frame(NamedTuple):
 
 
 def frames_of(stepper, count, ahead, keeps=None):
-    """The next frames of a stepper, as a generator that must be closed: it waits for what is still being computed.
+    """Yields the next frames of a stepper. Close the generator, which then waits for frames that are being computed.
 
-    While one is in use a thread computes those after it. The first is computed alone, for it may record graphs, beside which
-    the device takes nothing else.
+    While the caller uses one frame, a thread computes the next ones. The first is computed alone, because it may capture
+    graphs, and a capture tolerates no other work on the device.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`; closed early it has gone on further than the last frame taken.
-        count: How many.
-        ahead: The most that are computed beyond the one in use; 0 computes each when it is asked for, without a thread.
-        keeps: Function of how many frames there were before, which says whether the next one has the state, or None.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`. Its state is ahead of the frame that the caller has.
+        count: Number of frames.
+        ahead: Largest number of frames computed ahead; 0 computes each on demand, without a thread.
+        keeps: Function (number of frames before) → whether the next frame includes the state; or None.
     """
     numbers = itertools.count()
     copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
@@ -73,7 +73,7 @@ def frames_of(stepper, count, ahead, keeps=None):
             for left in range(count - 1, 0, -1):
                 found = taken(*pending.popleft().result())
                 if left > ahead:
-                    pending.append(pool.submit(compute))  # in the buffers that are free now
+                    pending.append(pool.submit(compute))  # reuses the buffers of the frame that was taken
                 yield found
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -81,7 +81,7 @@ def frames_of(stepper, count, ahead, keeps=None):
 
 @in_turn
 def state_of(stepper):
-    """Points and velocities as they are now, (B·n, 3) each, in the order of the scene, as arrays of their own."""
+    """Returns copies of the present points [m] and velocities [m/s], (B·n, 3) each, in the order of the scene."""
     model = stepper.model
     on_host(model.device, "reading a frame")
     return tuple(np.array(model.in_scene_order(array.numpy())) for array in stepper.state)  # on the CPU numpy() is a view
@@ -89,13 +89,13 @@ def state_of(stepper):
 
 @in_turn
 def _state_of(stepper):
-    """All that it carries, on the host."""
+    """Returns the whole state on the host."""
     return stepper.state.to_host()
 
 
 @in_turn
 def _copies(stepper, number):
-    """Returns buffers that take so many frames from a stepper."""
+    """Returns this number of buffers for frames of a stepper."""
     model = stepper.model
     if not model.device.is_cuda:
         return [_HostCopy(stepper) for _ in range(number)]
@@ -109,16 +109,15 @@ def _copies(stepper, number):
 
 @cache
 def _copy_stream(device):
-    """The stream of a device, by its name, that copies frames, made once and kept.
+    """Returns the stream that copies frames from a device, which is made once and kept.
 
-    Warp notes the streams that exist in a table without a lock: one that ends in one thread while another records a graph would
-    break that table.
+    Warp's table of streams has no lock: a stream deleted in one thread while another captures a graph would break it.
     """
     return wp.Stream(device)
 
 
 class _HostCopy:
-    """A frame that is computed on the host."""
+    """A buffer for a frame that is computed on the CPU."""
 
     def __init__(self, stepper):
         self.stepper = stepper
@@ -135,9 +134,9 @@ class _HostCopy:
 
 
 class _DeviceCopy:
-    """A frame on its way from the device: x and v put in the order of the scene, and copied from there by a second stream.
+    """A buffer for a frame on a CUDA device: x and v in the order of the scene, which a second stream copies to the host.
 
-    So the next frame begins while this one is copied, and who takes it waits for its event alone.
+    So the next frame begins during the copy, and a reader waits only for the event of this one.
     """
 
     def __init__(self, stepper, stream, indices, found, host):
@@ -166,7 +165,7 @@ class _DeviceCopy:
     def take(self):
         try:
             wp.synchronize_event(self._copied)
-        except RuntimeError:  # while another thread records a graph Warp waits for no event
+        except RuntimeError:  # Warp refuses to wait for an event while another thread captures a graph
             with TURN:
                 wp.synchronize_event(self._copied)
         seconds = 1e-3 * wp.get_event_elapsed_time(self._began, self._ended, synchronize=False)

@@ -1,4 +1,4 @@
-"""The history of a run: energies, work and the forces at pins and colliders, frame by frame, where they are asked for."""
+"""The recorded history of a run: energies, work, and forces at pins and colliders in each frame."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -23,15 +23,15 @@ from ..scene.scene import Scene
 from ..terms.refresh import STEP, Moment
 
 RECORDS = ("energies", "reactions", "pairs")
-# What "pairs" has of self-contact in each frame.
+# Numbers that record="pairs" has for each frame.
 PAIRS = ("pairs in contact", "pairs listed", "new lists", "moves kept", "least gap")
 
 
 def checked_record(record: Any, scene: Scene | None = None) -> tuple[str, ...]:
-    """Returns what to record, each word once, in the order of :data:`RECORDS`.
+    """Returns the words of a record, each once, in the order of :data:`RECORDS`.
 
     Raises:
-        ValueError: If a word is another, or is "pairs" without the scene of a run that has self-contact.
+        ValueError: A word is not one of these, or is "pairs" without the scene of a run, or without self-contact.
     """
     words = (record,) if isinstance(record, str) else record if isinstance(record, Iterable) else (record,)
     words = tuple(words)
@@ -44,12 +44,12 @@ def checked_record(record: Any, scene: Scene | None = None) -> tuple[str, ...]:
 
 
 def energy_names(scene: Scene) -> list[str]:
-    """Names of the energies and works that a run of a scene records."""
+    """Returns the names of the energies and works that a run of a scene records."""
     return [*dict.fromkeys(_term_names(scene)), *_other_names(scene)]
 
 
 def _term_names(scene):
-    """Names of the terms, and of contact and friction: their labels, numbered where one is taken; facets share theirs."""
+    """Returns names of terms, contact and friction: their labels, numbered if equal; all facets of a collider share one."""
     terms = [*scene.terms, *scene.contact_terms]
     first = [k for k, term in enumerate(terms) if not getattr(term, "facet", 0)]
     names = numbered((terms[k].label for k in first), _other_names(scene))
@@ -66,7 +66,7 @@ def _other_names(scene):
 
 
 def collider_names(scene: Scene) -> list[str]:
-    """Names of the colliders of a scene: their labels, numbered where one is taken."""
+    """Returns the names of the colliders of a scene: their labels, numbered if equal."""
     return numbered(collider.label for collider in scene.colliders)
 
 
@@ -75,22 +75,22 @@ class Evaluation:
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        h: Step over which damping is taken [s], or None without motion.
-        stepper: The :class:`warpcloth.solvers.solver.Stepper` whose colliders and multipliers it takes; None for colliders
-            where they start, and no hard terms.
-        forces: Whether it finds forces.
-        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact where there is no stepper.
+        h: Step for damping [s], or None without motion.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper` with the colliders and multipliers; None for colliders at their
+            start and without hard terms.
+        forces: Whether to compute forces.
+        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact, if there is no stepper.
 
     Attributes:
         names: Names of the energies.
-        names_of_friction: Those of them that friction with colliders stores.
-        stored: U of the springs of friction of cloth with itself, of the last :meth:`energies`, (B,) [J].
-        hidden: Whether some forces are those of multipliers.
+        names_of_friction: Names of those that friction with colliders stores.
+        stored: U of the friction springs of self-contact, of the last :meth:`energies`, (B,) [J].
+        hidden: Whether some forces follow from multipliers.
         gradient: ∂U/∂x of the last :meth:`launch`, (N,) [N].
-        pulls: :class:`warpcloth.contact.present.ColliderPulls` of it, or None without colliders.
+        pulls: Its :class:`warpcloth.contact.present.ColliderPulls`, or None without colliders.
 
     Raises:
-        ValueError: If a term is hard and the solver has no multipliers.
+        ValueError: A term is hard and the solver has no multipliers.
     """
 
     def __init__(self, model, h=None, stepper=None, forces=True, pairs=None):
@@ -126,13 +126,13 @@ class Evaluation:
         self._add = model.kernel(kernels.add_scaled, model.dtype) if self.pulls else None
 
     def launch(self, x, v=None):
-        """Launches ∂U/∂x at x into ``gradient`` (N,) [N], with the damping at velocities v and the pull of hard terms."""
+        """Launches ∂U/∂x at x into ``gradient`` (N,) [N], with damping at velocities v and the forces of hard terms."""
         model = self.model
         self.gradient.zero_()
         if self.pulls:
             self._present.launch(x, v)
             self.pulls.launch(x)
-            for found in self.pulls.found if not self.pulls.hard else ():  # else they come with all hard terms
+            for found in self.pulls.found if not self.pulls.hard else ():  # hard contact is among the hard terms
                 model.launch(self._add, model.count, [found.all, 1.0], [self.gradient])
         if self._elastic:
             self._elastic.add(x, self.gradient)
@@ -148,14 +148,17 @@ class Evaluation:
             self._pull(self.gradient)
 
     def reactions(self):
-        """The forces of the pins on the cloth along held axes, of the last :meth:`launch` and loads, (B, p, 3) [N]."""
+        """Returns the forces of pins on the cloth along held axes, from the last :meth:`launch` and loads, (B, p, 3) [N]."""
         found = self._host(self.gradient)[:, self._pins] - self._mass[:, self._pins, None] * self._gravity
         if self.model.loads is not None:
             found -= self._host(self.model.loads.force)[:, self._pins]
         return np.where(self._held, found, 0.0)
 
     def energies(self, x, v=None):
-        """U of each term, of motion, of gravity since the start, and work of constant loads since then, by name (B,) [J]."""
+        """Returns the energies of terms, motion and gravity, and the work of constant loads, by name, (B,) [J].
+
+        Those of gravity and loads are relative to the start.
+        """
         model, found = self.model, {}
         if self._energies is None:
             sums = Sums(model)
@@ -163,7 +166,7 @@ class Evaluation:
         self._present.launch(x, v)
         for name, energy in zip(self._term_names, self._energies, strict=True):
             total = model.scalars()
-            if energy is not None:  # a hard term stores none
+            if energy is not None:  # hard terms store no energy
                 energy.add(x, total)
             found[name] = found.get(name, 0.0) + total.numpy()
         if self._pairs is not None:
@@ -175,7 +178,7 @@ class Evaluation:
             found["self-contact"], self.stored = total.numpy(), stored.numpy()
         moved = self._host(x) - self._start
         if v is not None:
-            with np.errstate(over="ignore"):  # of a copy that diverges
+            with np.errstate(over="ignore"):  # a copy may diverge
                 found["kinetic"] = 0.5 * (self._mass * (self._host(v) ** 2).sum(axis=2)).sum(axis=1)
         found["gravity"] = -(self._mass * (moved * self._gravity).sum(axis=2)).sum(axis=1)
         if model.loads is not None and model.loads.constant is not None:
@@ -183,12 +186,12 @@ class Evaluation:
         return found
 
     def kinetic_of_pins(self, v):
-        """½Σ m v² of the pins along the axes that they hold, (B,) [J]."""
+        """Returns ½Σ m v² of the pins along the axes that they hold, (B,) [J]."""
         v = np.where(self._held, self._host(v)[:, self._pins], 0.0)
         return 0.5 * (self._mass[:, self._pins] * (v**2).sum(axis=2)).sum(axis=1)
 
     def mask(self):
-        """1 along the axes that pins hold, 0 elsewhere, (N,) vectors."""
+        """Returns vectors (N,) that are 1 along the axes that pins hold and 0 elsewhere."""
         found = np.zeros((*self._mass.shape, 3))
         found[:, self._pins] = self._held
         return self.model.array(found.reshape(-1, 3), self.model.vec3)
@@ -198,7 +201,7 @@ class Evaluation:
 
 
 def _kept(name):
-    """The attribute of the rows of one name, which a run that goes on sets."""
+    """Returns a property for the rows of one name, which a resumed run sets."""
 
     def get(history):
         return np.array(history._rows[name])
@@ -212,27 +215,26 @@ def _kept(name):
 class History:
     """Wraps a stepper and records energies and reactions after each frame, without changing its state.
 
-    Work that depends on the path, that of moving pins and colliders, of loads that change or follow the cloth, against
-    friction and of the filter of colliders, is summed in every step, and steps are then launched one by one; frames stay equal
-    to the bit.
+    Work that depends on the path is summed in every step: that of moving pins and colliders, of loads that change or follow the
+    cloth, against friction, and of the filter of colliders. Steps are then launched one by one; frames have the same bits.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
-        model: The model that it was bound to.
-        record: What to find, of :data:`RECORDS`.
+        model: The model that it is bound to.
+        record: Words of :data:`RECORDS`.
 
     Attributes:
         names: Names of the energies.
-        energies: Of each frame that was kept, (F, B, K) [J].
-        reactions: Of each frame that was kept, (F, B, p, 3) [N].
-        forces: On the colliders, and of these the part of friction, of each frame that was kept, (F, B, C, 2, 3) [N].
-        pairs: :data:`PAIRS` of each frame that was kept, (F, B, 5).
-        cuts: The share of the moves in each frame that was kept which contact cut short, (F, B).
-        totals: Work of pins, without their kinetic energy, of loads, of colliders, against friction and of the filter in the
-            last frame that was kept, (5, B) [J].
+        energies: Energies of each kept frame, (F, B, K) [J].
+        reactions: Reactions of each kept frame, (F, B, p, 3) [N].
+        forces: Total force and friction force on each collider in each kept frame, (F, B, C, 2, 3) [N].
+        pairs: :data:`PAIRS` of each kept frame, (F, B, 5).
+        cuts: Fraction of the moves in each kept frame that contact cut short, (F, B).
+        totals: Work of pins, without their kinetic energy, of loads, of colliders, against friction and of the filter, up to
+            the last kept frame, (5, B) [J].
 
     Raises:
-        ValueError: If a term is hard and the solver has no multipliers.
+        ValueError: A term is hard and the solver has no multipliers.
     """
 
     energies, reactions, pairs, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
@@ -269,7 +271,7 @@ class History:
         self._note()
 
     def _recorded_step(self, x, v):
-        """Allocates what is summed in every step, and records its launches."""
+        """Allocates the sums over steps, and captures their launches."""
         model, evaluation = self.model, self._evaluation
         self._before = before = kernels.past(model.dtype)()
         before.x, before.gradient, before.force = (model.vectors() for _ in range(3))
@@ -301,7 +303,7 @@ class History:
         return Segment(model.device, launch)
 
     def _begin(self):
-        """Begins to sum from the present state, in each frame anew, as a run does that goes on from there."""
+        """Starts the sums from the present state, in each frame anew, so that a resumed run has the same bits."""
         (x, v), loads, before = self._stepper.state, self.model.loads, self._before
         wp.copy(before.x, x)
         if loads is not None:
@@ -319,7 +321,7 @@ class History:
         return getattr(self._stepper, name)
 
     def frame(self):
-        """One frame of the stepper, with its work."""
+        """Takes one frame of the stepper, and sums its work."""
         if self._each_step is None:
             self._stepper.frame()
         else:
@@ -338,14 +340,14 @@ class History:
         self._note()
 
     def _add_rubbing(self):
-        """Adds the work against friction of cloth with itself in the step that ended; what is recorded lists pairs anew."""
+        """Adds the work against friction of self-contact in the last step."""
         if self._pulls_itself is not None:
             friction, x = self._stepper.pairs.friction, self._stepper.state.x
             friction.launch_acting(x, self._pulls_itself)
             self.model.launch(self._rub, self.model.count, [self._pulls_itself, friction.start, x], [self._works[3]])
 
     def _make_room(self):
-        """Makes room for all pairs of self-contact at the present state, and records what launches them again."""
+        """Allocates memory for all pairs of self-contact at the present state, and captures their launches again."""
         pairs = self._stepper.pairs
         if pairs is None:
             return
@@ -358,7 +360,7 @@ class History:
             pairs.launch_begin(self._stepper.state.x)
 
     def _note(self):
-        """Finds what is recorded of the present state."""
+        """Evaluates the present state."""
         self._make_room()
         evaluation, loads, (x, v), found = self._evaluation, self.model.loads, self._stepper.state, {}
         if "energies" in self._record:
@@ -379,7 +381,7 @@ class History:
             found["reactions"] = evaluation.reactions()
             if evaluation.pulls:
                 found["forces"] = evaluation.pulls.sums(self.model.copies)
-            if evaluation.hidden and not self._frame:  # multipliers are those of a step
+            if evaluation.hidden and not self._frame:  # there are no multipliers before the first step
                 for name in ("reactions", *["forces"] * bool(evaluation.pulls and evaluation.pulls.hard)):
                     found[name][:] = np.nan
         before, self._seen = self._seen, self._counted()
@@ -392,13 +394,13 @@ class History:
         self._found.append((found, self._total.copy()))
 
     def _counted(self):
-        """The counts of contact so far, (B,) each: cuts, of as many steps in each frame, lists of pairs, and their cuts."""
+        """Returns the counts of contact so far, (B,) each: cuts times frames, lists of pairs, and cuts of their filter."""
         pairs, none = self._stepper.pairs, np.zeros(self.model.copies)
         of_pairs = (none, none) if pairs is None else (pairs.lists.numpy().copy(), pairs.share * self._frame)
         return self._stepper.cut * self._frame, *of_pairs
 
     def keep(self, alive):
-        """Keeps what was found in the next frame, NaN in copies that are no longer ``alive`` (B,), and returns it by name."""
+        """Keeps the values of the last frame, with NaN for copies that are not ``alive`` (B,), and returns them by name."""
         found, self.totals = self._found.popleft()
         for name, values in found.items():
             values[~alive] = np.nan
@@ -406,13 +408,13 @@ class History:
         return found
 
     def go_on(self):
-        """Goes on from the frame kept last, to which the stepper was set."""
+        """Continues from the frame kept last; the stepper must be set to it."""
         self._found.clear()
         self._total, self._frame = np.array(self.totals), max(map(len, self._rows.values())) - 1
         self._seen = self._counted()
 
     def by_name(self):
-        """Returns the fields of the animation that it fills, by name; rows are (F, …), or (F, B, …) of several copies."""
+        """Returns fields of the animation by name, with rows (F, …), or (F, B, …) with several copies."""
         one, found = self.model.copies == 1, {}
         rows = {name: getattr(self, name)[:, 0] if one else getattr(self, name) for name in self._rows}
         if "energies" in rows:

@@ -1,6 +1,6 @@
-"""Lists what the command line can name, read from source files without running them: scenes, solvers and the options of these.
+"""Lists scenes, solvers and their options for the command line, by parsing source files.
 
-Nothing here loads Warp, so that help and the completion of a shell answer at once.
+Nothing here imports Warp, so that help and shell completion respond at once.
 """
 
 import ast
@@ -12,14 +12,14 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def folders():
-    """Folders of scenes that are known by their names: ./scenes, then those that come with the package."""
+    """Returns the folders of scenes that have names: ./scenes, then that of the package."""
     found = [Path("scenes"), _PACKAGE / "scenes"]
     return list({folder.resolve(): folder for folder in reversed(found) if folder.is_dir()})[::-1]
 
 
 @dataclass(frozen=True)
 class Listed:
-    """A scene file as :func:`list_scenes` shows it: the first lines of two docstrings, and ``name=default`` texts."""
+    """A scene file: its name, the first lines of two docstrings, and its parameters as ``name=default`` texts."""
 
     name: str
     summary: str
@@ -28,7 +28,7 @@ class Listed:
 
 
 def list_scenes(folder):
-    """The Python files of a folder that have a function ``scene``, read without running them.
+    """Lists the Python files of a folder that have a function ``scene``, by parsing them.
 
     Raises:
         FileNotFoundError: There is no such folder.
@@ -62,7 +62,7 @@ def _defaults(arguments):
 
 @cache
 def list_solvers():
-    """Returns the options of each solver of this package by its name: by option the words that it takes, or ()."""
+    """Returns a dict of the solvers of this package: by name a dict from options to the words that they take, or ()."""
     folder, classes = _PACKAGE / "solvers", {}
     for path in folder.glob("*.py"):
         classes |= {node.name: node for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ClassDef)}
@@ -72,12 +72,12 @@ def list_solvers():
 
 @cache
 def list_failures():
-    """Returns the names of the charts of failures, in their order."""
+    """Returns the names of the charts of failures, in order."""
     return tuple(map(ast.literal_eval, _value(ast.parse((_PACKAGE / "lab" / "failures.py").read_bytes()), "FAILURES").keys))
 
 
 def _assigned(node, name):
-    """Returns the value that the body of a module or class assigns to a name."""
+    """Returns the literal that a module or class assigns to a name."""
     return ast.literal_eval(_value(node, name))
 
 
@@ -96,7 +96,7 @@ def _options(record, classes):
 
 
 def _words(annotation):
-    """The words of each Literal[…] in an annotation."""
+    """Returns the words of each Literal[…] in an annotation."""
     found = [node for node in ast.walk(annotation) if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal"]
     return tuple(word for literal in found for word in ast.literal_eval(ast.Tuple(_elements(literal.slice), ast.Load())))
 

@@ -13,7 +13,7 @@ REACTION = "reaction"  # name of the primvar
 
 
 def primvar_names(names, kind="energies"):
-    """Names of primvars of a kind, such as energies:work_of_pins, by the names of what they hold."""
+    """Returns names of primvars, such as energies:work_of_pins, by the names of their values."""
     found = {}
     for name in names:
         key = before = f"{kind}:" + (re.sub(r"\W", "_", name, flags=re.ASCII) or "_")
@@ -42,7 +42,7 @@ class Memory:
         self.frames += 1
 
     def finish(self):
-        """The run has ended by itself."""
+        """Ends the recording of a run that was not interrupted."""
 
     def close(self):
         pass
@@ -55,21 +55,21 @@ class Memory:
 
 
 class File:
-    """Writes frames as USD, with checkpoints beside them until the run has ended, and reads them back when asked.
+    """Writes frames as USD, with a checkpoint until the run has ended, and reads them back on demand.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
         output: Path of the file.
-        single_file: Whether it is one file in the end.
-        facts: Function that gives the :func:`warpcloth.run.checkpoint.facts_of` of the run.
-        resume: Whether to go on with the run that was interrupted.
-        record: What else is recorded, of :data:`warpcloth.run.history.RECORDS`.
+        single_file: Whether to end with a single file.
+        facts: Function that returns the :func:`warpcloth.run.checkpoint.facts_of` of the run.
+        resume: Whether to continue an interrupted run.
+        record: Words of :data:`warpcloth.run.history.RECORDS`.
 
     Attributes:
-        checkpoint: The :class:`warpcloth.run.checkpoint.Checkpoint` to go on from, or None.
+        checkpoint: The :class:`warpcloth.run.checkpoint.Checkpoint` to continue from, or None.
 
     Raises:
-        ValueError: If there is nothing to resume, or it is another run.
+        ValueError: There is nothing to resume, or it is another run.
     """
 
     def __init__(self, scene, output, single_file, facts, resume=False, record=()):
@@ -111,7 +111,7 @@ class File:
                 raise
 
     def _resume(self):
-        """Goes on with the run whose checkpoint is the newest."""
+        """Continues the run of the newest checkpoint."""
         found = self.writer.runs_with(NAME)
         if not found:
             raise ValueError(
@@ -127,11 +127,11 @@ class File:
         return self.writer.frames
 
     def keeps(self, number):
-        """Whether there is a checkpoint after the frame of this number."""
+        """Returns whether a checkpoint follows the frame of this number."""
         return (number + 1) % self.writer.chunk == 0 and self._known() is not None
 
     def _known(self):
-        """The facts, or None of a scene that is not made of data alone, whose run cannot be resumed."""
+        """Returns the facts, or None if the scene cannot be hashed; such a run cannot be resumed."""
         if self._found is None:
             try:
                 self._found = (self._facts(),)
@@ -140,7 +140,7 @@ class File:
         return self._found[0]
 
     def append(self, points, velocities, state=None, watch=None, recorded=None):
-        """Adds a frame; with a checkpoint where it comes with the state and the watch and ends a chunk."""
+        """Adds a frame, and writes a checkpoint if state and watch are given and the frame ends a chunk."""
         self.writer.append(points, velocities, history=self._history(recorded or {}))
         if state is not None and self.writer.kept == self.writer.frames:
             chunks, span = self.writer.written()
@@ -164,7 +164,7 @@ class File:
         return found
 
     def finish(self):
-        """The run has ended by itself, so that nothing is left to resume once the file is complete."""
+        """Ends the recording of a run that was not interrupted, so that nothing is left to resume."""
         self._ended = True
         self.close()
 

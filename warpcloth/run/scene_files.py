@@ -1,4 +1,4 @@
-"""Scenes in files: found by name or path, listed, and called with parameters that are written as text."""
+"""Scenes in files: found by name or path, and built with parameters given as text."""
 
 import importlib.util
 import itertools
@@ -24,9 +24,9 @@ class SceneSource:
 
     Attributes:
         path: The file.
-        function: Called with ``parameters`` by name, returns a :class:`warpcloth.Scene`.
-        parameters: Of the function, as `inspect.Parameter` by name.
-        pins: A selection of vertices that stand still and replace the pins of the scene, or None.
+        function: Function that returns a :class:`warpcloth.Scene`, called with ``parameters`` by name.
+        parameters: Its parameters, `inspect.Parameter` by name.
+        pins: Selection of fixed vertices that replace the pins of the scene, or None.
     """
 
     path: Path
@@ -35,10 +35,10 @@ class SceneSource:
     pins: str | None = None
 
     def values(self, texts):
-        """The parameters that ``texts`` (text by name) sets, converted, and the defaults of the others.
+        """Returns the values of all parameters: those of ``texts``, text by name, converted, and defaults.
 
         Raises:
-            ValueError: A name or a value that the function does not take, or one missing that it needs.
+            ValueError: The function does not take a name or a value, or a required value is missing.
         """
         values = {name: p.default for name, p in self.parameters.items() if p.default is not p.empty}
         for name, text in texts.items():
@@ -70,10 +70,10 @@ class SceneSource:
 
 
 def find_source(name, pins=None):
-    """The scene that a Python file, a USD stage or a name in one of :func:`folders` stands for.
+    """Finds a scene: a Python file, a USD stage, or the name of a file in one of :func:`folders`.
 
     Args:
-        name: One of the three.
+        name: Path or name.
         pins: See :class:`SceneSource`.
 
     Raises:
@@ -101,7 +101,7 @@ def find_source(name, pins=None):
 
 
 def _python_source(path, pins):
-    # Under a name of its own: scenes may be called like modules, and may be loaded again after a change.
+    # A unique module name, because scenes may be called like modules, and may be loaded again after a change.
     name = f"warpcloth_scene_{next(_number_of_modules)}_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
@@ -115,7 +115,7 @@ def _python_source(path, pins):
 
 
 class _Located:
-    """Turns any error of a scene file, and an exit, into a ValueError of one line that says where in the file it arose."""
+    """Turns any error of a scene file, or an exit, into a ValueError of one line with the file and the line of its cause."""
 
     def __init__(self, path):
         self.path = path

@@ -28,20 +28,20 @@ from .history import History, checked_record, collider_names
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
 
-# Limits on the frames that a CUDA device computes ahead: their bytes on host and device each, their share of the free memory of
-# the device, and their number.
+# Limits on the frames that a CUDA device computes ahead: bytes on the host and on the device, fraction of the free memory of
+# the device, and number.
 AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
 
 
 class Inside(NamedTuple):
-    """A vertex that ended a step inside a collider: where all that could move it was prescribed.
+    """A vertex that ended a step inside a collider, because it could not move out.
 
     Attributes:
         vertex: Its index in the mesh.
-        frame: The frame in which, or before which, it came in.
+        frame: The frame in or before which it came in.
         collider: Name of the collider.
-        other: What held it back from there, of a free vertex between the two: the name of a collider, or ``"other cloth"`` with
-            self-contact. None for a vertex that is not free, because pins or locked axes hold it.
+        other: For a free vertex, the obstacle on its other side: the name of a collider, or ``"other cloth"`` with
+            self-contact. None for a vertex that pins or locked axes hold.
         copy: Index of its copy.
     """
 
@@ -62,14 +62,14 @@ class SelfContactSummary(NamedTuple):
     """The contact of cloth with itself in a run.
 
     Attributes:
-        pairs: The largest number of pairs in a list, those of all copies. A list has the pairs that are nearer than the contact
-            distance plus 0.35 of the longest edge.
-        lists: How many lists were made.
+        pairs: The largest number of pairs in a list of all copies. A list has the pairs nearer than the contact distance plus
+            0.35 of the longest edge.
+        lists: Number of lists that were made.
         kept: The fraction of the moves of free vertices, over all steps, that the filter left whole; with B > 1 copies one
             value per copy, (B,).
-        least_gap: The least distance of a pair in any frame, as stored in float32 [m], or (B,); infinite if none was listed.
-        too_near: None if all gaps in all frames are at least 4 units in the last place of the farthest float32 coordinate of
-            the pair. Else a sentence that names the first frame, a vertex there, and the least gap.
+        least_gap: The smallest distance of a pair in any frame, as stored in float32 [m], or (B,); infinite if none was listed.
+        too_near: None if all gaps in all frames are at least 4 units in the last place of the largest float32 coordinate of the
+            pair. Else a sentence that names the first frame, a vertex there, and the smallest gap.
     """
 
     pairs: int
@@ -106,17 +106,16 @@ class Animation:
         friction_forces: In the same form, the part of these forces that is friction, for colliders that have friction.
         pairs: With ``record="pairs"``, a dictionary of arrays (frames+1,) or (frames+1, B), of the pairs of self-contact at the
             end of each frame: ``"pairs in contact"``, nearer than the contact distance; ``"pairs listed"``; ``"new lists"``
-            that were made in the frame, for all copies alike; ``"moves kept"``, the fraction of the moves of free vertices that
-            the filter left whole; and ``"least gap"``, the least distance of a pair [m], infinite if none is listed.
+            made in the frame, a number for all copies; ``"moves kept"``, the fraction of the moves of free vertices that the
+            filter left whole; and ``"least gap"``, the smallest distance of a pair [m], infinite if none is listed.
         cuts: With a record, the fraction of the moves of free vertices in each frame that the filters of contact cut short,
             (frames+1,) or (frames+1, B); see ``cut``.
         cut: The fraction of the moves of free vertices, over all steps, that were cut short because they would have entered or
             crossed a collider, plus the fraction cut short because cloth would have crossed cloth; with B > 1 copies one value
             per copy, (B,).
-        inside: A tuple of :class:`Inside`, one for each collider that contained a vertex, with its first such vertex. This is a
-            vertex that is not free, if the collider moves over it or it moves into the collider, or a free vertex between two
-            colliders that close on one another.
-        crossings: How many pairs of triangles that crossed or touched at the start have not come free by the end, see
+        inside: A tuple of :class:`Inside`, the first vertex inside each collider that contained one. It is either not free, and
+            the collider moved over it or it into the collider, or it is caught between two obstacles.
+        crossings: Number of pairs of triangles that crossed or touched at the start and still do at the end, see
             ``SelfContact(crossing_start="run")``; with B > 1 copies one value per copy, (B,).
         self_contact: The :class:`SelfContactSummary` of a scene with self-contact, else None.
     """
@@ -141,7 +140,7 @@ class Animation:
     self_contact: SelfContactSummary | None = None
 
     def cloth(self, name: str) -> np.ndarray:
-        """Positions of one cloth of the scene, or of one part of its mesh, (frames+1, n, 3) or (frames+1, B, n, 3) [m].
+        """Returns the positions of a cloth of the scene, or a part of its mesh, (frames+1, n, 3) or (frames+1, B, n, 3) [m].
 
         Raises:
             ValueError: There is no such part.
@@ -206,11 +205,11 @@ def simulate(
         frame, and ``status`` says so. If one of several copies diverges, the others continue, and it is NaN from then on.
 
     Raises:
-        BlockingIOError: If another process, or thread, is writing ``output``.
-        Interrupted: A KeyboardInterrupt, if the user interrupts; the message says which frames are in ``output``.
-        OSError: If a file cannot be written; the message also says which frames are in ``output``.
-        ValueError: If an argument is not allowed, the scene's stage has changed and no longer fits the frames, or ``output``
-            has no run to resume, or another one.
+        BlockingIOError: Another process or thread is writing ``output``.
+        Interrupted: The user interrupts; a KeyboardInterrupt whose message says which frames are in ``output``.
+        OSError: A file cannot be written; the message also says which frames are in ``output``.
+        ValueError: An argument is not allowed, the scene's stage has changed and no longer fits the frames, or ``output`` has
+            no run to resume, or another one.
 
     Examples:
         >>> import warpcloth as wc
@@ -234,7 +233,7 @@ def simulate(
     def facts():
         return facts_of(scene, solver, device, dtype, vary, threads, record)
 
-    # First, for it refuses a wrong output before anything compiles.
+    # First, so that a wrong output is refused before anything compiles.
     recorder = Memory(frames, copies) if output is None else File(scene, output, single_file, facts, resume, record)
     with recording(recorder, frames):
         _refuse_size(frames, scene, dtype, copies, output)
@@ -279,7 +278,7 @@ def simulate(
 
 @in_turn
 def _crossings(stepper):
-    """How many pairs of triangles that crossed at the start have not come free, one number or (B,)."""
+    """Returns the number of pairs of triangles that crossed at the start and still do, one number or (B,)."""
     tangles = None if stepper.pairs is None else stepper.pairs.tangles
     left = np.zeros(stepper.model.copies, dtype=np.int64) if tangles is None else tangles.left()
     return left if len(left) > 1 else int(left[0])
@@ -287,11 +286,11 @@ def _crossings(stepper):
 
 @in_turn
 def _self_contact(stepper, ok):
-    """The :class:`SelfContactSummary` of a run that has ended; the gaps of the last frame are noted only now, if it is ok."""
+    """Returns the :class:`SelfContactSummary` of a run that has ended. If it is ok, notes the gaps of the last frame first."""
     pairs, model = stepper.pairs, stepper.model
     if pairs is None:
         return None
-    with suppress(Stopped):  # of the last gaps alone
+    with suppress(Stopped):  # the summary is then without the gaps of the last frame
         while ok:
             pairs.launch_begin(stepper.state.x)
             if not pairs.overflowed:
@@ -311,7 +310,7 @@ def _self_contact(stepper, ok):
 
 @in_turn
 def _inside(stepper):
-    """The :class:`Inside` of each collider and copy."""
+    """Returns the :class:`Inside` of each collider and copy."""
     model, found = stepper.model, []
     for copy, collider, step, vertex, other in stepper.inside:
         names = collider_names(model.scene)
@@ -334,7 +333,7 @@ def _resume(checkpoint, frames, stepper, watch):
 
 
 def _refuse_size(frames, scene, dtype, copies, output):
-    """Refuses frames whose positions and velocities exceed the free memory or, with an output, the free disk."""
+    """Raises ValueError if the frames do not fit in the free memory or, with an output, on the disk."""
     of = f" of {copies:,} copies" if copies > 1 else ""
     what, numbers = f"frames is {frames:,}{of}", 6 * len(scene.mesh.points) * (int(frames) + 1)
     if output is None:
@@ -344,10 +343,10 @@ def _refuse_size(frames, scene, dtype, copies, output):
 
 
 def _ahead(model, output):
-    """The number of frames that are computed ahead of the one that is watched and written.
+    """Returns the number of frames to compute ahead of the one that is checked and written.
 
-    On CUDA as many as fill ``AHEAD`` bytes or a share of the free memory, so that the device need not wait. On the CPU one, if
-    there is a file to write and a free core, else none.
+    On CUDA, as many as fill ``AHEAD`` bytes or a fraction of the free memory, so that the device need not wait. On the CPU one
+    if there is a file to write and a free core, else none.
     """
     if model.device.is_cuda:
         room = min(AHEAD, int(SHARE * model.device.free_memory))

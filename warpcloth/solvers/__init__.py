@@ -1,8 +1,8 @@
-"""The catalogue of the solvers: one file, one record and two lines here for each.
+"""The catalogue of solvers: each has a file of its own, with its record, and two lines here.
 
-A file has the equation of a method and its source, its options, its needs of every term, the settings by which it is measured
-and drawn, and the bound solver. The command line and others that name a solver look it up in :data:`SOLVERS`; :func:`register`
-adds one from outside the package.
+A file has the equation of a method and its source, its options, what it needs of every term, its settings for benchmarks and
+charts, and the bound solver. The command line, benchmarks and charts look up a solver by name in :data:`SOLVERS`.
+:func:`register` adds one from outside the package.
 """
 
 from .admm import ADMM
@@ -16,7 +16,7 @@ from .step import SOLVERS as SOLVERS
 from .step import register as register
 from .xpbd import XPBD
 
-# In the order in which lists and charts have them.
+# In the order of lists and charts.
 __all__ = [  # noqa: RUF022
     "Explicit",
     "Newton",

@@ -41,18 +41,17 @@ class ADMM(ImplicitStep):
     - u += Dx − z.
     - (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once.
 
-    Quadratic energies whose elements differ in their number of vertices, such as :class:`warpcloth.PlateBending`, are not
-    split: their matrix is part of that of the last step. Nor is the energy of self-contact, for which the last step is one of
-    Newton's method. The fixed point is that of
-    :class:`warpcloth.ProjectiveDynamics` and the x(t+h) of :class:`warpcloth.Newton`. Only the product WD matters:
-    if D is scaled and W inversely, the iterates stay the same.
+    Sparse quadratic energies, such as :class:`warpcloth.PlateBending`, are not split: their matrix is added to that of the last
+    step. The energy of self-contact is not split either: it makes the last step one of Newton's method. The fixed point is that
+    of :class:`warpcloth.ProjectiveDynamics`, and the x(t+h) of :class:`warpcloth.Newton`. Only the product WD matters: if D is
+    scaled and W inversely, the iterates stay the same.
 
     With too large a weight the iteration stalls, with too small a one it oscillates. An iteration multiplies the error of a
     mode with s = h²ω² by (1 + r²s)/((1 + rs)(1 + r)), which is smallest for r = 1/√s. So ``"auto"`` is r = 1/(2hₑω) for each
     element, where ω² is the largest eigenvalue of M⁻¹ s k A DᵀD of the element alone; the factor 2 accounts for the highest
-    frequency of a whole mesh, which is about twice as high. The table gives how many iterations a step takes, as measured,
-    until its distance to the solution is 1e-4 of the distance from x̃: with ``"auto"``, with the best of 17 weights from 1e-3
-    to 10 that all elements share, and with r = 1:
+    frequency of a whole mesh, which is about twice as high. The table gives the measured number of iterations until the
+    distance to the solution is 1e-4 of that from x̃: with ``"auto"``, with the best of 17 weights from 1e-3 to 10 that all
+    elements share, and with r = 1:
 
     =============================  =======  =======  =======
     hanging of 8 × 8, 1/240 s      "auto"   best     r = 1
@@ -77,11 +76,11 @@ class ADMM(ImplicitStep):
     1 over 2 to 100 iterations a step, and do not tear, as they do with a weight of 0.03. If an energy is concave somewhere, as
     that of hinges is, it may not converge with a small weight.
 
-    ``residual`` is the larger of the primal and the dual residual. Both are the largest acceleration of any vertex, relative to
+    ``residual`` is the larger of the primal and the dual residual. Each is the largest acceleration of any vertex, relative to
     gravity (in m/s² without gravity): the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before), divided by the masses. The
-    first factor gives the primal residual at least the stiffness k, by which the forces of U at Dx and at z differ: otherwise
-    a small weight would look like convergence. With energies that are not split, the dual residual is no less than
-    the unbalanced acceleration of the last step.
+    factor max(1, 1/r) weights the primal residual by at least the stiffness k, by which the forces of U at Dx and at z differ:
+    otherwise a small weight would look like convergence. With energies that are not split, the dual residual is at least the
+    unbalanced acceleration of the last step.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
@@ -134,7 +133,7 @@ class ADMM(ImplicitStep):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term has infinite stiffness, or is of rigid clusters.
+            ValueError: A term has infinite stiffness, or is a :class:`warpcloth.RigidCluster`.
         """
         self.refuse(model)
         return self._on(ADMMStepper, model)
@@ -223,7 +222,7 @@ class ADMMStepper(ImplicitStepper):
         return np.maximum(best_weights(model, elements, self.he, scale), least).astype(model.numpy_dtype)
 
     def _split_of(self, elements, ratio, scale):
-        """The struct of z, u, gap and change of a term, all 0."""
+        """Returns the struct of z, u, Dx − z and z − z before of a term, all 0."""
         model, kind = self.model, wp.types.matrix((elements.term.rows, 3), self.model.dtype)
         of = kernels.admm_elements(elements.term, model.dtype)()
         of.stiffness, of.ratio, of.scale = elements.stiffness, model.per_element(ratio), model.per_element(scale)

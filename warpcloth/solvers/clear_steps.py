@@ -1,4 +1,4 @@
-"""Steps in which nothing comes near a collider, without contact."""
+"""Takes steps without contact while no vertex comes near a collider."""
 
 from functools import partial
 
@@ -13,19 +13,20 @@ from ..terms.refresh import STEP
 
 
 class TwinSteps:
-    """Gives the steps in which nothing comes near to a twin of a stepper that has no contact.
+    """The base class that lets a twin of a stepper, without contact, take the steps in which nothing comes near.
 
-    Before a step a test tells. Where that was not enough, the step is taken again with contact, so that all steps end at the
-    minimiser of one problem. A subclass has ``_launch_look``, the test and what keeps the state in ``_kept``;
-    ``_launch_check``, the test after the step; and ``_launch_count``, after a step without contact.
+    A test before a step decides. A second test, after the step, finds whether contact was missed; then the step is taken again
+    with contact, so that every step ends at the minimiser of the same problem. A subclass has ``_launch_look``, the first test,
+    which also saves the state in ``_kept``; ``_launch_check``, the second test; and ``_launch_count``, after a step without
+    contact.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
-        twin: One of the same options on the model without contact, which shares its state.
+        twin: A stepper with the same options on the model without contact, which shares its state.
 
     Attributes:
         twin: As given.
-        near: Whether the last step was one with contact, (1,) int32.
+        near: Whether the last step was taken with contact, (1,) int32.
     """
 
     def __init__(self, stepper, twin):
@@ -34,13 +35,13 @@ class TwinSteps:
         self._kept = {name: wp.zeros_like(array) for name, array in twin.state.arrays.items()}
 
     def record(self):
-        """Records what :meth:`step` launches."""
+        """Captures the launches of :meth:`step`."""
         launches = self._launch_look, self._launch_check, self._restore, self._launch_count
         self._segments = [Segment(self.stepper.model.device, launch) for launch in launches]
         self._read = Mirror(self.near)
 
     def step(self, touching):
-        """Takes a step of a method that returns to the host: ``touching`` takes it with contact."""
+        """Takes a step of a method that reads on the host; ``touching`` is a function that takes it with contact."""
         stepper, twin = self.stepper, self.twin
         look, check, restore, count = self._segments
         look()
@@ -56,7 +57,7 @@ class TwinSteps:
         touching()
 
     def constraint_forces(self, touching, clear):
-        """The function of an array that launches ``touching`` or ``clear``, functions of it, as the last step was."""
+        """Returns a function (array) that launches ``touching(array)`` if the last step had contact, else ``clear(array)``."""
         return lambda out: wp.capture_if(self.near, lambda: touching(out), lambda: clear(out))
 
     def _restore(self):
@@ -64,7 +65,7 @@ class TwinSteps:
             wp.copy(array, self._kept[name])
 
     def _launch_in_turn(self, launch, times):
-        """A loop of the device."""
+        """Launches a loop on the device."""
         self._left.fill_(times)
         wp.capture_while(self._left, partial(self._launch_one, launch, self.stepper.model.kernel(count_down)))
 
@@ -74,9 +75,9 @@ class TwinSteps:
 
 
 class ClearSteps(TwinSteps):
-    """Gives the steps in which no vertex comes near a collider to a twin of a stepper that knows none.
+    """Lets a twin of a stepper, without colliders, take the steps in which no vertex comes near a collider.
 
-    Before a step, twice the way of the prediction tells.
+    Before a step, vertices count as near if twice the displacement of the prediction reaches a collider.
     """
 
     def __init__(self, stepper, twin):
@@ -99,13 +100,15 @@ class ClearSteps(TwinSteps):
         self._contact = [elements for elements in model.terms if elements.collider is not None]
 
     def follow(self):
-        """Makes steps without contact refresh its terms as well."""
+        """Makes steps without contact refresh the terms of contact too."""
         self._followed = True
         self.stepper.colliders.follow()
 
     def parts(self, touching):
-        """The parts of steps that are launches, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with
-        contact; the twin has as many."""
+        """Returns the parts of a step, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with contact.
+
+        The twin has as many parts.
+        """
         found = [(self._launch_look, 1)]
         for (own, times), (clear, _times) in zip(touching[:-1], self.twin.parts[:-1], strict=True):
             found.append((partial(wp.capture_if, self.near, own, clear), times))
@@ -119,7 +122,7 @@ class ClearSteps(TwinSteps):
         return [*found, (partial(wp.capture_if, self.near, own, last), times)]
 
     def _launch_look(self):
-        """Launches what finds whether the step is near, and keeps the state."""
+        """Launches the test before a step, and saves the state."""
         stepper = self.stepper
         stepper.colliders.launch_move()
         self.near.zero_()
@@ -131,7 +134,7 @@ class ClearSteps(TwinSteps):
         self._launch(0, None)
 
     def _launch_check(self):
-        """Launches what finds whether it was, and leaves no anchor of a step before."""
+        """Launches the test after a step, and clears the friction anchors of earlier steps."""
         self.stepper.colliders.launch_release()
         self._launch(1, self.stepper.state.x)
 

@@ -23,9 +23,9 @@ from .implicit import ImplicitStepper
 from .solver import Stepper
 from .step import ImplicitStep
 
-# The most iterations of one solve by conjugate gradients.
+# Maximum number of iterations of one conjugate gradient solve.
 LINEAR_ITERATIONS = 10_000
-# By what acceleration, over gravity's, a hard constraint may stay open at the end before it counts as contradicted.
+# Hard constraints contradict one another if the acceleration that would close one at the end exceeds this fraction of gravity.
 CARRIED = 1e-2
 
 
@@ -54,8 +54,8 @@ class ConstrainedDynamics(ImplicitStep):
         dt, substeps, integrator: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of the residual, the larger of two accelerations, relative to gravity (or without gravity to its
-            value at the first iterate): the largest unbalanced one of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest by
-            which a single constraint would meet C + α̃λ = 0 in a step.
+            value at the first iterate): the largest unbalanced one of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest one
+            with which a single constraint would reach C + α̃λ = 0 in a step.
         stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
         linear: ``"cg"``, or ``"factorised"`` on the host.
 
@@ -107,7 +107,7 @@ class ConstrainedDynamics(ImplicitStep):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term has no constraint, or infinite stiffness where that is not allowed.
+            ValueError: A term has no constraint, or infinite stiffness where that is not allowed.
         """
         self.refuse(model)
         self.refuse_hard(model)
@@ -131,7 +131,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self.ready()
 
     def _build(self):
-        """Allocates and records everything, as much as there are rows."""
+        """Allocates and captures everything for the present number of rows."""
         options, model, device = self.options, self.model, self.model.device
         self.constraints = Constraints(model, self.he, options.stabilisation == "geometric-stiffness", self.pairs)
         self._sums, self._row_sums = Sums(model), RowSums(model, self.constraints.per_copy)
@@ -175,7 +175,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
 
     def iterate(self, active):
         self._active.write(active)
-        if self._linear.capturable:  # a tenth of what the step is allowed
+        if self._linear.capturable:  # to a tenth of the tolerance of the step
             least = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
             wanted = 0.1 * self.options.tolerance / np.where(active, self._residual, 1.0)
             self._linear.tolerance.write(np.clip(wanted, least, 0.1))
@@ -184,7 +184,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._stuck = self._stepped.read() == 0.0
 
     def multiplier_forces(self, collider=None):
-        """Of M(x − x̃) = Jᵀλ: −Jᵀλ/hₑ²."""
+        """See :meth:`Stepper.constraint_forces`: adds −Jᵀλ/hₑ², from M(x − x̃) = Jᵀλ."""
         model, constraints = self.model, self.constraints
         of_terms = [part for part in constraints.parts if part.elements is not None]
         hard = [part for part in of_terms if part.elements.hard and collider in (None, part.elements.collider)]
@@ -199,15 +199,15 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         return launch
 
     def note(self, results, residual):
-        """Records how a step ended; hard constraints that keep a gap contradict one another."""
+        """Notes how a step ended. Hard constraints that keep a gap contradict one another."""
         carried = self._carried.read() / (self._scale * self.he**2)
-        resolved = self._carried.read() > self._rounding.read()  # positions and lengths contradict by rounding too
+        resolved = self._carried.read() > self._rounding.read()  # the rounding of positions and lengths leaves gaps too
         contradicted = np.isfinite(residual) & resolved & (carried > max(self.options.tolerance, CARRIED))
         results = [Result.CONTRADICTED if each else result for result, each in zip(results, contradicted, strict=True)]
         super().note(results, np.where(contradicted, np.maximum(residual, carried), residual))
 
     def _accelerations(self):
-        """The larger of both accelerations [m/s²] of each copy (B,)."""
+        """Returns the larger of both accelerations of each copy, (B,) [m/s²]."""
         return np.maximum(self._unbalanced.read(), self._open.read()) / self.he**2
 
     # What the segments record.
@@ -221,7 +221,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._launch_linearise()
 
     def _launch_linearise(self):
-        """J, both residuals and the right-hand side at d and λ."""
+        """Launches J, both residuals and the right-hand side at d and λ."""
         constraints, model = self.constraints, self.model
         constraints.launch_linearise(self.state.x, self.correction)
         constraints.launch_moves(constraints.multipliers, self._moves)
@@ -237,7 +237,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._linear.solve(self._right, self._change, self._active.array)
 
     def _launch_move(self):
-        """Δx = W JᵀΔλ − (x − x̃ − W Jᵀλ), and a step along Δx and Δλ."""
+        """Launches Δx = W JᵀΔλ − (x − x̃ − W Jᵀλ), and a step along Δx and Δλ."""
         model, constraints = self.model, self.constraints
         constraints.launch_moves(self._change, self._moves)
         self._of_vectors(kernels.mismatch, model.count, [self._moves, self._mismatch], [self._direction])

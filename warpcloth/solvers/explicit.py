@@ -84,11 +84,10 @@ class Explicit(Step):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Warns:
-            UserWarning: If the step is above the limit in motion, see :func:`step_limits`, which takes hinges and membranes
-                at rest.
+            UserWarning: The step is above the limit in motion, see :func:`step_limits`.
 
         Raises:
-            ValueError: If the step is above the limit and that is not allowed, or a stiffness is infinite.
+            ValueError: The step is above the limit about the rest shape and that is not allowed, or a stiffness is infinite.
         """
         self.refuse(model)
         stepper = self._on(ExplicitStepper, model)
@@ -98,7 +97,7 @@ class Explicit(Step):
 
     def _refuse_unstable(self, model, h):
         if self.stable(h, limit_in_motion(model)):
-            return  # below that about the rest shape too
+            return  # the limit about the rest shape is larger
         rest, motion = step_limits(model)
         fewest = int(1.0 / (model.scene.fps * rest)) + 1 if rest > 0.0 else 0
         allow = 'above_limit="allow" runs it all the same'
@@ -122,20 +121,20 @@ class Explicit(Step):
 
 @in_turn
 def step_limits(model):
-    """The largest stable steps of symplectic Euler [s]: about the rest shape, and in motion, see below.
+    """Returns the largest stable steps of symplectic Euler [s], about the rest shape and in motion.
 
-    The first is the h at which the largest eigenvalue of M⁻¹(h²K + 2hC), found by Lanczos iteration, is 4; K = ∂²U/∂x² and the
-    damping matrix C are those at rest. Without damping that is 2/ω. The second replaces the eigenvalues by Gershgorin's bounds,
-    max over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is 2·Σk/m, a bound in any
-    motion; for quadratic bending it is such a bound too. The Hessian of dihedral bending grows as the cloth folds or is
-    compressed, and those of membranes grow as they stretch. The second limit takes these at rest, so for scenes with them it is
-    not a bound. Both limits take strain and spring limits, which have no stiffness at rest, as reached, and add self-contact.
+    The first is the h at which the largest eigenvalue of M⁻¹(h²K + 2hC), found by Lanczos iteration, is 4, with K = ∂²U/∂x² and
+    the damping matrix C at rest. Without damping it is 2/ω. The second uses Gershgorin's bound in place of the eigenvalue, the
+    maximum over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is 2·Σk/m, a bound in
+    any motion, as it is for quadratic bending. The Hessian of dihedral bending grows as the cloth folds or is compressed, and
+    that of membranes as they stretch. Both are taken at rest, so the second limit is no bound for scenes with them. Both limits
+    include self-contact, and strain and spring limits with their stiffness beyond the range.
 
     Returns:
-        (rest, motion); infinite where nothing is stiff.
+        (rest, motion); infinite if nothing is stiff.
 
     Raises:
-        ValueError: If a stiffness is infinite.
+        ValueError: A stiffness is infinite.
     """
     Explicit.refuse(model)
     found = [(_at_rest(*stiff), _in_motion(*stiff)) for stiff in map(_linearised, _unlike(model))]
@@ -144,19 +143,19 @@ def step_limits(model):
 
 @in_turn
 def limit_in_motion(model):
-    """The second of :func:`step_limits`, which is the smaller one and far quicker to compute.
+    """Returns the second of :func:`step_limits`, which is smaller and much cheaper to compute.
 
     Raises:
-        ValueError: If a stiffness is infinite.
+        ValueError: A stiffness is infinite.
     """
     Explicit.refuse(model)
     return _with_pairs(model, min(_in_motion(*_linearised(one)) for one in _unlike(model)))
 
 
 def _with_pairs(model, h):
-    """The step limit h [s] as self-contact leaves it: that of 4/h² + 4kA/m, as if each vertex had a layer on either side.
+    """Returns the step limit with self-contact, from the limit h without: that of 4/h² + 4kA/m, a layer on either side.
 
-    By Gershgorin, the pairs of which it is the vertex and those of the other layer have 2kA on each side.
+    By Gershgorin, the pairs of a vertex and those of the other layer add 2kA on each side.
     """
     declared = model.scene.self_contact
     if declared is None:
@@ -167,7 +166,7 @@ def _with_pairs(model, h):
 
 
 def _unlike(model):
-    """A model of one copy for each kind of copy that has limits of its own."""
+    """Returns a model of one copy for each distinct copy."""
     B = model.copies
     arrays = [model.inverse_mass, *(array for each in model.terms for array in (each.stiffness, each.rest, each.damping))]
     arrays += [each.cells.rest for each in model.terms if each.cells and each.cells.weights is not None]
@@ -179,10 +178,10 @@ def _unlike(model):
 
 
 def _linearised(model):
-    """∂²U/∂x² about the rest shape, and that of the dissipation, or None, each an assembled :class:`Hessian`."""
+    """Returns ∂²U/∂x² about the rest shape, and that of the dissipation or None, as assembled :class:`Hessian` objects."""
     x = model.array(model.rest_points, model.vec3)
     found = [Hessian(model, terms=[elements.at_limit(model.rest_points) for elements in model.terms]), None]
-    damping = dissipations(model, 1.0)  # of stiffness β, and at rest the Hessian is that of a linear damper
+    damping = dissipations(model, 1.0)  # with stiffness β; at rest the Hessian is that of a linear damper
     if damping:
         model.refresh(STEP, Moment(x), damping)
         found[1] = Hessian(model, terms=damping)
@@ -192,13 +191,13 @@ def _linearised(model):
 
 
 def _at_rest(stiff, damping):
-    """The first of :func:`step_limits`."""
+    """Returns the first of :func:`step_limits`."""
     K = _over_mass(stiff)
     if damping is None:
         return float(_root(_largest(K)[0], 0.0))
     C = _over_mass(damping)
     h = _root(*(_largest(matrix)[0] for matrix in (K, C)))
-    for _ in range(20):  # the first is too small, all others, by Rayleigh's principle, too large and falling
+    for _ in range(20):  # the first h is too small; by Rayleigh's principle all others are too large and fall
         _value, u = _largest(h * h * K + 2.0 * h * C)
         before, h = h, _root(u @ K @ u, u @ C @ u)
         if abs(h - before) <= 1e-6 * h:
@@ -207,18 +206,18 @@ def _at_rest(stiff, damping):
 
 
 def _in_motion(stiff, damping):
-    """The second of :func:`step_limits`."""
+    """Returns the second of :func:`step_limits`."""
     return float(_root(_bounds(stiff), 0.0 if damping is None else _bounds(damping)).min(initial=np.inf))
 
 
 def _root(k, c):
-    """The h ≥ 0 with h² k + 2 h c = 4, infinite where both are 0."""
+    """Returns the h ≥ 0 with h² k + 2 h c = 4, infinite if both are 0."""
     with np.errstate(divide="ignore"):
         return np.divide(4.0, c + np.sqrt(c * c + 4.0 * np.maximum(k, 0.0)))
 
 
 def _over_mass(hessian):
-    """M^-½ A M^-½ as a scipy matrix (3n, 3n) [1/s²]."""
+    """Returns M^-½ A M^-½ as a scipy matrix (3n, 3n) [1/s²]."""
     from scipy.sparse import diags
 
     root = diags(np.sqrt(hessian.model.coordinate_mobility()))
@@ -226,12 +225,12 @@ def _over_mass(hessian):
 
 
 def _bounds(hessian):
-    """Gershgorin's bound of each row of the same (n,) [1/s²]."""
+    """Returns Gershgorin's bound of each row of M⁻¹A, (n,) [1/s²]."""
     return hessian.norms() * hessian.model.inverse_mass.numpy()
 
 
 def _largest(matrix):
-    """The largest eigenvalue of a symmetric matrix, and its vector."""
+    """Returns the largest eigenvalue of a symmetric matrix, and its eigenvector."""
     from scipy.sparse.linalg import eigsh
 
     if matrix.shape[0] <= 30:
@@ -240,8 +239,8 @@ def _largest(matrix):
     start = np.random.default_rng(0).normal(size=matrix.shape[0])
     if not matrix.count_nonzero():
         return 0.0, start
-    # The upper eigenvalues of a large net lie close together: 1e-4 takes 35 s at 512² vertices, 1e-2 a second, with a value
-    # that is 0.4 % too small. With the residual, about what it is off by, no step passes for stable that is not.
+    # The upper eigenvalues of a large net are close together: at 512² vertices, a tolerance of 1e-4 takes 35 s, 1e-2 takes 1 s
+    # but gives a value 0.4 % too small. The residual, about as large as the error, is added, so that no unstable step passes.
     tolerance = 1e-4 if matrix.shape[0] < 50_000 else 1e-2
     values, vectors = eigsh(matrix, k=1, which="LA", v0=start, tol=tolerance)
     u = vectors[:, 0]
@@ -252,7 +251,7 @@ class ExplicitStepper(LaunchedStepper):
     """:class:`Explicit` on a model.
 
     Args:
-        options, model: As of every stepper.
+        options, model: As for every stepper.
         backend: See :func:`warpcloth.fast.plan.plan`.
 
     Attributes:
@@ -271,7 +270,7 @@ class ExplicitStepper(LaunchedStepper):
     def _record_frame(self):
         if self.pairs is None:
             return super()._record_frame()
-        return [(self._segments(lambda: self.launch_steps(self.steps_per_frame)), 1)]  # which is a loop of the device
+        return [(self._segments(lambda: self.launch_steps(self.steps_per_frame)), 1)]  # a loop on the device
 
     def follow_contact(self):
         self.colliders.note_pushes()

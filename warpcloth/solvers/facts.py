@@ -1,4 +1,4 @@
-"""The settings by which benchmarks, charts and `choose` measure a solver, and its style in charts, as data of its record."""
+"""The settings of a solver for benchmarks, charts and `choose`, and its style in charts."""
 
 from dataclasses import dataclass
 
@@ -8,8 +8,8 @@ class Benchmark:
     """A scene of several sizes that `warpcloth bench` runs with a solver.
 
     Attributes:
-        options: Options of the solver, without a step if the solver is limited: its fewest stable substeps are taken.
-        cpu, cuda: Resolutions of the scene, such that a frame takes less than about a second on one core and on an H200.
+        options: Options of the solver; without a step for a limited solver, which takes the fewest stable substeps.
+        cpu, cuda: Resolutions of the scene at which a frame takes less than about a second on one core, and on an H200.
         scene: Name of the scene.
     """
 
@@ -26,12 +26,12 @@ class Facts:
     Attributes:
         method: The method, in a few words for tables.
         suits, weakness: The scenes that it suits, and where it fails or is slow, with measured figures, for tables.
-        benchmarks: A :class:`Benchmark` each.
+        benchmarks: The :class:`Benchmark` settings.
         runs: Options of settings that trade speed for accuracy: those near the Pareto front of error and time on ``hanging``
             with 32² and 64² vertices. Substeps are per 1/60 s; for a limited solver ``fewest``, a multiple of the fewest stable
             substeps, replaces them.
-        one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler. A tolerance is
-            so small that no step ends by it.
+        one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler. Tolerances are
+            so small that they never end a step.
         limits: Names of the limits, see :data:`warpcloth.lab.stability_limits.LIMITS`, that maps of stability draw.
         style: Colour and marker in every picture.
     """

@@ -1,4 +1,4 @@
-"""Steps of cloth with self-contact in which nothing comes near anything, without contact."""
+"""Takes steps without self-contact while no pair of the cloth comes near."""
 
 from functools import partial
 
@@ -9,14 +9,14 @@ from ..kernels.fast.far_step import far_limits, find_far, find_near
 from ..kernels.step import count_step
 from .clear_steps import TwinSteps
 
-# Sweeps of a step that are recorded one by one; more are a loop of the device.
+# Largest number of sweeps of a step that are captured one by one; more become a loop on the device.
 UNROLLED = 64
 
 
 class FarSteps(TwinSteps):
-    """Gives the steps in which no pair is listed, and none can come near, to a twin of a stepper that has no self-contact.
+    """Lets a twin of a stepper, without self-contact, take the steps in which no pair is listed and none can come near.
 
-    Before a step, the list and the way h v of each vertex tell. The tests are those of
+    Before a step, the list and the displacement h v of each vertex decide. The tests are those of
     :class:`warpcloth.fast.quiet_steps.QuietSteps`.
     """
 
@@ -27,7 +27,7 @@ class FarSteps(TwinSteps):
         limits = self._limits = far_limits(model.dtype)()
         limits.per_copy, limits.size = model.per_copy, model.per_copy if model.device.is_cpu else 1
         self._dim = model.copies, -(-model.per_copy // limits.size)
-        # Both below what the list and the filter allow, by more than rounding; all moves are then so near their mean.
+        # Both are below what the list and the filter allow, by more than rounding.
         limits.h, limits.way, limits.together = stepper.h, (1.0 - 1e-4) * WAY * pairs.skin, pairs.filter.moves_together
         limits.most = 0.49 * limits.way if limits.together else limits.way
         self._find_near, self._find_far = (model.kernel(each, model.dtype) for each in (find_near, find_far))
@@ -35,14 +35,13 @@ class FarSteps(TwinSteps):
 
     @staticmethod
     def serve(stepper):
-        """Whether they can: each copy is one piece, nothing else moves it, and it starts without crossings."""
+        """Returns whether a stepper can use it: each copy is one piece, starts without crossings, and nothing else moves it."""
         pairs, model = stepper.pairs, stepper.model
         one = len(pairs.proximity.centre) == model.copies
         return one and stepper.count is None and model.colliders is None and pairs.tangles is None
 
     def parts(self, touching):
-        """The one part of steps that are launches, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those
-        with contact."""
+        """Returns the part of a step, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with contact."""
         return [(partial(self._launch_step, touching), 1)]
 
     def _launch_step(self, touching):
@@ -67,7 +66,7 @@ class FarSteps(TwinSteps):
                 self._launch_in_turn(launch, times)
 
     def _launch_look(self):
-        """Launches what finds whether the step is near, and keeps the state."""
+        """Launches the test before a step, and saves the state."""
         stepper, pairs, kept = self.stepper, self.stepper.pairs, self._kept
         near, (x, v) = pairs.proximity, stepper.state
         wp.copy(self.near, pairs.listed)
@@ -77,7 +76,7 @@ class FarSteps(TwinSteps):
         stepper.model.launch(self._find_near, self._dim, given, [kept["x"], kept["v"], self.near])
 
     def _launch_check(self):
-        """Launches what finds whether it was."""
+        """Launches the test after a step."""
         given = [self._kept["x"], self.stepper.state.x, self._limits]
         self.stepper.model.launch(self._find_far, self._dim, given, [self.near])
 

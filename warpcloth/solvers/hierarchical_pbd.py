@@ -82,7 +82,7 @@ class HierarchicalPBD(Step):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term has no projection, scalar constraint or ``prox``.
+            ValueError: A term has no projection, scalar constraint or ``prox``.
         """
         self.refuse(model)
         return self._on(HierarchicalPBDStepper, model)
@@ -107,7 +107,7 @@ class HierarchicalPBDStepper(LaunchedStepper):
         self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
 
     def _on_level(self, level):
-        """The sweep over a level, and the launch by which the vertices that it drops follow it."""
+        """Returns the sweep over a level, and the arguments of the launch that interpolates to the vertices that it drops."""
         model, d = self.model, self.sweep.correction
         sweep = GaussSeidelSweep(
             on_device(model, level), self.state.x, self.h, "coloured", self.options.relaxation, correction=d, pool=self.pool
@@ -119,7 +119,7 @@ class HierarchicalPBDStepper(LaunchedStepper):
         return sweep, (model.kernel(follow, model.dtype), (model.copies, len(dropped)), given, [d])
 
     def _launch_start(self):
-        """The prediction, and the levels from the coarsest on."""
+        """Launches the prediction, and the sweeps over the levels, the coarsest first."""
         pool = self.pool
         pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
         for sweep, followers in reversed(self._coarse):

@@ -1,4 +1,4 @@
-"""The base of the solvers that iterate towards the minimiser of a step and stop at a tolerance."""
+"""The base class of solvers that iterate towards the minimiser of a step and stop at a tolerance."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ class ImplicitStepper(Stepper):
         self.iterations = 0
 
     def ready(self):
-        """Records the graph of the end of a step, finds a twin, and starts the integrator, which may step."""
+        """Captures the graph of the end of a step, makes a twin, and starts the integrator, which may step."""
         self.find_twin()
         if self.clear_steps is not None:
             self.clear_steps.record()
@@ -48,6 +48,6 @@ class ImplicitStepper(Stepper):
         self.note(ended.results, ended.residual)
 
     def note(self, results, residual):
-        """Records how a step ended, for each copy."""
+        """Notes how a step ended, for each copy."""
         self.results = [before.worse(now) for before, now in zip(self.results, results, strict=True)]
         self.residual = np.maximum(self.residual, residual)  # keeps NaN

@@ -80,7 +80,7 @@ class Newton(ImplicitStep):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term has infinite stiffness.
+            ValueError: A term has infinite stiffness.
         """
         self.refuse(model)
         return self._on(NewtonStepper, model)

@@ -63,7 +63,7 @@ class PBD(Step):
         weakness="its stiffness depends on the number of iterations and on the step",
         benchmarks=(
             Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),
-            # Jacobi sweeps alone: so many that what a frame takes besides, its points on the host above all, does not count.
+            # Measures Jacobi sweeps alone: so many that other costs of a frame, such as copying points to the host, vanish.
             Benchmark(
                 {"substeps": 1, "iterations": 1000, "sweep": "vertex-averaged"},
                 cpu=(16, 32, 64, 128),
@@ -102,7 +102,7 @@ class PBD(Step):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term has no projection, scalar constraint or ``prox``.
+            ValueError: A term has no projection, scalar constraint or ``prox``.
         """
         self.refuse(model)
         return self._on(PBDStepper, model)
@@ -119,7 +119,7 @@ class PBDStepper(LaunchedStepper):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations
         model = self.model
-        # Spread over one sweep it is what it is.
+        # With one sweep, both kinds of correction are equal.
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         given = model, self.state.x, self.h, options.sweep, options.relaxation
         if options.ordered:

@@ -36,7 +36,7 @@ class ProjectiveDynamics(ImplicitStep):
     For energies ½kA‖y − p(y)‖², y = Gx: with the projections p of all elements fixed, the objective of implicit Euler has its
     minimum at S x = (M/h²) x̃ + Σ k A Gᵀp, with the matrix S = M/h² + Σ k A GᵀG. S is the same for all three coordinates and
     all steps, and is factorised once. As ∂u/∂y = y − p(y), one iteration is d ← d − S⁻¹∇φ(d) with d = x − x̃, so that later
-    iterations correct the rounding of a solve. The objective φ never rises, and the fixed point is the x(t+h) of
+    iterations correct the rounding of earlier ones. The objective φ never rises, and the fixed point is the x(t+h) of
     :class:`warpcloth.Newton`.
 
     Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
@@ -104,7 +104,7 @@ class ProjectiveDynamics(ImplicitStep):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term has infinite stiffness, or an energy that is not a squared distance to a set.
+            ValueError: A term has infinite stiffness, or an energy that is not a squared distance to a set.
         """
         self.refuse(model)
         return self._on(ProjectiveDynamicsStepper, model)
@@ -176,9 +176,9 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._move()
 
     def slowest(self):
-        """A bound (B,) of the factor by which any part of the error shrinks in a plain iteration, 1 − min s mᵢ/Σⱼ|Sᵢⱼ|.
+        """Returns an upper bound (B,) of the factor by which a plain iteration multiplies the error, 1 − min s mᵢ/Σⱼ|Sᵢⱼ|.
 
-        S is at most its row sums, and where nothing is compressed the Hessian is at least s M.
+        S is at most its row sums, and the Hessian is at least s M if nothing is compressed.
         """
         mass, free = (array.numpy().reshape(self._sizes.shape) for array in (self.model.mass, self.model.inverse_mass))
         part = np.where(free > 0.0, self.inertia.s * mass.astype(np.float64) / self._sizes, 1.0)
@@ -201,13 +201,13 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._launch_gradient()
 
     def launch_plain_step(self, out):
-        """out = d − w."""
+        """Launches out = d − w."""
         model = self.model
         given = [self.correction, self.w, self._active.array, model.per_copy]
         model.launch(self._plain_step, model.count, given, [out])
 
     def _launch_gradient(self):
-        """∇φ at d, and the largest unbalanced acceleration."""
+        """Launches ∇φ at d, and the largest unbalanced acceleration."""
         self.gradient.zero_()
         self._gradient_of.add(self.state.x, self.gradient, self.correction)
         if self.pairs is not None:

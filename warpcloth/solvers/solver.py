@@ -1,4 +1,4 @@
-"""The base of bound solvers: the state, the step and the frame."""
+"""The base classes of bound solvers: the state, the step and the frame."""
 
 from functools import partial
 
@@ -28,25 +28,25 @@ class Stepper:
     Attributes:
         state: The :class:`warpcloth.core.state.State`.
         h: Step [s].
-        model: The model, whose terms include damping and are in the order in which steps take them.
+        model: The model, whose terms include damping, in the order of the steps.
         integrator: The integrator, see :mod:`warpcloth.numerics.integrators`, which computes x̃, and the new state from the
             minimiser; None for solvers without x̃.
         he: Effective step hₑ of the integrator [s], else h.
-        steps_per_frame: Steps a frame.
+        steps_per_frame: Number of steps per frame.
         colliders: :class:`warpcloth.contact.collider_steps.ColliderSteps`, or None if the scene has none.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None if cloth passes through itself.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 for methods that have none.
-        iterations: Iterations or sweeps of the last step; 1 for methods that do not iterate.
-        factorise_seconds: Time of factorising the constant matrices [s]; 0 for methods that have none.
+        iterations: Number of iterations or sweeps of the last step; 1 for methods that do not iterate.
+        factorise_seconds: Time of the factorisation of constant matrices [s]; 0 for methods that have none.
     """
 
     factorise_seconds = 0.0
     iterations = 1
-    uniform = False  # Whether all steps have as many iterations
-    _motion = None  # x and v that are parts of those of another stepper, see `part_of`
-    lead = None  # of a twin without contact, the stepper whose state it shares, see `find_twin`
-    clear_steps = None  # of a stepper with a twin
+    uniform = False  # whether all steps have the same number of iterations
+    _motion = None  # x and v, if they are views of those of another stepper, see `part_of`
+    lead = None  # for a twin without contact, the stepper whose state it shares, see `find_twin`
+    clear_steps = None  # the TwinSteps of a stepper with a twin
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -80,14 +80,14 @@ class Stepper:
 
     @classmethod
     def part_of(cls, motion, options, model):
-        """The stepper whose x and v are the arrays ``motion``, those of the copies of ``model`` in a larger batch."""
+        """Returns a stepper whose x and v are ``motion``, views of the arrays of a larger batch."""
         stepper = cls.__new__(cls)
         stepper._motion = motion
         stepper.__init__(options, model)
         return stepper
 
     def find_twin(self):
-        """Makes ``clear_steps`` if there are colliders or self-contact, unless the residual of a twin has another meaning."""
+        """Makes a twin for steps without contact, if there is contact and the residual of the twin has the same meaning."""
         model = self._bound_to
         if not FarSteps.serve(self) if self.pairs is not None else model.colliders is None:
             return
@@ -100,7 +100,7 @@ class Stepper:
 
     @property
     def results(self):
-        """See :class:`warpcloth.core.state.State`, as of the next."""
+        """The worst result of each copy so far."""
         return self.state.results
 
     @results.setter
@@ -117,7 +117,7 @@ class Stepper:
 
     @property
     def cut(self):
-        """The share of the moves of free vertices that contact cut short so far, (B,)."""
+        """The fraction of the moves of free vertices that contact cut short so far, (B,)."""
         found = np.zeros(self.model.copies)
         for contact in (self.colliders, self.pairs):
             if contact is not None:
@@ -126,29 +126,29 @@ class Stepper:
 
     @property
     def inside(self):
-        """The list that :meth:`warpcloth.contact.collider_steps.ColliderSteps.inside` returns, for the steps so far."""
+        """The list of :meth:`warpcloth.contact.collider_steps.ColliderSteps.inside` for the steps so far."""
         return [] if self.colliders is None else self.colliders.inside()
 
     @property
     def x_before(self):
-        """Positions where the step began, (N,) [m], or None if there are no colliders."""
+        """Positions at the start of the step, (N,) vectors [m], or None if there are no colliders."""
         return None if self.colliders is None else self.colliders.x_before
 
     def follow_contact(self):
-        """Makes steps keep the positions where they began and what the filter changed, and refresh contact whatever is near.
+        """Makes steps keep their initial positions and the changes of the filter, and refresh contact in every step.
 
-        The motion stays the same. Who reads these of :attr:`colliders` after a step calls it first, and takes steps one by one.
+        The motion does not change. Call it before reading these from :attr:`colliders`, and take steps one by one.
         """
         self.colliders.note_pushes()
         if self.clear_steps is not None:
             self.clear_steps.follow()
 
     def launch_pins(self, parts=1):
-        """Moves the pins that have keyframes on by h/``parts``, the same in all calls."""
+        """Launches the move of pins with keyframes by h/``parts``; all calls must have the same ``parts``."""
         self.launch_pins_of(self.model.pins, self.model.keyframes, self.count, *self.state, parts)
 
     def launch_pins_of(self, pins, keyframes, count, x, v, parts=1):
-        """Moves these pins, or none, on in x and v (N,) as `launch_pins` does; ``count`` counts steps of pins and loads."""
+        """Launches the move of these pins, or none, in x and v (N,), see `launch_pins`; ``count`` counts keyframe steps."""
         model = self.model
         add_one = model.kernel(kernels.count_step) if count is not None else None
         if pins is None:
@@ -157,32 +157,31 @@ class Stepper:
             return
         dim = (model.copies, len(pins))
         move = model.kernel(kernels.move_pins, model.dtype)
-        # Pins that hold some axes are all those of the model, for its steps are not divided.
+        # With pins that hold some axes, these are all pins of the model, because threads then do not share a step.
         given = [pins, keyframes, model.pin_axes, count, parts * self.steps_per_frame, model.per_copy]
         model.launch(move, dim, [*given, self.h / parts], [x, v])
         model.launch(add_one, model.copies, [], [count])
 
     @property
     def loads_at_end(self):
-        """Whether steps take the forces of loads at their end, not in the middle or where they begin."""
+        """Whether steps evaluate loads at their end, not in the middle or at the start."""
         return self.integrator is not None and self.integrator.part != 0.5
 
     @property
     def shares(self):
-        """The steppers that share the batch, each with its first copy and the one after its last."""
+        """The steppers that share the batch, each with its range of copies: (stepper, first, end)."""
         return [(self, 0, self.model.copies)]
 
     def constraint_forces(self, collider=None):
-        """Makes what adds −f, f the forces of hard terms by their multipliers in the last step, to an array (N,) [N].
+        """Returns a function (array) that launches array (N,) −= f [N], the forces of hard terms in the last step.
+
+        The forces follow from the multipliers.
 
         Args:
-            collider: Index of the collider whose contact it is of, or None for all hard terms.
-
-        Returns:
-            A function of the array, which launches it.
+            collider: Index of the collider whose contact forces to take, or None for all hard terms.
 
         Raises:
-            ValueError: If the method has no multipliers.
+            ValueError: The method has no multipliers.
         """
         touching = self.multiplier_forces(collider)
         if self.clear_steps is None:
@@ -190,14 +189,14 @@ class Stepper:
         return self.clear_steps.constraint_forces(touching, self.clear_steps.twin.multiplier_forces(collider))
 
     def multiplier_forces(self, collider=None):
-        """See :meth:`constraint_forces`; of steps that this stepper took itself."""
+        """See :meth:`constraint_forces`; for steps that its twin did not take."""
         raise ValueError(
             f"{type(self.options).__name__} has no multipliers, so the forces of terms with infinite stiffness and the "
             "reactions of pins are not known; take XPBD or ConstrainedDynamics, or a finite stiffness"
         )
 
     def launch_prediction(self):
-        """Updates what changes where a step begins, then sets x = x̃ and moves the pins to the end of the step."""
+        """Launches the updates at the start of a step, x = x̃, and the move of pins to the end of the step."""
         self.model.refresh(STEP, self.integrator.moment)
         if self.pairs is not None:
             self.pairs.launch_begin(self.state.x)
@@ -206,7 +205,7 @@ class Stepper:
             self.colliders.launch_clear(self.model.terms, self.state.x)
 
     def launch_finish(self, correction):
-        """x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser."""
+        """Launches x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser (N,) [m]."""
         self.integrator.launch_finish(correction)
         if self.colliders is not None:
             self.colliders.correction, self.colliders.he = correction, self.he
@@ -215,7 +214,7 @@ class Stepper:
             self.pairs.filter.launch_end(*self.state, self.state.arrays.get("move before"))
 
     def launch_end_of(self, pins, keyframes, count, x, v):
-        """The end of an explicit step in x and v (N,): pins move on, and vertices are kept out of colliders."""
+        """Launches the end of an explicit step in x and v (N,): the move of pins, and the filters of contact."""
         self.launch_pins_of(pins, keyframes, count, x, v)
         if self.colliders is not None:
             self.colliders.launch_end(x, v)
@@ -223,7 +222,7 @@ class Stepper:
             self.pairs.filter.launch_end(x, v)
 
     def take(self, steps):
-        """Calls ``steps``, and again from the same state with more room as long as not all pairs that are near had some."""
+        """Calls ``steps``, and repeats it from the same state with more memory while the list of pairs overflows."""
         if self.pairs is None:
             steps()
             return
@@ -241,19 +240,19 @@ class Stepper:
             steps()
 
     def record_again(self):
-        """Records what steps launch anew, where arrays of pairs are others."""
+        """Captures the launches of steps again, after the arrays of pairs were replaced."""
         raise NotImplementedError  # every solver that takes self-contact has its own
 
     def step(self):
-        """One step of h."""
+        """Takes one step of h."""
         raise NotImplementedError  # every solver has its own
 
     def prepare_frame(self):
-        """Records the graphs of `frame`, which must happen in the main thread; `frame` does it when it is first called."""
+        """Captures the graphs of `frame`, which must happen in the main thread; by default, the first `frame` does it."""
 
     @in_turn
     def frame(self):
-        """One frame, equal bit for bit to ``steps_per_frame`` calls of `step`."""
+        """Takes the steps of one frame, with the same bits as ``steps_per_frame`` calls of `step`."""
         for _ in range(self.steps_per_frame):
             self.step()
 
@@ -261,21 +260,21 @@ class Stepper:
     def reset(self, mask=None, positions=None, velocities=None):
         """Resets copies to their start, by one launch or, with free axes, two; they then repeat their first steps bit for bit.
 
-        Keyframes, ``results`` and ``residual`` of these copies start again as well. The other copies are not affected. After
-        the first call it allocates nothing. If all arguments are on the device and the solver has no residual, the host does
-        not wait, unless positions are given with colliders, for which it checks them.
+        Keyframes, ``results`` and ``residual`` of these copies start again as well. Other copies are not affected. Calls after
+        the first allocate nothing. If all arguments are on the device and the solver has no residual, the host does not wait,
+        unless positions are given with colliders, because it checks these.
 
         Args:
-            mask: Which copies to reset, (B,) truth values; None for all.
-            positions: Their start positions (B, n, 3) [m], by default those of the model; any finite values for other copies.
-                Rest states that terms took from the start do not change, and vertices with keyframes begin at these.
-            velocities: Their start velocities (B, n, 3) [m/s]; those of pinned vertices are ignored.
+            mask: Which copies to reset, (B,) booleans; None for all.
+            positions: Initial positions (B, n, 3) [m], by default those of the model; any finite values for other copies. Rest
+                states that follow from the initial positions do not change, and vertices with keyframes start at these.
+            velocities: Initial velocities (B, n, 3) [m/s]; those of pinned vertices are ignored.
 
         Each is a Warp array or anything that NumPy converts to an array. A Warp array on the device must have the precision of
         the model, and is read in place.
 
         Raises:
-            ValueError: If an argument is not allowed, a free vertex of one of these copies would start inside a collider, or
+            ValueError: An argument is not allowed, a free vertex of one of these copies would start inside a collider, or
                 positions or velocities are given with ``integrator="bdf2"``.
         """
         if self._reset is None:
@@ -283,7 +282,7 @@ class Stepper:
         self._reset(mask, positions, velocities)
 
 
-# Launches of a graph: of steps of one launch replaying them one by one takes 0.9 µs more each, recording one takes 100 µs.
+# Largest number of launches in a graph: each replay costs 0.9 µs, and each captured launch 100 µs.
 LAUNCHES = 64
 
 
@@ -303,11 +302,10 @@ class LaunchedStepper(Stepper):
         self.pool = ThreadPool(model.threads)
 
     def record(self, *parts):
-        """Records a step.
+        """Captures a step.
 
         Args:
-            parts: Pairs of a function and of how many times it runs. The function launches the part of the thread of the pool
-                that calls it.
+            parts: Pairs (function, number of calls). The function launches the share of the thread of the pool that calls it.
         """
         self.parts = [(launch, times) for launch, times in parts if times]
         if self.lead is not None:
@@ -327,7 +325,7 @@ class LaunchedStepper(Stepper):
             self._size += (launches[0] - before) // self.pool.threads * times
 
     def _segments(self, launch):
-        """The segment of each thread."""
+        """Returns the segment of each thread."""
         pool = self.pool
         return [Segment(self.model.device, pool.as_thread(thread, launch)) for thread in range(pool.threads)]
 
@@ -343,7 +341,7 @@ class LaunchedStepper(Stepper):
                     launch()
 
     def _record_frame(self):
-        """Segments of a frame, and how many times each is replayed, recorded when a frame is first asked for."""
+        """Captures the segments of a frame, on first use, and returns them with the number of replays of each."""
         steps = self.steps_per_frame
         chunk = min(steps, LAUNCHES // max(self._size, 1))
         if chunk < 2:
@@ -379,4 +377,4 @@ class LaunchedStepper(Stepper):
         self._replay(self._frame)
 
     def note(self):
-        """Records how the steps since the last call ended, for methods with a residual."""
+        """Notes how the steps since the last call ended, for methods with a residual."""

@@ -1,4 +1,4 @@
-"""The base of all records of options: the step, what a solver needs of every term, and its facts; and the catalogue by name."""
+"""The base classes of the records of solvers: the step, the needs of every term and the facts; and the catalogue by name."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from .facts import Facts
 from .solver import Stepper
 from .threaded import ThreadedStepper
 
-# The records by their names, in the order in which lists and charts have them.
+# The records by name, in the order of lists and charts.
 SOLVERS = {}
 
 
@@ -29,10 +29,10 @@ def register(record):
         record: A frozen dataclass that derives from :class:`Step` and has a ``name``.
 
     Returns:
-        The same class, so that this is a decorator too.
+        The same class, so that this can be used as a decorator.
 
     Raises:
-        ValueError: If it is not such a class, or another one of that name is registered.
+        ValueError: It is not such a class, or another one of that name is registered.
     """
     if not (isinstance(record, type) and issubclass(record, Step) and isinstance(record.name, str)):
         raise ValueError(
@@ -52,20 +52,20 @@ class Step:
 
     Attributes:
         dt: Step [s]; 1/(fps·dt) must be a whole number.
-        substeps: Steps a frame.
+        substeps: Number of steps per frame.
         ordered: Whether the result depends on the order of elements by more than rounding.
-        staggered: Whether velocities belong to a time half a step before that of the positions.
+        staggered: Whether velocities are half a step behind positions in time.
         closes: Whether a step may close the gap of a constraint regardless of its stiffness.
         residual: The :class:`warpcloth.core.status.Residual` that its steps report, or None.
         name: Its name on the command line and in benchmarks and charts; each record has its own.
-        needs: Its needs of every term, of :mod:`warpcloth.terms.needs`; the first that is not met is named.
-        facts: The :class:`warpcloth.solvers.facts.Facts` by which it is measured and drawn.
-        touches_itself: Whether it takes a scene with self-contact.
-        locks: Whether it takes a scene that locks coordinates, by ``free_axes`` or the axes of pins.
-        limited: Whether it refuses steps above a limit, which :meth:`step_limits` then finds.
+        needs: What it needs of every term, of :mod:`warpcloth.terms.needs`. Errors name the first need that is not met.
+        facts: Its :class:`warpcloth.solvers.facts.Facts` for benchmarks and charts.
+        touches_itself: Whether it supports self-contact.
+        locks: Whether it supports locked coordinates, by ``free_axes`` or the axes of pins.
+        limited: Whether it refuses steps above a stability limit, see :meth:`step_limits`.
 
     Raises:
-        ValueError: If both or neither are given, or the one given is not above 0.
+        ValueError: Both or neither are given, or the given one is not above 0.
     """
 
     ordered: ClassVar[bool] = False
@@ -87,12 +87,12 @@ class Step:
     substeps: int | None = None
 
     def residual_on(self, model: Model) -> Residual | None:
-        """Returns the residual that its steps report on a model, which may depend on the terms."""
+        """Returns the residual that its steps report on a model; it may depend on the terms."""
         return self.residual
 
     @property
     def damps(self) -> bool:
-        """Whether its steps damp what they do not resolve, or have a limit above which they are refused."""
+        """Whether its steps damp frequencies that they do not resolve, or are refused above a stability limit."""
         return True
 
     @property
@@ -104,22 +104,22 @@ class Step:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term lacks what the solver needs.
+            ValueError: A term lacks a property that the solver needs.
         """
         raise NotImplementedError  # every solver has its own
 
     @classmethod
     def refuse(cls, model, needs=None, options="", instead=None):
-        """Refuses arguments that are not a model, and models with terms that lack a property which the solver needs.
+        """Checks that the solver can take a model.
 
         Args:
             model: The model.
-            needs: The needs, if an option changes those of the record.
+            needs: Further needs that come with an option, or None.
             options: That option, as text.
-            instead: The value of the option without these needs, as text.
+            instead: A value of the option without these needs, as text.
 
         Raises:
-            ValueError: Naming the term or `free_axes`, the solver and what would work.
+            ValueError: It cannot. The message names the term or field of the scene, the solver and what would work.
         """
         if not isinstance(model, Model):
             given = "a Scene" if isinstance(model, Scene) else shown(model)
@@ -166,14 +166,14 @@ class Step:
         return h < limit
 
     def without_limits(self) -> "Step":
-        """Returns the record without its check of limits, for stability maps and for callers that check them by themselves."""
+        """Returns the record without its check of limits, for stability maps and for callers that check limits themselves."""
         return self
 
     def _on(self, stepper, model):
-        """The :class:`Stepper` of type ``stepper`` on a model; with several copies and threads, one for each thread.
+        """Returns the :class:`Stepper` of type ``stepper`` on a model, which threads share if there are several.
 
         Raises:
-            ValueError: If several threads cannot share one cloth, or there are more threads than vertices.
+            ValueError: Several threads cannot share one cloth, or there are more threads than vertices.
         """
         threads = model.threads
         if threads > 1 and model.copies > 1:
@@ -199,7 +199,11 @@ class Step:
             choice(name, getattr(self, name), words)
 
     def per_frame(self, fps: float) -> int:
-        """Steps a frame at ``fps``."""
+        """Returns the number of steps per frame at ``fps``.
+
+        Raises:
+            ValueError: ``dt`` does not divide a frame, or divides it into too many steps.
+        """
         if self.substeps is not None:
             return self.substeps
         steps = 1.0 / max(float(fps) * self.dt, 1e-300)
@@ -219,9 +223,8 @@ class ImplicitStep(Step):
     1 − ω⁴h⁴/2 if ωh is small, and damps stiff modes almost at once. All three are stable for every h if the motion is linear
     and steps converge; in free fall, midpoint and BDF2 are exact. Midpoint needs enough iterations, and steps that resolve
     rotations: with 4 substeps a frame ``hanging`` diverges with projective dynamics and ADMM, and on finer meshes with XPBD.
-        With midpoint the sweeps of XPBD alternate in direction, because in one fixed order they diverged at every step tried.
-        When a solver with BDF2 is bound, it takes two steps of Euler to find the past state; the scene may start far from
-        equilibrium, and with any damping.
+    With midpoint, the sweeps of XPBD alternate in direction, because in one fixed order they diverged at every step tried.
+    When a solver with BDF2 is bound, it takes two Euler steps to find the past state.
 
     Attributes:
         dt, substeps: See :class:`Step`.
@@ -235,16 +238,16 @@ class ImplicitStep(Step):
 
     @property
     def damps(self) -> bool:
-        """See :class:`Step`; midpoint does not."""
+        """Whether its steps damp frequencies that they do not resolve; those of midpoint do not."""
         return INTEGRATORS[self.integrator].damps
 
     def refuse_hard(self, model):
-        """Refuses infinite stiffness with an integrator that cannot take it."""
+        """Raises ValueError if a stiffness is infinite and the integrator cannot take it."""
         if not INTEGRATORS[self.integrator].hard:
             able = " or ".join(repr(name) for name, integrator in INTEGRATORS.items() if integrator.hard)
             self.refuse(model, (FINITE,), f"integrator={self.integrator!r}", f"integrator={able}")
 
 
 def fewest_substeps(fps, rest, motion):
-    """The fewest steps a frame with a step 10 % below the limit ``rest`` [s] about the rest shape, and below ``motion`` [s]."""
+    """Returns the fewest steps per frame with a step 10 % below the limit ``rest`` [s] about rest, and below ``motion`` [s]."""
     return math.floor(1.0 / (fps * min(rest / 1.1, motion))) + 1

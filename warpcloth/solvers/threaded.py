@@ -1,4 +1,4 @@
-"""Batches whose copies are shared out among threads."""
+"""Batches whose copies are divided among threads."""
 
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ from .solver import Stepper
 
 
 class ThreadedStepper(Stepper):
-    """A batch that several threads share: each has a stepper of its own, for a range of copies.
+    """A batch that several threads share, each with a stepper for a range of copies.
 
     Args:
         options: The record of the solver.
@@ -37,7 +37,7 @@ class ThreadedStepper(Stepper):
         self.factorise_seconds = sum(part.factorise_seconds for part in self.parts)
 
     def _part(self, stepper, motion, first, end):
-        """The stepper of the copies from ``first`` to ``end``."""
+        """Returns the stepper of copies ``first`` to ``end − 1``."""
         n, model = self.model.per_copy, self.model.part(first, end - first)
         return stepper.part_of(tuple(array[first * n : end * n] for array in motion), self.options, model)
 

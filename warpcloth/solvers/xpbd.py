@@ -32,8 +32,8 @@ class XPBD(ImplicitStep):
     Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y − α̃λ), λ += Δλ, x += W Gᵀ Δλ, α̃ = 1/(kAh²). As M(x − x̃) = Gᵀλ holds throughout, its
     fixed point for finite stiffness is implicit Euler, the x(t+h) of :class:`warpcloth.Newton`. Form ``"scalar"`` is the
     published one on C = ‖y − p(y)‖ with its changing gradient, Δλ = −(C + α̃λ)/(Σw‖∇C‖² + α̃): its fixed point misses
-    implicit Euler by the change of ∇C within the step. Terms that have only one of the two forms use that one: dihedral bending
-    the scalar form, quadratic bending and attachments the vector form.
+    implicit Euler because ∇C changes within the step. Terms with only one of the two forms use that one: dihedral bending the
+    scalar form, quadratic bending and attachments the vector form.
 
     One hanging mass stretches by mg/k at rest, with any number of iterations and any step. With few iterations cloth is too
     soft, and finer cloth is softer; more substeps help more than more iterations (Macklin et al. 2019, *Small steps*):
@@ -124,8 +124,8 @@ class XPBD(ImplicitStep):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: If a term has no projection, scalar constraint or ``prox``, or infinite stiffness with an integrator
-                other than Euler.
+            ValueError: A term has no projection, scalar constraint or ``prox``, or infinite stiffness with an integrator other
+                than Euler.
         """
         self.refuse(model)
         self.refuse_hard(model)
@@ -168,7 +168,7 @@ class XPBDStepper(LaunchedStepper):
         self.pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
 
     def _launch_to_and_fro(self):
-        """One sweep forward and one backward."""
+        """Launches one sweep forward and one backward."""
         self.sweep.launch()
         self.sweep.launch(backward=True)
 
@@ -199,7 +199,7 @@ class XPBDStepper(LaunchedStepper):
         self.model.launch(self._add_momentum, self.model.count, given, [self._force])
 
     def multiplier_forces(self, collider=None):
-        """Of M(x − x̃) = Gᵀλ: −Gᵀλ/hₑ², which is right at any number of sweeps."""
+        """See :meth:`Stepper.constraint_forces`: adds −Gᵀλ/hₑ², as M(x − x̃) = Gᵀλ holds after any number of sweeps."""
         model, pulls = self.model, []
         for elements, values, key in self.sweep.with_multipliers():
             if not elements.hard or collider not in (None, elements.collider):
