@@ -1,7 +1,7 @@
-"""Sources of energy for a cloth: what the start and moving pins can have put in, and how others say so of themselves.
+"""Sources of energy for a cloth: upper bounds of the energy that the start, pins, loads and colliders add.
 
-A part of a scene that puts energy in (a term, a wind, a collider) registers a function for its type with :func:`source_of`. The
-watch over the energy of a run asks all parts, and names none.
+A part of a scene that adds energy registers a function for its type with ``source_of.register``, so that the check for
+divergence knows no part by name.
 """
 
 from functools import cached_property, singledispatch
@@ -14,7 +14,7 @@ from ..scene.scene import Pins
 from ..solvers.solver import Stepper
 from ..terms.loads import Loads
 
-# More patches of pins than this are treated as one patch, whose pins move within it.
+# If there are more patches of pins than this, all pins are treated as one patch.
 _PATCHES = 32
 
 
@@ -23,14 +23,14 @@ class Source:
 
     Attributes:
         name: Its name in messages.
-        carried: Names of its attributes that go on from frame to frame.
+        carried: Names of its attributes that change from frame to frame, which checkpoints keep.
     """
 
     name = "a source"
     carried: tuple[str, ...] = ()
 
     def energy(self, frame, speed):
-        """Energy that it has put in up to a frame, (B,) [J]; called once for each frame, in order from 1.
+        """Returns the energy that it added up to a frame, (B,) [J]; called once for each frame, in order from 1.
 
         Args:
             frame: Number of the frame.
@@ -39,35 +39,32 @@ class Source:
         return 0.0
 
     def speed(self, frame):
-        """Speed at which it carries the whole cloth along in a frame [m/s]; energy is counted relative to that motion."""
+        """Returns the speed at which it moves the whole cloth in a frame [m/s]; energy counts relative to that motion."""
         return 0.0
 
     def stored(self, frame):
-        """Further energy that it has put in, (B,) [J]; costly, so called only if everything else is not enough."""
+        """Returns further energy that it added, (B,) [J]; costly, so called only if the rest does not explain the motion."""
         return 0.0
 
 
 @singledispatch
 def source_of(part, balance, stepper):
-    """The source of energy that a part of a scene is, or its solver; None of what puts no energy in.
+    """Returns the :class:`Source` that a part of a scene is, or None if it adds no energy.
 
     Args:
-        part: The part; ``source_of.register`` takes a function for a type of them.
+        part: The part; ``source_of.register`` registers a function for a type.
         balance: The :class:`warpcloth.run.balance.Balance` that asks.
         stepper: The :class:`warpcloth.solvers.solver.Stepper` of the run.
-
-    Returns:
-        :class:`Source` or None.
     """
 
 
 @source_of.register(Stepper)
 class Start(Source):
-    """Kinetic and elastic energy at the start, and that of contact.
+    """Kinetic, elastic and contact energy at the start.
 
-    Hard constraints count with the energy of closing their gaps in one step. N of them in a row move what hangs on them by up
-    to Σ gap ≤ √(N Σ gap²), and midpoint or a relaxation of 2 doubles the speed that hₑ gives. Soft constraints count in the
-    same way for solvers whose sweeps may close them too (``closes``).
+    Hard constraints count with the energy of closing their gaps in one step. A chain of N of them moves its end by up to
+    Σ gap ≤ √(N Σ gap²), and midpoint or a relaxation of 2 doubles the speed. Soft constraints count in the same way for solvers
+    whose sweeps may close them too (``closes``).
     """
 
     name = "the start"
@@ -91,10 +88,10 @@ class Start(Source):
 class MovingPins(Source):
     """Pins that keyframes move.
 
-    Pins that are joined by edges form a patch. If a patch moves as a rigid body, the cloth can move with it and keep its energy
-    relative to that motion. A change δ of the patch's speed, taken over the whole cloth, adds at most ½δ² + δ·speed per unit
-    mass, and apart from that only lifting adds energy. Patches that move against one another store at most the energy of
-    deforming the start with them, each vertex by the mean of their motions with weights 1/distance².
+    Pins joined by edges form a patch. If a patch moves as a rigid body, the cloth can move with it and keep its energy relative
+    to that motion. A change δ of the speed of a patch, over the whole cloth, adds at most ½δ² + δ·speed per unit mass. Apart
+    from that, only lifting adds energy. Patches that move relative to one another store at most the energy of the start
+    deformed by them, each vertex by the mean of their motions with weights 1/distance².
     """
 
     name = "moving pins"
@@ -125,7 +122,7 @@ class MovingPins(Source):
         self._lifted = balance.total * np.maximum.accumulate(np.maximum(heights, 0.0))
 
     def _found(self):
-        """Indices of the pins of each patch."""
+        """Returns the indices of the pins of each patch."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -141,7 +138,7 @@ class MovingPins(Source):
 
     @cached_property
     def _maps(self):
-        """The rigid motion of each patch since the start, as affine maps (F, 3, 4)."""
+        """Rigid motion of each patch since the start, as affine maps (F, 3, 4)."""
         found = []
         for patch in self._patches:
             frames = self._frames[:, patch]
@@ -152,7 +149,7 @@ class MovingPins(Source):
 
     @cached_property
     def _weights(self):
-        """Of each vertex and patch, (n, P)."""
+        """Weights of the patches at each vertex, (n, P)."""
         from scipy.spatial import cKDTree
 
         pins = self._points[self._balance.model.scene.pins.vertices]
@@ -183,10 +180,10 @@ class MovingPins(Source):
 
 
 class DrivenLoads(Source):
-    """Loads that change or follow the cloth, and any on a cloth that nothing holds; others count with the height.
+    """Loads that change or follow the cloth, and all loads on a free cloth; others count as potential energy.
 
-    Forces f on masses m give the power Σ f·v ≤ (Σ f²/m · Σ m v²)^½. With the acceleration a² = Σ f²/m / Σ m they add the speed
-    δ = a/fps to the cloth in a frame, and so at most ½δ² + δ·speed per unit mass.
+    Forces f on masses m have the power Σ f·v ≤ (Σ f²/m · Σ m v²)^½. With the acceleration a² = Σ f²/m / Σ m they add the speed
+    δ = a/fps in a frame, and so at most ½δ² + δ·speed per unit mass.
     """
 
     name = "loads"
@@ -223,7 +220,7 @@ class DrivenLoads(Source):
 
     @staticmethod
     def _during(values, frame):
-        """The larger of the values at the two ends of a frame; they are linear between them."""
+        """Returns the larger of the values at the two ends of a frame, between which they are linear."""
         last = len(values) - 1
         return np.maximum(values[min(frame - 1, last)], values[min(frame, last)])
 
@@ -247,8 +244,8 @@ def moving_collider(collider, balance, stepper):
 class MovingCollider(Source):
     """A collider that keyframes move.
 
-    In a frame in which its surface moves at V it may give each vertex a velocity of up to 2V, as a bat does a ball, and lift it
-    by V over the frame rate. A half-space that turns is taken as large as the cloth.
+    In a frame in which its surface moves at V, it may give each vertex a velocity of up to 2V, as a bat does to a ball, and
+    lift it by V over the frame rate. A half-space that turns counts as large as the cloth.
     """
 
     name = "moving colliders"

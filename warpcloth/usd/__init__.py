@@ -1,6 +1,6 @@
-"""USD stages: a cloth or a scene read from one, an animation or measures written as one.
+"""Reads cloths and scenes from USD stages, and writes animations and measures to them.
 
-Nothing else here imports pxr, and that is loaded when a stage is first touched.
+No other package imports pxr, and this one loads it when a stage is first used.
 """
 
 from ..base.outputs import STAGE_ENDINGS

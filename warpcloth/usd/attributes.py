@@ -1,4 +1,4 @@
-"""Whole scenes as USD stages: which attribute of a stage is which field of a scene, read and written by one table.
+"""The table that maps attributes of a USD stage to fields of a scene, for reading and writing.
 
 A cloth is a Mesh prim (or linear BasisCurves) with attributes. For a linen cloth, by hand:
 
@@ -9,19 +9,17 @@ A cloth is a Mesh prim (or linear BasisCurves) with attributes. For a linen clot
     token warpcloth:terms:bending:type = "QuadraticBending"
     double warpcloth:terms:bending:stiffness = 1e-5
 
-Our own names stand on the cloth's prim. They are in SI whatever the units of the stage, in world space, and as precise as
-the scene. Standard names are read where they stand, in the units of the stage; where both are authored ours are taken.
-`physics:surfaceShearStiffness` is not read, with a warning; neither is a spring stiffness guessed from
-`physics:youngsModulus` or from the attributes that cloth tools have of their own, nor are per-point `physics:masses` read.
+Our own attributes are on the cloth's prim. They are in SI units and world space, whatever the units of the stage, and in the
+precision of the scene. Standard attributes are read in the units of the stage; where both are authored, ours win.
+`physics:surfaceShearStiffness` is not read, with a warning. Per-point `physics:masses` are not read, nor is a spring stiffness
+guessed from `physics:youngsModulus` or from attributes of other cloth tools.
 
-What else a stage says:
+An attribute may also be on the Xform above the cloth, where Blender puts the properties of an object. Those on the cloth itself
+win. Other data of a stage:
 
-An attribute may also be on the Xform above the cloth, where Blender puts the properties of an object. Those of the cloth
-itself are taken first.
-
-- Rest shape: the default points, where the transform puts them at the first frame. Animated points: the cloth starts at the
-  first frame's. Pinned vertices follow animated points and transforms.
-- Pins: `warpcloth:pins`, `primvars:pins`, and the GeomSubsets of :func:`.stage.pinned_points`, together.
+- Rest shape: the default points, transformed as at the first frame. If points are animated, the cloth starts at those of the
+  first frame. Pinned vertices follow animated points and transforms.
+- Pins: the union of `warpcloth:pins`, `primvars:pins`, and the GeomSubsets of :func:`.stage.pinned_points`.
 - Frames per second: the stage's framesPerSecond, else its timeCodesPerSecond. Duration: `warpcloth:duration`, else the
   whole frames from start to end time code, else 1 s.
 - Gravity: `warpcloth:gravity`, else the PhysicsScene's, else 9.81 m/s² down the stage's up axis.
@@ -42,14 +40,14 @@ class Attribute:
     """One row of the table.
 
     Attributes:
-        field: Field of `Scene`, `Pins` ("pins.…"), a term ("terms.…") or `Mesh` ("mesh.…"); in brackets what a field is
-            computed from.
+        field: Field of `Scene`, `Pins` ("pins.…"), a term ("terms.…") or `Mesh` ("mesh.…"); in brackets, a quantity from which
+            fields are computed.
         name: Name of the attribute; <name> is any name for a term.
-        location: Where it is: "cloth", the prim or the Xform above it; "body", the prim or the nearest one above with
-            PhysicsDeformableBodyAPI; "material", the physics material bound to it; "collider", a collider or the Xform above
+        location: Its prim: "cloth", the cloth or the Xform above it; "body", the cloth or the nearest prim above it with
+            PhysicsDeformableBodyAPI; "material", the physics material bound to that; "collider", a collider or the Xform above
             it; "its material", the physics material bound to a collider; "physics scene".
-        type_names: Types that it may have, of any precision; the first for one value, the last for several.
-        kilograms, metres: Powers of kilogramsPerUnit and metersPerUnit that make it SI.
+        type_names: Allowed types, of any precision; the first for one value, the last for several.
+        kilograms, metres: Powers of kilogramsPerUnit and metersPerUnit by which to multiply for SI units.
     """
 
     field: str
@@ -71,7 +69,7 @@ class Attribute:
 
 
 ATTRIBUTES = (
-    # Our own. Of one field, those that are first here are taken first.
+    # Our own. Of several rows of one field, the first wins.
     Attribute("name", "warpcloth:name", "cloth", ("string",)),
     Attribute("density", "warpcloth:density", "cloth", ("double",)),
     Attribute("masses", "warpcloth:masses", "cloth", ("double[]",)),
@@ -84,10 +82,10 @@ ATTRIBUTES = (
     Attribute("pins.keyframes", "warpcloth:pins:keyframes", "cloth", ("double3[]",)),
     # The axes that the pins hold, such as "xz", or one text for each pin, those of lower index first.
     Attribute("pins.axes", "warpcloth:pins:axes", "cloth", ("token", "token[]")),
-    # How it touches colliders.
+    # Contact with colliders.
     Attribute("contact.distance", "warpcloth:contact:distance", "cloth", ("double",)),
     Attribute("contact.stiffness", "warpcloth:contact:stiffness", "cloth", ("double",)),
-    # How it touches itself.
+    # Self-contact.
     Attribute("self_contact.distance", "warpcloth:selfContact:distance", "cloth", ("double",)),
     Attribute("self_contact.stiffness", "warpcloth:selfContact:stiffness", "cloth", ("double",)),
     Attribute("self_contact.friction", "warpcloth:selfContact:friction", "cloth", ("double",)),
@@ -102,7 +100,7 @@ ATTRIBUTES = (
     Attribute("loads.force", "warpcloth:loads:<name>:force", "cloth", ("double3", "double3[]")),
     Attribute("loads.traction", "warpcloth:loads:<name>:traction", "cloth", ("double3", "double3[]")),
     Attribute("loads.pressure", "warpcloth:loads:<name>:pressure", "cloth", ("double", "double[]")),
-    # What the prim's own points and curves lose. Used while they agree with these: an artist's edit wins.
+    # The mesh in double precision. Used only if the prim's own points and curves agree, so that an artist's edit wins.
     Attribute("mesh.points", "warpcloth:points", "cloth", ("double3[]",)),  # in the prim's own space
     Attribute("mesh.edges", "warpcloth:edges", "cloth", ("int2[]",)),  # of curves, in order
     Attribute("mesh.grid_shape", "warpcloth:gridShape", "cloth", ("int2",)),
@@ -110,7 +108,7 @@ ATTRIBUTES = (
     Attribute("mesh.parts", "warpcloth:parts", "cloth", ("token[]",)),
     Attribute("mesh.part_sizes", "warpcloth:partSizes", "cloth", ("int[]",)),
     Attribute("mesh.part_grid_shapes", "warpcloth:partGridShapes", "cloth", ("int2[]",)),
-    # Colliders: whether it is one, or how a mesh is approximated; the points in double precision, used while they agree.
+    # Colliders: whether it is one, or how a mesh is approximated; points in double precision, used only if they agree.
     Attribute("(collides)", "warpcloth:collider", "collider", ("bool", "token")),
     Attribute("colliders.name", "warpcloth:name", "collider", ("string",)),
     Attribute("colliders.friction", "warpcloth:friction", "collider", ("double",)),
@@ -131,7 +129,7 @@ ATTRIBUTES = (
     Attribute("(gravity magnitude)", "physics:gravityMagnitude", "physics scene", ("float",), metres=1),
 )
 
-# Attributes of a term, whose names say which it is.
+# Namespace of the attributes of terms.
 TERMS_NAMESPACE = "warpcloth:terms"
 LOADS_NAMESPACE = "warpcloth:loads"
 
@@ -141,16 +139,16 @@ _OF_INDICES = {1: "int[]", 2: "int2[]", 3: "int3[]", 4: "int4[]"}
 
 
 def attributes():
-    """All rows of the table: one for each field of the energies that are registered, and those above."""
+    """Returns all rows of the table: one for each field of the registered energies, and those above."""
     rows = {
         "type": ("token",),
         "part": ("token",),
-        "name": ("string",),  # only where <name> is not the name of the term; empty where it has none
+        "name": ("string",),  # only if <name> is not the name of the term; empty if the term has none
     }
     for energy in TERMS.values():
         for field in fields(energy):
             quantity, indices = field.metadata.get("quantity"), field.metadata.get("indices")
-            types = ()  # of values of a shape that USD has no type for
+            types = ()  # if USD has no type for the shape of its values
             if quantity and quantity.shape in _OF_NUMBERS:
                 types = _OF_NUMBERS[quantity.shape]
             elif indices and indices.each in _OF_INDICES:
@@ -166,7 +164,7 @@ def attributes():
 
 
 class Values:
-    """The attributes of a cloth, or of a collider, by their field, in SI.
+    """The attributes of a cloth or of a collider by field, in SI units.
 
     Args:
         stage: The stage.
@@ -186,7 +184,7 @@ class Values:
         else:
             self.locations = {"collider": holders(prim), "its material": [material]}
         names = own_names(prim)
-        # In the order of the prim's properties, which is that of their names where nothing else is said.
+        # In the order of the prim's properties, by default that of their names.
         self.terms, self.loads = (
             list(dict.fromkeys(name.split(":")[2] for name in names if name.startswith(f"{namespace}:")))
             for namespace in (TERMS_NAMESPACE, LOADS_NAMESPACE)
@@ -195,13 +193,13 @@ class Values:
         known = {row.name.replace("<name>", key) for row in rows for key in (*self.terms, *self.loads, "")}
         unknown = sorted(set(names) - known)
         if unknown:
-            for key in self.terms:  # whose type may be the reason
+            for key in self.terms:  # an unknown type of a term may be the reason
                 kind_of(self, key)
             allowed = ", ".join(row.name for row in rows if row.name.startswith("warpcloth:"))
             raise ValueError(f"{unknown[0]} is no attribute of a {kind}, must be one of {allowed}")
 
     def authored(self, field, key=None):
-        """The authored attributes of a field as (row, Usd.Attribute), those to be taken first at first.
+        """Returns the authored attributes of a field as (row, Usd.Attribute), in order of precedence.
 
         Raises:
             ValueError: An attribute has another type than its row.
@@ -216,7 +214,7 @@ class Values:
                     yield row, attribute
 
     def get(self, field, key=None):
-        """The value of a field as a number, text, tuple of texts or array; None where nothing is said."""
+        """Returns the value of a field as a number, text, tuple of texts or array; None if it is not authored."""
         for row, attribute in self.authored(field, key):
             value = value_of(attribute, Usd.TimeCode.EarliestTime())
             if value is None:
@@ -231,7 +229,7 @@ class Values:
             refuse_unknown(attribute.GetName(), np.asarray(value), infinite=row.infinite)
             if row.location in ("body", "material", "its material") and value < 0:
                 raise ValueError(f"{attribute.GetName()} is {value}, must be 0 or more")
-            # UsdPhysics and the proposal say 0 for a mass, density or stiffness that is not given.
+            # In UsdPhysics and the proposal, 0 stands for a mass, density or stiffness that is not given.
             if row.location not in ("body", "material") or value != 0:
                 scale = self.kilograms**row.kilograms * self.metres**row.metres
                 return value if scale == 1 else value * scale
@@ -239,7 +237,7 @@ class Values:
 
 
 def kind_of(values, key, catalogue=TERMS, group="terms"):
-    """The name of the energy of a term, or of the kind of a load.
+    """Returns the name of the energy of a term, or of the kind of a load.
 
     Raises:
         ValueError: There is none of that name.
@@ -259,24 +257,24 @@ def _kind(type_name):
 
 
 def _rank(type_name):
-    """The number of dimensions of an array of numbers that has a type; -1 of texts."""
+    """Returns the number of dimensions of an array of a type; -1 for texts."""
     default = type_name.scalarType.defaultValue
     return -1 if isinstance(default, str) else np.ndim(default) + type_name.isArray
 
 
 def has_api(prim, name):
-    """Whether an API schema is applied, by name: the deformable ones need not be registered."""
+    """Returns whether an API schema is applied, by name, because the deformable ones need not be registered."""
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
 
 
 def holders(prim):
-    """The prims whose attributes are those of a shape: itself and, if that is an Xform or a SkelRoot, the prim above it."""
+    """Returns the prims that may have the attributes of a shape: itself, and the prim above if that is an Xform or SkelRoot."""
     parent = prim.GetParent()
     return [prim, parent] if parent.IsA(UsdGeom.Xform) or parent.IsA(UsdSkel.Root) else [prim]
 
 
 def own_names(prim):
-    """The names in our namespace that a shape has."""
+    """Returns the names of our attributes that a shape has."""
     return [each.GetName() for holder in holders(prim) for each in holder.GetAuthoredPropertiesInNamespace("warpcloth")]
 
 
@@ -288,7 +286,7 @@ def _body(cloth):
 
 
 def author(cloth, field, value, key=None, time=None):
-    """Writes a value under the name and as the type that the table has for its field."""
+    """Writes a value with the name and the type that the table has for its field."""
     row = next((row for row in attributes() if row.field == field), None)
     if row is None:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Writing samples so that the result can be opened at any moment, whatever happens to the process that writes it."""
+"""Writes time samples in chunks, so that the result can be opened at any moment, even after the process is killed."""
 
 import os
 import re
@@ -21,7 +21,7 @@ from .stage import METADATA_KEY, followed, identity
 from .values import refuse_path, sentences
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
-_COMPLETE = "complete"  # marks the folder of a run that has all of its frames and is not packed yet
+_COMPLETE = "complete"  # file that marks the folder of a run whose frames are complete but not packed yet
 
 
 class ChunkWriter:
@@ -29,41 +29,42 @@ class ChunkWriter:
 
     While it runs, the result is a small root layer, `path`, and a folder beside it, `<stem>_frames/<run>/`, with
 
-    - `rest.usdc`: all that is not animated. Without a source a complete stage, /World/Cloth and its material; with one,
-      what has to be said once about the artist's prim. It is weaker than the frames and stronger than the source.
-    - `frames_000000.usdc` and so on: value clips of `chunk` frames. USD interpolates between the last frame of one and
-      the first frame of the next too.
-    - `manifest.usda`: the names of the animated attributes, so that no chunk need be opened to find them.
+    - `rest.usdc`: everything that is not animated. Without a source, this is a complete stage, /World/Cloth and its material;
+      with one, constant opinions on the artist's prim. It is weaker than the frames and stronger than the source.
+    - `frames_000000.usdc` and so on: value clips of `chunk` frames. USD also interpolates between the last frame of a clip and
+      the first of the next.
+    - `manifest.usda`: the names of the animated attributes, so that USD need not open chunks to find them.
 
-    Every file is written under another name, complete, and then renamed; the root is replaced after each chunk. So a
-    process killed at any moment leaves a result that opens, with at most one chunk of frames missing, and the result of
-    an earlier run stays whole until the first chunk of this run is written, or for .usdz the whole package. Files are not
-    forced to the disk (fsync): a killed process loses nothing by that, a power failure may lose the newest chunks. Memory
-    holds one chunk. The folder belongs to the file: move them together, or make one file of them with
-    `close(single_file=True)`. Only one writer at a time, in all processes, has an output; another one is refused.
+    Every file is written under a temporary name and renamed when complete; the root is replaced after each chunk. So a process
+    killed at any moment leaves a result that opens, with at most one chunk of frames missing. The result of an earlier run
+    stays whole until the first chunk of this run is written, or for .usdz the whole package. Files are not flushed to the disk
+    (fsync), so that a power failure may lose the newest chunks. Memory holds one chunk. The folder belongs to the file: move
+    them together, or make one file with `close(single_file=True)`. Only one writer at a time, in all processes, can have an
+    output.
 
-    An interrupt (Ctrl-C) waits until a chunk, or `close`, is finished; a second one does not. A run removes what earlier runs
-    to the same output left in the folder, except files that it reads and the complete frames of a .usdz that was not packed.
+    An interrupt (Ctrl-C) waits until a chunk, or `close`, is finished; a second one does not. A run removes the files of
+    earlier runs to the same output from the folder, except files that it reads and the complete frames of a .usdz that was not
+    packed.
 
     Attributes:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
         frames: Number of frames appended.
         kept: Number of appended frames that are in the file.
-        chunk: Frames of a chunk.
+        chunk: Number of frames per chunk.
         run: The folder of the chunks.
     """
 
-    # Of all sampled prims: name of their set of value clips; a set in a source below with the same name is not seen.
+    # Name of the set of value clips of all sampled prims. It hides a set with this name in the source.
     _clip_set = METADATA_KEY
 
     def __init__(self, output, mesh, chunk):
-        """Checks the output; a writer says next what its samples are put on, by `_put_on`.
+        """Checks the output; the writer calls `_put_on` next.
 
         Args:
-            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file. Of a link the file that it stands
-                for is written, with the folder beside that; viewers find the frames through a link in the same folder only.
+            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file. If it is a link, the file behind it
+                is written, with the folder beside that; viewers find the frames only through a link in the same folder.
             mesh: The `Mesh`.
-            chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
+            chunk: Number of frames per chunk, which memory holds, and which a killed process may lose.
         """
         self._output = Path(os.path.abspath(followed(output)))
         _check_output(self._output)
@@ -76,25 +77,25 @@ class ChunkWriter:
         self._folder, self._packed = frames_folder(self._output), self._output.suffix == ".usdz"
         if self._folder.exists() and not self._folder.is_dir():
             raise ValueError(f"{self._folder}: is a file, must be free for the folder of frames")
-        # A name never used before: pxr may still hold layers of an earlier run in this process, and would show those.
+        # A new name, because pxr may still hold layers of an earlier run in this process, and would show those.
         self.run = self._folder / f"{self._output.suffix[1:]}-{secrets.token_hex(4)}"
         self.path = str(self.run / "animation.usdc" if self._packed else self._output)
         self.frames = self.kept = 0
         self._given, self._packing, self._lock = os.fspath(output), False, None
         self._span = None  # first and last time code appended
         self._pending = []
-        self._chunks = []  # (first time code, file) of each chunk that stands
+        self._chunks = []  # (first time code, file) of each written chunk
         self._number = 0  # of the next chunk
         self._stale = set()  # files of an interrupted run that the first root of this one no longer names
         self._closed = False
 
     def _put_on(self, rest, targets, root_metadata, metadata, source=None, files=(), refit=None):
-        """Sets the layer that the samples are put on, and locks the output for this writer.
+        """Sets the layer below the samples, and locks the output for this writer.
 
         Args:
-            rest: Layer of all that is not sampled; it has the sampled attributes without samples.
-            targets: The `Target` of each sampled prim, first the one that the file is about.
-            root_metadata: What only root layers say; rates too.
+            rest: Layer of everything that is not sampled; it has the sampled attributes without samples.
+            targets: The `Target` of each sampled prim, the main one first.
+            root_metadata: Metadata that USD reads from root layers only, and rates.
             metadata: Numbers and texts for customLayerData, or None.
             source: File of the artist's stage below, or None.
             files: Real paths of all files of that stage.
@@ -123,7 +124,7 @@ class ChunkWriter:
         if kind is None:
             self.close()
         elif not self._closed:
-            # What there is may be worth a look; it stays in chunks, for nobody waits for one file.
+            # After an error the frames so far stay in chunks, without packing.
             try:
                 self._write_chunk()
                 self._closed = True
@@ -131,7 +132,7 @@ class ChunkWriter:
                 self._lock.release()
 
     def saved(self) -> str:
-        """Says how many frames there are, and in which file."""
+        """Returns a text that says how many frames there are, and in which file."""
         if not self.kept:
             return "nothing was saved"
         path = self._given
@@ -141,13 +142,13 @@ class ChunkWriter:
         return f"frames 0 to {self.kept - 1} are in {path}" + (packing if self._packing else "")
 
     def close(self, single_file: bool = False, keep: bool = False) -> None:
-        """Writes what is pending. Without a single frame nothing is written.
+        """Writes the pending frames. Without frames nothing is written.
 
         Args:
-            single_file: Make one self-contained file, with all of the source in it, and remove the folder. Frames are
-                copied chunk by chunk, so that memory stays flat; .usda alone is written from a binary file. A .usdz
-                always is one.
-            keep: Whether the chunks stay beside one file too, for the run to be resumed.
+            single_file: Whether to make one self-contained file, which includes the source, and remove the folder. Frames are
+                copied chunk by chunk, so that memory stays constant; .usda alone is written from a binary file. A .usdz always
+                is one file.
+            keep: Whether to keep the chunks beside a single file, so that the run can be resumed.
 
         Raises:
             OSError: A file could not be written; the finished chunks stay.
@@ -180,27 +181,27 @@ class ChunkWriter:
 
     @property
     def complete(self):
-        """Whether it is closed, with everything in one file if that was asked for."""
+        """Whether it is closed, and packed in one file if that was asked for."""
         return self._closed and not self._packing
 
     def runs_with(self, name):
-        """Folders of runs to this output that left a file of this name, the newest first."""
+        """Returns the folders of runs to this output that have a file of this name, the newest first."""
         found = self._folder.glob(f"{self._output.suffix[1:]}-*/{name}") if self._folder.is_dir() else ()
         return [path.parent for path in sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)]
 
     def written(self):
-        """(chunks, span) for :meth:`resume`: the time code and the file name of each chunk, and the ends of all."""
+        """Returns (chunks, span) for :meth:`resume`: time code and file name of each chunk, first and last time code."""
         return [(time, path.name) for time, path in self._chunks], self._span
 
     def resume(self, run, chunks, span, frames):
-        """Goes on with a run to this output that was interrupted, before the first frame is appended.
+        """Continues an interrupted run to this output; call it before the first frame is appended.
 
-        What it wrote later than these chunks is removed once another chunk stands in its place.
+        Later chunks of that run are removed once a new chunk replaces them.
 
         Args:
             run: Its folder.
-            chunks: As :meth:`written` gave them.
-            span: As :meth:`written` gave it.
+            chunks: From :meth:`written`.
+            span: From :meth:`written`.
             frames: Number of frames in the chunks.
 
         Raises:
@@ -213,7 +214,7 @@ class ChunkWriter:
                 raise FileNotFoundError(f"{path}: is missing, so that the run cannot be resumed; run without resume")
         found = sorted(self.run.glob("frames_*.usdc"))
         self._stale = set(found) - {path for _, path in self._chunks}
-        self._number = int(found[-1].stem.removeprefix("frames_")) + 1  # pxr may hold files of the names that are there
+        self._number = int(found[-1].stem.removeprefix("frames_")) + 1  # a new name, because pxr may hold the old files
         self._span, self.frames, self.kept = tuple(span), frames, frames
         if self._packed:
             self.path = str(self.run / "animation.usdc")
@@ -231,7 +232,7 @@ class ChunkWriter:
             self.path = before
 
     def _check_source(self):
-        """Checks whether the files of the source have changed since they were read."""
+        """Warns if the files of the source have changed since they were read; raises ValueError if they no longer fit."""
         changed = [file for file, before in self._files.items() if identity(file) != before]
         if not changed:
             return
@@ -246,7 +247,7 @@ class ChunkWriter:
         warnings.warn(f"{changed[0]}: has changed during the run; the frames belong to its earlier version", stacklevel=4)
 
     def _append(self, time, samples):
-        """Adds a frame: at a time code values by path of attribute; every `chunk` frames they are written."""
+        """Adds a frame, the values at a time code by path of attribute, and writes a chunk if it is full."""
         self._pending.append((time, samples))
         self._span = (time if self._span is None else self._span[0], time)
         self.frames += 1
@@ -258,7 +259,7 @@ class ChunkWriter:
             raise ValueError(f"{self._output}: is closed, no frame can be appended")
 
     def _checked_primvars(self, primvars, unknown=False):
-        """Values of all primvars that were declared; where they may be unknown, NaN."""
+        """Checks the values of all declared primvars, and returns them; with ``unknown`` they may be NaN."""
         declared, primvars = self._targets[0].primvars, primvars or {}
         if primvars.keys() != declared.keys():
             names = ", ".join(map(repr, primvars)) or "none"
@@ -284,11 +285,11 @@ class ChunkWriter:
         return values
 
     def _attributes(self):
-        """Paths of all sampled attributes."""
+        """Returns the paths of all sampled attributes."""
         return [f"{target.prim}.{name}" for target in self._targets for name in target.attributes]
 
     def _write_chunk(self, last=False):
-        """Writes the pending frames as a clip, and a root that has it."""
+        """Writes the pending frames as a clip, and a root that includes it."""
         with deferred():
             if self._pending:
                 self._write_pending()
@@ -298,7 +299,7 @@ class ChunkWriter:
     def _write_pending(self):
         if not self._chunks:
             self._start_run()
-        elif not self._chunks[-1][1].exists():  # USD would make the folder again, and the file would lack the earlier frames
+        elif not self._chunks[-1][1].exists():  # USD would make the folder again, without the earlier frames
             self.kept, last = 0, self.frames - len(self._pending) - 1
             raise FileNotFoundError(f"{self.run}: has been removed during the run, with frames 0 to {last}")
         layer = self._declared(Sdf.Layer.CreateAnonymous(".usdc"))
@@ -312,7 +313,7 @@ class ChunkWriter:
         export(layer, path)
         chunks = [*self._chunks, (self._pending[0][0], path)]
         self._write_root(chunks)
-        # Only now, so that a chunk whose writing was interrupted is written again by close.
+        # Only now, so that close writes a chunk again whose writing was interrupted.
         self._chunks, self._pending, self.kept, self._number = chunks, [], self.frames, self._number + 1
         self._remove_stale()
         if len(chunks) == 1 and not self._packed:
@@ -324,13 +325,13 @@ class ChunkWriter:
         export(self._declared(Sdf.Layer.CreateAnonymous(".usda")), self.run / "manifest.usda")
 
     def _declared(self, layer):
-        """The layer, with all sampled attributes in it."""
+        """Declares all sampled attributes in a layer, and returns it."""
         for target in self._targets:
             target.declare(layer, target.attributes)
         return layer
 
     def _write_root(self, chunks):
-        """Writes a root that has these chunks."""
+        """Writes a root that includes these chunks."""
         folder = Path(self.path).parent
         layer = Sdf.Layer.CreateAnonymous(".usda")
         stage = Usd.Stage.Open(layer)
@@ -341,16 +342,16 @@ class ChunkWriter:
             clips.SetClipManifestAssetPath(Sdf.AssetPath(relative_path(self.run / "manifest.usda", folder)), self._clip_set)
             clips.SetClipPrimPath(target.prim, self._clip_set)
             clips.SetClipActive([(time, index) for index, (time, _) in enumerate(chunks)], self._clip_set)
-            # Clip time is stage time. One frame has one time: listed twice, USD 25.5 reports the frame twice.
+            # Clip time is stage time. With one frame listed twice, USD 25.5 reports the frame twice.
             clips.SetClipTimes([(time, time) for time in sorted(set(self._span))], self._clip_set)
         del clips, stage
         self._describe(layer)
-        # Last, for an anonymous layer cannot tell what they are relative to.
+        # Last, because an anonymous layer cannot resolve relative paths.
         layer.subLayerPaths = [relative_path(path, folder) for path in self._base_paths()]
         export(layer, self.path, self.run)
 
     def _describe(self, layer):
-        """Writes on a root layer what is read from root layers only."""
+        """Writes the metadata that USD reads from root layers only."""
         start, end = self._span
         for name, value in {"startTimeCode": start, "endTimeCode": end, **self._root_metadata}.items():
             layer.pseudoRoot.SetInfo(name, value)
@@ -364,7 +365,7 @@ class ChunkWriter:
         self._stale = set()
 
     def _remove_other_runs(self):
-        """Removes what earlier runs to the same output left, now that the output no longer refers to it."""
+        """Removes the files of earlier runs to the same output, to which the output no longer refers."""
         own_kind = re.compile(re.escape(self._output.suffix[1:]) + "-[0-9a-f]{8}")
         for folder in self._folder.iterdir():
             inside = os.path.join(os.path.realpath(folder), "")
@@ -378,7 +379,7 @@ class ChunkWriter:
                     stacklevel=5,
                 )
             else:
-                shutil.rmtree(folder, ignore_errors=True)  # a file that another process has open is no reason to fail
+                shutil.rmtree(folder, ignore_errors=True)  # another process may have a file open
 
     def _write_single_file(self, keep):
         contents = Contents(self.run)
@@ -409,7 +410,7 @@ class ChunkWriter:
             self._folder.rmdir()
 
     def _copy_frames(self, single):
-        """Copies all chunks to a binary layer, saved in place: nobody needs that file if the process dies."""
+        """Copies all chunks to a binary layer, without a temporary name, because nobody needs it if the process dies."""
         layer = Sdf.Layer.FindOrOpen(str(single))
         for _, path in self._chunks:
             chunk = Sdf.Layer.FindOrOpen(str(path))
@@ -422,7 +423,7 @@ class ChunkWriter:
 
 
 def frames_folder(output):
-    """The folder of frames that belongs to an output; of a link beside the file that it stands for."""
+    """Returns the folder of frames of an output; for a link, beside the file behind it."""
     output = Path(followed(output))
     return output.parent / f"{output.stem}_frames"
 
@@ -438,7 +439,7 @@ def _check_output(output):
 
 
 def check_scene(fps, up_axis):
-    """Refuses what a stage cannot have."""
+    """Raises ValueError if a stage cannot have this rate or up axis."""
     if not (np.isscalar(fps) and np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps is {fps}; it must be positive and finite")
     if up_axis not in ("Y", "Z"):
@@ -446,7 +447,7 @@ def check_scene(fps, up_axis):
 
 
 def _facts(metadata, where="metadata"):
-    """Metadata as a file can keep it: numbers, texts and more of such by name."""
+    """Converts metadata to what a file can keep: numbers, texts and dicts of these."""
     facts = {}
     for name, value in metadata.items():
         if isinstance(value, dict):
@@ -459,7 +460,7 @@ def _facts(metadata, where="metadata"):
 
 
 def export(layer, path, unfinished_in=None):
-    """Writes a layer under another name first, so that the path has either what was there or the whole layer."""
+    """Writes a layer under a temporary name and renames it, so that the path has either the old file or the whole layer."""
     path = Path(path)
     unfinished = Path(unfinished_in or path.parent) / f"unfinished{path.suffix}"
     _export(layer, unfinished, path)
@@ -481,5 +482,5 @@ def _export(layer, file, meant=None):
 
 
 def _writing(path):
-    """Raises pxr's errors about a file that cannot be written as one sentence."""
+    """Turns pxr's errors about a file that cannot be written into one OSError."""
     return sentences(path, OSError, "could not be written: ")

@@ -15,27 +15,27 @@ from .solids import SOLIDS
 from .stage import face_corners, local_to_metres, moving_space, placed, refuse_moving_topology, space_codes
 from .values import array_of, check_composed, refuse_unknown, time_codes_of, token_of, value_of
 
-# Approximations of a mesh that UsdPhysics has, and those that are taken as none: they make a mesh cheaper for rigid bodies, and
-# here it is taken as it is.
+# Approximations of a mesh in UsdPhysics that are supported, and those that count as none: they make a mesh cheaper for rigid
+# bodies, which is not needed here.
 _APPROXIMATIONS = ("none", "boundingCube", "boundingSphere", "convexHull")
 _TAKEN_AS_NONE = ("convexDecomposition", "meshSimplification", "sdf")
 _SIZES = ("size", "radius", "height")
-# Scales and angles of float32 and of products of them agree to this part.
+# Relative tolerance of scales and angles that come from float32 and their products.
 _SAME = 1e-5
 
 
 def read_colliders(stage, cloths, surroundings, codes):
-    """The colliders of a stage, in the order of its prims.
+    """Reads the colliders of a stage, in the order of its prims.
 
-    A collider is a shape with PhysicsCollisionAPI or with `warpcloth:collider`, on itself or on the Xform above it. It does not
-    matter whether it is visible. Planes, spheres, capsules and cubes are those of the scene where their scale allows it. Others
-    are meshes of triangles, as are cylinders and cones, and those whose size changes.
+    A collider is a shape, visible or not, with PhysicsCollisionAPI or `warpcloth:collider` on itself or on the Xform above it.
+    Planes, spheres, capsules and cubes become primitives if their scale allows it. Cylinders, cones, and shapes whose size
+    changes become triangle meshes.
 
     Args:
-        stage: The stage, as it is posed.
-        cloths: The prims of the cloth, which are none of them.
-        surroundings: The `StageMesh` of one.
-        codes: Function that gives the time codes of the frames from those of the samples of a collider.
+        stage: The posed stage.
+        cloths: The prims of the cloth, which are not colliders.
+        surroundings: The `StageMesh` of one cloth.
+        codes: Function that returns the time codes of frames from those of the samples of a collider.
 
     Returns:
         list: The `Collider` of each.
@@ -61,7 +61,7 @@ def read_colliders(stage, cloths, surroundings, codes):
 
 @contextmanager
 def errors_at(where):
-    """Says where a ValueError arose."""
+    """Prefixes the message of a ValueError with ``where``."""
     try:
         yield
     except ValueError as error:
@@ -69,7 +69,7 @@ def errors_at(where):
 
 
 def _mark(prim):
-    """The attribute that says whether a prim is a collider, of it or of the prim above it, ours first; or None."""
+    """Returns the attribute that marks a prim as a collider, on it or on the prim above it, ours first; or None."""
     own = [each.GetAttribute("warpcloth:collider") for each in holders(prim)]
     of_physics = [UsdPhysics.CollisionAPI(each) for each in holders(prim) if each.HasAPI(UsdPhysics.CollisionAPI)]
     found = [each for each in own if each and each.HasAuthoredValue()]
@@ -77,7 +77,7 @@ def _mark(prim):
 
 
 def collides(prim):
-    """Whether a prim is a shape that is a collider; refuses prims that are marked as colliders and are none."""
+    """Returns whether a prim is a collider; raises ValueError if it is marked as one but is no shape."""
     mark = _mark(prim)
     if mark and mark.ValueMightBeTimeVarying():
         raise ValueError(f"{mark.GetName()} changes over time, must have one value")
@@ -92,11 +92,7 @@ def collides(prim):
 
 
 class _Reader:
-    """A prim as a collider: its shape, at the time codes of the frames.
-
-    Args:
-        As those of :func:`read_colliders`, ``prim`` being that of the collider.
-    """
+    """Reads the collider of a prim at the time codes of the frames; for the arguments see :func:`read_colliders`."""
 
     def __init__(self, stage, prim, surroundings, codes):
         self.prim, self.kind, self.path = prim, str(prim.GetTypeName()), surroundings.path
@@ -107,13 +103,13 @@ class _Reader:
 
     @cached_property
     def _shape_codes(self):
-        """Time codes of the samples of the attributes that say the shape, if it changes."""
+        """Time codes of the samples of the attributes of its shape, if that changes."""
         found = [self.prim.GetAttribute(name) for name in (*_SIZES, "points", "warpcloth:points")]
         codes = [time_codes_of(each) for each in found if each]
         return sorted({code for each in codes if len(each) > 1 for code in each})
 
     def collider(self):
-        """The `Collider`."""
+        """Returns the `Collider`."""
         approximation = self._approximation()
         self._warn_of_dynamics()
         given = {"friction": self._friction(), "name": self._name()}
@@ -144,7 +140,7 @@ class _Reader:
         return self._mesh(approximation, given)
 
     def _warn_of_dynamics(self):
-        """Says that a rigid body does not move by forces."""
+        """Warns that forces do not move a rigid body."""
         body = self.prim
         while body and not body.HasAPI(UsdPhysics.RigidBodyAPI):
             body = body.GetParent()
@@ -156,7 +152,7 @@ class _Reader:
         warnings.warn(f"{self.path}, prim {self.prim.GetPath()}: {text}", stacklevel=2)
 
     def _friction(self):
-        """Our own coefficient, else the dynamic one of the material, else its static one."""
+        """Returns our own coefficient of friction, else the dynamic one of the material, else its static one."""
         said, static = next(self.values.authored("colliders.friction"), None), self.values.get("(static friction)")
         if said is None:
             return float(static or 0.0)
@@ -166,7 +162,7 @@ class _Reader:
         return friction
 
     def _name(self):
-        """Our own name, where empty that of the class, else the path."""
+        """Returns our own name, None if that is empty, or without it the path."""
         name = self.values.get("colliders.name")
         return str(self.prim.GetPath()) if name is None else name or None
 
@@ -177,7 +173,7 @@ class _Reader:
 
     @property
     def _size(self):
-        """The sizes of a solid, at first."""
+        """The sizes of a solid at its first sample."""
         found = {}
         for name in _SIZES:
             attribute = self.prim.GetAttribute(name)
@@ -190,9 +186,9 @@ class _Reader:
 
     @cached_property
     def _transforms(self):
-        """The transform (4, 4) to metres at each frame, or one where the space stands still.
+        """The transforms (4, 4) to metres at each frame, or one if the space does not move.
 
-        A scale of 0 hides it: it shrinks to a point.
+        A scale of 0 shrinks a collider to a point, which hides it.
         """
         if not moving_space(self.prim):
             return [local_to_metres(self.prim, "")]
@@ -203,9 +199,9 @@ class _Reader:
 
     @cached_property
     def _rigid(self):
-        """Scale (3, 3), positions (F, 3) [m] and quaternions (F, 4), with x = p·scale, turned, + position; None if no such are.
+        """Scale S (3, 3), positions t (F, 3) [m] and quaternions (F, 4) with x = rotate(p·S) + t; None if there are none.
 
-        Where the prim says them in this way, as those of `gprims` do, they are taken as they are.
+        If the prim has translate, orient and scale, as those of `gprims` do, their values are returned unchanged.
         """
         said = self._said
         if said is not None:
@@ -228,7 +224,7 @@ class _Reader:
 
     @property
     def _said(self):
-        """As :attr:`_rigid`, of a prim in world space and metres that has translate, orient and scale, in this order."""
+        """Like :attr:`_rigid`, for a prim in world space and metres with translate, orient and scale, in this order."""
         shape = UsdGeom.Xformable(self.prim)
         operations = {each.GetOpType(): each for each in shape.GetOrderedXformOps()}
         order = [UsdGeom.XformOp.TypeTranslate, UsdGeom.XformOp.TypeOrient, UsdGeom.XformOp.TypeScale]
@@ -250,11 +246,11 @@ class _Reader:
             and np.isfinite([*sizes, *positions.ravel()]).all()
             and (np.abs((rotations**2).sum(axis=1) - 1.0) < _SAME).all()
         ):
-            return None  # for the general way to refuse
+            return None  # the general case refuses it
         return np.diag(sizes), positions, rotations
 
     def _mesh(self, approximation, given):
-        """A `MeshCollider`, or what approximates it."""
+        """Returns a `MeshCollider`, or a collider that approximates it."""
         prim = self.prim
         if not (prim.IsA(UsdGeom.Mesh) or self.kind in SOLIDS):
             raise ValueError(f"is {self.kind}, must be a Mesh or one of {', '.join(SOLIDS)} to be a collider")
@@ -273,10 +269,10 @@ class _Reader:
         return self._approximated(approximation, points, triangles, given)
 
     def _surface(self):
-        """Points (n, 3) or (F, n, 3) in the prim's own space, and triangles (T, 3) from the front there."""
+        """Returns points (n, 3) or (F, n, 3) in the prim's own space, and triangles (T, 3) counter-clockwise there."""
         codes = self.codes if self._shape_codes else [Usd.TimeCode.EarliestTime()]
         if self.kind in SOLIDS:
-            self._size  # noqa: B018 (refuses sizes that are none)
+            self._size  # noqa: B018 (checks the sizes)
             solids = [SOLIDS[self.kind](self.prim, code) for code in codes]
             return _alone(np.array([each.vertices for each in solids])), np.array(solids[0].faces)
         refuse_moving_topology(self.prim)
@@ -298,7 +294,7 @@ class _Reader:
         return exact if same else points.astype(np.float64)
 
     def _approximation(self):
-        """How a mesh is approximated."""
+        """Returns the approximation of a mesh, and checks it."""
         own = self.values.get("(collides)")
         name = "warpcloth:collider" if isinstance(own, str) else "physics:approximation"
         wanted = own if isinstance(own, str) else self.values.get("(approximation)") or "none"
@@ -308,7 +304,7 @@ class _Reader:
         return wanted
 
     def _approximated(self, wanted, points, triangles, given):
-        """The collider that is asked for in the place of a mesh."""
+        """Returns the collider that approximates a mesh."""
         if wanted in _TAKEN_AS_NONE or (wanted != "none" and points.ndim == 3):
             reason = "it deforms" if points.ndim == 3 else "it is not approximated in that way"
             self._warn(f"its approximation {wanted} is taken as none, as {reason}: its triangles are the collider")
@@ -329,25 +325,25 @@ class _Reader:
         return Sphere(radius=radius, **given | self._shifted(centre, given))
 
     def _shifted(self, centre, given):
-        """The positions of a point of the body, by name."""
+        """Returns the positions of a point of the body, as a field by name."""
         from scipy.spatial.transform import Rotation
 
         return {"position": given["position"] + Rotation.from_quat(given["rotation"]).apply(centre)}
 
 
 def _alone(values):
-    """Values of frames, or those of the only one."""
+    """Returns the values of all frames, or of the only one without its axis."""
     return values[0] if len(values) == 1 else values
 
 
 def _volume(corners):
-    """The volume that triangles (T, 3, 3) enclose, below 0 if their fronts are inside."""
+    """Returns the volume that triangles (T, 3, 3) enclose, negative if their fronts face inwards."""
     corners = corners - corners[0, 0]
     return np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
 
 
 def _hull(points):
-    """The points (n, 3) and triangles (T, 3) of the convex hull, with their fronts outside."""
+    """Returns the points (n, 3) and triangles (T, 3) of the convex hull, with their fronts outwards."""
     from scipy.spatial import ConvexHull, QhullError  # loaded late, as importing this package stays light
 
     try:
@@ -363,7 +359,7 @@ def _hull(points):
 
 
 def _centre(points):
-    """The centre (3,) of the smallest sphere about points."""
+    """Returns the centre (3,) of the smallest sphere around points."""
     import trimesh
     from scipy.spatial import QhullError
 

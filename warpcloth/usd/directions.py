@@ -1,4 +1,4 @@
-"""Directions of elements as curves beside the prim that they are measured on: one straight segment for each element."""
+"""Directions of elements, drawn as one straight segment per element in curves beside the measured prim."""
 
 import numpy as np
 
@@ -7,15 +7,15 @@ from .modules import Gf, Sdf, Usd, UsdGeom, Vt
 from .stage import local_to_metres
 from .targets import Target
 
-# The first direction dark, the second light: both are seen on any colour of a map.
+# The first direction is dark, the second light, so that both are visible on any colour of a map.
 _COLOURS = ((0.05, 0.05, 0.05), (0.95, 0.95, 0.95))
 
 
 def check_directions(directions, mesh):
-    """Refuses directions, interpolation by name, that a mesh cannot have.
+    """Checks the names and interpolations of directions.
 
     Raises:
-        ValueError: A name that is none, or an interpolation that is not "vertex" or, of triangles, "uniform".
+        ValueError: A name is not allowed, or an interpolation is neither "vertex" nor, with triangles, "uniform".
     """
     allowed = ("vertex", "uniform") if len(mesh.triangles) else ("vertex",)
     for name, interpolation in directions.items():
@@ -32,9 +32,9 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
         stage: The stage, its edit target the layer to write to.
         prim: Path of the prim that the elements are of.
         mesh: The `Mesh`.
-        directions: "vertex" or "uniform" by name: segments of vertices or of triangles.
+        directions: "vertex" or "uniform" by name, for segments of vertices or of triangles.
         material: The material to bind, which shows displayColor.
-        nowhere: As of `segments`.
+        nowhere: As for `segments`.
 
     Returns:
         list: The `Target` of each, in the space and units of the prim's parent at its first time.
@@ -46,7 +46,7 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
     with np.errstate(invalid="ignore"):
         lengths = np.linalg.norm(mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]], axis=1)
     lengths = lengths[np.isfinite(lengths)]
-    mean_length = lengths.mean() if len(lengths) else 1.0  # without any there are no segments to be seen
+    mean_length = lengths.mean() if len(lengths) else 1.0  # any width will do without segments
     width = float(np.float32(CURVE_WIDTH * mean_length / np.cbrt(abs(np.linalg.det(transform[:3, :3])))))
     targets = []
     for row, (name, interpolation) in enumerate(directions.items()):
@@ -70,42 +70,39 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
 
 
 def segments(centres, vectors, nowhere):
-    """Ends (2E, 3) of a segment for each element, c ± v/2; without length where either is not known.
+    """Returns the ends c ± v/2 (2E, 3) [m] of a segment for each element, all finite; of length 0 if c or v is NaN.
 
     Args:
-        centres: (E, 3) [m].
-        vectors: (E, 3) [m], the segments from end to end.
-        nowhere: (3,) [m], for centres that are not known in any frame.
-
-    Returns:
-        np.ndarray: Finite, two rows for each element.
+        centres: c (E, 3) [m].
+        vectors: v (E, 3) [m].
+        nowhere: (3,) [m], position of segments if no centre is finite.
     """
     placed = np.isfinite(centres).all(axis=1)[:, None]
-    # Amid the others, so that what is not seen makes no extent larger.
+    # In the middle of the others, so that invisible segments do not enlarge the extent.
     centres = np.where(placed, centres, _middle(centres, nowhere))
     half = np.where(placed & np.isfinite(vectors).all(axis=1)[:, None], 0.5 * np.asarray(vectors), 0.0)
     return np.stack([centres - half, centres + half], axis=1).reshape(-1, 3)
 
 
 def _middle(points, otherwise):
-    """The mean of those points that are finite."""
+    """Returns the mean of the finite points, or ``otherwise`` if there are none."""
     points = points[np.isfinite(points).all(axis=1)]
     return points.mean(axis=0) if len(points) else otherwise
 
 
 def to_metres(stage, prim, time):
-    """The transform (4, 4) from the space of a prim's siblings to the stage's world space [m] at a time, for row vectors."""
+    """Returns the transform (4, 4) from the space of a prim's siblings to world space [m] at a time, for row vectors."""
     parent = stage.GetPrimAtPath(prim).GetParent()
     return local_to_metres(parent, f"prim {parent.GetPath()}, time code {time}", time)
 
 
 def middle(mesh):
-    """Position for elements that have none in any frame (3,) [m]: the middle of the finite points of the rest shape."""
+    """Returns a position (3,) [m] for elements that have none in any frame: the mean of the finite points at rest."""
     return _middle(mesh.points, np.zeros(3))
 
 
 def refuse_taken(stage, path, kind):
-    """Refuses a path where a stage has a prim of another type than the one to define there."""
+    """Raises ValueError if a stage has a prim of another type than ``kind`` at a path."""
     prim = stage.GetPrimAtPath(path)
     if prim and prim.GetTypeName() != kind:
         raise ValueError(f"prim {path}: is {prim.GetTypeName() or 'untyped'} in the source, must be free for a {kind}")

@@ -1,4 +1,4 @@
-"""All that a stage shows: its meshes, solids and linear curves, read at one time code after another."""
+"""Everything visible in a stage: its meshes, solids and linear curves, read at one time code after another."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,18 +30,18 @@ from .values import array_of, check_composed, sentences, time_codes_of
 
 @dataclass(frozen=True, eq=False)
 class DrawnPrim:
-    """A Mesh prim, a solid such as a Sphere, or linear BasisCurves as it is drawn.
+    """A Mesh prim, a solid such as a Sphere, or linear BasisCurves, for drawing.
 
     Attributes:
         path: Path of the prim.
-        cloth: Whether it is the cloth, and not part of its surroundings.
+        cloth: Whether it is cloth, as opposed to surroundings.
         count: Number of its points n.
         triangles: (T, 3) int32; empty for curves.
         edges: (E, 2) int32, the segments of curves; empty for a mesh.
-        radius: Of the curves [m].
+        radius: Radius of the curves [m].
         pins: Pinned points (p,).
-        points: Function that gives the points (n, 3) [m] in world space at a time code.
-        codes: Time codes of the samples of its points or, of points that stand still, of its space.
+        points: Function that returns the points (n, 3) [m] in world space at a time code.
+        codes: Time codes of the samples of its points, or if these are constant, of its transforms.
     """
 
     path: str
@@ -61,8 +61,8 @@ class DrawnStage:
 
     Attributes:
         prims: List of `DrawnPrim`.
-        codes: Time codes of the frames (F,): those of the cloth, or else of its surroundings; one where nothing moves.
-        rate: Time codes a second.
+        codes: Time codes of the frames (F,): those of the cloth, or else of its surroundings; one if nothing moves.
+        rate: Time codes per second.
         up_axis: "Y" or "Z".
         stage: The stage, whose prims are invalid once it is gone.
     """
@@ -77,19 +77,19 @@ class DrawnStage:
 def read_drawn(path, prim=None):
     """Reads all meshes, solids and linear curves that a stage shows. Solids keep their first size.
 
-    The cloth is the prim that is named or that an earlier run animated, or else each prim whose points move, or else all of
-    them. Prims that are invisible, guides or proxies, and prototypes of point instancers are left out.
+    The cloth is the named prim, else the prim that an earlier run animated, else each prim whose points move, else all prims.
+    Invisible prims, guides, proxies and prototypes of point instancers are left out.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
         prim: Path or name of the cloth, or None.
 
     Returns:
-        DrawnStage: It keeps the stage open, and has read the first frame only.
+        DrawnStage: It keeps the stage open. Only the first frame has been read.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no stage or shows no mesh, solid or linear curves; there is no such prim; a prim is broken.
+        ValueError: It is no stage, or shows no mesh, solid or linear curves; there is no such prim; or a prim is broken.
     """
     with sentences(path):
         stage = posed(open_stage(path), -np.inf, np.inf)
@@ -112,7 +112,7 @@ def read_drawn(path, prim=None):
 
 
 def draw_colliders(scene):
-    """The colliders of a :class:`warpcloth.Scene` as a `DrawnStage` of their own, whose time codes are frames."""
+    """Returns the colliders of a :class:`warpcloth.Scene` as a `DrawnStage` whose time codes are frames."""
     layer, *_rest = scene_layer(scene.mesh, None, scene.up_axis, "Cloth")
     define_colliders(layer, scene.colliders, scene.mesh)
     stage = Usd.Stage.Open(layer)
@@ -122,7 +122,7 @@ def draw_colliders(scene):
 
 
 def _shown(stage):
-    """The meshes and linear curves of a stage that a viewer shows."""
+    """Returns the visible meshes, solids and linear curves of a stage."""
     walk = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     for prim in walk:
         if prim.IsA(UsdGeom.PointInstancer):
@@ -138,7 +138,7 @@ def _shown(stage):
 
 
 def _codes(prim):
-    """Time codes of the samples of a prim's points, or else of its space."""
+    """Returns the time codes of the samples of a prim's points, or else of its transforms."""
     codes = time_codes_of(UsdGeom.PointBased(prim).GetPointsAttr()) if prim.IsA(UsdGeom.PointBased) else []
     ancestor = prim
     while not codes and ancestor and not ancestor.IsPseudoRoot():
@@ -148,7 +148,7 @@ def _codes(prim):
 
 
 def _drawn(prim, path, cloth, codes):
-    """The `DrawnPrim` of a prim, None of surroundings without points."""
+    """Returns the `DrawnPrim` of a prim, or None for surroundings without points."""
     check_composed(prim, path)
     where = f"{path}, prim {prim.GetPath()}"
     first = codes[0] if codes else Usd.TimeCode.Default()
@@ -183,7 +183,7 @@ def _drawn(prim, path, cloth, codes):
             corners, triangles = face_corners(prim, len(start))
             triangles, edges, radius = corners[triangles], np.empty((0, 2), np.int32), 0.0
             linear = local_to_metres(prim, where, first)[:3, :3]
-            if np.linalg.slogdet(linear)[0] < 0:  # as the mesh is read elsewhere, with its front outside
+            if np.linalg.slogdet(linear)[0] < 0:  # a reflection reverses the orientation of triangles
                 triangles = triangles[:, ::-1]
         else:
             triangles, edges = np.empty((0, 3), np.int32), curve_edges(prim, len(start)).astype(np.int32)
@@ -197,7 +197,7 @@ def _drawn(prim, path, cloth, codes):
 
 
 def _radius(prim, points, edges, transform):
-    """Half the mean width of curves [m], in part of their mean segment where they say none."""
+    """Returns half the mean width of curves [m], by default a fraction of their mean segment."""
     widths = array_of(UsdGeom.Curves(prim).GetWidthsAttr())
     if widths is not None and len(widths) and np.isfinite(widths).all() and widths.mean() > 0.0:
         return 0.5 * float(widths.mean()) * abs(np.linalg.det(transform[:3, :3])) ** (1 / 3)

@@ -34,7 +34,7 @@ _VECTORS = ("points", "velocities")
 
 
 def open_sequence(path, prim, fps):
-    """Opens the frames of a stage for :func:`warpcloth.open_sequence`; of several cloths that a run animated, those of all."""
+    """Opens the frames of a stage for :func:`warpcloth.open_sequence`; if a run animated several cloths, those of all."""
     prims = [] if prim is not None else [str(each.GetPath()) for each in animated_prims(open_stage(path))]
     if len(prims) > 1:
         return _sequence_of_cloths(path, prims, fps)
@@ -52,7 +52,7 @@ def open_sequence(path, prim, fps):
 
 
 def _sequence_of_cloths(path, prims, fps):
-    """The frames of several cloths, as one mesh whose parts are the cloths."""
+    """Returns the frames of several cloths, as one mesh whose parts are the cloths."""
     frames = JoinedFrames(path, prims)
     each = [read_stage_mesh(path, prim, Surface, frames.time_codes[0]) for prim in prims]
     joined = Mesh.join({prim.rsplit("/", 1)[1]: stage.mesh for prim, stage in zip(prims, each, strict=True)})
@@ -65,19 +65,18 @@ def _sequence_of_cloths(path, prims, fps):
 
 
 class FrameSequence:
-    """Sampled points, velocities or numbers of a prim, as an array that reads from the file what is asked for.
+    """Sampled points, velocities or numbers of a prim, as an array that reads frames from the file on demand.
 
-    A frame is read when it is indexed, and nothing is kept, so memory stays flat however many frames there are.
-    `np.asarray(sequence)` reads all of them. Once the file has been written again, by another run or the same, reading raises
-    a RuntimeError: USD may still hold some of the earlier frames, and would mix them with the new ones. After the file was
-    deleted reading goes on for as long as USD holds it. A frame with another number of values than the first one, or of points
-    with other faces than the prim has, raises a ValueError.
+    Indexing reads a frame and keeps nothing, so that memory stays constant. `np.asarray(sequence)` reads all frames. If the
+    file has been written again since, reading raises a RuntimeError, because USD may hold some of the earlier frames and mix
+    them with the new ones. If the file was deleted, reading works while USD holds it. A frame with another number of values
+    than the first, or whose faces differ from those of the prim, raises a ValueError.
 
-    Points of a prim whose transform is animated are taken where that puts them at their own time codes. The velocities of that
-    space, along its way since the frame before, are added to those of the prim.
+    If the prim's transform is animated, points are transformed at their own time codes, and the velocity of the transform since
+    the previous frame is added to the velocities of the prim.
 
     Attributes:
-        shape: (frames, n, 3); of a primvar (frames, n), or where it is uniform (frames, faces of the prim).
+        shape: (frames, n, 3); for a primvar (frames, n), or if it is uniform (frames, faces of the prim).
         dtype: float32.
         time_codes: Time code of each frame (frames,).
         times: Seconds since the first frame (frames,).
@@ -92,17 +91,17 @@ class FrameSequence:
             path: A .usd, .usda, .usdc or .usdz file.
             prim: Path or name of the prim; see `read_stage_mesh`.
             attribute: "points", in world space [m], "velocities" [m/s], or a primvar of single numbers, "primvars:<name>".
-            scale: Factor on a primvar, for another unit than the file's.
+            scale: Factor on a primvar, to convert its unit.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is no stage, the prim cannot be told, or the attribute is not animated or of another type.
+            ValueError: It is no stage, the prim is ambiguous, or the attribute is not animated or of another type.
         """
         if attribute not in _VECTORS and not str(attribute).startswith("primvars:"):
             raise ValueError(f'attribute is {attribute!r}; it must be "points", "velocities" or a primvar, "primvars:<name>"')
-        path = followed(path)  # USD looks for the frames beside a link, and not beside the file that it stands for
+        path = followed(path)  # USD would look for the frames beside a link, not beside the file behind it
         self._file = os.path.abspath(path)
-        self._identity = identity(self._file)  # before it is opened, so that no change is missed
+        self._identity = identity(self._file)  # before opening it, so that no change is missed
         with sentences(path):
             self._open(path, prim, attribute, scale)
 
@@ -126,13 +125,13 @@ class FrameSequence:
         if self._is_velocity:
             self._transform[3, :3] = 0.0
         self._scale = 1.0 if vectors else scale
-        self._faces = []  # what is sampled of the faces, and has to stay as it is
+        self._faces = []  # sampled attributes of the faces, which must not change
         if attribute == "points" and found.IsA(UsdGeom.Mesh):
             mesh = UsdGeom.Mesh(found)
             faces = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr())
             with self._located():
                 self._faces = [(sampled, topology(sampled)) for sampled in faces if sampled.GetNumTimeSamples()]
-        # Curves show a vertex several times where they meet; the first is read.
+        # Where curves meet, a vertex has several points; the first is read.
         self._points = None
         self._components = (3,) if vectors else ()
         with self._located():
@@ -145,12 +144,12 @@ class FrameSequence:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Real paths of the files that the stage is made of."""
+        """Real paths of the files of the stage."""
         return tuple(sorted(files_of_stage(self._stage)))
 
     @property
     def ndim(self) -> int:
-        """Three, of a primvar two."""
+        """3, or 2 for a primvar."""
         return len(self.shape)
 
     def __len__(self) -> int:
@@ -163,7 +162,7 @@ class FrameSequence:
         return (self._read(frame) for frame in range(len(self)))
 
     def __getitem__(self, key: Any) -> np.ndarray:
-        """Frames as NumPy has them: an integer gives (n, 3), a slice or list (k, n, 3), more indices a part of that."""
+        """Returns frames, indexed as in NumPy: an integer gives (n, 3), a slice or list (k, n, 3), further indices a part."""
         frames, rest = (key[0], key[1:]) if isinstance(key, tuple) and key else (key, ())
         if frames is Ellipsis or isinstance(frames, tuple):
             return np.asarray(self)[key]
@@ -182,13 +181,10 @@ class FrameSequence:
         return result if dtype is None else result.astype(dtype, copy=False)
 
     def exact(self, frame: int) -> np.ndarray:
-        """One frame of points or velocities in float64, which holds more of what a transform makes of the file's float32.
+        """Returns one frame of points [m] or velocities [m/s] (n, 3) in float64, so that a transform adds no float32 rounding.
 
         Args:
             frame: Its number, from 0.
-
-        Returns:
-            np.ndarray: (n, 3) [m] or [m/s].
         """
         values = self._values(frame).astype(np.float64)
         if not self._moving:
@@ -199,12 +195,12 @@ class FrameSequence:
         return values @ now[:3, :3] + self._velocities_of_space(frame, now)
 
     def _space(self, frame):
-        """The transform (4, 4) of a moving space at a frame."""
+        """Returns the transform (4, 4) of a moving space at a frame."""
         code = self.time_codes[frame]
         return local_to_metres(self._moving, f"{self._where}, time code {code:g}", code)
 
     def _velocities_of_space(self, frame, now):
-        """Velocities (n, 3) [m/s] of the points of a moving space."""
+        """Returns the velocities (n, 3) [m/s] of points fixed in a moving space."""
         if frame == 0:
             return 0.0
         with self._located():

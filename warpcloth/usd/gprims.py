@@ -1,4 +1,4 @@
-"""Colliders written as prims of a stage, with their motion and what UsdPhysics says about them."""
+"""Writes colliders as prims of a stage, with their motion and UsdPhysics schemas."""
 
 import numpy as np
 
@@ -10,18 +10,18 @@ from .modules import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from .targets import vertex_normals
 
 _COLOUR = (0.55, 0.55, 0.6)
-_SPREAD = 4.0  # of a plane, in sizes of the cloth
+_SPREAD = 4.0  # size of a drawn plane, in sizes of the cloth
 
 
 def define_colliders(layer, colliders, mesh):
     """Defines a prim for each collider, such as a Sphere, in a layer of :func:`.layers.scene_layer`, with its motion.
 
-    `colliders.read_colliders` gives the same motion and shape again, bit for bit.
+    `colliders.read_colliders` returns the same motion and shape, bit for bit.
 
     Args:
         layer: The layer.
-        colliders: Of a scene.
-        mesh: The cloth, which says how much of a plane is drawn.
+        colliders: Colliders of a scene.
+        mesh: The cloth, from which the size of a drawn plane follows.
     """
     if not colliders:
         return
@@ -37,7 +37,7 @@ def define_colliders(layer, colliders, mesh):
 
 
 def _free_path(stage, parent, name):
-    """A path below a prim by a name, counted where that is taken."""
+    """Returns a path below a prim with a name, numbered if it is taken."""
     name = Tf.MakeValidIdentifier(name)
     path, number = parent.AppendChild(name), 1
     while stage.GetPrimAtPath(path):
@@ -47,7 +47,7 @@ def _free_path(stage, parent, name):
 
 
 def _define(stage, path, collider, mesh):
-    """The primitive about the origin, its axis along y."""
+    """Defines the primitive of a collider at the origin, its axis along y."""
     if isinstance(collider, MeshCollider):
         return _define_mesh(stage, path, collider)
     _half, radius = collider.core
@@ -76,7 +76,7 @@ def _define(stage, path, collider, mesh):
 
 
 def _define_mesh(stage, path, collider):
-    """Its triangles, with a time sample of the points a frame where they deform."""
+    """Defines a mesh with the triangles of a collider; if it deforms, with a time sample of the points for each frame."""
     gprim, frames = UsdGeom.Mesh.Define(stage, path), collider.frames
     gprim.CreateFaceVertexCountsAttr(np.full(len(collider.triangles), 3, np.int32))
     gprim.CreateFaceVertexIndicesAttr(collider.triangles.ravel())
@@ -84,7 +84,7 @@ def _define_mesh(stage, path, collider):
     gprim.CreateDoubleSidedAttr(not collider.closed)
     gprim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     exact = np.array_equal(frames, frames.astype(np.float32))
-    times = [Usd.TimeCode.Default(), *(range(len(frames)) if len(frames) > 1 else ())]  # viewers want a shape at no time too
+    times = [Usd.TimeCode.Default(), *(range(len(frames)) if len(frames) > 1 else ())]  # viewers need a default shape too
     for time, points in zip(times, (frames[0], *frames), strict=False):
         gprim.CreatePointsAttr().Set(points.astype(np.float32), time)
         gprim.CreateNormalsAttr().Set(vertex_normals(points, collider.triangles).astype(np.float32), time)
@@ -95,7 +95,7 @@ def _define_mesh(stage, path, collider):
 
 
 def _move(gprim, collider):
-    """Its position and rotation, with a time sample a frame where it moves, and the scale of a box."""
+    """Writes position, rotation and the scale of a box; if the collider moves, with a time sample for each frame."""
     translate, orient = gprim.AddTranslateOp(), gprim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
     poses = collider.poses
     for frame, pose in enumerate(poses):
@@ -108,7 +108,7 @@ def _move(gprim, collider):
 
 
 def _add_physics(stage, prim, collider):
-    """That it is a collider, kinematic if it moves, its friction, and its name."""
+    """Writes the UsdPhysics schemas of a collider, kinematic if it moves, its friction and its name."""
     UsdPhysics.CollisionAPI.Apply(prim)
     if prim.IsA(UsdGeom.Mesh):
         UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(UsdPhysics.Tokens.none)

@@ -1,4 +1,4 @@
-"""The parts that all frames share: the layer that an animation is put on, a complete stage or one over an artist's."""
+"""The layer below an animation, with everything that is constant: a complete stage, or a layer over an artist's stage."""
 
 import os
 from dataclasses import replace
@@ -18,7 +18,7 @@ from .stage import (
 from .targets import SAMPLED, Target
 from .values import array_of
 
-# Attributes of the artist's prim that would be used instead of ours, or beside ours with values of another motion.
+# Attributes of the artist's prim that would override ours, or belong to another motion.
 _BLOCKED = (
     "accelerations",
     "primvars:normals",
@@ -29,12 +29,12 @@ _BLOCKED = (
 )
 _COLOUR = (0.17, 0.35, 0.58)
 _LINE_COLOUR = (0.05, 0.05, 0.05)
-# Curves are drawn as tubes this thick, as a part of the mean edge length.
+# Width of drawn curves, relative to the mean edge length.
 CURVE_WIDTH = 0.05
 
 
 def scene_layer(mesh, pins, up_axis, name):
-    """A complete stage of one cloth at rest, to be animated.
+    """Builds a complete stage of one cloth at rest, to be animated.
 
     Args:
         mesh: The `Mesh`.
@@ -46,7 +46,7 @@ def scene_layer(mesh, pins, up_axis, name):
         The layer, the `Target` in it, and its root's metadata.
 
     Raises:
-        ValueError: The name, or that of a pin, is none.
+        ValueError: The name of the prim or of a pin is not allowed.
     """
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
@@ -60,7 +60,7 @@ def scene_layer(mesh, pins, up_axis, name):
 
 
 def define_cloth(layer, mesh, pins, name):
-    """Defines a cloth at rest in a layer of `scene_layer`, which says what the parameters are, and returns its `Target`."""
+    """Defines a cloth at rest in a layer of `scene_layer`, with its parameters, and returns its `Target`."""
     if not Sdf.Path.IsValidIdentifier(name):
         raise ValueError(f"prim is {name!r}; it must be a name of letters, digits and _ where there is no source")
     stage, path = Usd.Stage.Open(layer), f"/World/{name}"
@@ -92,7 +92,7 @@ def define_lines(layer, mesh, lines):
     """Defines linear curves beside a cloth, along pairs of vertices of its mesh.
 
     Args:
-        layer: Of `scene_layer`.
+        layer: A layer of `scene_layer`.
         mesh: The `Mesh`.
         lines: Pairs (E, 2) and a thickness [m] by name. The name of the prim keeps only letters, digits and _.
 
@@ -116,7 +116,7 @@ def define_lines(layer, mesh, lines):
 
 
 def _define_curves(stage, path, paths, width):
-    """Makes linear curves along paths of vertices; where curves meet, each has a point for the vertex."""
+    """Defines linear curves along paths of vertices; where curves meet, each has its own point."""
     width = float(np.float32(width))
     curves = UsdGeom.BasisCurves.Define(stage, path)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
@@ -129,14 +129,14 @@ def _define_curves(stage, path, paths, width):
 
 
 def edge_paths(edges, count):
-    """Paths along edges that use each edge once, found greedily from the vertices of odd valence first.
+    """Returns paths along edges that use each edge once, found greedily, from the vertices of odd valence first.
 
     Args:
         edges: (E, 2).
         count: Number of vertices n.
 
     Returns:
-        list: Vertices of each path, at least two; a vertex without edges has a path of no length, so that it is kept.
+        list: Vertices of each path, at least two. A vertex without edges has a path of length 0.
     """
     neighbours = [[] for _ in range(count)]
     for edge, (a, b) in enumerate(np.asarray(edges).tolist()):
@@ -161,7 +161,7 @@ def edge_paths(edges, count):
 
 
 def _add_primvars(geometry, mesh):
-    """Texture coordinates where the mesh has them, and a colour that the material reads."""
+    """Adds texture coordinates, if the mesh has them, and a colour that the material reads."""
     primvars = UsdGeom.PrimvarsAPI(geometry)
     if mesh.texture_coordinates is not None and len(mesh.triangles):
         st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
@@ -170,7 +170,7 @@ def _add_primvars(geometry, mesh):
 
 
 def _add_pins(geometry, target, pins, count):
-    """A GeomSubset of points for each set of pins, in a family of their own, which may overlap."""
+    """Adds a GeomSubset of points for each set of pins, in a family of their own; sets may overlap."""
     for name, vertices in pins.items():
         if not Sdf.Path.IsValidIdentifier(name):
             raise ValueError(f"pins: {name!r} must be a name of letters, digits and _, not starting with a digit")
@@ -190,7 +190,7 @@ def _add_pins(geometry, target, pins, count):
 
 
 def define_material(stage, path):
-    """A UsdPreviewSurface that reads displayColor: viewers that ignore displayColor itself show it through this."""
+    """Defines a UsdPreviewSurface that reads displayColor, for viewers that ignore displayColor itself."""
     material = UsdShade.Material.Define(stage, path)
     surface = UsdShade.Shader.Define(stage, f"{path}/Surface")
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -212,25 +212,25 @@ def bind_material(prim, material):
 
 
 def over_layer(source, prim, mesh, primvars, history, layer=None):
-    """A layer of opinions on the artist's prim, to be animated: it says how to read normals, and has no points.
+    """Builds a layer of opinions on the artist's prim, to be animated. It has no points, and sets how normals are read.
 
-    The artist's default points stay the rest shape; only where there are none (samples alone) ours are given.
+    The artist's default points stay the rest shape. If there are none, only samples, ours are written.
 
     Args:
         source: File of the stage.
         prim: Path or name of the prim, or None.
         mesh: The `Mesh` that is simulated.
-        primvars: Interpolation of those that will be sampled, by name; the artist's of the same name are blocked.
-        history: Types of the primvars of the history of a run, likewise.
+        primvars: Interpolation of sampled primvars, by name; the artist's primvars of the same name are blocked.
+        history: Types of the primvars of the history of a run, by name; likewise.
         layer: A layer of other prims of the same source, to which this one is added, or None.
 
     Returns:
         The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, real paths of all files of the
-        artist's stage, and a function that gives the transform of the prim, as in `StageMesh`, at a time code of that stage, or
-        None where it stands still.
+        artist's stage, and a function that returns the transform of the prim, as in `StageMesh`, at a time code of that stage,
+        or None if it does not move.
 
     Raises:
-        ValueError: As `read_stage_mesh` and `artist_prim`; a primvar of the artist has another type than float[].
+        ValueError: As for `read_stage_mesh` and `artist_prim`; or a primvar of the artist has another type than float[].
     """
     surroundings = read_stage_mesh(source, prim)
     stage, artist = artist_prim(surroundings, mesh)
@@ -265,14 +265,14 @@ def over_layer(source, prim, mesh, primvars, history, layer=None):
 
 
 def artist_prim(surroundings, mesh):
-    """The prim that a layer is to be put over.
+    """Returns the artist's prim for a layer over it, and checks that the mesh fits.
 
     Args:
         surroundings: The `StageMesh`.
-        mesh: The `Mesh` that the frames are of.
+        mesh: The `Mesh` of the frames.
 
     Returns:
-        The stage, which has to be kept, and the prim in it.
+        The stage, which must be kept alive, and the prim in it.
 
     Raises:
         ValueError: The prim is an instance; the mesh has another number of vertices or other triangles.
@@ -291,7 +291,7 @@ def artist_prim(surroundings, mesh):
 
 
 def artist_target(artist, surroundings, primvars, **options):
-    """The `Target` of an artist's prim; more of its fields by name."""
+    """Returns the `Target` of an artist's prim; ``options`` are further fields."""
     half_width = 0.0
     if artist.IsA(UsdGeom.Curves):
         half_width = float(_widths(artist, surroundings).max(initial=0.0)) / 2
@@ -308,7 +308,7 @@ def artist_target(artist, surroundings, primvars, **options):
 
 
 def _widths(curves, surroundings):
-    """Widths (k,) of curves, in the units of the prim."""
+    """Returns the widths (k,) of curves, in the units of the prim."""
     try:
         widths = array_of(UsdGeom.Curves(curves).GetWidthsAttr())
         widths = np.empty(0) if widths is None else widths
@@ -320,7 +320,7 @@ def _widths(curves, surroundings):
 
 
 def declare_primvars(layer, artist, target, path):
-    """Declares the sampled primvars in a layer, and blocks what the artist has under their names.
+    """Declares the sampled primvars in a layer, and blocks the artist's primvars of the same names.
 
     Raises:
         ValueError: One of the artist's has another type.
@@ -341,7 +341,7 @@ def declare_primvars(layer, artist, target, path):
 
 
 def _block(artist, over, name):
-    """Blocks what an attribute has, in an over of its prim; whether there was anything."""
+    """Blocks an attribute in an over of its prim; returns whether it had a value."""
     attribute = artist.GetAttribute(name)
     if not (attribute and attribute.HasAuthoredValue()):
         return False
@@ -350,12 +350,12 @@ def _block(artist, over, name):
 
 
 def files_of_stage(stage):
-    """Real paths of all files that a stage is made of."""
+    """Returns the real paths of all files of a stage."""
     return {os.path.realpath(used.realPath) for used in stage.GetUsedLayers() if used.realPath}
 
 
 def root_metadata(stage):
-    """Units, up axis and default prim: USD reads them from a root layer only, so a root over it has to repeat them."""
+    """Returns units, up axis and default prim. A root layer over it must repeat them, because USD reads no others."""
     facts = {
         "metersPerUnit": UsdGeom.GetStageMetersPerUnit(stage),
         "upAxis": UsdGeom.GetStageUpAxis(stage),
@@ -367,7 +367,7 @@ def root_metadata(stage):
 
 
 def flattened_layer(base_paths, describe, named):
-    """One layer with everything that the given layers compose to, without their clips.
+    """Flattens layers, without their clips, into one layer.
 
     Args:
         base_paths: Files of the layers, strongest first.
@@ -378,7 +378,7 @@ def flattened_layer(base_paths, describe, named):
         Sdf.Layer: Anonymous.
     """
     root = Sdf.Layer.CreateAnonymous(".usda")
-    # Rates first: they decide how the times of the layers below are scaled.
+    # Rates first, because they scale the times of the layers below.
     describe(root)
     root.subLayerPaths = [os.path.abspath(path) for path in base_paths]
     stage = Usd.Stage.Open(root)
@@ -394,6 +394,6 @@ def named_from(folder):
 
 
 def relative_path(path, folder):
-    """Path of a file as a layer in a folder names it: "./…", for bare names are searched for elsewhere too."""
+    """Returns the path of a file for a layer in a folder, with "./", because USD searches for bare names elsewhere too."""
     path = os.path.relpath(os.path.abspath(path), os.path.abspath(folder)).replace(os.sep, "/")
     return path if path.startswith("../") else f"./{path}"

@@ -1,4 +1,4 @@
-"""Writing measures of a cloth: numbers and colours of its elements, over the stage that was measured or on one of their own."""
+"""Writes measures of a cloth, numbers and colours of its elements, over the measured stage or as a stage of their own."""
 
 import math
 import warnings
@@ -29,19 +29,18 @@ from .targets import DISPLAY_COLOUR, Interpolation, check_primvars
 
 
 class MeasureWriter(ChunkWriter):
-    """Writes measures of vertices or triangles as sampled primvars: `ChunkWriter` says in what files.
+    """Writes measures of vertices or triangles as sampled primvars, in the files of `ChunkWriter`.
 
-    With a source the result is a layer over the stage that was measured, which it sublayers by a relative path and never
-    changes. Points stay the source's own, with its time codes and rates. To the measured prim it adds `primvars:<name>` and,
-    where a measure is shown in colours, `primvars:displayColor`, doubleSided, and a material below it that shows
-    displayColor, bound instead of the prim's own and those of its faces. Without a source it is a complete stage,
-    /World/Cloth, with points, normals and extent too.
+    With a source, the result is a layer over the measured stage, which it sublayers by a relative path and never changes.
+    Points, time codes and rates are those of the source. The layer adds `primvars:<name>` to the measured prim. If a measure is
+    shown in colours, it also adds `primvars:displayColor`, doubleSided, and a material that shows displayColor, bound in place
+    of those of the prim and its faces. Without a source it is a complete stage, /World/Cloth, with points, normals and extent.
 
-    A value that is not known is NaN, in the file too. An artist's faces with more corners than three have the mean over
-    those of their triangles that have a value, and the mean of the same triangles' colours.
+    An unknown value is NaN, in the file too. An artist's face with more than three corners has the mean value, and the mean
+    colour, of its triangles that have a value.
 
-    Directions are linear BasisCurves beside the prim, `<prim>_<name>`: a segment for each element, moving with it. Beside a
-    prim that is a root they are roots too, and a reference to the default prim has none of them.
+    Directions are linear BasisCurves beside the prim, `<prim>_<name>`, with a segment for each element that moves with it. If
+    the prim is a root, they are roots too, and a reference to the default prim does not include them.
 
     Attributes:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
@@ -64,19 +63,18 @@ class MeasureWriter(ChunkWriter):
         """Checks everything that can be checked before the first frame; writes nothing yet.
 
         Args:
-            output: File to write: as of `AnimationWriter`.
-            mesh: The `Mesh` or `Surface`; its points are the rest shape. With a source: as read from it, and only there may
-                some not be finite.
-            primvars: "vertex", a value for each vertex, or "uniform", one for each triangle, by name of each primvar.
-            coloured: Name of the primvar that displayColor shows, or None: no colours.
+            output: File to write, as for `AnimationWriter`.
+            mesh: The `Mesh` or `Surface`; its points are the rest shape. With a source, as read from it; only then may points
+                be infinite or NaN.
+            primvars: "vertex", a value for each vertex, or "uniform", one for each triangle, by name of the primvar.
+            coloured: Name of the primvar that displayColor shows, or None for no colours.
             directions: "vertex" or "uniform" by name of each set of segments, or None.
-            source: The `StageMesh` that was measured, or several of one stage, whose meshes are one after another in ``mesh``;
-                or None.
+            source: The measured `StageMesh`, or several of one stage, whose meshes follow one another in ``mesh``; or None.
             fps: Frames per second, also time codes per second; a source has its own.
             up_axis: "Y" or "Z", by default that of the mesh; a source has its own.
-            chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
-            metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers, texts or dicts
-                of such.
+            chunk: Number of frames per chunk, which memory holds, and which a killed process may lose.
+            metadata: Further entries of the root layer's customLayerData["warpcloth"]: numbers, texts or dicts of these by
+                name.
 
         Raises:
             FileNotFoundError: The output's folder does not exist.
@@ -84,7 +82,7 @@ class MeasureWriter(ChunkWriter):
                 instance, is of another mesh, or has a primvar of another type under one of the names.
         """
         super().__init__(output, mesh, chunk)
-        # Its own, or earlier measures and the motion of a result that was measured would not be seen.
+        # A set of its own, so that it does not hide earlier measures and the motion of the source.
         self._clip_set = f"measures_{self.run.name[-8:]}"
         up_axis = up_axis or mesh.up_axis or "Y"
         check_scene(fps, up_axis)
@@ -124,7 +122,7 @@ class MeasureWriter(ChunkWriter):
         targets = define_directions(stage, target.prim, mesh, directions, material, self._nowhere) if directions else []
         self._own = len(own)
         self._put_on(rest, [*own, *targets], facts, metadata, path, files, refit)
-        if len(own) > 1:  # readers that look for one cloth would take the first
+        if len(own) > 1:  # otherwise readers of one cloth would read the first
             del self._root_metadata["customLayerData"][METADATA_KEY]["prim"]
 
     def append(
@@ -138,13 +136,12 @@ class MeasureWriter(ChunkWriter):
         """Adds a frame; every `chunk` frames they are written.
 
         Args:
-            time_code: Time code of the frame in the source, or its number; after the one before, at any distance.
-            primvars: Values by name of all that were declared, (n,) or, where uniform, (T,). NaN where there is none.
-            colours: (n, 3) or (T, 3) linear RGB, as the primvar that they show; if there is one.
-            directions: Centres and vectors [m], both (n, 3) or (T, 3) in world space, by name of all that were declared.
-                Where either is NaN there is no segment.
-            points: (n, 3) [m], world space; without a source. A frame with points that are not finite cannot be drawn:
-                leave it out.
+            time_code: Time code of the frame in the source, or its number; greater than the last.
+            primvars: Values of all declared primvars by name, (n,) or, if uniform, (T,); NaN if unknown.
+            colours: Linear RGB (n, 3) or (T, 3), like the primvar that they show, if there is one.
+            directions: Centres and vectors [m] of all declared directions by name, both (n, 3) or (T, 3), in world space. If
+                either is NaN, there is no segment.
+            points: (n, 3) [m], world space; without a source. Leave out frames with points that are not finite.
 
         Raises:
             ValueError: Other values than declared, a wrong shape, a value that is infinite as float32, with the frame and
@@ -165,7 +162,7 @@ class MeasureWriter(ChunkWriter):
         self._append(time, {f"{t.prim}.{name}": value for t, own in samples for name, value in own.items()})
 
     def _samples(self, vectors, primvars, colours):
-        """Samples of the prims, each with its part of the values."""
+        """Returns the samples of the prims, each with its part of the values."""
         starts = {"vertex": 0, "uniform": 0}
         for k, target in enumerate(self._targets[: self._own]):
             mesh = self._sources[k].mesh if self._own > 1 else None
@@ -177,7 +174,7 @@ class MeasureWriter(ChunkWriter):
             starts = {kind: part.stop for kind, part in parts.items()}
 
     def _curves(self, time, directions):
-        """Samples of the curves, in the space that they have at a time."""
+        """Returns the samples of the curves, in their space at a time."""
         if directions.keys() != self._directions.keys():
             names = [", ".join(map(repr, given)) or "none" for given in (directions, self._directions)]
             raise ValueError(f"directions: {names[0]} at frame {self.frames}, must be {names[1]}")
@@ -197,7 +194,7 @@ def _check_given(name, value, wanted):
 
 
 def _scene(mesh, up_axis, primvars, coloured):
-    """A complete stage to be measured on, as a layer; the `Target` in it, and its root's metadata."""
+    """Returns a complete stage for measures as a layer, its `Target` and its root metadata."""
     rest, target, facts = scene_layer(mesh, None, up_axis, "Cloth")
     target = replace(target, vectors=("points", "normals", "extent"), primvars=primvars, coloured=coloured)
     target.declare(rest, target.attributes)
@@ -208,7 +205,7 @@ def _scene(mesh, up_axis, primvars, coloured):
 
 
 def _over(rest, source, mesh, primvars, coloured):
-    """Adds primvars over the artist's prim to a layer; returns the `Target`, and a stage with the layer as its edit target."""
+    """Adds primvars on the artist's prim to a layer; returns the `Target`, and a stage with the layer as edit target."""
     stage, artist = artist_prim(source, mesh)
     target = artist_target(artist, source, primvars, vectors=(), coloured=coloured)
     Sdf.CreatePrimInLayer(rest, target.prim)
@@ -228,7 +225,7 @@ def _facts_of(stage, source):
 
 
 def _show_colours(stage, source, with_mesh):
-    """A material below the prim that shows displayColor; bound to the prim and its faces, if these are coloured."""
+    """Defines a material below the prim that shows displayColor, and binds it to the prim and its faces."""
     path = f"{source.prim}/DisplayColour"
     refuse_taken(stage, path, "Material")
     material = define_material(stage, path)
@@ -239,7 +236,7 @@ def _show_colours(stage, source, with_mesh):
     parts = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), familyName=UsdShade.Tokens.materialBind)
     for part in (prim, *(subset.GetPrim() for subset in parts)):
         bind_material(part, material)
-        # Materials for a purpose come before those for all.
+        # Materials bound for a purpose override those for all purposes.
         for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
             bound = UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(purpose)[0]
             if bound and bound.GetPath() != path:

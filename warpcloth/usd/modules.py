@@ -1,6 +1,6 @@
-"""The modules of pxr, loaded when one of their names is first used: importing this package stays light.
+"""The modules of pxr, loaded when one of their names is first used, so that this package imports quickly.
 
-All are loaded at once, with interrupts held back, because pxr would swallow one and go on with half of its modules.
+All are loaded together, with interrupts delayed, because pxr would swallow an interrupt and continue half loaded.
 """
 
 import math
@@ -19,7 +19,7 @@ def _load():
 
 
 class _Module:
-    """Stands for a module of pxr, and takes over each of its names when that is first used."""
+    """A proxy for a module of pxr, which copies each name on first use."""
 
     def __init__(self, name):
         self._name = name

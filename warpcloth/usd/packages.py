@@ -1,4 +1,4 @@
-"""Writes packages (.usdz): one file with a layer and the files that it refers to, and nothing else from the machine."""
+"""Writes packages (.usdz): one file with a layer and the files to which it refers."""
 
 import glob
 import os
@@ -12,14 +12,14 @@ _TILES = "<UDIM>"
 
 
 class Contents:
-    """The files that a layer refers to, with their names in a package.
+    """The files to which a layer refers, with their names in a package.
 
-    A stage can name any file on the machine without the user knowing. Only files in or below the folders of its layers are
-    packed; `UsdUtils.CreateNewUsdzPackage` would pack all of them.
+    A stage can refer to any file on the machine without the knowledge of the user. So only files in or below the folders of its
+    layers are packed; `UsdUtils.CreateNewUsdzPackage` would pack all.
     """
 
     def __init__(self, folder):
-        """Starts with nothing.
+        """Starts empty.
 
         Args:
             folder: A folder for files that are extracted from packages.
@@ -27,8 +27,9 @@ class Contents:
         self._folder, self._names = folder, {}
 
     def named(self, path, stage):
-        """Returns the path of a file in the package. With a warning, a file that is not packed keeps its path, a missing one
-        gets "".
+        """Returns the path of a file in the package.
+
+        A file that is not packed keeps its path, and a missing file gets "", both with a warning.
 
         Args:
             path: Path of the file in the flattened layer.
@@ -50,7 +51,7 @@ class Contents:
         return f"{os.path.dirname(self._names[files[0]])}/{os.path.basename(path.removesuffix(']'))}"
 
     def _files(self, path):
-        """Finds the files of a path (one, the tiles of a texture, or none), and their origins: themselves or a package."""
+        """Returns the files of a path (one, the tiles of a texture, or none), and their origins: themselves or a package."""
         if _TILES in path:
             head, tail = map(glob.escape, path.split(_TILES, 1))
             files = sorted(glob.glob(f"{head}[0-9][0-9][0-9][0-9]{tail}"))
@@ -67,7 +68,7 @@ class Contents:
             return [], []
 
     def write(self, layer, package, meant):
-        """Writes a package of a layer and all files that were named.
+        """Writes a package of a layer and all files that :meth:`named` found.
 
         Args:
             layer: The file of the layer.
@@ -95,7 +96,7 @@ def _is_below(file, folders):
 
 
 def _as_authored(path, stage):
-    """Returns the path as a layer of the stage has it, because flattening makes it absolute."""
+    """Returns the path as authored in a layer of the stage, because flattening makes it absolute."""
     for layer in stage.GetUsedLayers():
         if layer.realPath:
             for authored in chain(*UsdUtils.ExtractExternalReferences(layer.realPath)):
@@ -105,7 +106,7 @@ def _as_authored(path, stage):
 
 
 def _is_whole(package):
-    """Whether the package is complete on the disk; pxr does not notice a full disk."""
+    """Returns whether the package is complete on the disk, because pxr does not notice a full disk."""
     try:
         with zipfile.ZipFile(package) as archive:
             return archive.testzip() is None
