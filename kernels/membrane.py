@@ -25,6 +25,15 @@ RAW = wp.constant(int(HessianPolicy.RAW))
 ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
 
 
+def side_axes(points, triangles):
+    """Two axes in the plane of each triangle (T, 3), the first along its first side, (T, 2, 3) unit vectors."""
+    x = points[triangles]
+    side, other = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
+    side = side / np.linalg.norm(side, axis=1)[:, None]
+    across = np.cross(np.cross(side, other), side)
+    return np.stack([side, across / np.linalg.norm(across, axis=1)[:, None]], axis=1)
+
+
 def inverse_edges(points, stencil):
     """r₀, r₁, r₂ [1/m] of the triangles ``stencil`` (E, 3), (E, 3)."""
     a, b = points[stencil[:, 1]] - points[stencil[:, 0]], points[stencil[:, 2]] - points[stencil[:, 0]]
@@ -76,6 +85,16 @@ def green_strain(y: Any):
     half = y.dtype(0.5)
     one = y.dtype(1.0)
     return wp.vector(half * (wp.dot(y[0], y[0]) - one), half * (wp.dot(y[1], y[1]) - one), half * wp.dot(y[0], y[1]))
+
+
+@wp.func
+def covector(a: Any, b: Any):
+    """Rows a and b laid out as y is."""
+    v = wp.vector(length=6, dtype=a.dtype)
+    for row in range(3):
+        v[row] = a[row]
+        v[3 + row] = b[row]
+    return v
 
 
 @wp.func

@@ -4,6 +4,7 @@ from .attachment import ATTACHMENT as ATTACHMENT
 from .corotated_membrane import COROTATED_MEMBRANE as COROTATED_MEMBRANE
 from .dihedral_bending import DIHEDRAL_BENDING as DIHEDRAL_BENDING
 from .neo_hookean_membrane import NEO_HOOKEAN_MEMBRANE as NEO_HOOKEAN_MEMBRANE
+from .orthotropic_membrane import ORTHOTROPIC_MEMBRANE as ORTHOTROPIC_MEMBRANE
 from .plate_bending import PLATE_BENDING as PLATE_BENDING
 from .quadratic_bending import QUADRATIC_BENDING as QUADRATIC_BENDING
 from .rigid_cluster import RIGID_CLUSTER as RIGID_CLUSTER

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..membrane import green_strain, inverse_edges, kept2, measure, weight
+from ..membrane import covector, green_strain, inverse_edges, kept2, measure, weight
 from ..term import Dissipation, Term
 
 
@@ -40,15 +40,6 @@ def energy(y: Any, rest: Any):
 @wp.func
 def gradient(y: Any, rest: Any):
     return change(y, rest) * y  # F S, the columns of F as rows
-
-
-@wp.func
-def covector(a: Any, b: Any):
-    v = wp.vector(length=6, dtype=a.dtype)
-    for row in range(3):
-        v[row] = a[row]
-        v[3 + row] = b[row]
-    return v
 
 
 @wp.func

@@ -22,6 +22,7 @@ DAMPED = {
     "CorotatedMembrane": wc.CorotatedMembrane(stiffness=30.0, damping=0.7),
     "StVKMembrane": wc.StVKMembrane(stiffness=30.0, poisson_ratio=0.3, damping=0.7),
     "NeoHookeanMembrane": wc.NeoHookeanMembrane(stiffness=30.0, poisson_ratio=0.3, damping=0.7),
+    "OrthotropicMembrane": wc.OrthotropicMembrane(stiffness=30.0, weft_ratio=2.0, poisson_ratio=0.3, damping=0.7),
     "QuadraticBending": wc.QuadraticBending(stiffness=1e-2, damping=1e-3),
     "DihedralBending": wc.DihedralBending(stiffness=1e-2, damping=1e-3),
     "Attachment": wc.Attachment(vertices=[0, 5, 9], stiffness=30.0, damping=0.7),

@@ -26,6 +26,7 @@ every_dtype = pytest.mark.parametrize("dtype", DTYPES)
 MATERIALS = {
     "StVKMembrane": {"poisson_ratio": 0.3},
     "NeoHookeanMembrane": {"poisson_ratio": 0.3},
+    "OrthotropicMembrane": {"warp": np.array([2.0, 0.5, 1.0]), "weft_ratio": 2.0, "poisson_ratio": 0.3, "shear_ratio": 0.2},
     "SpringLimit": {"least": 0.9, "most": 1.05},
     "StrainLimit": {"least": 0.9, "most": 1.05},
     "Plane": {"normal": np.array([1.0, 2.0, 2.0])},
@@ -64,6 +65,7 @@ DECLARED = {
     "CorotatedMembrane": lambda mesh: wc.CorotatedMembrane(stiffness=50.0),
     "StVKMembrane": lambda mesh: wc.StVKMembrane(stiffness=50.0, **MATERIALS["StVKMembrane"]),
     "NeoHookeanMembrane": lambda mesh: wc.NeoHookeanMembrane(stiffness=50.0, **MATERIALS["NeoHookeanMembrane"]),
+    "OrthotropicMembrane": lambda mesh: wc.OrthotropicMembrane(stiffness=50.0, **MATERIALS["OrthotropicMembrane"]),
     "SpringLimit": lambda mesh: wc.SpringLimit(stiffness=50.0, **MATERIALS["SpringLimit"]),
     "StrainLimit": lambda mesh: wc.StrainLimit(stiffness=50.0, **MATERIALS["StrainLimit"]),
     "QuadraticBending": lambda mesh: wc.QuadraticBending(stiffness=0.5),

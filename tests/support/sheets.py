@@ -20,6 +20,7 @@ TERMS = {
     "limits": [wc.SpringLimit(stiffness=100.0, least=0.99, most=1.01), wc.StrainLimit(stiffness=10.0, least=0.99, most=1.01)],
     "corotated": [wc.CorotatedMembrane(stiffness=100.0, damping=0.01)],
     "St. Venant-Kirchhoff": [wc.StVKMembrane(stiffness=100.0, damping=0.01)],
+    "orthotropic": [wc.OrthotropicMembrane(stiffness=100.0, weft_ratio=2.0, poisson_ratio=0.3, damping=0.01)],
     "Neo-Hookean": [wc.NeoHookeanMembrane(stiffness=100.0)],
     "quadratic bending": [wc.QuadraticBending(stiffness=1e-3)],
     "damped quadratic bending": [wc.QuadraticBending(stiffness=1e-3, damping=1e-5)],

@@ -750,7 +750,7 @@ def test_policies_are_semidefinite(term, state, dtype, device):
 
 @every_dtype
 @pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("name", MEMBRANES)
+@pytest.mark.parametrize("name", [name for name in MEMBRANES if name != "OrthotropicMembrane"])  # which bounds them
 def test_policies_of_membranes_are_those_of_the_eigenvalues(name, state, dtype, device):
     """∂²u/∂F² with its negative eigenvalues dropped or turned: at their places, at random F, and where σ₁ = σ₂."""
     elements = stencils(term_of(name), state, 1.0, dtype, device)

@@ -48,6 +48,9 @@ def every_term():
                 name="rubber",
                 damping=np.linspace(0, 1, len(sheet.triangles)),
             ),
+            wc.OrthotropicMembrane(
+                stiffness=100.0, weft_ratio=np.linspace(1, 2, len(sheet.triangles)), shear_ratio=0.1, warp_angle=1 / 3
+            ),
             wc.QuadraticBending(stiffness=1e-5),
             wc.DihedralBending(stiffness=np.full(len(sheet.hinges), 1e-6)),
             wc.Attachment(vertices="corners", stiffness=[1.0, 2.0, 3.0, 4.0], name="by selection"),

@@ -213,7 +213,7 @@ def _material(arguments):
     from ..terms import TERMS
     from ..terms.membrane import Membrane
 
-    membranes = {energy.material: energy for energy in TERMS.values() if issubclass(energy, Membrane)}
+    membranes = {energy.material: energy for energy in TERMS.values() if issubclass(energy, Membrane) and energy.material}
     kind = "neo-hookean" if arguments.material is None else arguments.material
     choice("--material", kind, tuple(membranes))
     if arguments.stiffness is None:

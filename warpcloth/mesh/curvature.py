@@ -14,23 +14,16 @@ the plane of T, so that a curved mesh counts by its edge lengths alone.
 
 import numpy as np
 
+from ..kernels.membrane import side_axes
+
 _RANK = 1e-2  # ratio of the smallest to the largest singular value below which vertices do not determine a quadratic function
 _RINGS = 4  # largest number of rings of triangles to fit to
-
-
-def side_axes(mesh):
-    """Returns two orthogonal unit vectors in the plane of each triangle, the first along its first side, (T, 2, 3)."""
-    x = mesh.points[mesh.triangles]
-    side, other = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
-    side = side / np.linalg.norm(side, axis=1)[:, None]
-    across = np.cross(np.cross(side, other), side)
-    return np.stack([side, across / np.linalg.norm(across, axis=1)[:, None]], axis=1)
 
 
 def curvature_operator(mesh):
     """Returns K, a scipy sparse matrix (3T, n): rows 3t to 3t + 2 of K f are κ₁₁, κ₂₂, κ₁₂ of triangle t [unit of f/m²].
 
-    The axes are those of :func:`side_axes`.
+    The axes are those of :func:`warpcloth.kernels.membrane.side_axes`.
 
     Args:
         mesh: The :class:`warpcloth.Mesh`, of triangles.
@@ -40,7 +33,9 @@ def curvature_operator(mesh):
     """
     from scipy.sparse import csr_array
 
-    p = np.einsum("tai,tki->tka", side_axes(mesh), mesh.points[mesh.triangles] - mesh.points[mesh.triangles[:, :1]])
+    p = np.einsum(
+        "tai,tki->tka", side_axes(mesh.points, mesh.triangles), mesh.points[mesh.triangles] - mesh.points[mesh.triangles[:, :1]]
+    )
     area, T, n = mesh.triangle_areas, len(p), len(mesh.points)
     partner = _partners(mesh)
     side = np.roll(p, -1, axis=1) - p  # from corner k to k + 1

@@ -9,6 +9,7 @@ from .corotated_membrane import CorotatedMembrane
 from .declared import Declared
 from .dihedral_bending import DihedralBending
 from .neo_hookean_membrane import NeoHookeanMembrane
+from .orthotropic_membrane import OrthotropicMembrane
 from .plate_bending import PlateBending
 from .quadratic_bending import QuadraticBending
 from .rigid_cluster import RigidCluster
@@ -22,6 +23,7 @@ __all__ = [
     "CorotatedMembrane",
     "DihedralBending",
     "NeoHookeanMembrane",
+    "OrthotropicMembrane",
     "PlateBending",
     "QuadraticBending",
     "RigidCluster",

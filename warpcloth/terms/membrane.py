@@ -18,12 +18,12 @@ class Membrane(Damped):
     """The base class of membranes, whose energy and stress :func:`warpcloth.analyze` can measure.
 
     Attributes:
-        material: Name of the material on the command line.
+        material: Name of the material on the command line; None if its options do not describe it.
         stiffness: k = Et [N/m], Young's modulus times thickness. One or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
     """
 
-    material: ClassVar[str]
+    material: ClassVar[str | None] = None
 
     def stencil(self, mesh: Mesh) -> np.ndarray:
         return mesh.triangles

@@ -7,19 +7,20 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from ..base.checks import numeric, refuse
+from ..kernels.membrane import side_axes
 from ..kernels.term import Term
 from ..kernels.terms import PLATE_BENDING
-from ..mesh.curvature import curvature_operator, side_axes
+from ..mesh.curvature import curvature_operator
 from ..mesh.mesh import Mesh
 from .declared import quantity
 from .sparse import Sparse
+from .woven import ABOVE_0, Woven
 
-_ABOVE_0 = quantity("must be finite and above 0", lambda values: (values > 0.0) & np.isfinite(values))
 Own = TypeVar("Own", bound="PlateBending")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlateBending(Sparse):
+class PlateBending(Woven, Sparse):
     """Plate bending, U = Σ ½AκᵀCκ.
 
     κᵀCκ is D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂². κ holds the second derivatives of the positions of each triangle along warp
@@ -36,6 +37,8 @@ class PlateBending(Sparse):
         twist_ratio: D₆₆/D₁, one or (T,); ½(1 − ν)√(D₂/D₁) if None.
         warp: Vector along the warp, (3,) or (T,3), of which each triangle takes the component in its plane. By default the
             direction in which the texture coordinate s grows and t is constant. Isotropic plates need neither.
+        warp_angle: Angle [rad] by which the warp is turned from there in the plane of the triangle, counter-clockwise if seen
+            from the front, one or (T,).
         name: To tell two terms of one kind apart.
 
     Examples:
@@ -50,11 +53,7 @@ class PlateBending(Sparse):
         default=0.0,
         metadata=quantity("must be above -1 and below 1", lambda ratio: (ratio > -1.0) & (ratio < 1.0)),
     )
-    weft_ratio: float | Sequence[float] | np.ndarray = field(default=1.0, metadata=_ABOVE_0)
-    twist_ratio: float | Sequence[float] | np.ndarray | None = field(default=None, metadata=_ABOVE_0)
-    warp: Sequence[float] | np.ndarray | None = field(
-        default=None, metadata=quantity("must be finite", np.isfinite, shape=(3,))
-    )
+    twist_ratio: float | Sequence[float] | np.ndarray | None = field(default=None, metadata=ABOVE_0)
 
     @classmethod
     def from_stiffnesses(
@@ -85,7 +84,10 @@ class PlateBending(Sparse):
         root = np.zeros((T, 3, 3))  # of C/D₁
         root[:, 0, 0], root[:, 0, 1] = 1.0, ratio * np.sqrt(weft)
         root[:, 1, 1], root[:, 2, 2] = np.sqrt(weft * (1.0 - ratio**2)), 2.0 * np.sqrt(twist)
-        c, s = self._warp(mesh).T  # rotates κ from the axes of each triangle to warp and weft
+        axes = side_axes(mesh.points, mesh.triangles)
+        isotropic = self.warp is None and self.twist_ratio is None and (weft == 1.0).all()
+        warp = axes[:, 0] if isotropic else self.warp_directions(mesh)
+        c, s = np.einsum("tai,ti->at", axes, warp)  # rotates κ from the axes of each triangle to warp and weft
         turn = np.stack([c * c, s * s, 2.0 * c * s, s * s, c * c, -2.0 * c * s, -c * s, c * s, c * c - s * s], axis=1)
         columns = np.broadcast_to(3 * np.arange(T)[:, None, None] + np.arange(3), root.shape)
         entries = (root @ turn.reshape(-1, 3, 3)).ravel(), columns.ravel(), np.arange(0, 9 * T + 1, 3)
@@ -93,22 +95,3 @@ class PlateBending(Sparse):
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         return mesh.triangle_areas[:, None]
-
-    def _warp(self, mesh):
-        """Returns the unit vector along the warp in the axes of each triangle, (T, 2)."""
-        axes, T = side_axes(mesh), len(mesh.triangles)
-        if self.warp is not None:
-            warp = np.broadcast_to(self.of_elements("warp", T), (T, 3))
-        elif self.twist_ratio is None and (np.asarray(self.weft_ratio) == 1.0).all():  # isotropic
-            return np.broadcast_to([1.0, 0.0], (T, 2))
-        elif mesh.texture_coordinates is None:
-            raise ValueError(f"{self.label}.warp is None on a mesh without texture coordinates; it must be a vector")
-        else:
-            x, st = mesh.points[mesh.triangles], mesh.texture_coordinates[mesh.triangles]
-            sides, ((s1, t1), (s2, t2)) = x[:, 1:] - x[:, :1], (st[:, 1:] - st[:, :1]).transpose(1, 2, 0)
-            warp = np.sign(s1 * t2 - s2 * t1)[:, None] * (t2[:, None] * sides[:, 0] - t1[:, None] * sides[:, 1])
-        found = np.einsum("tai,ti->ta", axes, warp)
-        size = np.linalg.norm(found, axis=1)
-        for t in np.flatnonzero(~(size > 1e-6 * np.linalg.norm(warp, axis=1)))[:1]:
-            raise ValueError(f"{self.label}.warp has no direction in triangle {t}; it must have a part in its plane")
-        return found / size[:, None]

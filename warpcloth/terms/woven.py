@@ -1,0 +1,53 @@
+"""The base of energies of fabrics, which are stiffer along warp or weft."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..kernels.membrane import side_axes
+from ..mesh.mesh import Mesh
+from .declared import FINITE, Declared, quantity
+
+ABOVE_0 = quantity("must be finite and above 0", lambda values: (values > 0.0) & np.isfinite(values))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Woven(Declared):
+    """An energy of triangles with two directions at right angles: the warp, along which its stiffness is, and the weft.
+
+    Attributes:
+        weft_ratio: Stiffness along weft over that along warp, one or (T,).
+        warp: Vector along the warp, (3,) or (T, 3); each triangle takes the part in its plane. By default the direction in
+            which the texture coordinate s grows and t does not.
+        warp_angle: Angle [rad] by which the warp is turned from there in the plane of the triangle, counter-clockwise if seen
+            from the front, one or (T,).
+    """
+
+    weft_ratio: float | Sequence[float] | np.ndarray = field(default=1.0, metadata=ABOVE_0)
+    warp: Sequence[float] | np.ndarray | None = field(
+        default=None, metadata=quantity("must be finite", np.isfinite, shape=(3,))
+    )
+    warp_angle: float | Sequence[float] | np.ndarray = field(default=0.0, metadata=FINITE)
+
+    def warp_directions(self, mesh: Mesh) -> np.ndarray:
+        """Unit vectors along the warp in the plane of each triangle, (T, 3).
+
+        Raises:
+            ValueError: The mesh has no texture coordinates and ``warp`` is None, or a triangle has no such direction.
+        """
+        axes, T = side_axes(mesh.points, mesh.triangles), len(mesh.triangles)
+        if self.warp is not None:
+            warp = np.broadcast_to(self.of_elements("warp", T), (T, 3))
+        elif mesh.texture_coordinates is None:
+            raise ValueError(f"{self.label}.warp is None on a mesh without texture coordinates; it must be a vector")
+        else:
+            x, st = mesh.points[mesh.triangles], mesh.texture_coordinates[mesh.triangles]
+            sides, ((s1, t1), (s2, t2)) = x[:, 1:] - x[:, :1], (st[:, 1:] - st[:, :1]).transpose(1, 2, 0)
+            warp = np.sign(s1 * t2 - s2 * t1)[:, None] * (t2[:, None] * sides[:, 0] - t1[:, None] * sides[:, 1])
+        along = np.einsum("tai,ti->at", axes, warp)
+        size = np.linalg.norm(along, axis=0)
+        for t in np.flatnonzero(size <= 1e-6 * np.linalg.norm(warp, axis=1))[:1]:
+            raise ValueError(f"{self.label}.warp has no direction in triangle {t}; it must have a part in its plane")
+        angle = np.arctan2(along[1], along[0]) + self.of_elements("warp_angle", T)
+        return np.cos(angle)[:, None] * axes[:, 0] + np.sin(angle)[:, None] * axes[:, 1]
