@@ -7,7 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from warpcloth.cli import _parser
+from warpcloth.cli.fabrics import COLUMNS
+from warpcloth.cli.fabrics import rows as rows_of_fabrics
 from warpcloth.cli.options import _of_solver, _values
+from warpcloth.scene.measured_fabrics import fabrics
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms import TERMS
 from warpcloth.terms.needs import lacks
@@ -159,7 +162,20 @@ def solver_options():
     return table(("Option", "Values", "Solvers (default)"), rows)
 
 
+def measured_fabrics():
+    """Lists the fabrics."""
+    return table(COLUMNS, rows_of_fabrics(list(fabrics.values())))
+
+
+def fabric_sources():
+    """Lists the sources of the fabrics, and what each says."""
+    found = dict.fromkeys((fabric.source, fabric.notes) for fabric in fabrics.values())
+    return "".join(f"- [{k}] {source}. {notes}\n" for k, (source, notes) in enumerate(found, start=1))
+
+
 TABLES = {
+    "fabrics": measured_fabrics,
+    "fabric sources": fabric_sources,
     "energies": energies,
     "solvers": solvers,
     "methods": methods,

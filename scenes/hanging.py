@@ -9,9 +9,18 @@ import numpy as np
 import warpcloth as wc
 
 
-def scene(n: int = 32, stiffness: float = 1e3, bending: float = 1e-5, density: float = 0.1, duration: float = 1.0):
-    """n vertices a side, spring stiffness [N/m], plate bending stiffness [N·m], density [kg/m²], duration [s]."""
+def scene(
+    n: int = 32,
+    stiffness: float = 1e3,
+    bending: float = 1e-5,
+    density: float = 0.1,
+    duration: float = 1.0,
+    fabric: str | None = None,
+):
+    """n vertices a side, springs [N/m], bending [N·m], density [kg/m²], duration [s]; or one of 'warpcloth fabrics'."""
     mesh = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")
+    if fabric is not None:
+        return wc.Scene(mesh, fabric=fabric, pins=[0, n - 1], duration=duration, name="hanging")
     return wc.Scene(
         mesh,
         masses=np.full(n * n, density / n**2),

@@ -42,6 +42,8 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .scene.colliders import Contact as Contact
     from .scene.colliders import Plane as Plane
     from .scene.colliders import Sphere as Sphere
+    from .scene.fabric import Fabric as Fabric
+    from .scene.measured_fabrics import fabrics as fabrics
     from .scene.mesh_collider import MeshCollider as MeshCollider
     from .scene.scene import Pins as Pins
     from .scene.scene import Scene as Scene
@@ -82,6 +84,8 @@ _MODULES = {
     "Contact": "scene.colliders",
     "Plane": "scene.colliders",
     "Sphere": "scene.colliders",
+    "Fabric": "scene.fabric",
+    "fabrics": "scene.measured_fabrics",
     "MeshCollider": "scene.mesh_collider",
     "Pins": "scene.scene",
     "Scene": "scene.scene",

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..base.interrupts import Interrupts
 from ..base.version import installed_version
-from . import analyze, bench, chart, check, choose, compare, deform, info, options, render, run, scenes
+from . import analyze, bench, chart, check, choose, compare, deform, fabrics, info, options, render, run, scenes
 from .terminal import DTYPES, Printable, say, show_warning
 
 
@@ -208,6 +208,7 @@ def _parser():
     )
     for sub in (runs, deforms, analyzes, checks):
         sub.add_argument("--single-file", action="store_true", help="write one file instead of a file and a folder of frames")
+    add("fabrics", fabrics.fabrics, "List measured fabrics, their moduli, bending lengths and sources.")
     lists = add("scenes", scenes.scenes, "List scenes and their parameters.")
     lists.add_argument(
         "folder", metavar="FOLDER", nargs="?", help="a folder of scene files (default: ./scenes and the included scenes)"

@@ -1,7 +1,7 @@
 """Scenes. A scene is data without a solver, and any solver that supports its terms runs it unchanged."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, InitVar, dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +18,9 @@ from ..terms.contact import VertexContact, VertexFriction
 from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
 from .colliders import Collider, Contact, checked_colliders, default_stiffness, refuse_inside
+from .fabric import Fabric
 from .joining import fields_of_cloths, pins_of_cloths
+from .measured_fabrics import fabrics
 from .mesh_collider import MeshCollider
 from .self_contact import SelfContact
 
@@ -115,6 +117,7 @@ class Scene:
             passes through cloth.
         cloths: Names of the cloths of a scene that :meth:`join` made, the parts of the mesh; else empty. In files each is a
             prim of its own.
+        fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, in place of ``density`` and ``terms``, which it sets.
 
     Raises:
         ValueError: A value is not allowed. The message names it.
@@ -145,6 +148,7 @@ class Scene:
     contact: Contact | None = None
     self_contact: SelfContact | None = None
     cloths: tuple[str, ...] = ()
+    fabric: InitVar[Fabric | str | None] = None
 
     @classmethod
     def join(cls, cloths: Mapping[str, "Scene"], **whole: Any) -> "Scene":
@@ -177,7 +181,7 @@ class Scene:
         """Pins, terms, loads and colliders, all of which may do work on the cloth."""
         return (self.pins, *self.terms, self.loads, *self.colliders)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, fabric: Fabric | str | None) -> None:
         if not isinstance(self.mesh, Mesh):
             raise ValueError(f"mesh is {shown(self.mesh)}; it must be a Mesh, such as Mesh.grid(32, 32)")
         n = len(self.mesh.points)
@@ -185,6 +189,13 @@ class Scene:
         def keep(field, value):
             object.__setattr__(self, field, value)
 
+        if fabric is not None:
+            self._refuse_with_fabric()
+            fabric = fabrics[fabric] if isinstance(fabric, str) else fabric
+            if not isinstance(fabric, Fabric):
+                raise ValueError(f"fabric is {shown(fabric)}; it must be a Fabric or its name")
+            keep("density", fabric.density)
+            keep("terms", fabric.terms())
         number("fps", self.fps, above=0.0)
         number("duration", self.duration, above=0.0)
         frames = float(self.duration) * float(self.fps)
@@ -215,6 +226,11 @@ class Scene:
         keep("contact", self._checked_contact())
         keep("self_contact", self._checked_self_contact())
         self.refuse_inside(self.positions)
+
+    def _refuse_with_fabric(self):
+        for name, value in (("density", self.density), ("masses", self.masses), ("terms", self.terms)):
+            if not (value is None or (isinstance(value, Sequence) and not value)):
+                raise ValueError(f"fabric and {name} are given; a fabric has {name} of its own, so leave one of them out")
 
     def _checked_terms(self):
         rule = "it must be a list of energies, such as [Spring(stiffness=1e3)]"

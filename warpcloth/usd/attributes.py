@@ -72,6 +72,7 @@ ATTRIBUTES = (
     # Our own. Of several rows of one field, the first wins.
     Attribute("name", "warpcloth:name", "cloth", ("string",)),
     Attribute("density", "warpcloth:density", "cloth", ("double",)),
+    Attribute("fabric", "warpcloth:fabric", "cloth", ("token",)),  # in place of a density and terms
     Attribute("masses", "warpcloth:masses", "cloth", ("double[]",)),
     Attribute("positions", "warpcloth:positions", "cloth", ("double3[]",)),
     Attribute("velocities", "warpcloth:velocities", "cloth", ("double3[]",)),

@@ -120,8 +120,9 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all):
     rest = surroundings.mesh.points
     surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
     mesh = surroundings.mesh
-    density, masses, terms = _density(values, mesh), values.get("masses"), _terms(values, mesh)
-    _refuse_missing(density is not None or masses is not None, len(terms) > 0)
+    fabric, density, masses, terms = values.get("fabric"), _density(values, mesh), values.get("masses"), _terms(values, mesh)
+    if fabric is None:
+        _refuse_missing(density is not None or masses is not None, len(terms) > 0)
     vertices = _pinned(values, cloth, surroundings)
     positions, keyframes = _motion(values, cloth, surroundings, vertices, round(duration * fps), fps)
     if positions is not None and np.array_equal(positions, rest):
@@ -142,8 +143,9 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all):
         fps=fps,
         name=cloth.GetName() if name is None else name,
         stage=surroundings,
+        fabric=fabric,
     )
-    for term in terms:
+    for term in scene.terms:
         term.elements(mesh, scene.positions)  # refuses now, when the file is known, what would be refused later
     return scene
 
@@ -172,7 +174,7 @@ def read_limits(stage, cloth, surroundings):
 
 def _refuse_missing(mass, term):
     wanted = {
-        "mass": (mass, ("density", "masses", "(total mass)", "(mass per volume)")),
+        "mass": (mass, ("density", "fabric", "masses", "(total mass)", "(mass per volume)")),
         "term": (term, ("terms.type", "(stretch stiffness)", "(bend stiffness)")),
     }
     missing = [

@@ -1,0 +1,44 @@
+"""The command ``fabrics``: lists measured fabrics."""
+
+
+def fabrics(arguments):
+    from ..scene.measured_fabrics import fabrics
+
+    for line in table_lines(fabrics.values()):
+        print(line)
+    sources = list(dict.fromkeys((fabric.source, fabric.notes) for fabric in fabrics.values()))
+    for number, (source, notes) in enumerate(sources, start=1):
+        print(f"\n[{number}] {source}. {notes}")
+    return 0
+
+
+COLUMNS = ("fabric", "kg/m²", "t mm", "E₁t N/m", "E₂t N/m", "Gt N/m", "ν₁₂", "D₁ µN·m", "D₂ µN·m", "l₁ mm", "l₂ mm", "source")
+
+
+def rows(fabrics):
+    """The columns of :data:`COLUMNS` as texts, "–" where a number is not known; l are the bending lengths."""
+    sources = list(dict.fromkeys(fabric.source for fabric in fabrics))
+    found = []
+    for fabric in fabrics:
+        values = [fabric.density, _times(1e3, fabric.thickness), fabric.warp, fabric.weft, fabric.shear, fabric.poisson_ratio]
+        values += [_times(1e6, D) for D in (fabric.bending_warp, fabric.bending_weft)]
+        values += [_times(1e3, length) for length in fabric.bending_lengths]
+        texts = ["–" if value is None or value != value else f"{value:.4g}" for value in values[:7]]
+        texts += ["–" if value is None or value != value else f"{value:.3g}" for value in values[7:]]
+        found.append([fabric.name, *texts, f"[{sources.index(fabric.source) + 1}]"])
+    return found
+
+
+def table_lines(fabrics):
+    """Lines of a table in columns."""
+    cells = [COLUMNS, *rows(list(fabrics))]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        first, *others = (
+            text.ljust(width) if k == 0 else text.rjust(width) for k, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        yield "  ".join([first, *others])
+
+
+def _times(factor, value):
+    return None if value is None else factor * value

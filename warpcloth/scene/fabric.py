@@ -1,0 +1,112 @@
+"""Fabrics: measured moduli, from which the energies of a cloth follow."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from ..base.checks import number, shown
+from ..terms.declared import Declared
+from ..terms.orthotropic_membrane import OrthotropicMembrane
+from ..terms.plate_bending import PlateBending
+
+_GRAVITY = 9.81  # [m/s²]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fabric:
+    """The density and the moduli of a fabric along warp and weft. A number that was not measured is None.
+
+    Attributes:
+        name: Its key in ``warpcloth.fabrics``.
+        density: ρ [kg/m²].
+        warp, weft: E₁t and E₂t [N/m], Young's moduli times thickness.
+        shear: Gt [N/m].
+        poisson_ratio: ν₁₂, by how much a strip that is pulled along the warp narrows.
+        bending_warp, bending_weft: D₁ and D₂ [N·m].
+        thickness: t [m].
+        source: Where the numbers are from.
+        notes: How they were measured, what was derived, and how uncertain they are.
+
+    Raises:
+        ValueError: A number is not finite or not allowed.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> denim = wc.fabrics["denim"]
+        >>> denim.density, [type(term).__name__ for term in denim.terms()]
+        (0.4, ['OrthotropicMembrane', 'PlateBending'])
+    """
+
+    name: str
+    density: float
+    warp: float | None = None
+    weft: float | None = None
+    shear: float | None = None
+    poisson_ratio: float | None = None
+    bending_warp: float | None = None
+    bending_weft: float | None = None
+    thickness: float | None = None
+    source: str = ""
+    notes: str = ""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("name", "source", "notes"):
+                if not isinstance(value, str):
+                    raise ValueError(f"Fabric.{field.name} is {shown(value)}; it must be a text")
+            elif value is not None or field.name == "density":
+                number(f"Fabric.{field.name}", value, above=None if field.name == "poisson_ratio" else 0.0)
+
+    def membrane(self, **given: Any) -> OrthotropicMembrane:
+        """The :class:`warpcloth.OrthotropicMembrane` of the fabric, with further fields such as ``warp_angle``.
+
+        Raises:
+            ValueError: A number that it needs is None, or the moduli are not positive definite.
+        """
+        warp, weft, shear, ratio = self._known("a membrane", "warp", "weft", "shear", "poisson_ratio")
+        direction = given.pop("warp", None)
+        return OrthotropicMembrane.from_moduli(warp, weft, shear, ratio, direction, **given)
+
+    def bending(self, **given: Any) -> PlateBending:
+        """The :class:`warpcloth.PlateBending` of the fabric, with further fields such as ``warp_angle``.
+
+        D₁₂ is that of a plate of one material, √(ν₁₂ν₂₁ D₁D₂). D₆₆ is Gt t²/12 if the thickness is known, else that of
+        :class:`warpcloth.PlateBending`.
+
+        Raises:
+            ValueError: A number that it needs is None.
+        """
+        one, two = self._known("bending", "bending_warp", "bending_weft")
+        E1, E2, ratio = self._known("bending", "warp", "weft", "poisson_ratio")
+        if self.shear is not None and self.thickness is not None:
+            given["twist_ratio"] = self.shear * self.thickness**2 / 12.0 / one
+        return PlateBending(stiffness=one, weft_ratio=two / one, poisson_ratio=ratio * (E2 / E1) ** 0.5, **given)
+
+    def terms(self, **given: Any) -> list[Declared]:
+        """The energies of the fabric: :meth:`membrane` and :meth:`bending`.
+
+        Args:
+            **given: Fields of both, such as ``warp`` and ``warp_angle``.
+        """
+        return [self.membrane(**given), self.bending(**given)]
+
+    @property
+    def bending_lengths(self) -> tuple[float, float]:
+        """(D/ρg)^⅓ [m] of strips cut along warp and weft; NaN where D is None."""
+        found = [np.nan if D is None else (D / (self.density * _GRAVITY)) ** (1 / 3) for D in self._bending]
+        return found[0], found[1]
+
+    @property
+    def _bending(self):
+        return self.bending_warp, self.bending_weft
+
+    def _known(self, purpose, *names):
+        for name in names:
+            if getattr(self, name) is None:
+                raise ValueError(
+                    f"fabric {self.name!r} has no {name}, which {purpose} needs; give it, "
+                    f"such as dataclasses.replace(fabric, {name}=…)"
+                )
+        return [getattr(self, name) for name in names]
