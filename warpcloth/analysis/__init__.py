@@ -1,1 +1,1 @@
-"""Measures of sequences, and comparison of two."""
+"""Measures of mesh sequences, comparison of two sequences, and intersections."""

@@ -1,4 +1,4 @@
-"""Measures of an animated cloth: deformation, strain, rotation and their rates, frame by frame or of all frames at once."""
+"""Measures of an animated cloth: deformation, strain, rotation and their rates, frame by frame or for all frames."""
 
 import warnings
 from collections.abc import Iterable, Iterator
@@ -20,17 +20,16 @@ from .measures import chosen
 from .samples import Analysis, Exclusion, Sample
 from .surfaces import RATES, Neighbourhoods, Triangles, check_material, material_directions
 
-# Frames as `analyze` takes them; an `Animation` or a `Deformation` has them as `points`.
+# The types of frames that `analyze` takes.
 Frames = FilePath | Sequence | ArrayLike | HasPoints
-_MOST = 100  # missing frames that have a sentence each
+_MOST = 100  # missing frames that get a message each
 
 
 def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, **options: Any) -> Analysis:
-    """Measures an animation.
+    """Measures an animation: each vertex if a ``neighbourhood`` is given, else each triangle.
 
-    With a ``neighbourhood`` it measures each vertex, else each triangle. For all measures see
-    :data:`warpcloth.analysis.measures.MEASURES` or docs/measuring.md. All frames are kept in memory; :class:`Analyzer` gives
-    one frame at a time.
+    :data:`warpcloth.analysis.measures.MEASURES` and docs/measuring.md list the measures. Results of all frames are kept in
+    memory; :class:`Analyzer` gives one frame at a time.
 
     Args:
         frames: Points (F, n, 3) [m], an :class:`warpcloth.Animation`, or anything that :func:`warpcloth.open_sequence` opens or
@@ -43,7 +42,7 @@ def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, *
         :class:`Analysis`.
 
     Raises:
-        ValueError: As :class:`Analyzer`; or a frame is broken.
+        ValueError: As for :class:`Analyzer`, or a frame is broken.
 
     Examples:
         >>> import warpcloth as wc
@@ -73,39 +72,39 @@ def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, *
 
 
 class Analyzer:
-    """Measures of an animation, row by row: ``for sample in Analyzer(frames, mesh): …`` gives a :class:`Sample` for each.
+    """Measures an animation row by row: ``for sample in Analyzer(frames, mesh): …`` yields a :class:`Sample` for each row.
 
-    A row is a frame against its reference. Memory holds three frames, however many there are.
+    A row compares a frame with its reference. Memory holds three frames.
 
     Args:
-        frames: As of :func:`analyze`.
-        mesh: As there.
-        dt: As there.
-        measures: Names, or "all" that can be had with what is given. Nothing else is computed.
-        reference: "rest", "first", "previous" or the number of a frame, see :func:`warpcloth.analysis.frame_pairs.pairs_of`;
-            instead of it ``pairs`` or ``lag``.
-        pairs: "1:2,1:3", reference and frame.
-        lag: Frames from reference to frame.
-        every: Every k-th frame alone.
-        neighbourhood: None for triangles; of vertices "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m],
-            "nearest:2%" of all vertices, or a set of vertices for each. Fixed by the rest shape.
-        rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt then; "logarithm", exact
-            for a constant L. All need turns below 180° from frame to frame. D is accurate for small turns: if a frame turns by
-            θ, midpoint makes a strain 1/cos²(θ/2) times too large, and logarithm up to θ/sin θ times. The first frame, which
-            has none before it, has no rates.
-        directions: Warp and weft: "st" for the texture coordinates, or a vector (3,) in the rest shape.
+        frames: As for :func:`analyze`.
+        mesh: As for :func:`analyze`.
+        dt: As for :func:`analyze`.
+        measures: Names, or "all" for those that the other arguments allow. Only these are computed.
+        reference: "rest", "first", "previous" or the number of a frame, see :func:`warpcloth.analysis.frame_pairs.pairs_of`.
+            Give ``pairs`` or ``lag`` in its place.
+        pairs: Pairs of reference and frame, such as "1:2,1:3".
+        lag: Number of frames from reference to frame.
+        every: Measure only every k-th frame.
+        neighbourhood: None to measure triangles. To measure vertices, "1-ring", "2-ring", "nearest:k=12",
+            "nearest:radius=0.05" [m], "nearest:2%" of all vertices, or a set of vertices for each. Fixed by the rest shape.
+        rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt for rigid motion; or
+            "logarithm", exact for a constant L. All need rotations below 180° between frames. D is accurate for small
+            rotations: if a frame rotates by θ, midpoint makes a strain 1/cos²(θ/2) times too large, and logarithm up to
+            θ/sin θ times. The first frame has no rates, because no frame precedes it.
+        directions: Directions of warp and weft: "st" for the texture coordinates, or a vector (3,) in the rest shape.
         material: A membrane term for energy and stress, such as :class:`warpcloth.NeoHookeanMembrane`.
         device: A Warp device.
         dtype: "float32" or "float64".
 
     Attributes:
-        mesh, sequence: What is measured.
-        on, count: "triangle" or "vertex", and how many.
+        mesh, sequence: The measured mesh and sequence.
+        on, count: "triangle" or "vertex", and their number.
         measures: List of :class:`warpcloth.analysis.measures.Measure`.
         pairs: List of :class:`warpcloth.analysis.frame_pairs.Pair`.
 
     Raises:
-        ValueError: An option is none of those above; a measure needs one that is not given; the mesh has no triangles.
+        ValueError: An option is not allowed, a measure needs an option that is not given, or the mesh has no triangles.
     """
 
     def __init__(
@@ -151,7 +150,7 @@ class Analyzer:
                     raise ValueError(f"{name}: is for measures of triangles, must be None with a neighbourhood")
             self._elements = Neighbourhoods(self.mesh, self.measures, neighbourhood, device, dtype)
         self.count = self._elements.count
-        self._reference = self._without = None  # what the elements refer to, and which have none in it
+        self._reference = self._without = None  # the reference frame of the elements, and which have no reference there
 
     def _chosen(self, names, directions, material):
         given = {"directions": directions is not None, "material": material is not None}
@@ -169,7 +168,7 @@ class Analyzer:
         return found
 
     def _check_times(self):
-        """Refuses times between frames of which a number of this precision has no reciprocal."""
+        """Raises ValueError if the reciprocal of a time between frames overflows or underflows in this precision."""
         if any(measure.rate for measure in self.measures):
             times, least = self.sequence.times, np.finfo(self.dtype).tiny
             rule = f"must be from {least:g} to {1.0 / least:g}, of which {np.dtype(self.dtype)} has the reciprocal"
@@ -179,16 +178,16 @@ class Analyzer:
                     raise ValueError(f"dt: {dt:g} s to frame {self._label(pair.frame):g}, {rule}")
 
     def of(self, *measures: str) -> "Analyzer":
-        """Returns an analyzer of other measures with the options of this one."""
+        """Returns an analyzer of other measures with the same options."""
         return Analyzer(**(self._given | {"frames": self.sequence, "dt": None, "measures": measures}))
 
     @property
     def areas(self) -> np.ndarray:
-        """Rest areas (E,) of triangles, or lumped ones of vertices [m²]."""
+        """Rest areas of triangles, or lumped areas of vertices, (E,) [m²]."""
         return self.mesh.triangle_areas if self.on == "triangle" else self.mesh.vertex_areas
 
     def positions(self, points: np.ndarray) -> np.ndarray:
-        """Positions of the elements, (E, 3) [m]: the centroids of triangles, or the vertices, of points (n, 3) [m]."""
+        """Returns the positions of the elements, (E, 3) [m]: centroids of triangles, or vertices, of points (n, 3) [m]."""
         if self.on == "vertex":
             return points
         a, b, c = self.mesh.triangles.T
@@ -248,13 +247,13 @@ class Analyzer:
             excluded = []
 
     def _refer(self, held):
-        """Makes the elements refer to a frame, where another iteration may have been since; returns which have none in it."""
+        """Sets the reference frame of the elements, unless it is set already; returns which elements have none there."""
         if self._reference is not held:
             self._without, self._reference = self._elements.refer(held.points, held.rounding), held
         return self._without
 
     def _exclude(self, measure, pair, values, known, held):
-        """Makes what could not be measured NaN in all its numbers; returns elements that are not ``known`` to be so."""
+        """Sets all numbers of elements that could not be measured to NaN; returns those that are not ``known`` yet."""
         if measure.rate:
             if pair.before is None:
                 values[:] = np.nan
@@ -268,7 +267,7 @@ class Analyzer:
         points = self.mesh.points.view() if index is None else self.sequence[index]
         points.flags.writeable = False  # samples share it with the frames that follow
         lost = ~np.isfinite(points).all(axis=1)
-        # By the input, and by what computes about one of the points.
+        # The rounding of the input and that of the computation, which is relative to one of the points.
         rounding, found = self.sequence.rounding(points), points[~lost]
         if len(found):
             rounding += np.finfo(self.dtype).eps * np.ptp(found, axis=0).max()
@@ -280,7 +279,7 @@ class Analyzer:
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """Points of a frame, what they are rounded by [m], which are not finite (n,), and which elements those touch (E,)."""
+    """Points of a frame, their rounding [m], which are not finite (n,), and which elements have such points (E,)."""
 
     points: np.ndarray
     rounding: float
@@ -289,7 +288,7 @@ class _Held:
 
 
 def _missing(labels):
-    """Exclusions of frames that are not there; of very many, as one stray file may leave, a single one."""
+    """Returns exclusions of missing frames; a single one if there are very many, as after one stray file."""
     if len(labels) <= _MOST:
         return [_frame(label, "is missing") for label in labels]
     return [_frame(labels[0], f"is missing, and so are {len(labels) - 1} more, the last of them {labels[-1]:g}")]
@@ -300,7 +299,7 @@ def _frame(label, reason):
 
 
 def _frames_first(name, frames, mesh):
-    """Returns frames and mesh; takes them in the other order, which was that of before, with a warning."""
+    """Returns frames and mesh; if they are given in the old order, mesh first, swaps them with a warning."""
     if isinstance(frames, Mesh) or (frames is None and mesh is not None and not isinstance(mesh, Mesh)):
         warnings.warn(f"{name}: frames come first now, {name}(frames, mesh)", DeprecationWarning, stacklevel=3)
         return mesh, frames

@@ -1,4 +1,4 @@
-"""All meshes of a source that may cross, as one, with the colliders and limits that the source declares."""
+"""All meshes of a source that may intersect, joined, with the colliders and limits that the source declares."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -29,22 +29,23 @@ class Cloths:
     """The meshes of a source, one after another.
 
     Attributes:
-        names: Of the meshes: paths of prims, or parts of a mesh that :meth:`warpcloth.Mesh.join` made; "" where there is one.
-        mesh: All of them, a `Surface`; its points are the rest shape.
-        first: Of each mesh the first vertex (M,).
+        names: Names of the meshes: paths of prims, or parts of a mesh that :meth:`warpcloth.Mesh.join` made; "" if there is one
+            mesh.
+        mesh: All meshes as one `Surface`; its points are the rest shape.
+        first: First vertex of each mesh (M,).
         owner: Index of the mesh of each triangle (T,).
-        faces: Its face there (T,).
-        labels: Numbers of the frames (F,), as the source has them.
-        times: Of the frames (F,) [s], or None.
-        read: Function that gives the points (n, 3) [m] from the index of a frame; they need not be finite.
-        precision: Type of the numbers of the source.
-        missing: Numbers of frames that the source leaves out.
-        colliders: The colliders, at these frames.
-        limits: The limits that are declared.
-        others: Paths of meshes of a stage that are not among them, and no colliders.
-        stages: The `StageMesh` of each mesh of a stage, else none.
-        files: Paths that the source is read from.
-        up_axis: "Y" or "Z"; None if the source does not say.
+        faces: Face of each triangle in its mesh (T,).
+        labels: Numbers of the frames in the source (F,).
+        times: Times of the frames (F,) [s], or None.
+        read: Function that returns the points (n, 3) [m] of a frame from its index; they may be infinite or NaN.
+        precision: Floating-point type of the source.
+        missing: Numbers of frames that are missing in the source.
+        colliders: The colliders, with keyframes at these frames.
+        limits: The declared limits.
+        others: Paths of meshes of a stage that are neither among these nor colliders.
+        stages: The `StageMesh` of each mesh of a stage, else empty.
+        files: Paths of the files of the source.
+        up_axis: "Y" or "Z"; None if the source has none.
     """
 
     names: tuple[str, ...]
@@ -65,11 +66,11 @@ class Cloths:
     up_axis: UpAxis | None = None
 
     def face(self, triangle: int) -> tuple[str, int]:
-        """The mesh of a triangle, by name, and its face there."""
+        """Returns the name of the mesh of a triangle, and its face there."""
         return self.names[self.owner[triangle]], int(self.faces[triangle])
 
     def vertex(self, vertex: int) -> tuple[str, int]:
-        """The mesh of a vertex, by name, and its index there."""
+        """Returns the name of the mesh of a vertex, and its index there."""
         owner = int(np.searchsorted(self.first, vertex, side="right")) - 1
         return self.names[owner], int(vertex - self.first[owner])
 
@@ -80,11 +81,11 @@ def cloths_of(
     prim: str | Iterable[str] | None = None,
     fps: float | None = None,
 ) -> Cloths:
-    """The :class:`Cloths` of a source, as :func:`warpcloth.intersections` takes them.
+    """Returns the :class:`Cloths` of a source; for the arguments see :func:`warpcloth.intersections`.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The source is none, or has no triangles.
+        ValueError: The source is not supported, or has no triangles.
     """
     if fps is not None:
         number("fps", fps, above=0.0)
@@ -123,7 +124,7 @@ def _of_path(path, mesh, prims, fps):
 
 
 def _of_points(source, mesh):
-    """Arrays (n, 3) or (F, n, 3), a mesh, a scene, or a result that has ``points``, with its scene if it has one."""
+    """Returns the cloths of arrays (n, 3) or (F, n, 3), a mesh, a scene, or a result with ``points``."""
     scene = source if isinstance(source, Scene) else getattr(source, "scene", None)
     points = source.positions if isinstance(source, Scene) else getattr(source, "points", source)
     if mesh is None:
@@ -150,7 +151,7 @@ def _of_points(source, mesh):
 
 
 def _of_sequence(sequence, files=None):
-    """The only mesh of a sequence, or its parts."""
+    """Returns the mesh of a sequence, or its parts."""
     mesh = sequence.mesh
     parts = mesh.parts or {"": None}
     first = np.array([0 if part is None else part.first for part in parts.values()])
@@ -174,7 +175,7 @@ def _of_sequence(sequence, files=None):
 
 
 def _of_stage(path, prims, fps):
-    """The meshes of a stage."""
+    """Returns the meshes of a stage."""
     stage = read_surfaces(path, prims)
     surfaces = stage.surfaces
     rests = [each.stage.mesh for each in surfaces]

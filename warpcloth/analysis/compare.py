@@ -1,4 +1,4 @@
-"""How far two animated cloths are apart, frame by frame: positions, surfaces and stretches."""
+"""Compares two animated cloths, frame by frame: distances of positions and surfaces, and differences of stretches."""
 
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -17,16 +17,16 @@ from .samples import Exclusion
 from .surfaces import Triangles
 
 Compared = FilePath | Sequence | tuple[Mesh, FilePath | ArrayLike | HasPoints]
-_SAME_TIME = 1e-6  # of the shortest frame
+_SAME_TIME = 1e-6  # tolerance of times, relative to the shortest frame
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two sequences of frames, a and b, side by side. Of the pairs of dimension (2,) the first is a's.
+    """The comparison of two sequences, a and b. On axes of length 2, a comes first.
 
-    A frame is a pair of frames of one time. Where it could not be compared its numbers are NaN, and ``excluded`` says why.
-    Vertices and triangles of the one are compared with those of the other where the topology is the same; where it is not
-    these arrays are None, and what is left is how far the surfaces are apart.
+    A frame is a pair of frames at one time. If it could not be compared, its numbers are NaN, and ``excluded`` says why. If the
+    topologies differ, vertices and triangles cannot be compared: these arrays are None, and only distances of surfaces are
+    left.
 
     Attributes:
         same_topology: Whether both have the same number of vertices and the same triangles, in the same order.
@@ -34,24 +34,24 @@ class Comparison:
             of a.
         times: Times of the frames (F,) [s].
         frames: Their indices in a and in b (F, 2).
-        labels: Their numbers as the files have them (F, 2).
-        unmatched: Indices of the frames of a, and of b, that have no partner at their time: two arrays.
-        excluded: What could not be compared of a, and of b: two lists of `analysis.Exclusion`, with numbers of frames as in the
-            file. Triangles that have no area at rest in the one count for the stretches in neither.
+        labels: Their numbers in the files (F, 2).
+        unmatched: Indices of the frames of a, and of b, without a partner at their time: two arrays.
+        excluded: What could not be compared, in a and in b: two lists of `analysis.Exclusion`, with frame numbers of the files.
+            Triangles without area in one of the rest shapes do not count for stretches.
         sizes: Diagonal of the bounding box of a (F,) [m].
         rms: Root mean square over vertices of ‖aᵢ − bᵢ‖ (F,) [m], or None.
         largest: The largest of these distances (F,) [m], or None.
-        largest_vertex: The vertex that has it (F,), −1 of what is excluded, or None.
-        surface_mean: Mean distance of a's vertices to the surface of b, and the other way (F, 2) [m]. A vertex counts by the
-            area about it, a third of that of its triangles in the frame; one without triangles is on no surface.
-        surface_rms: Root mean square of the same (F, 2) [m].
-        surface_largest: The largest of the same (F, 2) [m].
-        hausdorff: The larger of the two (F,) [m], the Hausdorff distance as vertices have it. That of the surfaces is no less,
-            but for the rounding of `surface_distances`, and may be more, for they may be further apart between vertices.
-        hausdorff_bound: What it is at most (F,) [m]: hausdorff + l/√3 with the longest side l, for a point of a triangle is
-            within l/√3 of one of its vertices; or ``largest`` where that is less.
+        largest_vertex: The vertex with the largest distance (F,), −1 in excluded frames, or None.
+        surface_mean: Mean distance of a's vertices to the surface of b, and of b's to that of a (F, 2) [m]. Vertices are
+            weighted by a third of the area of their triangles in the frame; vertices without triangles do not count.
+        surface_rms: Root mean square of the same distances (F, 2) [m].
+        surface_largest: The largest of the same distances (F, 2) [m].
+        hausdorff: The larger of the two (F,) [m], the Hausdorff distance of the vertices. That of the surfaces is no less,
+            apart from the rounding of `surface_distances`, but may be more, because they may be further apart between vertices.
+        hausdorff_bound: Upper bound of the Hausdorff distance of the surfaces (F,) [m]: hausdorff + l/√3 with the longest side
+            l, as a point of a triangle is within l/√3 of a vertex; or ``largest`` if that is less.
         stretch_rms: Root mean square over triangles of the differences of the principal stretches λ₁ ≥ λ₂, the singular values
-            of the deformation gradient from the own rest shape (F, 2: λ₁, λ₂) [1], or None.
+            of the deformation gradient from each one's rest shape (F, 2: λ₁, λ₂) [1], or None.
         stretch_largest: The largest of these differences (F, 2: λ₁, λ₂) [1], or None.
     """
 
@@ -76,7 +76,7 @@ class Comparison:
 
     @property
     def relative_rms(self) -> np.ndarray | None:
-        """``rms`` by ``sizes`` (F,), NaN where a is a point; None where ``rms`` is."""
+        """``rms`` over ``sizes`` (F,), NaN if a is a point; None if ``rms`` is None."""
         if self.rms is None:
             return None
         return np.divide(self.rms, self.sizes, out=np.full(len(self.rms), np.nan), where=self.sizes > 0.0)
@@ -124,8 +124,8 @@ def compare(
         :class:`Comparison`.
 
     Raises:
-        ValueError: An input is refused or has no times, a frame cannot be read, no two frames have the same time, or none of
-            those that have can be compared.
+        ValueError: An input is not allowed or has no times, a frame cannot be read, no two frames have the same time, or no
+            pair of frames can be compared.
 
     Examples:
         >>> import warpcloth as wc
@@ -163,7 +163,7 @@ def compare(
 
 
 def opened(name: str, source: Any, prim: str | None = None, fps: float | None = None) -> Sequence:
-    """The `Sequence` of one of the two, as `compare` takes it; ``name`` is for errors."""
+    """Returns the `Sequence` of an input of `compare`; ``name`` is for error messages."""
     if isinstance(source, Sequence):
         return source
     if isinstance(source, (str, PathLike)):
@@ -182,14 +182,14 @@ def opened(name: str, source: Any, prim: str | None = None, fps: float | None = 
 
 
 def up_axis_of(name, sequence, given):
-    """Returns the up axis that is given for a sequence, or its own."""
+    """Returns the given up axis, or by default that of the sequence."""
     if given is not None:
         choice(name, given, UP_AXES)
     return given or sequence.up_axis
 
 
 def _turned(b, axis_a, axis_b):
-    """Turns the frames of b to the up axis of a, without rounding; leaves b alone if the axes agree or one is not known."""
+    """Rotates the frames of b to the up axis of a, without rounding; returns b if the axes agree or one is unknown."""
     if axis_a is None or axis_b is None or axis_a == axis_b:
         return b
     columns, signs = ([0, 2, 1], [1.0, 1.0, -1.0]) if axis_a == "Y" else ([0, 2, 1], [1.0, -1.0, 1.0])
@@ -197,7 +197,7 @@ def _turned(b, axis_a, axis_b):
 
 
 def _matching(a, b):
-    """Indices of the frames of one time (F, 2), F at least 1."""
+    """Returns the indices of frames at the same time (F, 2), F at least 1."""
     steps = np.concatenate([np.diff(a.times), np.diff(b.times)])
     near = _SAME_TIME * (steps.min() if len(steps) else 1.0)
     after = np.searchsorted(b.times, a.times - near).clip(max=len(b) - 1)
@@ -209,14 +209,14 @@ def _matching(a, b):
 
 
 def _columns(rows):
-    """Arrays by name from a dict for each frame, which is empty where the frame is excluded."""
+    """Returns arrays by name from one dict per frame, which is empty for an excluded frame."""
     first = next(row for row in rows if row)
     missing = {name: -1 if name == "largest_vertex" else np.full(np.shape(value), np.nan) for name, value in first.items()}
     return {name: np.array([row.get(name, missing[name]) for row in rows]) for name in first}
 
 
 class _Pair:
-    """Measures frames of two sequences against each other; collects what is ``excluded`` of each."""
+    """Compares frames of two sequences, and collects what is ``excluded`` in each."""
 
     def __init__(self, a, b, device):
         self.sequences, self.device = (a, b), device
@@ -237,7 +237,7 @@ class _Pair:
             self.kept = ~(without[0] | without[1])
 
     def measure(self, i, j):
-        """Numbers by name of frame i of a and j of b; none where a point is not finite."""
+        """Returns the numbers by name for frame i of a and j of b; empty if a point is not finite."""
         points = [sequence[index] for sequence, index in zip(self.sequences, (i, j), strict=True)]
         labels = [sequence.labels[index] for sequence, index in zip(self.sequences, (i, j), strict=True)]
         lost = [np.flatnonzero(~np.isfinite(x).all(axis=1)) for x in points]
@@ -264,11 +264,11 @@ class _Pair:
         return {"stretch_rms": _rms(apart), "stretch_largest": apart.max(axis=0)}
 
     def _surfaces(self, points, labels, apart):
-        """Distances both ways; ``apart`` are those of vertices to their partners, or None."""
+        """Returns the distances both ways; ``apart`` are the distances of corresponding vertices, or None."""
         mean, rms, largest = np.full((3, 2), np.nan)
         for k, used in enumerate(self.used):
             found = surface_distances(points[k][used], points[1 - k], self.triangles[1 - k], self.device)
-            if apart is not None:  # a partner is a point of the other surface
+            if apart is not None:  # the corresponding vertex is a point of the other surface
                 found = np.minimum(found, apart[used])
             largest[k] = found.max()
             thirds = np.repeat(areas_of(points[k], self.triangles[k]) / 3.0, 3)

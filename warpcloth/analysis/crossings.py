@@ -1,4 +1,4 @@
-"""Triangles that intersect, found by exact predicates: signs of determinants that rounding does not change."""
+"""Finds intersecting triangles by exact predicates: signs of determinants, unaffected by rounding."""
 
 from importlib.util import find_spec
 
@@ -8,9 +8,9 @@ import numpy as np
 class Crossings:
     """Finds the pairs of triangles of a mesh that intersect, frame by frame.
 
-    Triangles are closed sets: those without a common vertex intersect where they touch. Those with a common vertex or edge
-    intersect only if they have more in common than that. Both by the exact orientations of libigl (Shewchuk 1997, *Adaptive
-    precision floating-point arithmetic and fast robust geometric predicates*).
+    Triangles are closed sets: those without a common vertex also intersect if they touch. Those with a common vertex or edge
+    intersect only if they have more in common than that. Both tests use the exact orientation predicates of libigl (Shewchuk
+    1997, *Adaptive precision floating-point arithmetic and fast robust geometric predicates*).
 
     Args:
         triangles: (T, 3), with one index for each vertex.
@@ -28,11 +28,11 @@ class Crossings:
         self._fans, self._hinges, self._twins = _neighbours(self._triangles, np.flatnonzero(self._proper))
 
     def pairs(self, points: np.ndarray, judged: np.ndarray) -> np.ndarray:
-        """The pairs that intersect, (P, 2), the smaller index first, sorted.
+        """Returns the pairs that intersect, (P, 2), the smaller index first, sorted.
 
         Args:
-            points: (n, 3) [m], finite in the triangles that are judged.
-            judged: Which triangles to look at, (T,): those that have an area.
+            points: (n, 3) [m], finite at the judged triangles.
+            judged: Which triangles to test, (T,); they must have an area.
         """
         from igl.predicates import find_self_intersections
 
@@ -41,7 +41,7 @@ class Crossings:
         found = [np.empty((0, 2), np.int64)]
         if len(own):
             apart = own[find_self_intersections(points, self._triangles[own])[1].reshape(-1, 2)]
-            # It tests neighbours in rounded numbers, within 1e-8, and they are tested here.
+            # libigl tests neighbours with a tolerance of 1e-8, so they are tested here.
             corners = self._triangles[apart]
             found.append(apart[~(corners[:, 0, :, None] == corners[:, 1, None]).any(axis=(1, 2))])
         for candidates, cross in ((self._fans, _fans_cross), (self._hinges, _hinges_overlap)):
@@ -54,7 +54,7 @@ class Crossings:
 
 
 def have_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Which triangles (T, 3) of finite points (n, 3) have an area, exactly, (T,)."""
+    """Returns which triangles (T, 3) of finite points (n, 3) have an area, exactly, (T,)."""
     corners = points[triangles]
     found = np.zeros(len(triangles), dtype=bool)
     for axis in range(3):
@@ -66,17 +66,17 @@ def have_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _side(a, b, c, d):
-    """On which side of the planes through a, b, c the points d (k, 3) are: 1, -1 or 0, exactly, (k,)."""
+    """Returns the side of the plane through a, b, c on which d is, each (k, 3): 1, −1 or 0, exactly, (k,)."""
     from igl.predicates import orient3d
 
     return orient3d(*(np.ascontiguousarray(each) for each in (a, b, c, d))) if len(a) else np.zeros(0, np.int32)
 
 
 def _fans_cross(corners):
-    """Which pairs of triangles (v, a, b), (v, c, d) have more than the vertex v in common, of corners (k, 5, 3).
+    """Returns which triangles (v, a, b) and (v, c, d) have more than v in common, (k,), from corners (k, 5, 3).
 
-    Near v they are cones. Each has a ray in the plane of the other if the other two corners are on different sides of that,
-    and the two rays are one or opposite, by the signs.
+    Near v they are sectors. A sector meets the plane of the other in a ray if its two corners are on different sides of that
+    plane. The signs tell whether the two rays coincide.
     """
     v, a, b, c, d = corners.transpose(1, 0, 2)
     of_first = [_side(v, c, d, each) for each in (a, b)]
@@ -89,7 +89,7 @@ def _fans_cross(corners):
 
 
 def _sectors_overlap(v, a, b, c, d):
-    """As :func:`_fans_cross`, of triangles in one plane."""
+    """Like :func:`_fans_cross`, for triangles in one plane."""
     above = _above(v, a, b)
 
     def holds(left, right, ray):
@@ -100,7 +100,7 @@ def _sectors_overlap(v, a, b, c, d):
 
 
 def _hinges_overlap(corners):
-    """Which pairs of triangles (u, v, a), (u, v, b) are folded flat upon one another, of corners (k, 4, 3)."""
+    """Returns which triangles (u, v, a) and (u, v, b) are folded flat onto one another, (k,), from corners (k, 4, 3)."""
     u, v, a, b = corners.transpose(1, 0, 2)
     found = _side(u, v, a, b) == 0
     u, v, a, b = (each[found] for each in (u, v, a, b))
@@ -110,7 +110,7 @@ def _hinges_overlap(corners):
 
 
 def _above(a, b, c):
-    """Points (k, 3) that are in none of the planes through a, b, c: steps from a along the axis that is steepest to them."""
+    """Returns points (k, 3) off the planes through a, b, c: steps from a along the axis nearest to the normal."""
     normal = np.cross(b - a, c - a)
     rows, axis = np.arange(len(a)), np.abs(normal).argmax(axis=1) if len(a) else np.zeros(0, int)
     found = a.copy()
@@ -119,11 +119,11 @@ def _above(a, b, c):
 
 
 def _neighbours(triangles, own):
-    """Pairs of triangles (T, 3) with one, two and three vertices in common, of those with the indices ``own``.
+    """Finds the pairs of triangles (T, 3), with indices ``own``, that have one, two and three vertices in common.
 
     Returns:
-        The pairs (k, 2) of those with one, and with two, each with the vertices in common and then the others of both
-        (k, 5), (k, 4); the pairs with three.
+        The pairs (k, 2) with one and those with two, each with the common vertices followed by the others, (k, 5) and (k, 4);
+        and the pairs with three.
     """
     count = len(triangles)
     corners = triangles[own].ravel()
@@ -132,7 +132,7 @@ def _neighbours(triangles, own):
     starts = np.flatnonzero(np.diff(vertex, prepend=-1))
     sizes = np.diff(starts, append=len(vertex))
     rows = np.arange(len(vertex))
-    later = np.repeat(starts + sizes, sizes) - rows - 1  # corners after each at its vertex
+    later = np.repeat(starts + sizes, sizes) - rows - 1  # number of later corners at the same vertex
     first = np.repeat(rows, later)
     second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
     keys, common = np.unique(owner[first] * count + owner[second], return_counts=True)

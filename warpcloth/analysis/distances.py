@@ -1,4 +1,4 @@
-"""Distances of points to a surface of triangles, in float64, with the search of Warp's `wp.Mesh`."""
+"""Distances of points to a surface of triangles, in float64, with Warp's `wp.Mesh` for the search."""
 
 import numpy as np
 import warp as wp
@@ -8,30 +8,28 @@ from ..base.turns import in_turn
 from ..kernels import nearest
 from ..mesh.mesh import areas_of
 
-# 2·area by the sum of the squared sides: an equilateral triangle has 0.29. Float32 searches ones below by their rounding.
+# Threshold of 2·area over the sum of the squared sides, 0.29 for an equilateral triangle. Below it, a search in float32 is
+# dominated by rounding.
 _FLAT = 1e-3
 
 
 @in_turn
 def surface_distances(points, x, triangles, device="cpu"):
-    """Distance of each point to the surface that triangles span, flat ones included.
+    """Returns the distance (k,) [m] of each point to a surface of triangles, degenerate ones included.
 
-    Warp searches in float32, about the centre of both and by their size; the distance to the triangle that it finds is then
-    computed in float64. So what is found is never too small, and too large by no more than rounding of the search, about 1e-7
-    of the size, where another triangle is nearer by less than that.
+    Warp searches in float32, relative to the centre and size of both; the distance to the triangle that it finds is computed in
+    float64. So a distance is never too small. It may be too large by the rounding of the search, about 1e-7 of the size, if
+    another triangle is nearer by less than that.
 
     Args:
         points: (k, 3) [m], finite.
         x: Vertices of the surface (n, 3) [m], finite.
         triangles: (T, 3), at least one.
         device: A Warp device.
-
-    Returns:
-        np.ndarray: (k,) [m].
     """
     low, high = (bound(np.stack([bound(points, axis=0), bound(x, axis=0)]), axis=0) for bound in (np.min, np.max))
     centre = low + 0.5 * (high - low)
-    # A power of two, which rounds nothing.
+    # A power of two, which adds no rounding.
     scale = 2.0 ** np.ceil(np.log2(np.max(high - low) / 2.0 or 1.0))
     points, x = (points - centre) / scale, (x - centre) / scale
     sides = x[triangles] - x[np.roll(triangles, 1, axis=1)]

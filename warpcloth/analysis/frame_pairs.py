@@ -1,4 +1,4 @@
-"""Which frame of a sequence is measured against which."""
+"""The pairs of a frame and its reference that an analysis measures."""
 
 import re
 from dataclasses import dataclass
@@ -10,12 +10,12 @@ from ..base.checks import shown, whole
 
 @dataclass(frozen=True)
 class Pair:
-    """One row of an analysis, by indices of frames in their sequence.
+    """One row of an analysis, as indices of frames in the sequence.
 
     Attributes:
         reference: The frame that counts as undeformed; None for the rest shape.
-        frame: The frame that is measured.
-        before: The frame from which rates are taken; None where there is none.
+        frame: The measured frame.
+        before: The frame from which rates are computed, or None.
     """
 
     reference: int | None
@@ -24,21 +24,23 @@ class Pair:
 
 
 def pairs_of(labels, reference=None, pairs=None, lag=None, every=1):
-    """The rows of an analysis.
+    """Returns the rows of an analysis.
 
     Args:
-        labels: Numbers of the frames, rising (F,).
-        reference: "rest", "first", "previous" or the number of a frame: what each frame is measured against; "rest" where
-            nothing is given. Rates are taken from the frame before, of "previous" from the reference.
+        labels: Numbers of the frames (F,), ascending.
+        reference: Reference of every frame: "rest", the default, "first", "previous" or the number of a frame. Rates are
+            computed from the frame before, with "previous" from the reference.
         pairs: Instead, a text such as "1:2,1:3,72:75" or pairs of numbers: reference and frame, also for rates.
-        lag: Instead, whole number K: of every frame the one K frames later, as 1:4, 2:5 and so on for 3, also for rates.
-        every: Every k-th frame alone, beginning with the first.
+        lag: Instead, a whole number K: each frame is the reference of the one K later, also for rates; 3 gives 1:4, 2:5 and so
+            on.
+        every: Use only every k-th frame, from the first.
 
     Returns:
-        tuple: A list of :class:`Pair`, and a list of (number, reason) of frames that could have been in one and are not.
+        tuple: A list of :class:`Pair`, and a list of (number, reason) of frames that are left out.
 
     Raises:
-        ValueError: More than one of the three, a number that no frame has, a pair of a frame with itself, or no row at all.
+        ValueError: More than one of the three is given, a number has no frame, a frame is paired with itself, or there is no
+            row.
     """
     given = [name for name, value in (("reference", reference), ("pairs", pairs), ("lag", lag)) if value is not None]
     if len(given) > 1:

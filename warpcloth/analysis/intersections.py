@@ -1,4 +1,4 @@
-"""The intersections of an animation, found exactly, vertices inside colliders, and limits of stretch that are exceeded."""
+"""Finds intersections in an animation, exactly, vertices inside colliders, and exceeded limits of stretch."""
 
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Several
@@ -19,18 +19,18 @@ from .crossings import Crossings, have_area
 from .samples import Exclusion
 from .stretch_limits import edge_limit
 
-# Beyond [m], determinants of coordinates overflow.
+# Beyond these coordinates [m], determinants overflow.
 _FARTHEST = 1e90
 
 
 @dataclass(frozen=True, eq=False)
 class FrameCheck:
-    """One frame.
+    """The result for one frame.
 
     Attributes:
-        index: Its index in the source.
-        frame: Its number there.
-        time: [s]; NaN if the source has no times.
+        index: Index of the frame in the source.
+        frame: Its number in the source.
+        time: Its time [s]; NaN if the source has no times.
         pairs: The triangles that intersect (P, 2), the smaller index first.
         inside: Vertices (k,) in each collider, by its name; colliders without any are left out.
         exceeded: Elements (k,) that exceed a limit of stretch and their stretches (k,), by the name of the limit.
@@ -47,12 +47,12 @@ class FrameCheck:
 
     @property
     def clean(self) -> bool:
-        """Whether all of it could be judged, and nothing was found."""
+        """Whether all elements could be judged, and nothing was found."""
         return not (len(self.pairs) or self.inside or self.exceeded or self.excluded)
 
     @property
     def vertices_inside(self) -> int:
-        """How many vertices are in colliders, each counted in each collider."""
+        """Number of vertices in colliders; a vertex counts once for each collider."""
         return sum(map(len, self.inside.values()))
 
 
@@ -70,7 +70,7 @@ class Intersections:
 
     @property
     def clean(self) -> bool:
-        """Whether all frames are."""
+        """Whether all frames are clean."""
         return all(each.clean for each in self.frames)
 
     @property
@@ -140,7 +140,7 @@ def intersections(
 
 
 class Checker:
-    """The frames of :func:`intersections` one after another, in memory that does not grow.
+    """Checks the frames of :func:`intersections` one after another, in constant memory.
 
     Args:
         cloths: The :class:`warpcloth.analysis.cloths.Cloths`.
@@ -148,10 +148,10 @@ class Checker:
 
     Attributes:
         cloths: As given.
-        indices: Of the frames that are checked.
+        indices: Indices of the checked frames.
         limits: The :class:`warpcloth.analysis.stretch_limits.StretchLimit` of each limit.
         colliders: The colliders by name.
-        sewn: How many vertices are not counted, because they are at the positions of others.
+        sewn: Number of vertices that are merged with others at the same position.
     """
 
     def __init__(
@@ -218,9 +218,9 @@ class Checker:
 
     @cached_property
     def _index(self):
-        """Of each vertex the first at its position in all frames (n,), if both are on a boundary.
+        """For each vertex, the first vertex that has its position in all frames (n,), if both are on a boundary.
 
-        A vertex without a finite position in a frame that has any is apart from all others.
+        A vertex that is not finite in a frame that has finite points is merged with none.
         """
         cloths = self.cloths
         found, own, together = np.arange(len(cloths.mesh.points)), cloths.mesh.boundary, None

@@ -1,4 +1,4 @@
-"""The measures of a deforming surface: names, shapes, units and what each is."""
+"""The measures of a deforming surface: names, shapes, units and definitions."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,14 +14,14 @@ class Measure:
 
     Attributes:
         name: Its name.
-        shape: Shape of one element's value, () a number.
-        unit: SI unit, "1" of what has none.
-        text: What it is.
-        neutral: Its value where nothing is deformed, the middle of a scale; None where it starts at 0.
-        rate: Whether it is a rate, from the frame before to this one.
-        needs: "directions" or "material", of :func:`warpcloth.analyze`; "" for neither.
-        summed: Whether its scalars say something; of rotations and unit vectors they are the same everywhere.
-        undefined: Why a value may be missing of an element that has a reference and finite points.
+        shape: Shape of the value of one element, () for a number.
+        unit: SI unit, "1" if it has none.
+        text: Its definition.
+        neutral: Its value without deformation, the middle of a colour scale; None if scales start at 0.
+        rate: Whether it is a rate, from the previous frame to this one.
+        needs: "directions" or "material", options of :func:`warpcloth.analyze`; "" for neither.
+        summed: Whether :func:`scalars` uses it; scalars of rotations and unit vectors would be constant.
+        undefined: Why an element with a reference and finite points may have no value.
     """
 
     name: str
@@ -86,18 +86,15 @@ MEASURES = {on: {measure.name: measure for measure in listed} for on, listed in 
 
 
 def chosen(names, on, given=("directions", "material", "rate")):
-    """The measures of a list of names.
+    """Returns the measures of a list of names, each once.
 
     Args:
-        names: Names, or "all" for those that can be had with what is given.
+        names: Names, or "all" for those whose needs are met.
         on: "triangle" or "vertex".
-        given: Which needs are met.
-
-    Returns:
-        list: Of :class:`Measure`, each once.
+        given: The needs that are met.
 
     Raises:
-        ValueError: No name, or one that there is not.
+        ValueError: There is no name, or no such measure.
     """
     known = MEASURES[on]
     if isinstance(names, str):
@@ -119,15 +116,14 @@ def chosen(names, on, given=("directions", "material", "rate")):
 
 
 def scalars(measure, values):
-    """The numbers of a field that can be coloured or summarised.
+    """Returns the scalars of a field, for colours and summaries, as arrays (E,) by name.
+
+    A number gives itself, a vector each component, such as ``stretch_1``, and a matrix its Frobenius norm, such as
+    ``spin_norm``. Rotations and unit vectors give none.
 
     Args:
         measure: The :class:`Measure`.
         values: (E, *shape).
-
-    Returns:
-        dict: Arrays (E,) by name: of a number itself, of a few numbers each, as ``stretch_1``, of a matrix its Frobenius norm,
-        as ``spin_norm``. None of rotations and unit vectors.
     """
     if not measure.summed:
         return {}

@@ -1,4 +1,4 @@
-"""Sets of vertices around each vertex of a mesh: rings of neighbours, or the nearest points."""
+"""Neighbourhoods of vertices: rings of neighbours, or the nearest points."""
 
 import re
 import warnings
@@ -10,31 +10,30 @@ from ..numerics.rotation import point_sets
 
 _RULE = 'must be "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, or a set for each'
 _SHARE = 2.0  # per cent
-# Points lie on a line if their spread across it is at most this fraction of the spread along it. An error across the line
-# then turns the set a hundred times as far.
+# Points count as on a line if their spread across it is at most this fraction of the spread along it. Rotations about the line
+# would amplify errors a hundredfold.
 _LINE = 0.01
-# Number of nearest points that are checked for all vertices at once; more lie on a line only on very uneven meshes.
+# Number of nearest points that are checked for all vertices at once; only on very uneven meshes, more lie on a line.
 _FEW = 8
 
 
 def neighbourhoods(mesh, chosen):
-    """The neighbourhood of each vertex, itself among them.
+    """Returns the neighbourhood of each vertex, which includes the vertex itself.
 
-    Rings follow edges. Nearest points are those of the rest shape, as the crow flies: of a garment they may belong to a layer
-    that only lies near, and a vertex without a finite position has none. A vertex without a triangle has none, and is in
-    none.
+    Rings follow edges. Nearest points are measured in the rest shape, in space, so that they may belong to another layer of a
+    garment; a vertex without a finite position has none. A vertex without a triangle has no neighbourhood, and is in none.
 
     Args:
         mesh: The :class:`warpcloth.Mesh`.
-        chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, which is
-            "nearest" too; or sets of vertices, (n, k) or n lists. If a share of the vertices is fewer than three, or all of
-            them are on one line, the fewest nearest vertices that determine a rotation are taken, with a warning.
+        chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, which is the
+            default of "nearest"; or sets of vertices, (n, k) or n lists. If a percentage gives fewer than three vertices, or
+            all on one line, the fewest nearest vertices that determine a rotation are used, with a warning.
 
     Returns:
         tuple: offsets (n + 1,) and members, int32: those of vertex i are members[offsets[i]:offsets[i + 1]].
 
     Raises:
-        ValueError: It is none of these.
+        ValueError: ``chosen`` is none of these.
     """
     n = len(mesh.points)
     used = np.ones(n, dtype=bool)
@@ -77,7 +76,7 @@ def _nearest(mesh, used, chosen):
         raise ValueError(f"neighbourhood = {shown(chosen)}: no vertex with a triangle is at a finite position, one must be")
     tree = cKDTree(points)
     if kind == "radius":
-        # One vertex after another: together they may be more than memory holds as Python's lists.
+        # One vertex after another, because Python lists of all may exceed the memory.
         rows = [np.sort(np.asarray(tree.query_ball_point(point, value), dtype=np.int32)) for point in points]
         sizes = np.array([len(row) for row in rows])
         members = np.concatenate(rows)
@@ -115,7 +114,7 @@ def _sets(tree, k, widen):
         part, least, most = todo.pop()
         near = tree.query(points[part], k=most)[1]
         size = np.full(len(part), 0 if widen else k)
-        for count in range(least, most + 1):  # ends soon: three or four points are seldom on a line
+        for count in range(least, most + 1):  # ends soon, as three or four points are seldom on a line
             unknown = np.flatnonzero(size == 0)
             if not len(unknown):
                 break
@@ -135,6 +134,6 @@ def _sets(tree, k, widen):
 
 
 def _on_a_line(sets):
-    """Whether the points of each set (m, k, 3) lie on a line."""
+    """Returns whether the points of each set (m, k, 3) lie on a line, (m,)."""
     spread = np.linalg.svd(sets - sets.mean(axis=1, keepdims=True), compute_uv=False)
     return ~(spread[:, 1] > _LINE * spread[:, 0])

@@ -1,4 +1,4 @@
-"""The results of an analysis: rows of measures, and the elements and frames that were left out."""
+"""The results of an analysis: rows of measures, and excluded elements and frames."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from ..base.renamed import renamed
 from ..mesh.mesh import Mesh
 from .measures import Measure
 
-_SHOWN = 8  # elements that a sentence names
+_SHOWN = 8  # elements that a message names
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,9 +18,9 @@ class Exclusion:
 
     Attributes:
         frame: Number of the frame; None for the rest shape.
-        kind: "triangle", "vertex" or "frame", of which there are no elements.
+        kind: "triangle" or "vertex"; "frame" for a whole frame, without elements.
         elements: Indices (k,).
-        reason: Why, as the end of a sentence.
+        reason: The reason, as the end of a sentence.
     """
 
     frame: float | None
@@ -44,14 +44,14 @@ class Sample:
     """One row of an analysis: a frame measured against its reference.
 
     Attributes:
-        row: Its index among the rows.
+        row: Index of the row.
         reference: Number of the reference frame; None for the rest shape.
         frame: Number of the frame.
         index: Index of the frame in its sequence.
-        time: Of the frame [s]; NaN where the sequence has no times.
+        time: Time of the frame [s]; NaN if the sequence has no times.
         points: (n, 3) [m], read-only.
-        values: Arrays (E, *shape) by name of measure, NaN in what is excluded; the analyzer's next sample overwrites them.
-        excluded: List of :class:`Exclusion` that this row is the first to meet.
+        values: Arrays (E, *shape) by name of measure, NaN for excluded elements; the next sample overwrites them.
+        excluded: List of :class:`Exclusion` that occur first in this row.
     """
 
     row: int
@@ -69,14 +69,14 @@ class Analysis(Mapping[str, np.ndarray]):
     """Measures of all rows, arrays (rows, E, *shape) by name: ``analysis["stretch"]``.
 
     Attributes:
-        mesh: The mesh, E of whose triangles or vertices were measured.
+        mesh: The mesh, with E triangles or vertices.
         on: "triangle" or "vertex".
-        measures: What each is, :class:`warpcloth.analysis.measures.Measure` by name.
+        measures: The :class:`warpcloth.analysis.measures.Measure` of each array, by name.
         references: Number of each row's reference frame; None for the rest shape.
         frames: Numbers of the frames (rows,).
-        times: Of the frames (rows,) [s].
-        excluded: What could not be measured, list of :class:`Exclusion`; the values there are NaN.
-        arrays: The arrays.
+        times: Times of the frames (rows,) [s].
+        excluded: List of :class:`Exclusion`, elements that could not be measured; their values are NaN.
+        arrays: The arrays by name.
     """
 
     mesh: Mesh

@@ -1,4 +1,4 @@
-"""Fields of many rows as arrays of one NPZ file."""
+"""Writes fields of many rows as arrays of one NPZ file."""
 
 import math
 import shutil
@@ -11,10 +11,11 @@ from ..base.outputs import Output
 
 
 class NpzWriter(Output):
-    """Fields of all rows, for ``numpy.load``: (rows, E, *shape) by name, and ``frames``, ``references`` and ``times``.
+    """Writes fields of all rows, (rows, E, *shape) by name, and ``frames``, ``references`` and ``times``, for ``numpy.load``.
 
-    The latter are (rows,) float64: labels, NaN for the rest shape, and s. Memory holds them and one row of the fields, which
-    grow in files beside the output and are put together at `close`, without compression. Rows that did not come are left out.
+    The last three are (rows,) float64: frame labels, labels of references, NaN for the rest shape, and times [s]. Memory holds
+    them and one row of the fields. Fields are written to files beside the output, and `close` copies them into one file,
+    without compression. Missing rows are left out.
 
     Attributes:
         rows: Number of rows appended.
@@ -25,7 +26,7 @@ class NpzWriter(Output):
 
         Args:
             path: File to write.
-            rows: The most rows that will come.
+            rows: Largest number of rows.
             fields: (shape of a row, dtype) of each field, by name.
 
         Raises:
@@ -47,11 +48,11 @@ class NpzWriter(Output):
         Args:
             frame: Label of the frame.
             reference: Label of the frame that it is measured against; None is the rest shape.
-            time: Of the frame [s].
-            values: The fields by name, others too; each (E, *shape), of the dtype promised.
+            time: Time of the frame [s].
+            values: The fields by name, each (E, *shape), of the declared dtype; others are ignored.
 
         Raises:
-            ValueError: A field differs from what was promised, or there are more rows.
+            ValueError: A field has another shape or dtype than declared, or there are too many rows.
         """
         if self.rows == self._promised:
             raise ValueError(f"{self.path}: {self._promised} rows were promised, and this is one more")
@@ -64,7 +65,7 @@ class NpzWriter(Output):
             self._parts[name].write(array.tobytes())
         for name, head in zip(self._heads, (frame, np.nan if reference is None else reference, time), strict=True):
             self._heads[name][self.rows] = head
-        self.rows += 1  # last: an interrupted row is none
+        self.rows += 1  # last, so that an interrupted row does not count
 
     def parts(self):
         return self._parts.values()
@@ -75,12 +76,12 @@ class NpzWriter(Output):
                 with _member(archive, name) as member:
                     np.lib.format.write_array(member, head[: self.rows])
             for name, (shape, dtype) in self._fields.items():
-                with _member(archive, name) as member, self._parts[name] as part:  # which frees its space on the disk
+                with _member(archive, name) as member, self._parts[name] as part:  # closing a part frees its disk space
                     _copy(part, member, (self.rows, *shape), dtype)
 
 
 def _copy(part, member, shape, dtype):
-    """Copies the rows that are whole, with the header of an array in front."""
+    """Copies the complete rows, after the header of an array."""
     header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(member, header)
     part.truncate(math.prod(shape) * dtype.itemsize)
@@ -89,6 +90,6 @@ def _copy(part, member, shape, dtype):
 
 
 def _member(archive, name):
-    """A file of an archive, larger than 4 GiB if need be, with no date: equal arrays are equal files."""
+    """Opens a member of an archive, which may exceed 4 GiB, without a date, so that equal arrays give equal files."""
     info = zipfile.ZipInfo(f"{name}.npy")
     return archive.open(info, "w", force_zip64=True)

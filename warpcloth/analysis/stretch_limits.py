@@ -8,7 +8,7 @@ import numpy as np
 from ..mesh.mesh import Mesh
 from ..terms.limit import Limit
 
-# Of the rounding of a coordinate, by how much a length may exceed a limit because of it.
+# Tolerance of lengths, in units of the rounding of a coordinate.
 _ROUNDINGS = 4.0
 
 
@@ -17,10 +17,10 @@ class StretchLimit:
     """Bounds of the stretches of pairs of vertices, l/L, or of triangles, the singular values of F.
 
     Attributes:
-        name: Of the limit.
+        name: Name of the limit.
         stencil: Vertices of each element, (E, 2) or (E, 3).
         rest: Rest positions of all vertices (n, 3) [m].
-        least, most: The bounds (E,); 0 and infinite where there is none.
+        least, most: The bounds (E,); 0 and infinity stand for no bound.
     """
 
     name: str
@@ -31,7 +31,7 @@ class StretchLimit:
 
     @cached_property
     def _sides(self):
-        """Of a triangle at rest the length of its first side, and the second along and across it; of a pair its length."""
+        """Rest length of the first side of each element; for triangles also the second side along and across it, (E,) [m]."""
         first, *others = self._edges(self.rest)
         with np.errstate(all="ignore"):
             length = np.linalg.norm(first, axis=1)
@@ -40,11 +40,11 @@ class StretchLimit:
         return length, *along, *across
 
     def _edges(self, points):
-        """From the first vertex of each element to the others, (E, 3) each."""
+        """Returns the vectors from the first vertex of each element to the others, (E, 3) each."""
         return [points[vertices] - points[self.stencil[:, 0]] for vertices in self.stencil.T[1:]]
 
     def stretches(self, points: np.ndarray) -> np.ndarray:
-        """The least and the largest stretch of each element at points (n, 3) [m], (E, 2); NaN where there is none."""
+        """Returns the smallest and largest stretch of each element at points (n, 3) [m], (E, 2); NaN if undefined."""
         length, *others = self._sides
         first, *second = self._edges(points)
         with np.errstate(all="ignore"):
@@ -58,12 +58,12 @@ class StretchLimit:
             return np.sqrt(np.maximum(np.stack([middle - apart, middle + apart], axis=1), 0.0))
 
     def exceeded(self, points: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
-        """The elements that exceed the limit by more than the rounding of points [m], and their stretches, (k,), (k,)."""
+        """Returns the elements that exceed the limit by more than ``rounding`` [m] explains, and their stretches, (k,) each."""
         low, high = self.stretches(points).T
         length, *others = self._sides
         with np.errstate(all="ignore"):
             size = length
-            if others:  # the height on the longest side is the least length there is
+            if others:  # the smallest length is the height on the longest side
                 x, y = others
                 size = length * y / np.maximum(length, np.maximum(np.hypot(x, y), np.hypot(x - length, y)))
             allowed = _ROUNDINGS * rounding / size
@@ -73,19 +73,19 @@ class StretchLimit:
 
 
 def edge_limit(mesh: Mesh, most: float) -> StretchLimit:
-    """The limit l/L ≤ ``most`` of all edges."""
+    """Returns the limit l/L ≤ ``most`` of all edges."""
     count = len(mesh.edges)
     return StretchLimit("edges", mesh.edges, mesh.points, np.zeros(count), np.full(count, float(most)))
 
 
 def declared_limits(terms: list[Limit], mesh: Mesh, first: int = 0, where: str = "") -> list[StretchLimit]:
-    """The limits that terms declare.
+    """Returns the limits that terms declare.
 
     Args:
         terms: The terms.
-        mesh: The mesh that they are of.
-        first: The index of its first vertex among those of all meshes.
-        where: Name of the mesh, or nothing.
+        mesh: Their mesh.
+        first: Index of its first vertex among those of all meshes.
+        where: Name of the mesh, or "".
     """
     found = []
     for term in terms:

@@ -1,4 +1,4 @@
-"""Fields of an analysis in few numbers, and their files: CSV and JSON."""
+"""Summaries of the fields of an analysis, and their CSV and JSON files."""
 
 import csv
 import math
@@ -16,23 +16,23 @@ PERCENTILES = (0, 1, 5, 25, 50, 75, 95, 99, 100)
 
 @dataclass(frozen=True)
 class Summary:
-    """A scalar field of one row of an analysis, over the elements that have a value; NaN is none, infinity is one.
+    """Statistics of a scalar field of one row, over elements with a value. NaN means no value; infinity is a value.
 
     Attributes:
         frame: Label of the frame.
         reference: Label of the frame that it is measured against; None is the rest shape.
-        time: Of the frame [s].
-        name: Of the scalar.
-        unit: Of the scalar.
+        time: Time of the frame [s].
+        name: Name of the scalar.
+        unit: Unit of the scalar.
         measured: Number of elements with a value.
-        excluded: Number of elements without one.
-        mean: Over elements.
+        excluded: Number of elements without a value.
+        mean: Mean over elements.
         area_mean: Σ wᵢvᵢ / Σ wᵢ, w the rest areas.
-        percentiles: (9,) those of `PERCENTILES`, interpolated linearly.
-        smallest: The first element with the smallest value, -1 where none has a value.
-        smallest_at: (x, y, z) of it in this frame [m].
-        largest: As ``smallest``, of the largest value.
-        largest_at: As ``smallest_at``.
+        percentiles: Percentiles `PERCENTILES` (9,), interpolated linearly.
+        smallest: The first element with the smallest value, -1 if none has a value.
+        smallest_at: Its position (x, y, z) in this frame [m].
+        largest: The first element with the largest value, -1 if none has a value.
+        largest_at: Its position (x, y, z) in this frame [m].
     """
 
     frame: float
@@ -52,20 +52,20 @@ class Summary:
 
 
 def summarise(name, unit, values, positions, weights, *, frame, reference, time):
-    """The `Summary` of a scalar field.
+    """Returns the `Summary` of a scalar field.
 
     Args:
-        name: Of the scalar.
-        unit: Of the scalar.
-        values: (E,), NaN where an element is excluded.
-        positions: (E, 3) centroids of triangles or positions of vertices in this frame [m].
-        weights: (E,) rest areas of triangles, or lumped ones of vertices [m²]; those of excluded elements are not read.
+        name: Name of the scalar.
+        unit: Unit of the scalar.
+        values: (E,), NaN for excluded elements.
+        positions: Centroids of triangles, or vertices, in this frame (E, 3) [m].
+        weights: Rest areas of triangles, or lumped areas of vertices (E,) [m²]; those of excluded elements are not read.
         frame: Label of the frame.
-        reference: Label of the frame that it is measured against; None is the rest shape.
-        time: Of the frame [s].
+        reference: Label of the reference frame; None for the rest shape.
+        time: Time of the frame [s].
 
     Raises:
-        ValueError: A shape is not as above, or the weight of a measured element is negative or not finite.
+        ValueError: An array has another shape, or the weight of a measured element is negative or not finite.
     """
     values, weights, positions = np.asarray(values, dtype=np.float64), np.asarray(weights), np.asarray(positions)
     if values.ndim != 1 or weights.shape != values.shape or positions.shape != (*values.shape, 3):
@@ -105,14 +105,14 @@ def _weighted_mean(values, weights):
     if not total > 0.0:
         return math.nan
     with np.errstate(invalid="ignore", over="ignore"):
-        return float(np.where(weights > 0.0, values, 0.0) @ weights / total)  # 0·∞ is no share
+        return float(np.where(weights > 0.0, values, 0.0) @ weights / total)  # avoids 0·∞
 
 
 def percentiles(values):
-    """`PERCENTILES` of values without NaN, as NumPy interpolates; next to an infinite value that value."""
+    """Returns `PERCENTILES` of values without NaN, interpolated like NumPy's; beside an infinite value, that value."""
     if not len(values):
         return (math.nan,) * len(PERCENTILES)
-    ordered = np.sort(values)  # with vector instructions several times as fast as a partition
+    ordered = np.sort(values)  # vectorised, and so several times as fast as a partition
     at = np.array(PERCENTILES) / 100 * (len(values) - 1)
     low, high = ordered[np.floor(at).astype(int)], ordered[np.ceil(at).astype(int)]
     t = at - np.floor(at)
@@ -127,10 +127,10 @@ def _label(reference):
 
 
 class CsvWriter(Output):
-    """A table with a line for each frame and scalar: the columns of `COLUMNS`, in UTF-8.
+    """Writes a CSV table with a line for each frame and scalar: the columns of `COLUMNS`, in UTF-8.
 
-    Numbers have as many digits as float64 needs; what there is no value for is an empty cell. The scalar is in its ``unit``,
-    ``time`` in s, and the positions ``min_x`` to ``max_z`` in m.
+    Numbers have all digits of float64; a missing value is an empty cell. The scalar is in its ``unit``, ``time`` in s, and the
+    positions ``min_x`` to ``max_z`` in m.
     """
 
     COLUMNS = (
@@ -161,12 +161,12 @@ class CsvWriter(Output):
 
 
 class JsonWriter(Output):
-    """One strict JSON object, streamed: ``input``, ``measures``, ``rows``, ``exclusions``, ``facts``.
+    """Writes one strict JSON object as a stream: ``input``, ``measures``, ``rows``, ``exclusions``, ``facts``.
 
-    What there is no value for is null; infinite numbers, which JSON does not have, are the texts "inf" and "-inf".
+    A missing value is null; infinite numbers are the strings "inf" and "-inf".
 
     Attributes:
-        facts: What else is said of the analysis, by name; written at `close`.
+        facts: Further facts about the analysis by name, written by `close`.
     """
 
     def __init__(self, path, input, measures):
@@ -174,7 +174,7 @@ class JsonWriter(Output):
 
         Args:
             path: File to write.
-            input: What was measured: texts and numbers by name.
+            input: Description of the input: texts and numbers by name.
             measures: The measures by name, each with ``shape``, ``unit`` and ``neutral``.
 
         Raises:

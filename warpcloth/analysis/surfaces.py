@@ -1,4 +1,4 @@
-"""The measures of one frame against another, on a device: of the triangles of a mesh, or of a neighbourhood of each vertex."""
+"""Measures one frame against another on a device: the triangles of a mesh, or the neighbourhood of each vertex."""
 
 import numpy as np
 import warp as wp
@@ -12,16 +12,16 @@ from ..terms import TERMS
 from ..terms.membrane import Membrane
 from .neighbourhoods import neighbourhoods
 
-# Measures of vertices that do not follow from F, which is found where any other is measured.
+# Measures of vertices that do not need F; any other measure does.
 _WITHOUT_GRADIENT = ("rotation", "rotation_angle", "residual", "cross_covariance")
 RATES = {"midpoint": rates.MIDPOINT, "forward": rates.FORWARD, "logarithm": rates.LOGARITHM}
 
 
 class _Elements:
-    """The base of triangles and neighbourhoods: results that are allocated once, and rates between gradients.
+    """The base class of triangles and neighbourhoods: results, which are allocated once, and rates between gradients.
 
     Attributes:
-        values: Results (E, *shape) by name of measure, overwritten by each call; on the CPU views of what kernels wrote.
+        values: Results (E, *shape) by name of measure, overwritten by each call.
     """
 
     def __init__(self, count, measures, device, dtype):
@@ -42,7 +42,7 @@ class _Elements:
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy), dtype=kind, device=self.device)
 
     def centred(self, points):
-        """Points (n, 3) on the device, in float32 relative to one of them, so that no digits are lost far from the origin."""
+        """Returns points (n, 3) on the device; in float32 relative to one of them, to keep digits far from the origin."""
         if self.numpy is np.float32:
             finite = np.isfinite(points).all(axis=1)
             points = points - points[finite.argmax()] if finite.any() else points
@@ -50,12 +50,12 @@ class _Elements:
 
     @in_turn
     def launch(self, kernel, inputs, outputs, count=None):
-        """Launches a kernel; outputs are names of measures, which are left out where nobody has chosen them, or arrays."""
+        """Launches a kernel; outputs are arrays, or names of measures, which are left out if they are not chosen."""
         outputs = [self.results.get(out) if isinstance(out, str) else out for out in outputs]
         wp.launch(kernel, self.count if count is None else count, inputs=inputs, outputs=outputs, device=self.device)
 
     def chosen(self, struct):
-        """A struct of measures with the results that somebody has chosen."""
+        """Returns a struct of measures with the arrays of the chosen results."""
         found = struct()
         for name in struct.vars:
             if name in self.results:
@@ -66,14 +66,14 @@ class _Elements:
         return any(name in self.results for name in names)
 
     def rates(self, dt, method, rounding):
-        """Rates from the gradients ``before`` to ``gradients``, a time dt [s] later, of points rounded by ``rounding`` [m]."""
+        """Computes rates from the gradients ``before`` and ``gradients``, dt [s] later, of points with ``rounding`` [m]."""
         inputs = [self.materials, self.sizes, self.before, self.gradients]
         inputs += [self.scalar(dt), int(RATES[method]), self.scalar(rounding)]
         self.launch(rates.measure_rates(self.scalar), inputs, [self.chosen(rates.rate_measures(self.scalar))])
 
     @in_turn
     def read(self):
-        """Results by name, NumPy arrays (E, *shape)."""
+        """Returns the results by name, NumPy arrays (E, *shape)."""
         return {name: found.numpy() for name, found in self.results.items()}
 
     def _kind(self, shape):
@@ -86,12 +86,12 @@ class Triangles(_Elements):
     """The triangles of a mesh.
 
     Attributes:
-        without: Why one has no reference.
+        without: Why a triangle may have no reference.
 
     Args:
         mesh: A mesh of triangles.
         measures: List of :class:`warpcloth.analysis.measures.Measure`.
-        directions: (T, 2, 2) edge coefficients of two material directions in columns, or None; see
+        directions: Edge coefficients of two material directions in columns (T, 2, 2), or None; see
             :func:`material_directions`.
         material: A membrane term, or None.
         device: A Warp device.
@@ -108,14 +108,14 @@ class Triangles(_Elements):
             mat22 = wp.types.matrix((2, 2), self.scalar)
             self.coefficients, self.materials = self.upload(directions, mat22), self.empty(mat22)
         if material is not None:
-            with np.errstate(all="ignore"):  # a triangle without area is left out, whatever its rest state
+            with np.errstate(all="ignore"):  # triangles without area are left out
                 elements = material.elements(mesh, None)
             self.term = elements.term
             self.stiffness = self.upload(np.broadcast_to(elements.stiffness, self.count), self.scalar)
             self.rest = self.upload(elements.rest, wp.types.vector(self.term.parameters, self.scalar))
 
     def refer(self, X, rounding):
-        """Sets the reference X (n, 3), rounded by ``rounding`` [m]; returns which triangles have none in it, (T,)."""
+        """Sets the reference X (n, 3), with ``rounding`` [m]; returns which triangles have no reference in it, (T,)."""
         outputs = (self.frames, self.inverse_edges, self.sizes)
         self.launch(deformation.frame_triangles(self.scalar), [self.triangles, self.centred(X), self.scalar(rounding)], outputs)
         if self.materials is not None:
@@ -144,7 +144,7 @@ class Triangles(_Elements):
         self.launch(deformation.triangle_gradients(self.scalar), inputs, [out])
 
     def touched(self, vertices):
-        """Which triangles have one of some vertices (n,) bool."""
+        """Returns which triangles have one of the vertices (n,) bool, (T,) bool."""
         return vertices[self.triangles.numpy()].any(axis=1)
 
 
@@ -152,7 +152,7 @@ class Neighbourhoods(_Elements):
     """The neighbourhood of each vertex of a mesh.
 
     Attributes:
-        without: Why one has no reference.
+        without: Why a vertex may have no reference.
 
     Args:
         mesh: A mesh of triangles.
@@ -182,10 +182,7 @@ class Neighbourhoods(_Elements):
         self.sizes = self.upload(np.sqrt(mesh.vertex_areas), self.scalar)
 
     def refer(self, X, rounding):
-        """Sets the reference X (n, 3), rounded by ``rounding`` [m]; returns which vertices have none in it, (n,).
-
-        These cannot be fitted to themselves.
-        """
+        """Sets the reference X (n, 3), with ``rounding`` [m]; returns which vertices have no reference in it, (n,)."""
         self.X, self.rounding = self.centred(X), self.scalar(rounding)
         self._find_normals(self.X, self.reference_normals)
         self._fit(X, [self.gradients, self.frames, None, None, None])
@@ -205,7 +202,7 @@ class Neighbourhoods(_Elements):
             self.launch(neighbourhood_fit.measure_neighbourhoods(self.scalar), inputs, [self.chosen(outputs)])
 
     def touched(self, vertices):
-        """Which neighbourhoods have one of some vertices (n,) bool."""
+        """Returns which neighbourhoods have one of the vertices (n,) bool, (n,) bool."""
         offsets, members = self.host
         return np.bincount(np.repeat(np.arange(self.count), np.diff(offsets)), vertices[members], self.count) > 0.0
 
@@ -222,20 +219,20 @@ class Neighbourhoods(_Elements):
 
 
 def material_directions(mesh, chosen, corner_coordinates=None):
-    """Two directions in the material of each triangle, as coefficients α of its edges: X₁ − X₀ and X₂ − X₀ times α.
+    """Returns two material directions of each triangle, as coefficients α of its edges: α₁(X₁ − X₀) + α₂(X₂ − X₀).
 
     Args:
         mesh: A mesh of triangles.
-        chosen: "st", along which one texture coordinate grows and the other does not; or a vector (3,), whose part in the
-            plane of each triangle of the rest shape is the first, and the second is square to it.
-        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), where vertices do not have one each.
+        chosen: "st", the directions along which one texture coordinate grows and the other is constant; or a vector (3,), whose
+            component in the plane of each triangle at rest is the first direction, with the second perpendicular to it.
+        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), if vertices have several.
 
     Returns:
-        np.ndarray: (T, 2, 2), warp and weft in columns; NaN where there is none: the texture is degenerate, or the vector
-        stands on the triangle.
+        np.ndarray: (T, 2, 2), warp and weft in columns; NaN if the texture is degenerate or the vector is perpendicular to the
+        triangle.
 
     Raises:
-        ValueError: It is none of these, or the mesh has no texture coordinates.
+        ValueError: ``chosen`` is none of these, the mesh has no texture coordinates, or no triangle has directions.
     """
     rule = 'be "st" or a vector (3,)'
     X = mesh.points[mesh.triangles]
@@ -275,7 +272,7 @@ def material_directions(mesh, chosen, corner_coordinates=None):
 
 
 def check_material(material):
-    """Refuses what is no membrane."""
+    """Raises ValueError if ``material`` is neither None nor a membrane."""
     if not isinstance(material, Membrane):
         names = ", ".join(name for name, kind in TERMS.items() if issubclass(kind, Membrane))
         raise ValueError(

@@ -1,4 +1,4 @@
-"""As-rigid-as-possible deformation: a rest shape follows its handles, every neighbourhood as rigidly as it can."""
+"""As-rigid-as-possible deformation: a rest shape follows its handles, each neighbourhood as rigidly as possible."""
 
 import importlib.util
 import warnings
@@ -27,7 +27,7 @@ from ..numerics.rotation import kabsch
 
 Weights = Literal["cotangent", "clamped", "intrinsic", "uniform"]
 CellEnergy = Literal["spokes", "spokes_and_rims"]
-# A weight below this share of the largest is one of rounding.
+# A weight below this fraction of the largest counts as rounding.
 _ROUNDING = 1e-12
 
 
@@ -38,9 +38,9 @@ class Deformed:
     Attributes:
         points: (n, 3) [m]; the handles are at their targets.
         rotations: (n, 3, 3), R_c of the cell of each vertex, fitted to ``points``.
-        energies: (iterations + 1,) [m²]: of the start and after each iteration, with the rotations fitted to those points.
-        iterations: Iterations made, k.
-        converged: Whether the last one met the tolerance.
+        energies: Energies (iterations + 1,) [m²] at the start and after each iteration, with rotations fitted to those points.
+        iterations: Number of iterations.
+        converged: Whether the last iteration met the tolerance.
     """
 
     points: np.ndarray
@@ -57,18 +57,18 @@ class Arap:
     targets, over x. Energies, each with its cells:
 
     - "spokes": the edges at c (Sorkine & Alexa 2007, *As-rigid-as-possible surface modeling*). Every edge is in two cells.
-    - "spokes_and_rims": all edges of the triangles at c, with the weight that they have in that triangle (Chao, Pinkall,
-      Sanan & Schröder 2010, *A simple geometric model for elastic deformations*). It is Σ_t area ‖∇x − R_c‖² over the
-      triangles at c, so never negative.
+    - "spokes_and_rims": all edges of the triangles at c, with their weights in these triangles (Chao, Pinkall, Sanan &
+      Schröder 2010, *A simple geometric model for elastic deformations*). It is Σ_t area ‖∇x − R_c‖² over the triangles at c,
+      and so never negative.
 
-    An iteration first minimises E exactly over all R_c, then over all x, so the energy never rises. The second step solves L x
-    = b with a constant matrix, which is factorised once. Weights w_ij of edges:
+    An iteration first minimises E exactly over all R_c, then over all x, so the energy never rises. The second step solves
+    L x = b with a constant matrix, which is factorised once. Weights w_ij of edges:
 
-    - "cotangent": ½(cot α + cot β) of the angles opposite the edge; negative where α + β > 180°.
-    - "clamped": the same, with negative weights set to 0. Linear precision is lost: inside a flat mesh, L x = 0 no longer
+    - "cotangent": ½(cot α + cot β) of the angles opposite the edge; negative if α + β > 180°.
+    - "clamped": the same, with negative weights set to 0. This loses linear precision: inside a flat mesh, L x = 0 no longer
       holds.
     - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges replace those of the mesh (Fisher et al.
-      2007); negative on the boundary at most. For orientable manifolds. Needs libigl:
+      2007); they can be negative only on the boundary. For orientable manifolds. Needs libigl:
       ``pip install -e '.[intrinsic]'`` in the checkout.
     - "uniform": 1 for each edge; an edge mesh takes only these.
 
@@ -76,7 +76,7 @@ class Arap:
 
     Args:
         mesh: The rest shape, a :class:`warpcloth.Mesh`.
-        handles: Vertices that are moved (h,), each once, or a selection (see :meth:`warpcloth.Mesh.select`), which is sorted.
+        handles: Moved vertices (h,), each once, or a selection (see :meth:`warpcloth.Mesh.select`), which is sorted.
             Every connected component of the mesh needs a handle.
         weights: One of those above.
         energy: One of those above.
@@ -87,8 +87,8 @@ class Arap:
         handles: (h,) int32, in the order in which :meth:`solve` takes their positions.
         parts: Number of the connected component of each vertex (n,); edges with a weight other than 0 connect vertices.
         laplacian: L (n, n), scipy CSR, with L_ij = −w_ij and rows that sum to 0.
-        negative_edges: (k, 2) pairs of vertices with a negative weight. With "spokes" each of them adds a negative energy, so
-            that even a rigid motion may not be a minimum, and there is a warning.
+        negative_edges: Edges (k, 2) with a negative weight. With "spokes", each adds a negative energy, so that even a rigid
+            motion may not be a minimum; a warning says so.
 
     Raises:
         ValueError: An argument is not one of those above, a vertex is isolated, a component of the mesh has no handle, or the
@@ -157,7 +157,7 @@ class Arap:
         self.laplacian = (diags(np.asarray(adjacency.sum(axis=1))[:, 0]) - adjacency).tocsr()
         self.parts = self._connected(adjacency)
 
-        # The free vertices come first, so that what the system solves for is a slice of every array.
+        # Free vertices come first, so that the unknowns are a slice of every array.
         near = worthwhile_order(mesh)
         vertices = np.arange(n) if near is None else near
         self._order = np.concatenate([vertices[~np.isin(vertices, self.handles)], self.handles])
@@ -166,13 +166,13 @@ class Arap:
         self._coupling = system[:, self.handles]
         self._factor = constant_factor(system[:, self._order[:f]], self.device, self._scalar) if f else None
 
-        # Coordinates of about unit size near the origin: nothing is lost to the position or the size of a mesh. A power of two
-        # scales without rounding.
+        # Scales to about unit size near the origin, so that the position and size of a mesh cost no precision. A power of two
+        # adds no rounding.
         self._unit = 2.0 ** np.ceil(np.log2(np.ptp(mesh.points, axis=0).max()))
         self._rest = (mesh.points - mesh.points[self.handles].mean(axis=0)) / self._unit
         # The energy of edges that are all strained by 1.
         self._size = 2.0 * float(np.abs(w) @ (np.diff(self._rest[pairs], axis=1)[:, 0] ** 2).sum(axis=1))
-        # What rounding of coordinates of size 1 makes of the energy.
+        # Energy by the rounding of coordinates of size 1.
         self._rounding = 16.0 * np.finfo(self._numpy).eps ** 2 * np.abs(adjacency).sum()
 
         vec3, mat33 = types(self._scalar)
@@ -187,22 +187,19 @@ class Arap:
     def solve(
         self, positions: ArrayLike, iterations: int = 100, tolerance: float = 1e-6, initial: ArrayLike | None = None
     ) -> Deformed:
-        """Moves the handles and lets the rest follow. Reuses the factorisation and all arrays of earlier calls.
+        """Moves the handles and solves for all points. Reuses the factorisation and all arrays of earlier calls.
 
         Args:
             positions: Targets of the handles (h, 3) [m], in their order.
             iterations: Maximum number of iterations, each of one solve and one fit of rotations.
-            tolerance: It has converged when an iteration lowers the energy by no more than this share of it, or than edges
-                strained by this much have, or by what rounding makes of it; 0 to make all iterations.
-            initial: Points to start from (n, 3) [m]; those of handles are ignored. By default the rest shape, each component of
-                which is moved rigidly so that its handles fit their targets best. If the energy is not negative, a rigid motion
-                of all handles is then followed exactly.
-
-        Returns:
-            Deformed: Points, rotations, energies.
+            tolerance: Iterations end when one lowers the energy by no more than this fraction of it, than the energy of edges
+                with this strain, or than rounding; 0 makes all iterations.
+            initial: Initial points (n, 3) [m]; those of handles are ignored. By default the rest shape, each component moved
+                rigidly so that its handles fit their targets best. If the energy is not negative, a rigid motion of all handles
+                is then followed exactly.
 
         Raises:
-            ValueError: If an argument is not allowed, or the energy overflows.
+            ValueError: An argument is not allowed, or the energy overflows.
         """
         whole("iterations", iterations, 0)
         number("tolerance", tolerance, least=0.0)
@@ -253,7 +250,7 @@ class Arap:
 
     @in_turn
     def carry(self, points: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Points moved along with the handles: each component rigidly, by the best fit to the motion of its handles.
+        """Moves points along with the handles: each component rigidly, by the best fit to the motion of its handles.
 
         Args:
             points: (n, 3) [m].
@@ -270,10 +267,10 @@ class Arap:
         return np.einsum("nij,nj->ni", rotations[self.parts], points - old[self.parts]) + new[self.parts]
 
     def _connected(self, adjacency):
-        """The part of the mesh that each vertex belongs to (n,), numbered from 0.
+        """Returns the connected component of each vertex (n,), numbered from 0.
 
         Raises:
-            ValueError: If a part has no handle.
+            ValueError: A component has no handle.
         """
         from scipy.sparse.csgraph import connected_components
 
@@ -288,7 +285,7 @@ class Arap:
         return parts
 
     def _record(self, mesh, pairs, w, rims):
-        """The segment that fits the rotations of the cells and finds the energy and the right-hand side."""
+        """Captures the fit of the rotations of all cells, the energy and the right-hand side."""
         rest, rank, n = self._rest, self._rank, len(self._order)
         vec3, _ = types(self._scalar)
         if rims:
@@ -306,7 +303,7 @@ class Arap:
             elements, kernel, weights, kind = pairs, cells.edge_energy, w, self._scalar
         cell, member, moments = _summed(rank[entries[0]], rank[entries[1]], entries[2].reshape(-1, 3), n)
         rows = self._compressed(cell, member, moments, n)
-        # Every edge is in 2 cells, or every side of a triangle in 3, so that the sum over cells is that often L x = b.
+        # Every edge is in 2 cells, or every side of a triangle in 3, so that the sum over cells is 2 or 3 times L x = b.
         columns = self._compressed(member, cell, moments / (3 if rims else 2), n)
 
         index = wp.types.vector(elements.shape[1], wp.int32)
@@ -316,7 +313,7 @@ class Arap:
         energies = self._zeros(len(elements), wp.float64)
         partial = self._zeros((1, CHUNKS if self.device.is_cuda else 1), wp.float64)
         placed = self._array(rest[self._order], vec3)
-        # By themselves: a graph that held its owner would keep the factors until garbage is collected.
+        # Local variables, because a graph that refers to self would keep the factors alive until the garbage collector runs.
         device, scalar, x, rotations = self.device, self._scalar, self._x.array, self._rotations.array
         total, start, b = self._energy.array, self._start.array, self._b
 
@@ -334,7 +331,7 @@ class Arap:
         return Segment(self.device, fit_cells)
 
     def _compressed(self, rows, columns, values, count):
-        """(offsets, columns, values) on the device, sorted by row and column, of entries with vectors as values."""
+        """Returns entries with vector values as (offsets, columns, values) on the device, sorted by row and column."""
         order = np.lexsort((columns, rows))
         offsets = np.searchsorted(rows[order], np.arange(count + 1))
         indices = [wp.array(part.astype(np.int32), dtype=wp.int32, device=self.device) for part in (offsets, columns[order])]
@@ -348,7 +345,7 @@ class Arap:
 
 
 def _points(name, value, count, label):
-    """``value`` as finite points (count, 3), float64; ``label`` names a row."""
+    """Returns ``value`` as finite points (count, 3), float64; ``label`` names a row in errors."""
     found = numeric(name, value, f"have shape {(count, 3)}")
     if found.shape != (count, 3):
         raise ValueError(f"{name} has shape {found.shape}; it must be {(count, 3)}")
@@ -358,14 +355,14 @@ def _points(name, value, count, label):
 
 
 def _half_cotangents(mesh):
-    """½ cot of the angle at each corner of each triangle (T, 3), signed."""
+    """Returns ½ cot of the angle at each corner of each triangle (T, 3), signed."""
     corners = mesh.points[mesh.triangles]
     one, other = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     return 0.5 * np.einsum("tki,tki->tk", one, other) / np.linalg.norm(np.cross(one, other), axis=2)
 
 
 def _edge_weights(mesh, weights):
-    """Pairs of vertices (E, 2), of a matrix the smaller index first, and their weights (E,)."""
+    """Returns edges (E, 2) and their weights (E,)."""
     from scipy.sparse import coo_matrix, triu
 
     if weights == "uniform":
@@ -376,7 +373,7 @@ def _edge_weights(mesh, weights):
             raise ImportError("weights = 'intrinsic' needs libigl: pip install -e '.[intrinsic]' in the checkout")
         import igl
 
-        triangles = igl.bfs_orient(mesh.triangles.astype(np.int64))[0]  # which its flips rely on
+        triangles = igl.bfs_orient(mesh.triangles.astype(np.int64))[0]  # edge flips need a consistent orientation
         sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
         sides, counts = np.unique(sides, axis=0, return_counts=True)
         for side in sides[counts > 1][:1]:
@@ -394,7 +391,7 @@ def _edge_weights(mesh, weights):
 
 
 def _summed(rows, columns, values, n):
-    """Entries with vectors as values: those of one entry added, and those of value 0 dropped but on the diagonal."""
+    """Adds up entries with vector values that have equal rows and columns, and drops zeros off the diagonal."""
     keys, inverse = np.unique(rows.astype(np.int64) * n + columns, return_inverse=True)
     rows, columns = np.divmod(keys, n)
     values = np.stack([np.bincount(inverse, axis) for axis in values.T], axis=1)

@@ -1,4 +1,4 @@
-"""As-rigid-as-possible deformation driven by keyframes: a mesh and moved handles in, an animation out."""
+"""As-rigid-as-possible deformation by keyframes of handles."""
 
 import time
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ class Deformation:
     """The result of a deformation: a frame for each keyframe.
 
     Attributes:
-        points: (F, n, 3) [m]; in memory, or read from ``output`` when asked for (float32 then).
-        largest_angles: Largest of the angles of each frame (F,) [rad].
-        angles: Angle by which the neighbourhood of each vertex is turned from its rest shape, (F, n) [rad], 0 to π: no turn
-            counts twice. In the file it is ``primvars:rotationAngle``, in degrees.
-        energies: Energy that is left in each frame (F,) [m²].
-        iterations: Iterations of each frame (F,).
+        points: (F, n, 3) [m], in memory, or with ``output`` float32, read from the file on demand.
+        largest_angles: Largest angle of each frame (F,) [rad].
+        angles: Rotation angle of the neighbourhood of each vertex from its rest shape, (F, n) [rad], 0 to π. In the file it is
+            ``primvars:rotationAngle``, in degrees.
+        energies: Final energy of each frame (F,) [m²].
+        iterations: Number of iterations of each frame (F,).
         converged: Whether each frame reached the tolerance (F,).
         times: (F,) [s].
         timings: ``factorise`` and ``frames`` (a list) [s].
@@ -101,8 +101,8 @@ def deform(
         :class:`Deformation`.
 
     Raises:
-        BlockingIOError, Interrupted, OSError: As :func:`warpcloth.simulate`.
-        ValueError: If an argument is not allowed here or by :class:`warpcloth.Arap`, or a frame overflows; the frames before it
+        BlockingIOError, Interrupted, OSError: As for :func:`warpcloth.simulate`.
+        ValueError: An argument is not allowed here or by :class:`warpcloth.Arap`, or a frame overflows; the frames before it
             are in ``output``.
 
     Examples:
@@ -123,9 +123,9 @@ def deform(
     if pins.keyframes is None:
         raise ValueError("pins.keyframes is None; a deformation needs positions of its handles, (F, p, 3), in each frame")
     frames = len(pins.keyframes)
-    if output is not None:  # before an earlier result is replaced
+    if output is not None:  # before it replaces an earlier result
         _refuse_beyond_float32(pins.keyframes, fps)
-    # First, for it refuses a wrong output before anything is factorised.
+    # First, so that a wrong output is refused before the factorisation.
     recorder = _Memory(mesh, frames) if output is None else _File(mesh, pins, fps, output, single_file, stage, up_axis)
     results, points = [], None
     with recording(recorder, frames - 1):
@@ -154,7 +154,7 @@ def deform(
 
 
 def _refuse_beyond_float32(keyframes, fps):
-    """Refuses handles whose positions or velocities a file of float32 does not hold."""
+    """Raises ValueError if positions or velocities of handles overflow in the float32 of a file."""
     limit = np.finfo(np.float32).max
     rule = f"cannot be written: a file holds float32, up to {limit:.2g}"
     refuse("pins.keyframes", keyframes, ~(np.abs(keyframes) <= limit), rule)
@@ -164,7 +164,7 @@ def _refuse_beyond_float32(keyframes, fps):
 
 
 def rotation_angles(rotations: np.ndarray) -> np.ndarray:
-    """Angles of rotation matrices (n, 3, 3) → (n,) [rad], 0 to π, as precise near both ends as the matrices are."""
+    """Returns the angles (n,) [rad], 0 to π, of rotation matrices (n, 3, 3), as precise as the matrices near both ends."""
     R = rotations
     axial = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
     return np.arctan2(np.linalg.norm(axial, axis=1), np.trace(R, axis1=1, axis2=2) - 1.0)  # 2 sin, 2 cos
@@ -192,7 +192,7 @@ class _Memory:
 
 
 class _File:
-    """Writes frames as USD and reads them back when asked."""
+    """Writes frames as USD, and reads them back on demand."""
 
     def __init__(self, mesh, pins, fps, output, single_file, stage, up_axis):
         self.single_file, primvars = single_file, {PRIMVAR: "vertex"}

@@ -225,7 +225,7 @@ def _facts_of(stage, source):
 
 
 def _show_colours(stage, source, with_mesh):
-    """Defines a material below the prim that shows displayColor, and binds it to the prim and its faces."""
+    """Defines a material below the prim that shows displayColor; if ``with_mesh``, binds it to the prim and its faces."""
     path = f"{source.prim}/DisplayColour"
     refuse_taken(stage, path, "Material")
     material = define_material(stage, path)
