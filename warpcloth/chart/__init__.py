@@ -1,4 +1,4 @@
-"""Colours, pictures and plots of measured cloth. Nothing else here imports matplotlib, the extra "chart"."""
+"""Plots of measured cloth and of solvers, with matplotlib, the extra "chart"."""
 
 from ..picture.colour import Scale, range_over
 from ..picture.picture import draw

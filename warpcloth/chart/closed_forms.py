@@ -8,14 +8,14 @@ _MARKS = "os^Dv"
 
 
 def plot_physics(path, results):
-    """Plots the error against h and against the time, two panels a case, pattern and angle.
+    """Plots the error against h and against the time, with two panels for each case, pattern and angle.
 
-    Dashed: what the free sides of a cantilever cost, below which no mesh comes; and how well the equilibria are known, below
-    which errors mean nothing, written where it is below the picture. What did not end well is named beside.
+    Dashed lines show the effect of the free sides of a cantilever, which no mesh can avoid, and the accuracy of the equilibria,
+    below which errors mean nothing; if that is below the picture, it is written. Points that failed are named beside it.
 
     Args:
         path: The file, .png, .svg or .pdf.
-        results: Pairs of the arguments of :func:`physics.measure` and what it gave, in any order.
+        results: Pairs of arguments and result of :func:`physics.measure`, in any order.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -36,7 +36,7 @@ def plot_physics(path, results):
     panels = figure.subplots(down, 2 * across, squeeze=False, sharey=True).reshape(-1, 2)
     for (left, right), (title, lines) in zip(panels, rows.items(), strict=False):
         for k, (label, points) in enumerate(lines.items()):
-            # One that is exact to the last bit cannot be drawn on logarithmic axes either.
+            # An error of 0 cannot be drawn on logarithmic axes.
             good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if found["error"])
             style = {"marker": _MARKS[k % len(_MARKS)], "markersize": 4, "linewidth": 1.0, "color": f"C{k}"}
             left.plot([h for h, _, _ in good], [error for _, error, _ in good], label=label, **style)
@@ -56,7 +56,7 @@ def plot_physics(path, results):
 
 
 def _floor(left, right, floors):
-    """A line at the largest of the floors; errors alone say how far down the picture goes."""
+    """Draws a line at the largest of the floors, but errors alone set the range of the picture."""
     if not floors:
         return
     (low, high), floor = left.get_ylim(), max(floors)
@@ -72,7 +72,7 @@ def _finish(left, right, title, points):
     left.set_xlabel("h / L", color=GREY)
     right.set_xlabel("time [ms]", color=GREY)
     for axes in (left, right):
-        if not any(len(line.get_xdata(orig=True)) for line in axes.lines):  # as of a cylinder, which nothing solves for
+        if not any(len(line.get_xdata(orig=True)) for line in axes.lines):  # such as for a cylinder, which needs no solve
             axes.set_axis_off()
             continue
         axes.set(xscale="log", yscale="log")
@@ -96,7 +96,7 @@ def _title(arguments):
 
 
 def _label(arguments):
-    """The settings of a line, beside what is in the title."""
+    """Returns the settings of a line that are not in the title."""
     words = [] if arguments["case"] in ("chain", "catenary", "patch") else [arguments.get("bending", "quadratic")]
     if arguments["case"] == "cantilever":
         words.append(f"Γ = {arguments.get('gamma', 1.0):g}")

@@ -1,4 +1,4 @@
-"""Distances of two animations over time."""
+"""Plots the distances of two animations over time."""
 
 from pathlib import Path
 
@@ -6,12 +6,12 @@ from ..picture.figures import PICTURES, check_path, save
 
 
 def plot_distances(path, found, names):
-    """Plots how far two animations are apart over time, and where they have the same triangles the stretches below.
+    """Plots the distances of two animations over time and, if they have the same triangles, differences of stretches below.
 
     Args:
         path: The file, .png, .svg or .pdf.
         found: The :class:`warpcloth.Comparison`.
-        names: Of the two files.
+        names: Names of the two files.
 
     Raises:
         FileNotFoundError: The folder does not exist.

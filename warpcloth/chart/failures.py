@@ -1,11 +1,11 @@
-"""Charts of failures."""
+"""Draws charts of failures."""
 
 from ..lab.failures import FAILURES
 from .panels import plot_panels
 
 
 def plot_failure(path, found):
-    """Draws what :func:`failure_chart` returned.
+    """Draws the result of :func:`failure_chart`.
 
     Raises:
         FileNotFoundError: The folder does not exist.

@@ -1,4 +1,4 @@
-"""Maps of stability: a panel for each method, with the limits that theory gives, and the same as a table."""
+"""Draws maps of stability, a panel for each method with its theoretical limits, and writes them as a table."""
 
 import math
 
@@ -10,8 +10,8 @@ from ..lab.cells import FRAMES
 from ..lab.stability_limits import DIVERGES, KNOWN
 from ..picture.figures import GREY, PICTURES, check_path, save
 
-# sRGB. What diverged goes from the dark, at once, to the light, in the last frame; all differ in lightness too, for those who
-# do not see red.
+# sRGB colours. Divergence goes from dark, at once, to light, in the last frame. All differ in lightness too, for people who do
+# not see red.
 _PLAIN = {
     "stable": (0.66, 0.83, 0.93),
     "unsure": (0.66, 0.83, 0.93),
@@ -34,21 +34,21 @@ _STYLES = {
     "r = 1/(2hω)": ((0, (5, 1)), "the weight that converges fastest"),
     KNOWN: ((0, (1, 2)), "beyond, the reference is less accurate"),
 }
-# Of what is stable or inaccurate.
+# Hatching of cells that are stable or inaccurate.
 _UNSURE = {"facecolor": _PLAIN["stable"], "edgecolor": _PLAIN["inaccurate"], "hatch": "///", "linewidth": 0.0}
 _TICKS = 4
 _SMALL, _TEXT = 9.5, 11.0  # sizes of letters [pt]
 
 
 def plot_maps(path, survey, cells, accuracy=None):
-    """Draws what became of each cell, a panel for each method, and where the rules of :mod:`warpcloth.lab.stability_limits` are
-    1.
+    """Draws the verdict of each cell, a panel for each method, with lines where limits of
+    :mod:`warpcloth.lab.stability_limits` are 1.
 
     Args:
         path: The file, .png, .svg or .pdf.
         survey: The :class:`warpcloth.lab.stability.Survey`.
-        cells: (setup, y, x) as :meth:`warpcloth.lab.stability.Survey.table` gives them.
-        accuracy: What is inaccurate, to say so, or None.
+        cells: (setup, y, x), from :meth:`warpcloth.lab.stability.Survey.table`.
+        accuracy: The error above which cells are inaccurate, for the legend, or None.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -93,7 +93,7 @@ def plot_maps(path, survey, cells, accuracy=None):
 
 
 def _coordinates(name, values):
-    """Where the values stand along an axis."""
+    """Returns the coordinates of values along an axis."""
     return np.log10(values) if AXES[name].logarithmic else np.asarray(values, dtype=np.float64)
 
 
@@ -108,7 +108,7 @@ def _ticks(name, values, at):
 
 
 def edges(at):
-    """Ends of cells about coordinates (n,), (n+1,)."""
+    """Returns the edges of cells (n+1,) around coordinates (n,)."""
     if len(at) == 1:
         return np.array([at[0] - 0.5, at[0] + 0.5])
     middle = 0.5 * (at[1:] + at[:-1])
@@ -116,7 +116,7 @@ def edges(at):
 
 
 def _colours(rows):
-    """sRGB of cells (y, x, 3)."""
+    """Returns the sRGB colours of cells (y, x, 3)."""
     return np.array([[_colour(cell) for cell in row] for row in rows])
 
 
@@ -128,7 +128,7 @@ def _colour(cell):
 
 
 def _hatch(axes, coordinates, rows):
-    """Hatches the cells that are stable and inaccurate, in the colours of both."""
+    """Hatches the cells that are stable or inaccurate, in the colours of both."""
     from matplotlib.patches import Rectangle
 
     across, up = map(edges, coordinates)
@@ -139,7 +139,7 @@ def _hatch(axes, coordinates, rows):
 
 
 def _line(axes, coordinates, rows, name, style):
-    """The line where a rule is 1, between the cells; whether there is one."""
+    """Draws the line between cells where a limit is 1; returns whether there is one."""
     ratios = np.array([[cell["rules"].get(name) or np.nan for cell in row] for row in rows], dtype=float)
     if min(ratios.shape) < 2:
         return False

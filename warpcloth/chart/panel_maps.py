@@ -1,4 +1,4 @@
-"""Maps among the panels of charts of failures: cells coloured by value or by series, with laws as lines over them."""
+"""Draws maps in charts of failures: cells coloured by value or by series, with laws as lines."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from ..picture.figures import GREY
 from .maps import edges
 
 _DASHES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
-# sRGB of kinds, in their order; they differ in lightness too, for those who do not see red.
+# sRGB of kinds, in order; they differ in lightness too, for people who do not see red.
 _KINDS = ((0.66, 0.83, 0.93), (0.93, 0.62, 0.20), (0.42, 0.02, 0.11))
 _LETTERS = 8  # [pt]
 _REFUSED = {"facecolor": "white", "edgecolor": "0.8", "hatch": "////"}
@@ -16,13 +16,13 @@ def draw_map(axes, panel, rows, lines):
     """Draws the cells and laws of a :class:`warpcloth.lab.panels.Map`.
 
     Args:
-        axes: Of matplotlib.
+        axes: Axes of matplotlib.
         panel: The map.
         rows: Its points.
-        lines: Line styles by the label of the law, shared by all maps of a figure.
+        lines: Line styles by label of the law, shared by all maps of a figure.
 
     Returns:
-        The cells, for a bar of their colours; None if they are coloured by series.
+        The cells, for a colour bar; None if they are coloured by series.
     """
     xs, ys = (sorted({row[name] for row in rows}) for name in "xy")
     values, crossed = np.full((len(ys), len(xs)), np.nan), []
@@ -57,11 +57,11 @@ def _edges(values, scale):
 
 
 def add_keys(figure, maps, lines):
-    """Adds the bars of colours to a figure, one for all maps alike, and a legend of the lines, kinds and crosses of all.
+    """Adds colour bars to a figure, one for all maps with the same colours, and a legend of lines, kinds and crosses.
 
     Args:
-        figure: Of matplotlib.
-        maps: (axes, panel, cells) of each map, cells as :func:`draw_map` returns them.
+        figure: Figure of matplotlib.
+        maps: (axes, panel, cells) of each map, with the cells of :func:`draw_map`.
         lines: Line styles by label.
     """
     from matplotlib.lines import Line2D

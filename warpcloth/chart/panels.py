@@ -1,4 +1,4 @@
-"""Panels of measured points with laws as lines, for all charts of failures."""
+"""Draws panels of measured points with laws as lines, for charts of failures."""
 
 import math
 
@@ -13,13 +13,13 @@ _COLOURS = ("black", "tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purp
 
 
 def plot_panels(path, panels, rows, title):
-    """Draws points as markers, or as cells of maps, and laws as lines.
+    """Draws points as markers or cells, and laws as lines.
 
     Args:
         path: The file, .png, .svg or .pdf.
         panels: :class:`warpcloth.lab.panels.Panel` records.
         rows: Points, see :func:`warpcloth.lab.panels.point`.
-        title: Of the whole.
+        title: Title of the figure.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -60,7 +60,7 @@ def _draw(axes, panel, rows):
     for k, (label, points) in enumerate(series.items()):
         known = sorted((row["x"], row["value"]) for row in points if row["value"] is not None)
         style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKS[k % len(_MARKS)], "markersize": 4.5}
-        # Where a law is the line, points are left by themselves.
+        # A line joins points only if no law does.
         width = 0.0 if label in panel.follows else 0.8
         axes.plot(*np.array(known).reshape(-1, 2).T, label=label, linewidth=width, fillstyle="none", **style)
     at = [row["x"] for row in rows]
@@ -76,7 +76,7 @@ def _draw(axes, panel, rows):
         axes.set_ylim(panel.limits)
     for axis, scale in zip((axes.xaxis, axes.yaxis), panel.scales, strict=True):
         low, high = axis.get_view_interval()
-        if scale == "log" and high < 100.0 * low:  # its numbers, as there may be no power of ten
+        if scale == "log" and high < 100.0 * low:  # plain numbers, because there may be no power of ten
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter("{x:g}")
             if high > 10.0 * low:
@@ -95,5 +95,5 @@ def _label(axes, panel):
 
 
 def _between(low, high, scale):
-    """Points of a line, at equal distances on the axis."""
+    """Returns points of a line, equidistant on the axis."""
     return np.geomspace(low, high, 400) if scale == "log" else np.linspace(low, high, 721)

@@ -1,4 +1,4 @@
-"""Pictures of speed against accuracy: settings as points with what nothing beats, and methods as lines towards a minimum."""
+"""Draws speed against accuracy: settings with their Pareto front, and the convergence of methods."""
 
 import textwrap
 
@@ -10,7 +10,7 @@ from ..solvers import SOLVERS
 _DASHES = ("-", "--", ":", "-.")
 _WIDTH, _LINES = 46, 48  # characters and lines of the texts beside a picture
 _SMALL, _TEXT = 8.5, 10.0  # sizes of letters [pt]
-# Of a motion, with what is written along them.
+# Errors of a motion, with the labels of their axes.
 _ERRORS = {
     "error": "error: RMS of all vertices and frames, over the size",
     "strain_error": "error of strains: 99th percentile of edges and frames",
@@ -75,7 +75,7 @@ def plot_time(path, found):
 
 
 def plot_solver(path, found):
-    """Draws the gap that methods leave of a step over their iterations and over their time, down to what float64 tells.
+    """Draws the gap of the objective within a step over iterations and over time, down to the rounding of float64.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -110,7 +110,7 @@ def plot_solver(path, found):
 
 
 def plot_spectrum(path, found):
-    """Draws μ over its rank, and beside it errors as points on the lines that the spectrum predicts, each down to its rounding.
+    """Draws μ over its rank, and beside it measured errors on lines predicted by the spectrum, down to their rounding.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -144,12 +144,12 @@ def plot_spectrum(path, found):
 
 
 def _floor(axes, value, label, colour=GREY):
-    """A line below which nothing is known."""
+    """Draws a line below which errors mean nothing."""
     axes.axhline(value, color=colour, linestyle="--", linewidth=0.8, label=label)
 
 
 def _missing(head, found):
-    """Lines that say what is left out, and why."""
+    """Returns lines of text that name settings without a point, with the reason."""
     lines = [line for each in without_point(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]
     return ["", head, *lines] if lines else []
 
@@ -189,7 +189,7 @@ def _name_ends(figure, axes, ends):
 
 
 def _figure(path, texts):
-    """A figure with two panels on logarithmic scales, and one for texts."""
+    """Returns a figure with two panels on logarithmic scales, and one for text."""
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 
@@ -210,7 +210,7 @@ def _figure(path, texts):
 
 
 def _finish(figure, axes, notes, title, texts, found):
-    """Adds the title with the machine, the legend, and the texts below it."""
+    """Adds the title with the machine, the legend, and the text below it."""
     known = {}
     for each in axes:
         number_axis(each.xaxis)

@@ -1,4 +1,4 @@
-"""Percentiles of measures over time."""
+"""Plots percentiles of measures over time."""
 
 import math
 
@@ -7,23 +7,23 @@ import numpy as np
 from ..base.checks import choice
 from ..picture.figures import GREY, PICTURES, check_path, save
 
-# Columns of the percentiles 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, and the grey of each band.
+# Columns of each band among the percentiles 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, its grey and its label.
 _BANDS = ((1, 7, "0.88", "1 to 99 %"), (2, 6, "0.76", "5 to 95 %"), (3, 5, "0.6", "25 to 75 %"))
 _MEDIAN, _EXTREMES = 4, (0, 8)
 _NOTE = {"ha": "right", "fontsize": 7, "color": GREY, "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1.0}}
 
 
 def plot_percentiles(path, summaries, along="time", neutrals=None):
-    """Plots each scalar in a panel: its median, the bands from 25 to 75, 5 to 95 and 1 to 99 %, and thin its extremes.
+    """Plots each scalar in a panel: its median, bands from 25 to 75, 5 to 95 and 1 to 99 %, and its extremes as thin lines.
 
-    Rows without values leave gaps. Extremes far outside the bands leave the panel, which then says how far they go.
+    Rows without values leave gaps. Extremes far outside the bands leave the panel, which then gives their values.
 
     Args:
         path: The file, .png, .svg or .pdf.
-        summaries: In the order of the rows, each with ``name``, ``unit``, ``time`` [s], ``frame`` and ``percentiles``: of 0, 1,
-            5, 25, 50, 75, 95, 99 and 100 %.
+        summaries: Summaries in the order of the rows, each with ``name``, ``unit``, ``time`` [s], ``frame`` and
+            ``percentiles``: of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %.
         along: "time" or "frame".
-        neutrals: A dictionary from names to the value of an undeformed element, drawn as a line; None is none.
+        neutrals: Values of an undeformed element by name, drawn as a line; None for no line.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -60,7 +60,7 @@ def plot_percentiles(path, summaries, along="time", neutrals=None):
 
 
 def _panel(axes, at, percentiles, neutral):
-    """One scalar: percentiles (F, 9) over ``at`` (F,)."""
+    """Plots one scalar: percentiles (F, 9) over ``at`` (F,)."""
     _frame(axes, percentiles, neutral)
     percentiles = np.where(np.isfinite(percentiles), percentiles, np.nan)
     alone = _alone(~np.isnan(percentiles[:, _MEDIAN]))
@@ -81,13 +81,13 @@ def _panel(axes, at, percentiles, neutral):
 
 
 def _alone(known):
-    """Which rows have no row with values beside them, so that no line and no band shows them."""
+    """Returns which rows have no neighbour with values, so that neither lines nor bands show them."""
     padded = np.pad(known, 1)
     return known & ~padded[:-2] & ~padded[2:]
 
 
 def _frame(axes, percentiles, neutral):
-    """Limits what is shown to the bands and as much again on either side, and says how far extremes are beyond that."""
+    """Limits the panel to the bands and as much again on either side, and labels extremes beyond that with their values."""
     known = percentiles[~np.isnan(percentiles)]
     finite = known[np.isfinite(known)]
     if not len(finite):

@@ -1,4 +1,4 @@
-"""A camera with perspective, and one that shows all of a motion."""
+"""A perspective camera, also one that frames a whole motion."""
 
 from dataclasses import dataclass
 
@@ -7,24 +7,24 @@ import numpy as np
 from ..base.checks import array, number
 from .view import View
 
-# Of the longest extent: half of what the picture shows at least, where a motion is nearest.
+# Smallest half height of the picture at the nearest point of a motion, relative to the longest extent.
 _CLOSEST = 0.1
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera with perspective.
+    """A perspective camera.
 
     Attributes:
-        position: Of the eye [m].
-        target: What is in the middle of the picture [m]. Its distance also says how large the scene is: rays that find how
-            much of the sky a point sees are about as long as half the height of the picture there.
-        up: What is up in the picture, not along the view; of any length.
-        fov: Angle from the lower to the upper side of the picture [°], above 0 and below 180.
-        shift: By how many heights of the picture its middle is to the right of the target, as by a shifted lens.
+        position: Position of the camera [m].
+        target: The point in the middle of the picture [m]. Its distance also sets the scale of the scene: rays to the sky are
+            about as long as half the height of the picture there.
+        up: Up direction in the picture, of any length, not along the view.
+        fov: Vertical field of view [°], above 0 and below 180.
+        shift: Lens shift: how far the middle of the picture is to the right of the target, in heights of the picture.
 
     Raises:
-        ValueError: A number is not finite or beyond its range, the target is at the position, or up is along the view.
+        ValueError: A number is not finite or out of range, the target is at the position, or up is along the view.
     """
 
     position: tuple[float, float, float]
@@ -49,7 +49,7 @@ class Camera:
 
     @classmethod
     def framed(cls, frames, azimuth=-38.0, elevation=24.0, up_axis="Y", aspect=16 / 9, fov=30.0, margin=0.08):
-        """The nearest camera in a direction that sees all of some frames.
+        """Returns the nearest camera in a direction that shows all points of some frames.
 
         Args:
             frames: Points (n, 3) of each [m], read once, one at a time; points that are not finite do not count.
@@ -58,7 +58,7 @@ class Camera:
             up_axis: "Y" or "Z".
             aspect: Width of the picture by its height.
             fov: Angle from the lower to the upper side [°].
-            margin: Part of the picture that stays empty on each side.
+            margin: Fraction of the picture that stays empty on each side.
 
         Raises:
             ValueError: No point is finite, or a number is beyond its range.
@@ -70,8 +70,8 @@ class Camera:
             raise ValueError(f"fov is {fov:g} and margin {margin:g}; they must be below 180 and 0.5")
         view = View(azimuth, elevation, up_axis)
         half = np.tan(np.radians(fov) / 2.0) * (1.0 - 2.0 * margin) * np.array([aspect, 1.0])
-        # A point (x, y, z) to the right, up and towards a viewer at (X, Y, Z) is in the picture if |x − X| ≤ half (Z − z):
-        # the largest of ± x + half z are all that must be known of the points.
+        # A point (x, y, z), right, up and towards a viewer at (X, Y, Z), is in the picture if |x − X| ≤ half (Z − z). So only
+        # the maxima of ± x + half z over all points are needed.
         most, low, high = np.full((2, 2), -np.inf), np.full(3, np.inf), np.full(3, -np.inf)
         for points in frames:
             seen = view.project(points).reshape(-1, 3)
@@ -82,7 +82,7 @@ class Camera:
         if not (low <= high).all():
             raise ValueError("no point of the frames is finite; a camera must have something to show")
         size = (high - low).max() or 1.0
-        # What is seen along its length, or is a point, is not all of the picture.
+        # A motion seen along its length, or a point, must not fill the picture.
         depth = max((most.sum(axis=0) / (2.0 * half)).max(), high[2] + _CLOSEST * size / half.min())
         eye = np.append((most[0] - most[1]) / 2.0, depth)
         middle = np.append(eye[:2], (low[2] + high[2]) / 2.0)

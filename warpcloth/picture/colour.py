@@ -1,4 +1,4 @@
-"""Colours of a measure: one fixed scale for all frames of a sequence."""
+"""Colour scales of measures, one for all frames of a sequence."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -9,26 +9,25 @@ from ..base.checks import number, shown
 from .figures import require_matplotlib
 
 SEQUENTIAL = "viridis"
-# Of matplotlib's diverging maps the most even one (Moreland 2009, "Diverging color maps for scientific visualization"). Its
-# lightness L* rises from 38 to 88 and falls back the same way to 0.3, monotone on both sides; red to blue through white, the
-# next best, differs by 4.4 between its sides. Its middle is grey without a tint, which stands out from a white page, and its
-# ends are light enough to be shaded.
+# The most even of matplotlib's diverging maps (Moreland 2009, "Diverging color maps for scientific visualization"). Its
+# lightness L* rises from 38 to 88 and falls back symmetrically to within 0.3; red to blue through white, the next best, differs
+# by 4.4 between its sides. Its middle is a neutral grey, visible on a white page, and its ends are light enough to be shaded.
 DIVERGING = "coolwarm"
-# sRGB of what is excluded, 31 ΔE or more from every colour of the one map and 60 from the other.
+# sRGB of excluded elements, at least 31 ΔE from every colour of the one map and 60 from the other.
 EXCLUDED = (0.25, 0.25, 0.25)
-# Of the largest magnitude: float32 rounds by 6e-8 of it, and rounding alone must not fill a scale.
+# Smallest width of a scale, relative to the largest magnitude, so that float32 rounding, 6e-8 of it, does not fill a scale.
 _NARROWEST = 1e-6
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Maps values to colours; what is beyond an end has the colour of the end, and NaN the grey `EXCLUDED`.
+    """Maps values to colours. Values beyond an end get the colour of the end, and NaN gets the grey `EXCLUDED`.
 
     Attributes:
         low: Value at the lower end.
         high: Value at the upper end.
-        neutral: Value in the middle of a diverging map, about which the ends are moved apart until they are symmetric. None
-            is a sequential map.
+        neutral: Value in the middle of a diverging map; the ends are extended to be symmetric about it. None for a sequential
+            map.
         colormap: Name of a colour map of matplotlib; by default `DIVERGING` with a neutral value, `SEQUENTIAL` without.
 
     Raises:
@@ -55,11 +54,11 @@ class Scale:
 
     @property
     def map(self):
-        """Name of the map, as matplotlib has it."""
+        """Name of the map in matplotlib."""
         return self.colormap or (SEQUENTIAL if self.neutral is None else DIVERGING)
 
     def srgb(self, values):
-        """Colours (…, 3) of values (…) in sRGB, for plots.
+        """Returns the colours (…, 3) of values (…) in sRGB, for plots.
 
         Raises:
             ImportError: matplotlib, which has the maps, is not installed.
@@ -74,7 +73,7 @@ class Scale:
         return colours
 
     def linear(self, values):
-        """Colours (…, 3) of values (…) in linear Rec. 709, as the displayColor of USD has them.
+        """Returns the colours (…, 3) of values (…) in linear Rec. 709, for displayColor of USD.
 
         Raises:
             ImportError: matplotlib, which has the maps, is not installed.
@@ -82,10 +81,10 @@ class Scale:
         return to_linear(self.srgb(values))
 
     def legend(self, measure, unit):
-        """The scale as a dictionary of numbers and texts, for the metadata of a file; colours are linear Rec. 709.
+        """Returns the scale as a dictionary of numbers and texts, for metadata of files; colours are linear Rec. 709.
 
         Args:
-            measure: Name of what is coloured.
+            measure: Name of the scalar.
             unit: Its unit.
         """
         values = np.linspace(self.low, self.high, 9)
@@ -100,21 +99,21 @@ class Scale:
 
 
 def range_over(summaries, neutral=None):
-    """Low and high of one scale for all frames: the least first percentile and the largest ninety-ninth.
+    """Returns one range for all frames: from the smallest 1st percentile to the largest 99th.
 
     Args:
-        summaries: Of one scalar, one a frame, each with ``percentiles``: of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %. Those that
-            are not finite do not count.
+        summaries: Summaries of one scalar, one per frame, each with ``percentiles``: of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %.
+            Those that are not finite do not count.
         neutral: Value about which the range is symmetric, or None.
 
     Returns:
-        tuple: (low, high), of which low is below high also where all values are equal, or where there are none.
+        tuple: (low, high), with low below high even if all values are equal or there are none.
     """
     return range_of([summary.percentiles for summary in summaries], neutral)
 
 
 def range_of(rows, neutral=None):
-    """`range_over` of the percentiles themselves, (9,) of each frame."""
+    """Like `range_over`, for rows of percentiles, (9,) for each frame."""
     ends = np.array(rows, dtype=np.float64).reshape(-1, 9)[:, [1, -2]]
     ends = ends[np.isfinite(ends)]
     if not len(ends):
@@ -128,12 +127,12 @@ def range_of(rows, neutral=None):
 
 
 def to_linear(colours):
-    """sRGB to linear Rec. 709, as IEC 61966-2-1 has it."""
+    """Converts sRGB to linear Rec. 709 (IEC 61966-2-1)."""
     return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
 
 
 def check_colormap(name):
-    """Refuses a name that is not a colour map of matplotlib.
+    """Checks that matplotlib has a colour map.
 
     Raises:
         ImportError: matplotlib is not installed.
@@ -151,7 +150,7 @@ def check_colormap(name):
 
 @cache
 def table(name):
-    """A map of matplotlib as (257, 3) in sRGB, so that one is in the middle.
+    """Returns a map of matplotlib as (257, 3) in sRGB; an odd number, so that one colour is in the middle.
 
     Raises:
         ImportError: matplotlib is not installed.

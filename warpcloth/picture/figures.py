@@ -1,4 +1,4 @@
-"""Figures of matplotlib without pyplot, which holds figures and a window system for the whole process."""
+"""Figures of matplotlib without pyplot, which has global state and needs a window system."""
 
 import importlib.util
 from pathlib import Path
@@ -12,7 +12,7 @@ _METADATA = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 
 def require_matplotlib():
-    """Says in a sentence what is missing.
+    """Checks that matplotlib is installed.
 
     Raises:
         ImportError: matplotlib is not installed.
@@ -22,7 +22,7 @@ def require_matplotlib():
 
 
 def check_path(path, endings):
-    """Refuses a file that cannot be written, before anything is drawn.
+    """Checks that a picture can be written, before anything is drawn.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -38,7 +38,7 @@ def check_path(path, endings):
 
 
 def number_axis(axis):
-    """Numbers a logarithmic axis of less than two decades, where the usual numbers overlap, or there may be none."""
+    """Labels a logarithmic axis of less than two decades, on which the default labels overlap or are missing."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     low, high = axis.get_view_interval()

@@ -1,4 +1,4 @@
-"""Writes pictures, one after another, as a still, a GIF or a film in real time, the same bytes each time."""
+"""Writes pictures as a still, a GIF or a film in real time. Equal pictures give equal bytes."""
 
 import importlib.util
 import io
@@ -12,22 +12,21 @@ from PIL import Image
 from ..base.outputs import Output
 
 STILL, FILMS = ".png", (".gif", ".mp4")
-# Browsers show a GIF's frame that is to last less for 0.1 s.
+# Browsers show frames of a GIF that are shorter than this [s] for 0.1 s.
 SHORTEST = 0.02
-# Of H.264: fine folds and the edges of letters stay clean; 23 is the encoder's own. The rate control by trees of macroblocks
-# reads memory that nobody has written, and gives other bytes now and then.
+# H.264 quality at which fine folds and the edges of letters stay clean; the default crf is 23. The mbtree rate control reads
+# uninitialised memory, so that bytes would vary.
 _QUALITY = {"crf": "16", "preset": "slow", "x264-params": "mbtree=0"}
 # IEC 61966-2-1 (sRGB) on the primaries of Rec. 709, with the matrix of Rec. 709, 16 to 235.
 _PRIMARIES, _TRANSFER, _MATRIX, _RANGE = 1, 13, 1, 1
-# Seconds that a picture is shown: the longest of a GIF, which holds 16 bits of hundredths, and the shortest of an .mp4, whose
-# inverse is its rate.
+# Shortest and longest time [s] that a picture can be shown. A GIF stores hundredths of seconds in 16 bits.
 _INTERVALS = {".gif": (0.01, 655.0), ".mp4": (1e-6, 1000.0)}
-# Of each channel, in which the colours of a GIF are counted.
+# Bins per channel in which the colours of a GIF are counted.
 _BINS = 64
 
 
 def check_film(path, size):
-    """Refuses a picture or film that cannot be written, before anything is read or drawn.
+    """Checks that a picture or film can be written, before anything is read or drawn.
 
     Args:
         path: The file.
@@ -36,7 +35,7 @@ def check_film(path, size):
     Raises:
         FileNotFoundError: The folder does not exist.
         ImportError: PyAV, which writes films, is not installed.
-        ValueError: The ending is none of the three, the size does not suit it, or there is a folder or device.
+        ValueError: The ending is none of the three, the size does not suit it, or the path is a folder or a device.
     """
     path, (width, height) = Path(path), size
     if path.suffix.lower() not in (STILL, *FILMS):
@@ -54,14 +53,14 @@ def check_film(path, size):
 
 
 def check_times(path, times):
-    """Refuses a film whose pictures are shown for longer or shorter than its format can say.
+    """Checks that the format of a film can store the times of its pictures.
 
     Args:
         path: The file.
-        times: When each picture is shown [s], rising (F,).
+        times: Times at which pictures are shown [s], ascending (F,).
 
     Raises:
-        ValueError: An interval is beyond what the format holds.
+        ValueError: An interval is out of range.
     """
     ending, intervals = Path(path).suffix.lower(), np.diff(times)
     if not len(intervals) or ending not in _INTERVALS:
@@ -74,15 +73,15 @@ def check_times(path, times):
 
 
 def open_film(path, size, times):
-    """Opens the file that pictures are to be added to.
+    """Opens a file for pictures.
 
     Args:
         path: Ends with .png, .gif or .mp4.
         size: Width and height [px].
-        times: When each picture is shown [s], rising (F,). The last is shown as long as the one before it.
+        times: Times at which pictures are shown [s], ascending (F,). The last is shown as long as the one before it.
 
     Returns:
-        Output: With a method ``add``, which takes an image of Pillow.
+        Output: With a method ``add`` that takes a Pillow image.
     """
     kind = {".png": _Still, ".gif": _Gif, ".mp4": _Video}[Path(path).suffix.lower()]
     return kind(path, size, np.asarray(times, dtype=float))
@@ -101,9 +100,9 @@ class _Still(Output):
 
 
 class _Gif(Output):
-    """A GIF that repeats, with one palette for all frames, so that what stands still is stored once.
+    """A looping GIF with one palette for all frames, so that static regions are stored once.
 
-    The palette is known at the end only; until then frames are held as PNG, which takes about the memory of the GIF.
+    The palette is known only at the end. Until then frames are kept as PNG, which takes about the memory of the GIF.
     """
 
     def __init__(self, path, size, times):
@@ -139,9 +138,10 @@ class _Gif(Output):
         return Image.open(io.BytesIO(self._held[k])).convert("RGB")
 
     def _palette(self):
-        """An image with the 256 colours that suit all frames.
+        """Returns an image with 256 colours that suit all frames.
 
-        A colour counts by the root of its pixels, or a large ground would take all entries and leave none to a small pin.
+        A colour is weighted by the square root of its pixels. Otherwise a large ground would use all entries, and leave none
+        for a small pin.
         """
         colours, found = np.nonzero(self._pixels)[0], self._pixels[self._pixels > 0]
         means = np.round(self._sums[colours] / found[:, None]).astype(np.uint8)
@@ -154,14 +154,14 @@ class _Gif(Output):
 
 
 def durations(times):
-    """How long a GIF shows each of its frames [ms], in whole hundredths of a second that add up to the times."""
+    """Returns the durations of the frames of a GIF [ms], in whole hundredths of a second that add up to the times."""
     last = times[-1] - times[-2] if len(times) > 1 else 1.0
     ends = np.floor(100.0 * (np.append(times, times[-1] + last) - times[0]) + 0.5).astype(int)
     return (10 * np.diff(ends)).tolist()
 
 
 class _Video(Output):
-    """A film in H.264 by one thread, so that the same pictures make the same bytes."""
+    """A film in H.264, encoded by one thread, so that equal pictures give equal bytes."""
 
     def __init__(self, path, size, times):
         import av
@@ -170,10 +170,10 @@ class _Video(Output):
         self.frames = 0
         intervals = np.diff(times)
         rate = Fraction(1.0 / float(intervals.min()) if len(intervals) else 24.0).limit_denominator(1001)
-        # Frames that are missing leave a gap; the one before is shown longer.
+        # If frames are missing, the one before is shown longer.
         self._counts = [math.floor(float(time - times[0]) * rate + 0.5) for time in times]
         self._av, self._tick = av, 1 / rate
-        # By its name: at the end it is opened again, to move the table of frames to the front.
+        # By name, because at the end PyAV opens it again to move the index to the front.
         self._container = av.open(self.file.name, "w", format="mp4", options={"movflags": "+faststart"})
         self._stream = self._container.add_stream("libx264", rate=rate, options=_QUALITY)
         self._stream.width, self._stream.height = size

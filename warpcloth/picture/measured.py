@@ -1,4 +1,4 @@
-"""Colours of a cloth by what is measured on it, on one scale for all frames."""
+"""Colours of a cloth by a measure, on one scale for all frames."""
 
 import numpy as np
 
@@ -10,27 +10,27 @@ from .colour import Scale, range_of
 
 
 def scalar_names(measure):
-    """Names of the scalars of a measure."""
+    """Returns the names of the scalars of a measure."""
     return list(scalars(measure, np.zeros((1, *measure.shape))))
 
 
 def neutral_of(measure):
-    """Where the scale of a scalar of a measure has its middle; norms begin at 0."""
+    """Returns the middle of the colour scale of a measure's scalars; None for norms, whose scales start at 0."""
     return measure.neutral if len(measure.shape) < 2 else None
 
 
 def scale_of(analyzers, name, measure, given=None, colormap=None):
-    """One scale for all rows of some analyses.
+    """Returns one scale for all rows of some analyses.
 
     Args:
         analyzers: List of :class:`warpcloth.Analyzer`.
         name: The scalar.
         measure: The :class:`warpcloth.analysis.measures.Measure` that has it.
         given: (low, high), or None for those of :func:`warpcloth.chart.range_over`.
-        colormap: Of matplotlib, or None.
+        colormap: A colour map of matplotlib, or None.
 
     Returns:
-        Scale: About the value of what is undeformed, where there is one.
+        Scale: Symmetric about the value without deformation, if there is one.
     """
     neutral = neutral_of(measure)
     if given is None:
@@ -48,7 +48,7 @@ class MeasuredScalar:
         name: The scalar, such as "stretch_1".
         rest: The rest shape, or None for that of the subject.
         device: A Warp device.
-        options: More of :class:`warpcloth.Analyzer`, by name.
+        options: Further options of :class:`warpcloth.Analyzer`, by name.
 
     Raises:
         ValueError: There is no such scalar, it cannot be measured, or the cloth has no triangles.
@@ -64,12 +64,12 @@ class MeasuredScalar:
         self.analyzers = [Analyzer(each, rest, **chosen, **options) for each in subject.sequences()]
 
     def scale(self, others, given, colormap):
-        """The scale for these values and those of others."""
+        """Returns the scale for these values and those of others."""
         analyzers = [each for one in (self, *others) for each in one.analyzers]
         return scale_of(analyzers, self.name, self.measure, given, colormap)
 
     def rows(self, frames):
-        """Yields the values (E,) of rising indices of frames; NaN in a frame that is not measured."""
+        """Yields the values (E,) of frames with ascending indices; NaN for a frame that is not measured."""
         rows = [_Rows(each, self.name, self.measure) for each in self.analyzers]
         for frame in frames:
             yield np.concatenate([each.at(frame) for each in rows])
@@ -131,7 +131,7 @@ class GivenColours:
             raise ValueError(f"colour has shape {self.values.shape}; it must be {rule} in all frames")
 
     def scale(self, others, given, colormap):
-        """None, as colours need no scale."""
+        """Returns None, because colours need no scale."""
 
     def rows(self, frames):
         for frame in frames:

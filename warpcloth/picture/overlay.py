@@ -1,4 +1,4 @@
-"""Draws the bar of the colours, names and the time on pictures, as large as the picture asks."""
+"""Draws the colour bar, names and the time on pictures, in sizes that suit the picture."""
 
 import unicodedata
 from functools import cached_property
@@ -9,9 +9,9 @@ from PIL import Image, ImageDraw, ImageFont
 from .colour import EXCLUDED
 
 INK = (64, 64, 68)
-# Height of letters by that of the picture, or of 9/16 of its width; below so many pixels they cannot be read.
+# Height of letters relative to that of the picture, or to 9/16 of its width; and the smallest legible height [px].
 _LETTERS, _LEAST = 0.03, 10
-# Of the height of a picture, the bar; of its width, at most all that is about the bar.
+# Height of the bar relative to that of the picture, and largest width of everything around it relative to its width.
 _BAR, _WIDEST = 0.56, 0.4
 
 
@@ -21,9 +21,9 @@ class Overlay:
     Args:
         size: Width and height [px].
         scale: The :class:`Scale` of the bar, or None for none.
-        title: Name of what is coloured.
-        unit: Its unit, "1" of what has none.
-        names: Of each panel, panels being side by side; none of a single one.
+        title: Name of the coloured scalar.
+        unit: Its unit, "1" if it has none.
+        names: Names of the panels, which are side by side; empty for a single panel.
         background: sRGB of the background, from 0 to 255.
     """
 
@@ -36,7 +36,7 @@ class Overlay:
 
     @cached_property
     def beside(self):
-        """Width that the bar takes, to the right of the picture [px]."""
+        """Width of the space for the bar, to the right of the picture [px]."""
         if self.scale is None:
             return 0
         em, labels = self.letters, [self._length(text) for _, text in self._ticks]
@@ -46,7 +46,7 @@ class Overlay:
 
     @cached_property
     def _ticks(self):
-        """Values and texts beside the bar."""
+        """Values and labels of the ticks of the bar."""
         room = _BAR * self.height / (2.4 * self.letters)
         values = round_numbers(self.scale.low, self.scale.high, max(2, min(6, int(room))))
         factor = 10.0**self._exponent
@@ -54,12 +54,12 @@ class Overlay:
         digits = int(max(0, -np.floor(np.log10(step) + 1e-9), -np.floor(np.log10(step * 10) + 1e-9)))
         while digits and all(f"{value / factor:.{digits}f}".endswith("0") for value in values):
             digits -= 1
-        # With a hyphen before negative ones, for the font has no minus sign.
+        # With a hyphen for negative values, because the font has no minus sign.
         return [(value, f"{value / factor:.{digits}f}") for value in values]
 
     @cached_property
     def _exponent(self):
-        """Of ten, by which the numbers beside the bar are divided."""
+        """The power of ten by which the labels of the bar are divided."""
         most = max(abs(self.scale.low), abs(self.scale.high))
         exponent = 3 * int(np.floor(np.log10(most) / 3.0)) if most > 0.0 else 0
         return exponent if not -3 < exponent < 6 else 0
@@ -80,15 +80,15 @@ class Overlay:
         return self._font.getlength(text)
 
     def draw(self, panels, time=None, excluded=False):
-        """Puts panels side by side and draws what belongs to them.
+        """Puts panels side by side, and draws the bar, names and time.
 
         Args:
             panels: Images (height, width, 3) uint8.
             time: Text in the lower left corner, or None.
-            excluded: Whether a colour of the picture means that there is no value.
+            excluded: Whether to explain the colour of elements without a value.
 
         Returns:
-            PIL.Image.Image: Of the whole size.
+            PIL.Image.Image: The whole picture.
         """
         canvas = Image.new("RGB", (self.width, self.height), self.background)
         pen = ImageDraw.Draw(canvas)
@@ -108,7 +108,7 @@ class Overlay:
         return canvas
 
     def _write(self, pen, position, text, anchor="lm"):
-        """Text with a rim of the background, which keeps it apart from what it is drawn on."""
+        """Writes text with an outline in the colour of the background, so that it stands out."""
         rim = max(1, self.letters // 8)
         pen.text(position, text, INK, self._font, anchor, stroke_width=rim, stroke_fill=self.background)
 
@@ -126,7 +126,7 @@ class Overlay:
         colours = np.round(255.0 * colours).astype(int)
         for row, colour in enumerate(colours):
             pen.line([(start, top + row), (end - 1, top + row)], tuple(colour.tolist()))
-        tip = round(0.55 * em)  # values beyond the ends have their colours
+        tip = round(0.55 * em)  # arrows for values beyond the ends, which have the colours of the ends
         for at, beyond, colour in ((top - 1, top - tip, colours[0]), (bottom, bottom + tip, colours[-1])):
             pen.polygon([(start, at), (end - 1, at), ((start + end - 1) / 2, beyond)], tuple(colour.tolist()))
         for value, text in self._ticks:
@@ -144,14 +144,14 @@ class Overlay:
 
 
 def written(text):
-    """A text in characters that the built-in font has: m² is m^2, é is e, and what has no such form a question mark."""
+    """Returns a text in characters of the built-in font: m^2 for m², e for é, and a question mark for all others."""
     powers = text.translate(str.maketrans({"²": "^2", "³": "^3", "⁻": "-", "−": "-", "×": "x"}))
     decomposed = "".join(c for c in unicodedata.normalize("NFKD", powers) if not unicodedata.combining(c))
     return "".join(c if c.isascii() or c in "°·…" else "?" for c in decomposed)
 
 
 def round_numbers(low, high, most):
-    """Multiples of 1, 2 or 5 times a power of ten from low to high, at most so many, or at least low and high."""
+    """Returns at most ``most`` multiples of 1, 2 or 5 times a power of ten in [low, high], or else low and high."""
     rough = (high - low) / most
     power = 10.0 ** np.floor(np.log10(rough))
     for factor in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0):

@@ -1,13 +1,13 @@
-"""Patterns of samples: fixed, so that the same picture has the same bytes, and even."""
+"""Sampling patterns that are even, and fixed, so that equal pictures have equal bytes."""
 
 import numpy as np
 
 
 def pixel_samples(count):
-    """Positions (count, 2) in a pixel from 0 to 1, as even as they can be in each direction.
+    """Returns positions (count, 2) in a pixel, from 0 to 1, as even as possible in each direction.
 
-    Four are the corners of a square that is turned by atan ½; others are the lattice (k + ½, gk + ½)/count with the g that
-    keeps them farthest apart.
+    Four samples are the corners of a square rotated by atan ½. Other counts use the lattice (k + ½, gk + ½)/count with the g
+    that maximises the smallest distance.
     """
     if count == 4:
         return np.array([(0.125, 0.625), (0.375, 0.125), (0.625, 0.875), (0.875, 0.375)])
@@ -22,7 +22,7 @@ def pixel_samples(count):
 
 
 def disc(count):
-    """Points (count, 2) of a sequence that fills the unit disc, every part of it evenly.
+    """Returns points (count, 2) of a low-discrepancy sequence in the unit disc.
 
     Multiples of 1/g and 1/g² modulo 1, where g³ = g + 1 (Roberts 2018), are squared radii and angles.
     """

@@ -9,11 +9,11 @@ from .colour import EXCLUDED
 from .figures import GREY, check_path, save
 from .view import View, brightness
 
-# Inches: the longer side of what is shown, what is beside, above and, of several panels, below it, and gaps.
+# Inches: the longer side of a panel, the margins beside, above and, with several panels, below it, and gaps.
 _SIDE, _RIGHT, _TOP, _FOOT, _GAP = 6.0, 1.2, 0.5, 0.3, 0.15
-# Points: edges in the colour of their triangle close the hairlines between neighbours, at 150 dots per inch from 0.8 on.
+# Line widths [pt]: edges in the colour of their triangle close hairline gaps between neighbours, which at 150 dpi needs 0.8.
 _EDGE, _LINE = 0.8, 0.7
-# The bar has the colours in full light, from which shaded ones must not stray far.
+# Smallest brightness of shading, because the bar shows the colours in full light.
 _LEAST_LIGHT = 0.85
 _GREYS = (0.0, 1.0, 0.5)
 
@@ -21,24 +21,24 @@ _GREYS = (0.0, 1.0, 0.5)
 def draw(
     path, points, triangles, values, scale, on="triangle", title="", unit="1", view=None, directions=None, both_sides=False
 ):
-    """Writes a PNG of a cloth in parallel projection, coloured on both sides, with a bar of the colours.
+    """Writes a PNG of a cloth in parallel projection, coloured on both sides, with a colour bar.
 
-    A value of a vertex colours a third of each triangle beside it, the part that is nearest in barycentric coordinates. Dark
-    grey has no value. A triangle with a corner that is not finite cannot be drawn; the picture says how many they are.
+    The value of a vertex colours a third of each triangle at it, the part nearest in barycentric coordinates. Dark grey means
+    no value. Triangles with a corner that is not finite are not drawn, and the picture gives their number.
 
     Args:
         path: The file.
         points: (n, 3) [m].
         triangles: Vertices (T, 3).
-        values: (T,), or (n,) on vertices; NaN where there is none.
+        values: (T,), or (n,) on vertices; NaN for no value.
         scale: The :class:`Scale`.
         on: "triangle" or "vertex".
-        title: Above the picture.
-        unit: Of the values, beside the bar.
-        view: The :class:`View`, fitted to all frames of a sequence if they are to be seen alike. It is fitted to these
-            points if it is None or without a window.
+        title: Title above the picture.
+        unit: Unit of the values, beside the bar.
+        view: The :class:`View`, fitted to all frames of a sequence if pictures should be comparable. If it is None or has no
+            window, it is fitted to these points.
         directions: Segments to draw on the cloth, as a dictionary from names to (centres (E, 3) [m], vectors (E, 3) [m] from
-            end to end); the first are black, the second white, the third grey. Those that are not finite are left out.
+            end to end); the first are black, the second white, the third grey. Segments that are not finite are left out.
         both_sides: Whether a second panel shows the cloth from the opposite side; each panel then has its view as a title.
 
     Raises:
@@ -77,7 +77,7 @@ def _paint_cloth(axes, view, points, triangles, colours, on, directions):
     depths = outlines[..., 2].mean(axis=1)
     if directions:
         segments, greys = _segments(view, directions)
-        # As outlines that go there and back, a little towards the viewer, before the triangles that they cross.
+        # Segments are outlines of zero width, moved a little towards the viewer, in front of the triangles that they cross.
         lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
         depths = np.append(depths, segments[..., 2].mean(axis=1) + lengths / 2.0)
         outlines = np.concatenate([outlines, segments[:, np.minimum(np.arange(outlines.shape[1]), 1)]])
@@ -90,11 +90,11 @@ def paint(axes, outlines, depths, colours, widths):
     """Draws polygons from the back to the front.
 
     Args:
-        axes: Of matplotlib.
+        axes: Axes of matplotlib.
         outlines: Corners (P, k, 2), to the right and up.
-        depths: Towards the viewer (P,).
+        depths: Coordinates towards the viewer (P,).
         colours: sRGB (P, 3) or with alpha (P, 4).
-        widths: Of the edges [pt], one or (P,).
+        widths: Widths of the edges [pt], one or (P,).
     """
     from matplotlib.collections import PolyCollection
 
@@ -104,7 +104,7 @@ def paint(axes, outlines, depths, colours, widths):
 
 
 def _check(points, triangles, values, on):
-    """Refuses arrays that do not go together."""
+    """Raises ValueError if arrays have wrong shapes or indices."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points has shape {points.shape}; it must be (n, 3)")
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
@@ -117,12 +117,12 @@ def _check(points, triangles, values, on):
 
 
 def _whole(corners, colours):
-    """Outlines (T, 3, 3) and lit colours (T, 3) of triangles, by their corners and colours (T, 3)."""
+    """Returns outlines (T, 3, 3) and shaded colours (T, 3) of triangles, from their corners and colours (T, 3)."""
     return corners, colours * brightness(corners, _LEAST_LIGHT)[:, None]
 
 
 def _thirds(corners, colours):
-    """Outlines (3T, 4, 3) and lit colours (3T, 3) of thirds of triangles, by their corners and the colours there (T, 3, 3)."""
+    """Returns outlines (3T, 4, 3) and shaded colours (3T, 3) of thirds of triangles, from corners and colours (T, 3, 3)."""
     following, before = np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)
     middle = np.broadcast_to(corners.mean(axis=1, keepdims=True), corners.shape)
     outlines = np.stack([corners, (corners + following) / 2.0, middle, (corners + before) / 2.0], axis=2)
@@ -130,7 +130,7 @@ def _thirds(corners, colours):
 
 
 def _segments(view, directions):
-    """Ends (S, 2, 3) as they are seen and greys (S, 3) of all directions; nothing is drawn of those that are not finite."""
+    """Returns the projected ends (S, 2, 3) and greys (S, 3) of all finite segments."""
     ends, greys = [], []
     for (name, (centres, vectors)), grey in zip(directions.items(), cycle(_GREYS), strict=False):
         if np.shape(centres) != np.shape(vectors) or np.shape(centres)[1:] != (3,):
@@ -166,7 +166,7 @@ def _layout(window, title, count=1):
 
 
 def _explain(figure, beside, scale, unit, excluded, unplaced):
-    """The bar of the colours, and what is grey or cannot be drawn."""
+    """Adds the colour bar, and notes on excluded elements and triangles that cannot be drawn."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 

@@ -1,4 +1,4 @@
-"""Pictures of surfaces and tubes in the light of a sun and the sky, by rays."""
+"""Ray-casts surfaces, tubes and balls in the light of a sun and the sky."""
 
 import numpy as np
 import warp as wp
@@ -13,48 +13,48 @@ from ..model.threads import cores, threads_on
 from .patterns import disc, pixel_samples
 
 BACKGROUND = (0.90, 0.92, 0.94)
-GROUND = BACKGROUND  # so that only shadows are seen of it: over a fade 8 bits show rings
+GROUND = BACKGROUND  # only shadows show on the ground, because a fade to another colour has visible bands in 8 bits
 _UP = {"Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
-# Of half the height of the picture: what a ray to the sky needs to be free, and where the ground has faded.
+# Length of a ray to the sky, and distance at which the ground has faded, relative to half the height of the picture.
 _SKY_DISTANCE, _GROUND = 1.0, 6.0
-# How much of the light on a surface that faces the sun is the sky's, and by how much that is lighter above than below, where a
-# light ground reflects it.
+# Fraction of sky light on a surface that faces the sun, and how much brighter it is from above than from below, where a light
+# ground reflects it.
 _SKY, _TILT = 0.42, 0.15
-# Beyond, products of three coordinates of float32 overflow.
+# Beyond these coordinates, products of three overflow in float32.
 _FARTHEST = 1e9
-# Samples a pixel from which on their noise is less than what smoothing blurs.
+# With this number of samples per pixel or more, noise is too small to need smoothing.
 _PLAIN = 32
-# Rows that a thread of the CPU takes at a time.
+# Number of rows that a CPU thread takes at a time.
 _ROWS = 8
 
 
 class RayCaster:
-    """Makes pictures of shapes that move: allocates once, and takes positions, a camera and colours for each picture.
+    """Draws moving shapes: allocates once, and takes positions, a camera and colours for each picture.
 
-    Light comes from the sky and from a sun over the viewer's right shoulder; of each visible point a ray finds whether it sees
-    the sun, another whether it sees the sky. The light on a surface that faces the sun and sees all of the sky is 1: there the
-    colour in the picture is the surface's. It is nowhere above 1.01, and white, so that colours keep their hue. Rays are the
-    same for each picture, so the same input gives the same bytes on one device.
+    Light comes from the sky and from a sun over the viewer's right shoulder. From each visible point, one ray tests whether the
+    sun is visible and another tests the sky. The light on a surface that faces the sun and sees the whole sky is 1, so that it
+    shows its own colour. Light is white and at most 1.01, so that colours keep their hue. Rays are the same for each picture,
+    so that on one device equal input gives equal bytes.
 
     Args:
         shapes: The :class:`Shape` list.
-        width: Of the picture [px].
-        height: Of the picture [px].
+        width: Width of the picture [px].
+        height: Height of the picture [px].
         samples: Rays from the camera through each pixel.
-        ground: Height of a level ground that fades into the background [m], or None.
+        ground: Height of a horizontal ground that fades into the background [m], or None.
         device: A Warp device.
         up_axis: "Y" or "Z".
         threads: Threads of the CPU; by default all of its cores.
-        sun_angle: Angle that the sun fills [°], which makes its shadows soft.
-        contrast: How much of the light and shadow is seen where an image has colours, from 0 to 1: 0 shows the colours alone.
-        background: Linear Rec. 709.
+        sun_angle: Angular diameter of the sun [°], which makes shadows soft.
+        contrast: Strength of shading on coloured surfaces, from 0, colours alone, to 1.
+        background: Colour of the background, linear Rec. 709.
 
     Attributes:
-        left_out: After :meth:`image`, how many triangles, lines and balls it does not show: those with a point that is not
-            finite, or so far away that float32 does not hold it.
+        left_out: After :meth:`image`, number of triangles, lines and balls that are not drawn, because a point is not finite or
+            too far away for float32.
 
     Raises:
-        ValueError: A number is beyond its range, or this machine has no such device.
+        ValueError: A number is out of range, or this machine has no such device.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class RayCaster:
             self._samples = wp.array(pixel_samples(samples), dtype=wp.vec2)
             radius = np.tan(np.radians(sun_angle) / 2.0)
             self._sun_rays = wp.array(radius * disc(16 * samples), dtype=wp.vec2)
-            # A disc lifted to the half sphere has the cosine as density (Malley).
+            # Malley's method: points of a disc projected to the hemisphere have a cosine density.
             flat = disc(256 * samples)
             lifted = np.sqrt(1.0 - (flat**2).sum(axis=1, keepdims=True))
             self._sky_rays = wp.array(np.concatenate([flat, lifted], axis=1), dtype=wp.vec3)
@@ -134,13 +134,13 @@ class RayCaster:
 
     @in_turn
     def image(self, points, camera, colours=None):
-        """Makes a picture.
+        """Draws a picture.
 
         Args:
-            points: Positions (n, 3) of each shape [m]. What has a point that is not finite is left out.
+            points: Positions (n, 3) of each shape [m]. Elements with a point that is not finite are left out.
             camera: A :class:`Camera`.
-            colours: Of each shape, linear Rec. 709 or None: (n, 3) of vertices, (T, 3, 3) of the corners of triangles, or
-                (E, 2, 3) of the ends of lines.
+            colours: Colours of each shape, linear Rec. 709, or None: (n, 3) of vertices, (T, 3, 3) of corners of triangles, or
+                (E, 2, 3) of ends of lines.
 
         Returns:
             np.ndarray: (height, width, 3) uint8 in sRGB.
@@ -169,7 +169,7 @@ class RayCaster:
             return self._image.numpy().reshape(height, width, 3).copy()
 
     def _viewer(self, camera):
-        """Length of one in coordinates of the picture [m], a power of two, and the rays of the camera in them."""
+        """Returns the unit of length of the picture [m], a power of two, and the rays of the camera in that unit."""
         width, height = self._size
         position, target, up = (np.asarray(a) for a in (camera.position, camera.target, camera.up))
         forward = target - position
@@ -188,7 +188,7 @@ class RayCaster:
         return unit, viewer
 
     def sun(self, camera):
-        """Unit vector towards the sun, over the right shoulder of a camera (3,)."""
+        """Returns the unit vector towards the sun (3,), over the right shoulder of a camera."""
         view = np.subtract(camera.target, camera.position)
         right = np.cross(view, camera.up)
         right /= np.linalg.norm(right)
@@ -215,7 +215,7 @@ class RayCaster:
         return light
 
     def _set_positions(self, points, camera, unit):
-        """Copies the positions to the device, and fits the trees and the normals to them."""
+        """Copies the positions to the device, and updates trees and normals."""
         first = 0
         for k, (shape, found) in enumerate(zip(self.shapes, points, strict=True)):
             found = np.asarray(found)
@@ -239,7 +239,7 @@ class RayCaster:
             self._mesh = wp.Mesh(g.points, g.triangles)
             g.mesh = self._mesh.id
         if len(self._tubes):
-            # No thinner than a pixel, of which a few samples may miss all.
+            # At least as wide as a pixel, because a few samples may miss thinner tubes.
             eye = np.subtract(camera.position, camera.target) / unit
             nearest = np.linalg.norm(local[self._tubes] - eye, axis=2).min(axis=1)
             pixel = 2.0 * np.tan(np.radians(camera.fov) / 2.0) / self._size[1]
@@ -294,7 +294,7 @@ class RayCaster:
         g.backs = wp.array(np.concatenate([none, *backs]), dtype=wp.vec3)
 
     def _launch_rows(self, kernel, inputs, outputs):
-        """Launches over the pixels: on the CPU each thread takes some rows, then the next that nobody has taken."""
+        """Launches over the pixels; on the CPU, each thread takes the next free rows until none are left."""
         width, height = self._size
         step = _ROWS if self._device.is_cpu else height
         launches = iter(

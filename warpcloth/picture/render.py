@@ -1,4 +1,4 @@
-"""Pictures and films of what moves: sources in, a file out."""
+"""Draws pictures and films of animations."""
 
 import os
 import warnings
@@ -24,9 +24,9 @@ from .overlay import Overlay
 from .raycast import BACKGROUND, RayCaster
 from .subjects import located, subject_of
 
-# Surroundings that are so many times as large as the cloth are not fitted into the picture.
+# Surroundings that are larger than this, relative to the cloth, are not fitted into the picture.
 _LARGE = 1.5
-# By the size of the motion: how far the ground is below it, so that a cloth that lies on it is above.
+# Distance of the ground below the motion, relative to its size, so that cloth that lies on it is visible.
 _BELOW = 1e-3
 
 
@@ -172,7 +172,7 @@ def _checked_size(size):
 
 
 def _are_several(source):
-    """Whether it is a list of two sources, and not a list of frames."""
+    """Returns whether it is a list of two sources, not a list of frames."""
     if not isinstance(source, (list, tuple)) or not len(source):
         return False
     frames = [isinstance(each, np.ndarray | list | tuple) for each in source]
@@ -184,16 +184,16 @@ def _are_several(source):
 
 
 class _Shot:
-    """One picture of a film: when it is shown [s], the frame of each subject, and the text of its time."""
+    """One picture of a film: the time at which it is shown [s], the frame of each subject, and the text of its time."""
 
     def __init__(self, time, frames, text):
         self.time, self.frames, self.text = time, frames, text
 
 
 def _shots(subjects, ending, frame, frames, every, speed):
-    """The pictures to be drawn.
+    """Returns the pictures to be drawn.
 
-    The frames of the first subject lead; of the second that is shown which is nearest in time, up to its end.
+    There is one for each frame of the first subject, with the frame of the second that is nearest in time, up to its end.
     """
     first = subjects[0]
     if ending == STILL:
@@ -224,7 +224,7 @@ def _shots(subjects, ending, frame, frames, every, speed):
 
 
 def _text(subject, k):
-    """The time of a frame, or its number."""
+    """Returns the time of a frame, or its number, as text."""
     if subject.times is None:
         return f"{subject.labels[k]:g}"
     digits = 2 if subject.interval < 10.0 else 0
@@ -244,7 +244,7 @@ def _ends(subject):
 
 
 def _between(subject, frames):
-    """Indices of the frames from one number to another."""
+    """Returns the indices of the frames from one number to another."""
     if frames is None:
         return np.arange(len(subject))
     if not isinstance(frames, Several) or isinstance(frames, str) or len(frames) != 2:
@@ -259,7 +259,7 @@ def _between(subject, frames):
 
 
 def _colours(subjects, colour, given, colormap, rest, device, measuring):
-    """The values of each subject, and their one scale; None without colours."""
+    """Returns the values of each subject, and their common scale; None without colours."""
     if not isinstance(colour, str):
         options = {"measuring": measuring or None}
         options |= {"colour_range": given, "colormap": colormap} if colour is None else {}
@@ -285,7 +285,7 @@ def _colours(subjects, colour, given, colormap, rest, device, measuring):
 
 
 class _Picture:
-    """All pictures of a film, in one size and by one camera."""
+    """Draws all pictures of a film, in one size and with one camera."""
 
     def __init__(self, subjects, shots, size, samples, view, ground, values, scale, device):
         self._subjects, self._shots, self._values, self._scale, self.left_out = subjects, shots, values, scale, 0
@@ -298,7 +298,7 @@ class _Picture:
         room = width - self._overlay.beside
         widths = [room // len(subjects)] * len(subjects)
         widths[0] += room - sum(widths)
-        # The bar is on the last panel, whose motion stays to the left of it.
+        # The bar is on the last panel, so the motion there is shifted to the left of it.
         shifts = [0.0] * (len(subjects) - 1) + [0.5 * self._overlay.beside / height]
         low = self._frame(view, min(widths) / height)
         below = self._camera.position["YZ".index(self._up) + 1] < low
@@ -340,7 +340,7 @@ class _Picture:
         return float(lowest - _BELOW * np.linalg.norm(span[1] - span[0]))
 
     def images(self, with_time):
-        """Yields the pictures, images of Pillow."""
+        """Yields the pictures as Pillow images."""
         rows = None
         if self._values:
             columns = zip(*(shot.frames for shot in self._shots), strict=True)
@@ -358,13 +358,13 @@ class _Picture:
             yield self._overlay.draw(panels, shot.text if with_time else None, excluded)
 
     def _painted(self, shape, values):
-        """Colours of vertices (n, 3), or of the corners of triangles (T, 3, 3)."""
+        """Returns colours of vertices (n, 3), or of corners of triangles (T, 3, 3)."""
         colours = values if values.ndim == 2 else self._scale.linear(values)
         return colours if len(values) == shape.count else np.repeat(colours[:, None], 3, axis=1)
 
 
 def _held(rows, frames):
-    """Yields the row of each frame, also where a frame is shown again."""
+    """Yields the row of each frame; frames may repeat."""
     found = rows(dict.fromkeys(frames))
     last = values = None
     for frame in frames:
@@ -374,7 +374,7 @@ def _held(rows, frames):
 
 
 def _fitted(subject):
-    """Indices of the shapes that the camera shows all of: the cloth, and surroundings that are not much larger."""
+    """Returns the indices of the shapes that the camera frames: the cloth, and surroundings that are not much larger."""
     drawn = [each[_seen(shape)] for shape, each in zip(subject.shapes, subject.read(0), strict=True)]
     finite = [located(each) for each in drawn]
     sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]
@@ -382,12 +382,12 @@ def _fitted(subject):
 
 
 def _seen(shape):
-    """Indices of the points of a shape that something is drawn of; others are nowhere in the picture."""
+    """Returns the indices of the points of a shape that belong to a triangle, line or ball."""
     return np.unique(np.concatenate([shape.triangles.ravel(), shape.lines.ravel(), shape.balls]))
 
 
 def _srgb(linear):
-    """Linear Rec. 709 as sRGB from 0 to 255."""
+    """Converts linear Rec. 709 to sRGB from 0 to 255."""
     c = np.asarray(linear)
     coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
     return tuple(np.round(255.0 * coded).astype(int).tolist())

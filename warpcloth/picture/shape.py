@@ -1,4 +1,4 @@
-"""The things in a picture: surfaces, tubes and balls."""
+"""Shapes in a picture: surfaces, tubes and balls."""
 
 from dataclasses import dataclass, field
 
@@ -6,29 +6,29 @@ import numpy as np
 
 from ..base.checks import array, number, whole
 
-# Linear Rec. 709 of plain cloth, and factors of it on the back, which is grey: one tells the sides apart.
+# Linear Rec. 709 of plain cloth, and factors for its back, which is greyer, to tell the sides apart.
 CLOTH = (0.20, 0.43, 0.72)
 BACK = (1.7, 1.12, 0.86)
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One thing in a picture: what it is made of, and its looks. Its positions come with each picture.
+    """The topology and the look of one shape in a picture. Positions come with each picture.
 
     Attributes:
         count: Number n of points.
-        triangles: Vertices of triangles (T, 3), which are seen from both sides.
+        triangles: Vertices of triangles (T, 3), visible from both sides.
         lines: Vertices of tubes with round ends (E, 2).
-        radius: Of the tubes [m]. Where they would be thinner than a pixel they are drawn as wide as one.
-        balls: Vertices that are balls (k,).
-        ball_radius: Of the balls [m].
-        colour: Linear Rec. 709 of what has no colours of its own.
-        ball_colour: Of the balls.
+        radius: Radius of the tubes [m]. Tubes are drawn at least one pixel wide.
+        balls: Vertices drawn as balls (k,).
+        ball_radius: Radius of the balls [m].
+        colour: Linear Rec. 709 of elements without colours of their own.
+        ball_colour: Linear Rec. 709 of the balls.
         back: Factors of the colour on the back of triangles. Colours of a measure are the same on both sides.
-        smooth: Whether triangles are lit as a smooth surface. Where it bends by more than some 70° it keeps its edges.
+        smooth: Whether to shade triangles as a smooth surface. Edges that bend by more than some 70° stay sharp.
 
     Raises:
-        ValueError: An array has another shape, an index is of no point, or a radius is not above 0.
+        ValueError: An array has another shape, an index has no point, or a radius is not above 0.
     """
 
     count: int

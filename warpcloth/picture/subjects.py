@@ -1,4 +1,4 @@
-"""Shows what there is to draw, whatever it comes from: shapes whose positions are read one frame at a time."""
+"""Turns any source into shapes to draw, whose positions are read one frame at a time."""
 
 import glob
 import os
@@ -23,35 +23,36 @@ from .shape import BACK, CLOTH, Shape
 
 # Linear Rec. 709 of meshes beside the cloth, and of strings and bars.
 SURROUNDINGS, LINES = (0.42, 0.41, 0.39), (0.06, 0.06, 0.065)
-# Radius of pins by the size of the cloth: as large as neighbours do not touch, within these.
+# Largest and smallest radius of pins relative to the size of the cloth, and a limit relative to the edge length, so that
+# neighbours do not touch.
 _PIN, _PIN_LEAST, _PIN_EDGE = 0.009, 0.006, 0.35
-# Radius of the tubes of a net or chain that says none, by its size: thinner ones are hardly seen.
+# Smallest radius of the tubes of a net or chain without widths, relative to its size, so that they are visible.
 _THINNEST = 0.003
-# Likewise of strings and bars beside a cloth.
+# The same for strings and bars beside a cloth.
 _THINNEST_LINE = 0.001
-# From the middle of one cloth of a batch to that of the next, by their size.
+# Distance between the centres of neighbouring cloths of a batch, relative to their size.
 _APART = 1.12
-# Of the height of a cloth, how much farther behind it the next row of a batch is, so that it is seen.
+# Additional distance to the next row of a batch, relative to the height of a cloth, so that it is visible.
 _HIDES = 1.0
-# Beyond, the cube of a distance [m] overflows.
+# Beyond this distance [m], its cube overflows.
 _FARTHEST = 1e100
 _SOURCES = "a path, an Animation, a Deformation, a Scene, a Mesh, a Sequence, or an array of frames with its mesh"
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """All that is drawn of a source.
+    """Everything that is drawn of a source.
 
     Attributes:
-        name: Of the source, for a picture with two.
+        name: Name of the source, shown in pictures with two sources.
         shapes: List of :class:`Shape`.
-        labels: Numbers of the frames (F,), as the source has them.
-        times: Of the frames (F,) [s], or None.
-        read: Function that gives the positions (n, 3) [m] of each shape from the index of a frame.
-        up_axis: "Y" or "Z"; None where the source does not say.
+        labels: Numbers of the frames in the source (F,).
+        times: Times of the frames (F,) [s], or None.
+        read: Function that returns the positions (n, 3) [m] of each shape from the index of a frame.
+        up_axis: "Y" or "Z"; None if the source does not say.
         coloured: Index of the shape that is coloured by a measure.
-        sequences: Function that gives the :class:`Sequence` to be measured of each cloth of the coloured shape.
-        files: Paths that the source is read from.
+        sequences: Function that returns the :class:`Sequence` of each cloth of the coloured shape, to be measured.
+        files: Paths of the files of the source.
     """
 
     name: str
@@ -69,26 +70,26 @@ class Subject:
 
     @property
     def interval(self):
-        """Seconds between frames, 1/24 where nobody says it."""
+        """Time between frames [s]; 1/24 s if the source has no times."""
         if self.times is None or len(self.times) < 2:
             return 1.0 / 24.0
         return float(np.median(np.diff(self.times)))
 
 
 def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0):
-    """The :class:`Subject` of a source.
+    """Returns the :class:`Subject` of a source.
 
     Args:
-        source: Any of those that :func:`warpcloth.render` takes.
+        source: Any source of :func:`warpcloth.render`.
         mesh: The :class:`warpcloth.Mesh` of frames that have none.
         prim: Path or name of the cloth in a stage, or of the geometry in a file.
-        fps: Frames a second, where the source does not say it or says it wrong.
+        fps: Frames per second, if the source does not give them or to override them.
         copy: Index of the cloth of a batch, or None for all, side by side.
-        azimuth: From where they are side by side [°].
+        azimuth: Azimuth of the view in which cloths of a batch are side by side [°].
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The source is none, or has nothing to draw.
+        ValueError: The source is not supported, or has nothing to draw.
     """
     if isinstance(source, (str, os.PathLike)):
         found = _of_path(os.fspath(source), mesh, prim, fps)
@@ -131,7 +132,7 @@ def _of_path(path, mesh, prim, fps):
 
 
 def _of_stage(path, name, prim, fps):
-    """All meshes and curves of a stage."""
+    """Returns all meshes and curves of a stage."""
     stage = read_drawn(path, prim)
     codes = stage.codes
     first = np.concatenate([each.points(codes[0]) for each in stage.prims if each.cloth])
@@ -154,7 +155,7 @@ def _of_stage(path, name, prim, fps):
 
 
 def _prim_shape(prim, code, size):
-    """The shape of a `DrawnPrim`, beside a cloth of a size."""
+    """Returns the shape of a `DrawnPrim`, beside a cloth of a size."""
     edge = np.linalg.norm(np.diff(prim.points(code)[prim.edges], axis=1), axis=-1).mean() if len(prim.edges) else 0.0
     radius = max(prim.radius, min((_THINNEST if prim.cloth else _THINNEST_LINE) * size, 0.2 * edge))
     colour = CLOTH if prim.cloth else LINES if len(prim.edges) else SURROUNDINGS
@@ -175,7 +176,7 @@ def _of_sequence(sequence, mesh):
 
 
 def _of_frames(name, mesh, frames, times, pins=(), scene=None):
-    """Frames (F, n, 3) of a mesh, with the strings, bars and colliders of a scene."""
+    """Returns frames (F, n, 3) of a mesh, with the strings, bars and colliders of a scene."""
     positions, count = _reader(frames, mesh)
     times = None if times is None else np.asarray(times, dtype=float)
     shapes, read = _with_surroundings(scene, _cloth(mesh, positions(0), pins), positions)
@@ -187,7 +188,7 @@ def _of_frames(name, mesh, frames, times, pins=(), scene=None):
 
 
 def _reader(frames, mesh):
-    """Function that gives a frame (n, 3) from its index, and the number of frames."""
+    """Returns a function that returns a frame (n, 3) from its index, and the number of frames."""
     if not hasattr(frames, "exact"):
         frames = frames if isinstance(frames, (list, tuple)) else np.asarray(frames)
     if not len(frames):
@@ -199,7 +200,7 @@ def _reader(frames, mesh):
 
 
 def _of_animation(animation, scene, copy, azimuth):
-    """The frames of a run; of a batch all cloths side by side, or one."""
+    """Returns the frames of a run; for a batch, all cloths side by side, or one."""
     points = animation.points
     if points.ndim == 3 and copy is not None:
         raise ValueError(f"copy is {shown(copy)}; the animation is of one cloth, so that it must be None")
@@ -227,13 +228,13 @@ def _of_animation(animation, scene, copy, azimuth):
 
 
 def _with_surroundings(scene, cloth, positions, offsets=0.0):
-    """The shapes of a cloth and of the strings, bars and colliders of its scene, and the function that reads their positions.
+    """Returns the shapes of a cloth, of the strings, bars and colliders of its scene, and a function that reads positions.
 
     Args:
         scene: The scene, or None.
         cloth: The shape of the cloth.
-        positions: Function that gives the positions of the cloth from the index of a frame.
-        offsets: Of the cloths of a batch, (B, 1, 3) [m], each of which has the colliders about it; 0 for one.
+        positions: Function that returns the positions of the cloth from the index of a frame.
+        offsets: Offsets of the cloths of a batch, (B, 1, 3) [m], each with its own colliders; 0 for one cloth.
     """
     if scene is None:
         return [cloth], lambda frame: [positions(frame)]
@@ -242,14 +243,14 @@ def _with_surroundings(scene, cloth, positions, offsets=0.0):
         return own, lambda frame: [positions(frame)] * len(own)
     stage, size = draw_colliders(scene), _size(scene.positions)
 
-    def read(frame):  # keeps the stage, without which its prims cannot be read
+    def read(frame):  # keeps the stage alive, which its prims need
         return [positions(frame)] * len(own) + [(each.points(frame) + offsets).reshape(-1, 3) for each in stage.prims]
 
     return own + [_prim_shape(each, 0, size) for each in stage.prims], read
 
 
 def _side_by_side(points, azimuth, up_axis):
-    """Offsets (B, 1, 3) [m] by which the cloths of a batch stand in rows, seen from an azimuth."""
+    """Returns offsets (B, 1, 3) [m] that arrange the cloths of a batch in rows, seen from an azimuth."""
     batch = points.shape[1]
     a = np.radians(azimuth)
     right, back = np.array([np.cos(a), 0.0, -np.sin(a)]), np.array([-np.sin(a), 0.0, -np.cos(a)])
@@ -270,7 +271,7 @@ def _side_by_side(points, azimuth, up_axis):
 
 
 def _repeated(shape, batch):
-    """The shape of all cloths of a batch, one after another."""
+    """Returns the shape of all cloths of a batch, one after another."""
     offsets = shape.count * np.arange(batch)
 
     def tiled(rows):
@@ -286,13 +287,13 @@ def _repeated(shape, batch):
 
 
 def _strings(mesh, lines):
-    """Shapes of strings and bars, pairs and a thickness by name."""
+    """Returns the shapes of strings and bars, from pairs and a thickness by name."""
     count, least = len(mesh.points), _THINNEST_LINE * _size(mesh.points)
     return [Shape(count, lines=pairs, radius=max(width / 2.0, least), colour=LINES) for pairs, width in (lines or {}).values()]
 
 
 def _cloth(mesh, points, pins=()):
-    """The shape of a cloth: its triangles, or the tubes of a mesh of edges, and its pins as balls."""
+    """Returns the shape of a cloth: its triangles, or tubes for a mesh of edges, and its pins as balls."""
     lengths = mesh.edge_lengths[np.isfinite(mesh.edge_lengths)]
     edge = float(lengths.mean()) if len(lengths) else 0.0
     edges = np.empty((0, 2), int) if len(mesh.triangles) else mesh.edges
@@ -316,11 +317,11 @@ def _shape(count, triangles, edges, radius, pins, size, edge, colour):
 
 
 def located(points):
-    """Those of points (n, 3) that a camera can show: finite, and not so far away that products of distances overflow."""
+    """Returns the points (n, 3) that a camera can show: finite, and near enough that products of distances do not overflow."""
     return points[(np.abs(points) < _FARTHEST).all(axis=1)]
 
 
 def _size(points):
-    """Diagonal of the box of points that are finite [m]."""
+    """Returns the diagonal of the bounding box of the finite points [m]."""
     finite = located(points)
     return float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 1.0

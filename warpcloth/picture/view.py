@@ -1,4 +1,4 @@
-"""From where a cloth is seen, and in what light."""
+"""The view of a still: a parallel projection, and shading."""
 
 from dataclasses import dataclass, replace
 
@@ -6,22 +6,22 @@ import numpy as np
 
 from ..base.checks import array, choice, number
 
-# Columns of a z-up point that make it y-up, and their signs.
+# Columns and signs that rotate points to y up.
 _UPRIGHT = {"Y": ([0, 1, 2], [1.0, 1.0, 1.0]), "Z": ([0, 2, 1], [1.0, 1.0, -1.0])}
 _MARGIN = 0.03
-# Of the longer side; a cloth seen edge-on still has a picture.
+# Smallest ratio of the sides of a window, so that a cloth seen edge-on has a picture.
 _THINNEST = 0.2
 
 
 @dataclass(frozen=True)
 class View:
-    """A parallel projection, and the window of it that is shown.
+    """A parallel projection and its visible window.
 
     Attributes:
         azimuth: Angle of the viewer about the vertical [°], from +z of a y-up world, from −y of a z-up one.
         elevation: Angle of the viewer above the horizontal [°].
         up_axis: "Y" or "Z".
-        window: (left, right, bottom, top) [m] of what is shown, in the plane of the picture; None until :meth:`fit`.
+        window: Visible window (left, right, bottom, top) [m] in the plane of the picture; None until :meth:`fit`.
 
     Raises:
         ValueError: A number is not finite, the axis is neither of the two, or the window is empty.
@@ -42,7 +42,7 @@ class View:
                 raise ValueError(f"window is {self.window}; left must be below right and bottom below top")
 
     def fit(self, frames):
-        """This view with a window that shows all of some frames.
+        """Returns this view with a window that shows all points of some frames.
 
         Args:
             frames: Points (n, 3) of each [m], read once, one at a time; points that are not finite do not count.
@@ -69,7 +69,7 @@ class View:
         return replace(self, azimuth=azimuth, elevation=-self.elevation, window=window)
 
     def project(self, points):
-        """Right, up and towards the viewer (…, 3) of points or vectors (…, 3)."""
+        """Returns the coordinates to the right, up and towards the viewer (…, 3) of points or vectors (…, 3)."""
         a, e = np.radians([self.azimuth, self.elevation])
         towards = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
         right = np.array([np.cos(a), 0.0, -np.sin(a)])
@@ -80,14 +80,11 @@ class View:
 
 
 def brightness(corners, least):
-    """Light from the viewer's upper left on either side of triangles.
+    """Returns the brightness (T,) of triangles, from ``least`` to 1, in light from the viewer's upper left, on both sides.
 
     Args:
-        corners: Of each triangle (T, 3, 3), to the right, up and towards the viewer.
-        least: Brightness of what the light does not reach, up to 1.
-
-    Returns:
-        numpy.ndarray: (T,), from ``least`` to 1.
+        corners: Corners of the triangles (T, 3, 3), to the right, up and towards the viewer.
+        least: Brightness without light, up to 1.
     """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)[:, None]
